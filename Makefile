@@ -1,0 +1,44 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/pip --disable-pip-version-check install --quiet --constraint constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format clean
+
+help: ## show this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: $(VENV)/.stamp-render ## render a short sequence, denoise it, and write pictures and figures to demo/
+	$(BIN)/mcdenoise demo -o demo
+
+# GOMP_SPINCOUNT: on a busy machine spinning OpenMP threads make torch many times slower.
+test: $(VENV)/.stamp-dev ## run every test that is not marked slow
+	GOMP_SPINCOUNT=0 $(BIN)/pytest -m "not slow"
+
+lint: $(VENV)/.stamp-dev ## check style, format and types; change nothing
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+format: $(VENV)/.stamp-dev ## mend style and format where that is safe
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+clean: ## remove .venv, caches and everything written by make
+	rm -rf $(VENV) demo build dist *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# One stamp for each set of extras, so that a second run installs nothing.
+$(VENV)/.stamp-%: pyproject.toml constraints.txt | $(BIN)/pip
+	@echo "installing mcdenoise[$*] into $(VENV); the first time this takes some minutes"
+	@$(PIP) torch
+	@$(PIP) --editable '.[$*]'
+	@touch $@
+
+# pip comes after the interpreter: a venv without it was interrupted, and is made again.
+$(BIN)/pip:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "mcdenoise needs Python 3.11 or newer; '$(PYTHON)' is not. Name one, such as: make demo PYTHON=python3.12" >&2; \
+	  exit 1; }
+	@$(PYTHON) -m venv --clear $(VENV)

@@ -1,0 +1,217 @@
+"""The vocabulary of the project: what a renderer hands over for one frame, in which layout, unit and range."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mcdenoise.errors import InputError
+
+# How far half floats and a renderer's own arithmetic may lead out of a range.
+_ROUNDING = 1e-2
+
+
+@dataclass(frozen=True)
+class BufferSpec:
+    """What a buffer holds: its channels, range and meaning.
+
+    Args:
+        channels: number of channels.
+        low: smallest legal value.
+        high: largest legal value.
+        meaning: unit and convention, for messages and documentation.
+        infinite: whether positive infinity is legal (a distance where nothing was hit).
+        slack: how far values may overshoot ``high`` before they are refused; up to there they are clamped.
+    """
+
+    channels: int
+    low: float
+    high: float
+    meaning: str
+    infinite: bool = False
+    slack: float = _ROUNDING
+
+
+_UNBOUNDED = float("inf")
+
+BUFFERS: dict[str, BufferSpec] = {
+    "color": BufferSpec(3, 0.0, _UNBOUNDED, "noisy radiance, scene-linear RGB, not clamped"),
+    "albedo": BufferSpec(3, 0.0, 1.0, "diffuse reflectance, linear RGB; 0 where there is none", slack=1.0),
+    "normal": BufferSpec(3, -1.0, 1.0, "shading normal, world space, unit length; 0 where nothing was hit"),
+    "depth": BufferSpec(
+        1, 0.0, _UNBOUNDED, "distance along the view axis, scene units; inf where nothing was hit", infinite=True
+    ),
+    "position": BufferSpec(3, -_UNBOUNDED, _UNBOUNDED, "world-space hit point, scene units"),
+    "motion": BufferSpec(2, -_UNBOUNDED, _UNBOUNDED, "pixels (x right, y down): previous = current + motion"),
+    "reference": BufferSpec(3, 0.0, _UNBOUNDED, "converged radiance, scene-linear RGB"),
+}
+
+
+_MATRIX = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "world-to-clip matrix")
+
+
+# eq=False: comparing tensors has no single truth value, so frames are equal only to themselves.
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One frame of a renderer's outputs: every buffer is ``(B, C, H, W)``, all of the same batch, size and device.
+
+    Only ``color`` is required. Constructing a frame checks shapes, dtypes and devices (cheap); :meth:`validate` also
+    looks at every value.
+
+    Args:
+        color: ``(B, 3, H, W)`` noisy radiance, scene-linear, non-negative, unclamped.
+        albedo: ``(B, 3, H, W)`` diffuse reflectance in [0, 1]; 0 on emitters, mirrors, glass and background.
+        normal: ``(B, 3, H, W)`` world-space unit shading normal in [-1, 1]; 0 where nothing was hit.
+        depth: ``(B, 1, H, W)`` distance along the view axis in scene units; ``inf`` where nothing was hit.
+        position: ``(B, 3, H, W)`` world-space hit point in scene units.
+        motion: ``(B, 2, H, W)`` pixels, x right and y down, ``previous_position = current_position + motion``.
+        view_projection: ``(B, 4, 4)`` row-vector world-to-clip matrix, ``clip = [x y z 1] @ M``; clip y points down.
+        reference: ``(B, 3, H, W)`` converged radiance of the same pixels.
+
+    Raises:
+        InputError: a buffer has the wrong type, number of channels, size, dtype or device. The message names it.
+
+    Example:
+        >>> frame = Frame(color=torch.rand(1, 3, 4, 6), depth=torch.ones(1, 1, 4, 6))
+        >>> frame.size
+        (4, 6)
+        >>> Frame(color=torch.rand(1, 3, 4, 6), albedo=torch.rand(1, 3, 4, 5))
+        Traceback (most recent call last):
+        ...
+        mcdenoise.errors.InputError: buffer 'albedo': expected shape (1, 3, 4, 6) like 'color', found (1, 3, 4, 5)
+    """
+
+    color: Tensor
+    albedo: Tensor | None = None
+    normal: Tensor | None = None
+    depth: Tensor | None = None
+    position: Tensor | None = None
+    motion: Tensor | None = None
+    view_projection: Tensor | None = None
+    reference: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        _check_buffer("color", self.color)
+        if self.color.ndim != 4 or self.color.shape[1] != 3 or 0 in self.color.shape:
+            raise InputError(f"buffer 'color': expected shape (B, 3, H, W), found {tuple(self.color.shape)}")
+        batch, _, height, width = self.color.shape
+        for name, value in self.items():
+            _check_buffer(name, value)
+            if value.device != self.color.device:
+                raise InputError(
+                    f"buffer '{name}': expected on {self.color.device} like 'color', found on {value.device}"
+                )
+            spec = BUFFERS.get(name)
+            expected = (batch, spec.channels, height, width) if spec else (batch, 4, 4)
+            if tuple(value.shape) != expected:
+                raise InputError(f"buffer '{name}': expected shape {expected} like 'color', found {tuple(value.shape)}")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self.color.shape[2], self.color.shape[3]
+
+    def items(self) -> Iterator[tuple[str, Tensor]]:
+        """Name and tensor of every buffer that is present."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None:
+                yield field.name, value
+
+    def replace(self, **changes: Tensor | None) -> Frame:
+        """The same frame with some buffers changed."""
+        buffers: dict[str, Any] = dict(self.items()) | changes
+        return Frame(**buffers)
+
+    def to(self, target: torch.device | torch.dtype | str) -> Frame:
+        """Every buffer moved to a device or converted to a dtype."""
+        return Frame(**{name: value.to(target) for name, value in self.items()})
+
+    def validate(self) -> tuple[Frame, int]:
+        """Look at every value: repair what is a renderer's daily bread, refuse what would spoil the result.
+
+        Pixels of ``color`` with NaN, infinity or a negative value get the mean of their usable 3x3 neighbours (0 if
+        there is none), so that they never spread. Values of ``albedo`` and ``normal`` that overshoot their range by
+        rounding are clamped, and so are albedos up to 2 (rough conductors evaluated at the normal).
+
+        Returns:
+            The clean frame, and the number of pixels of ``color`` that were replaced.
+
+        Raises:
+            InputError: another buffer holds NaN, an illegal infinity or a value far outside its range.
+        """
+        changes: dict[str, Tensor | None] = {}
+        color, replaced = replace_invalid(self.color)
+        if replaced:
+            changes["color"] = color
+        for name, value in self.items():
+            if name != "color":
+                clean = _check_values(name, value)
+                if clean is not value:
+                    changes[name] = clean
+        return (self.replace(**changes) if changes else self), replaced
+
+
+def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
+    """Replace pixels with NaN, infinite or negative radiance by the mean of their usable 3x3 neighbours.
+
+    Args:
+        color: ``(B, C, H, W)`` radiance.
+
+    Returns:
+        The clean radiance (``color`` itself where nothing was wrong), and the number of pixels that were replaced.
+
+    Example:
+        >>> color = torch.ones(1, 3, 3, 3)
+        >>> color[0, 1, 1, 1] = float("nan")
+        >>> clean, replaced = replace_invalid(color)
+        >>> replaced, clean[0, :, 1, 1].tolist()
+        (1, [1.0, 1.0, 1.0])
+    """
+    usable = (torch.isfinite(color) & (color >= 0)).all(dim=1, keepdim=True)
+    replaced = int((~usable).sum())
+    if replaced == 0:
+        return color, 0
+    zeroed = torch.where(usable, color, 0)
+    # Divided before they are summed, and never in half precision: bright neighbours must not add up to infinity.
+    dtype = torch.promote_types(color.dtype, torch.float32)
+    total = torch.nn.functional.avg_pool2d(zeroed.to(dtype) / 9, 3, stride=1, padding=1, divisor_override=1)
+    count = torch.nn.functional.avg_pool2d(usable.to(dtype), 3, stride=1, padding=1, divisor_override=1)
+    mean = (total * (9 / count.clamp_min(1))).to(color.dtype)
+    return torch.where(usable, color, mean), replaced
+
+
+def _check_buffer(name: str, value: object) -> None:
+    if not isinstance(value, Tensor):
+        raise InputError(f"buffer '{name}': expected a torch.Tensor, found {type(value).__name__}")
+    if not value.is_floating_point():
+        raise InputError(f"buffer '{name}': expected a floating-point dtype, found {value.dtype}")
+
+
+def _check_values(name: str, value: Tensor) -> Tensor:
+    spec = BUFFERS.get(name, _MATRIX)
+    bad = ~torch.isfinite(value)
+    if spec.infinite:
+        bad &= value != _UNBOUNDED
+    if bad.any():
+        where = bad.nonzero()[0].tolist()
+        place = f"first at row {where[2]}, column {where[3]}" if len(where) == 4 else f"first at {where[1:]}"
+        raise InputError(
+            f"buffer '{name}': expected finite values ({spec.meaning}), "
+            f"found {int(bad.sum())} NaN or infinite ones, {place}; render the buffer again or leave it out"
+        )
+    if spec.high == _UNBOUNDED and spec.low == -_UNBOUNDED:
+        return value
+    low, high = float(value.min()), float(value.max())
+    if low >= spec.low and high <= spec.high:
+        return value
+    if low < spec.low - _ROUNDING or high > spec.high + spec.slack:
+        raise InputError(
+            f"buffer '{name}': expected values in [{spec.low:g}, {spec.high:g}] ({spec.meaning}), "
+            f"found [{low:.4g}, {high:.4g}]"
+        )
+    return value.clamp(spec.low, spec.high)

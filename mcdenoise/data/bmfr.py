@@ -1,0 +1,245 @@
+"""The layout of the BMFR data set: one EXR a buffer and frame, cameras in a C header (Koskela et al. 2019)."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mcdenoise.buffers import BUFFERS, Frame
+from mcdenoise.data.camera_matrices import Array, CameraMatrices, read_camera_matrices
+from mcdenoise.data.exr import LARGEST_HALF, Metadata, MetadataValue, read_exr, read_exr_header, write_exr
+from mcdenoise.data.files import write_text
+from mcdenoise.errors import InputError
+
+# Buffer to file name, in the order of writing: color comes last, so that a frame that has its color is complete.
+_STEMS = {
+    "albedo": "albedo",
+    "normal": "shading_normal",
+    "position": "world_position",
+    "depth": "depth",
+    "motion": "motion",
+    "reference": "reference",
+    "color": "color",
+}
+_CHANNELS = {1: ["Y"], 2: ["X", "Y"], 3: ["R", "G", "B"]}
+_MATRICES = "camera_matrices.h"
+_DESCRIPTION = "camera.json"
+
+
+@dataclass(frozen=True)
+class BmfrFolder:
+    """A folder in this layout: ``{color,albedo,shading_normal,world_position,...}N.exr`` and ``camera_matrices.h``.
+
+    Args:
+        path: the folder that holds the files.
+        files: for each buffer, the file of each frame number.
+        numbers: frames in use, ascending.
+        size: height and width in pixels, the same for every buffer and frame.
+        cameras: what ``camera_matrices.h`` says, or ``None`` without it.
+        color_has_albedo: whether the color files hold radiance (``camera.json`` says so) or radiance divided by
+            albedo (the published data, which has no ``camera.json``). Without albedo files it is always radiance.
+    """
+
+    path: Path
+    files: Mapping[str, Mapping[int, Path]]
+    numbers: list[int]
+    size: tuple[int, int]
+    cameras: CameraMatrices | None
+    color_has_albedo: bool
+
+    @property
+    def buffers(self) -> frozenset[str]:
+        """Names of the buffers that every frame has, as :meth:`frame` gives them."""
+        present = {name for name, files in self.files.items() if all(number in files for number in self.numbers)}
+        if self.cameras is not None:
+            present |= {"view_projection", "depth"} if "position" in present else {"view_projection"}
+        return frozenset(present)
+
+    @property
+    def reference_numbers(self) -> list[int]:
+        """Frames in use that have a reference."""
+        return [number for number in self.numbers if number in self.files["reference"]]
+
+    def metadata(self, number: int) -> Metadata:
+        """Attributes of the color file of one frame."""
+        return read_exr_header(self.files["color"][number]).metadata
+
+    def frame(self, number: int, *, reference: bool = True) -> Frame:
+        """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
+        buffers = {
+            name: self._read(name, files[number])
+            for name, files in self.files.items()
+            if number in files and (reference or name != "reference")
+        }
+        if not self.color_has_albedo:
+            buffers["color"] = buffers["color"] * buffers["albedo"]
+        if self.cameras is not None:
+            matrix = self.cameras.view_projection(number, self.size)
+            if "position" in buffers:
+                matrix, distance = _view_depth(matrix, buffers["position"])
+                buffers.setdefault("depth", distance)
+            buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
+        if "depth" in buffers:
+            buffers["depth"] = _normalise_depth(buffers["depth"], buffers.get("albedo"), buffers.get("normal"))
+        return Frame(**buffers)
+
+    def _read(self, name: str, path: Path) -> Tensor:
+        image, channels, _ = read_exr(path)
+        _check_file(name, path, image.shape[:2], channels, self.size)
+        return torch.from_numpy(image).permute(2, 0, 1)[None].contiguous()
+
+
+def find_frames(path: Path) -> dict[str, dict[int, Path]] | None:
+    """List the files of a folder in this layout by buffer and frame number; ``None`` if it has no color files.
+
+    Raises:
+        InputError: the folder cannot be listed, or two files are the same frame of a buffer.
+    """
+    found: dict[str, dict[int, Path]] = {name: {} for name in _STEMS}
+    patterns = {name: re.compile(rf"{stem}([0-9]{{1,9}})\.exr") for name, stem in _STEMS.items()}
+    try:
+        entries = sorted(os.listdir(path))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+    for entry in entries:
+        for name, pattern in patterns.items():
+            if match := pattern.fullmatch(entry):
+                other = found[name].setdefault(int(match[1]), path / entry)
+                if other.name != entry:
+                    raise InputError(f"{path}: expected one file a frame, found {other.name} and {entry}; remove one")
+    return found if found["color"] else None
+
+
+def open_bmfr(path: Path, files: Mapping[str, Mapping[int, Path]], numbers: list[int]) -> BmfrFolder:
+    """Check the chosen frames of a folder, from file names and headers alone.
+
+    Args:
+        path: the folder.
+        files: what :func:`find_frames` found there.
+        numbers: the frames to use, ascending; each has a color file.
+
+    Raises:
+        InputError: a file is missing or unreadable, or sizes or channels differ from what is expected.
+    """
+    size = read_exr_header(files["color"][numbers[0]]).size
+    used = {name for name in files if any(number in files[name] for number in numbers)} | {"reference"}
+    for name in sorted(used):
+        for number in numbers:
+            if number in files[name]:
+                header = read_exr_header(files[name][number])
+                _check_file(name, files[name][number], header.size, header.channels, size)
+            elif name != "reference":
+                missing = path / f"{_STEMS[name]}{number}.exr"
+                raise InputError(
+                    f"{missing}: expected buffer '{name}' for every frame, found it for some; "
+                    f"render it, or leave out all {_STEMS[name]} files"
+                )
+    cameras = read_camera_matrices(path / _MATRICES) if (path / _MATRICES).exists() else None
+    if cameras is not None and len(cameras) <= numbers[-1]:
+        raise InputError(
+            f"{path / _MATRICES}: expected a matrix for frame {numbers[-1]}, found {len(cameras)} (frames 0 to "
+            f"{len(cameras) - 1}); write all matrices, or choose fewer frames"
+        )
+    has_albedo = _color_has_albedo(path, "albedo" in used)
+    return BmfrFolder(path, {name: files[name] for name in used}, numbers, size, cameras, has_albedo)
+
+
+def write_bmfr_frame(
+    folder: Path, number: int, frame: Frame, *, metadata: Mapping[str, MetadataValue] | None = None
+) -> None:
+    """Write the buffers of one frame: 32-bit floats for positions (and depths beyond half's range), half for the rest.
+
+    The color file is written last. A folder without ``camera.json`` gets one that says that color is radiance.
+    ``view_projection`` is not written: see :func:`mcdenoise.data.camera_matrices.write_camera_matrices`.
+
+    Args:
+        folder: where to write; made if it does not exist.
+        number: frame number.
+        frame: batch of 1. Infinite depths are stored as 0.
+        metadata: attributes for every file.
+
+    Raises:
+        InputError: a file cannot be written.
+        ValueError: the frame holds more than one image.
+    """
+    if frame.color.shape[0] != 1:
+        raise ValueError(f"frame: expected a batch of 1, found {frame.color.shape[0]}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from error
+    # Without it a reader must take the folder for published BMFR data, whose color is divided by albedo.
+    if not (folder / _DESCRIPTION).exists():
+        write_text(folder / _DESCRIPTION, json.dumps({"color_includes_albedo": True}) + "\n")
+    buffers = dict(frame.items())
+    for name, stem in _STEMS.items():
+        if name not in buffers:
+            continue
+        image = buffers[name][0].detach().float().permute(1, 2, 0).cpu().numpy()
+        if name == "depth":
+            image = np.where(np.isinf(image), 0, image)
+        half = name != "position" and not (name == "depth" and image.max() > LARGEST_HALF)
+        write_exr(folder / f"{stem}{number}.exr", image, _CHANNELS[image.shape[2]], half=half, metadata=metadata)
+
+
+def _check_file(
+    name: str, path: Path, size: Iterable[int], channels: list[str], expected_size: tuple[int, int]
+) -> None:
+    expected = BUFFERS[name].channels
+    if len(channels) != expected:
+        raise InputError(
+            f"{path}: expected {expected} channels for buffer '{name}', found {len(channels)} "
+            f"({', '.join(channels[:8])}); write only those that belong to it"
+        )
+    height, width = size
+    if (height, width) != expected_size:
+        raise InputError(
+            f"{path}: expected {expected_size[1]} x {expected_size[0]} pixels like the first color file, "
+            f"found {width} x {height}; render all buffers and frames at one size"
+        )
+
+
+def _color_has_albedo(path: Path, albedo_present: bool) -> bool:
+    description = path / _DESCRIPTION
+    if not description.exists():
+        # Without albedo there is nothing to multiply back: somebody's plain radiance, not the published data.
+        return not albedo_present
+    try:
+        content = json.loads(description.read_text(encoding="utf-8"))
+        has_albedo = content.get("color_includes_albedo", True)
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
+        raise InputError(f"{description}: expected a JSON object, found something else; repair or remove it") from error
+    if not isinstance(has_albedo, bool):
+        raise InputError(f"{description}: expected 'color_includes_albedo' to be true or false, found {has_albedo!r}")
+    if not has_albedo and not albedo_present:
+        raise InputError(
+            f"{path}: expected albedo files, because camera.json says that color has no albedo in it, found none; "
+            "add them, or set 'color_includes_albedo' to true"
+        )
+    return has_albedo
+
+
+def _view_depth(matrix: Array, position: Tensor) -> tuple[Array, Tensor]:
+    """Clip w of every position; the matrix comes back with the sign that makes it positive in front of the camera."""
+    w = position[0].double().permute(1, 2, 0) @ torch.from_numpy(matrix[:3, 3]) + matrix[3, 3]
+    # A matrix and its negative project alike; what was seen lies in front.
+    if w.median() < 0:
+        matrix, w = -matrix, -w
+    return matrix, w.float()[None, None]
+
+
+def _normalise_depth(depth: Tensor, albedo: Tensor | None, normal: Tensor | None) -> Tensor:
+    """Infinity where nothing was hit: depth 0, a placeholder behind the camera, or neither albedo nor normal."""
+    nothing = depth <= 0
+    if albedo is not None and normal is not None:
+        # Both: mirrors and glass have no albedo, but they have a normal.
+        nothing |= ((albedo == 0) & (normal == 0)).all(dim=1, keepdim=True)
+    return torch.where(nothing, torch.inf, depth)

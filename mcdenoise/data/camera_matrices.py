@@ -1,0 +1,162 @@
+"""``camera_matrices.h``: the cameras of a sequence as the C header that the BMFR data set uses."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcdenoise.data.files import write_text
+from mcdenoise.errors import InputError
+
+Array: TypeAlias = NDArray[np.float64]
+
+_LARGEST_FILE = 50 * 2**20
+# A comment that is never closed swallows the rest, so that whatever it hides counts as missing.
+_COMMENT = re.compile(r"//[^\n]*|/\*.*?(?:\*/|\Z)", re.DOTALL)
+_NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+_LITERAL = re.compile(rf"\s*(?:([{{}},])|({_NUMBER.pattern})[fF]?(?![\w.]))")
+
+
+@dataclass(frozen=True)
+class CameraMatrices:
+    """The cameras of N frames and the limits of BMFR's temporal accumulation.
+
+    Args:
+        matrices: float64 ``(N, 4, 4)`` row-vector world-to-clip matrices, ``clip = [x y z 1] @ M``, clip y down.
+        pixel_offsets: float64 ``(N, 2)``, ``(ox, oy)`` in pixels: a point at (u, v) lies at pixel index
+            ``(u W - ox, v H - (1 - oy))``. (0.5, 0.5) puts integers at pixel centres.
+        position_limit_squared: squared distance, in scene units, beyond which two points are not the same surface.
+        normal_limit_squared: the same for unit normals.
+    """
+
+    matrices: Array
+    pixel_offsets: Array
+    position_limit_squared: float
+    normal_limit_squared: float
+
+    def __len__(self) -> int:
+        return len(self.matrices)
+
+    def view_projection(self, index: int, size: tuple[int, int]) -> Array:
+        r"""One frame's matrix with its pixel offset folded in, so that ``u W - 0.5, v H - 0.5`` is the pixel index.
+
+        .. math:: M'_{:,0} = M_{:,0} + \frac{1 - 2 o_x}{W} M_{:,3}, \quad
+                  M'_{:,1} = M_{:,1} + \frac{2 o_y - 1}{H} M_{:,3}
+
+        Args:
+            index: which frame, from 0.
+            size: height and width of the image in pixels.
+
+        Returns:
+            float64 ``(4, 4)``.
+        """
+        height, width = size
+        offset_x, offset_y = self.pixel_offsets[index]
+        matrix: Array = self.matrices[index].copy()
+        matrix[:, 0] += (1 - 2 * offset_x) / width * matrix[:, 3]
+        matrix[:, 1] += (2 * offset_y - 1) / height * matrix[:, 3]
+        return matrix
+
+
+def read_camera_matrices(path: Path) -> CameraMatrices:
+    """Read a ``camera_matrices.h``.
+
+    Args:
+        path: the C header with ``camera_matrices[N][4][4]``, ``pixel_offsets[N][2]``, ``position_limit_squared`` and
+            ``normal_limit_squared``. Comments and the suffix ``f`` are understood; nothing is computed.
+
+    Raises:
+        InputError: the file is missing, too large, incomplete, or holds something that is no finite number.
+    """
+    try:
+        if os.path.getsize(path) > _LARGEST_FILE:
+            raise InputError(
+                f"{path}: expected at most {_LARGEST_FILE} bytes, found more; is this a camera_matrices.h?"
+            )
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+    text = _COMMENT.sub(" ", text)
+    matrices = _read_variable(path, text, "camera_matrices", (-1, 4, 4))
+    return CameraMatrices(
+        matrices,
+        _read_variable(path, text, "pixel_offsets", (len(matrices), 2)),
+        float(_read_variable(path, text, "position_limit_squared", ())),
+        float(_read_variable(path, text, "normal_limit_squared", ())),
+    )
+
+
+def write_camera_matrices(path: Path, cameras: CameraMatrices, comment: str = "") -> None:
+    """Write a ``camera_matrices.h``, whole or not at all; numbers keep single precision.
+
+    Args:
+        path: the file to be written. Its folder must exist.
+        cameras: what to write.
+        comment: one line for the head of the file.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    count = len(cameras)
+    lines = [f"// {comment}"] if comment else []
+    lines += [
+        f"const float position_limit_squared = {_literal(cameras.position_limit_squared)};",
+        f"const float normal_limit_squared = {_literal(cameras.normal_limit_squared)};",
+        f"const float camera_matrices[{count}][4][4] = {_literal(cameras.matrices.tolist())};",
+        f"const float pixel_offsets[{count}][2] = {_literal(cameras.pixel_offsets.tolist())};",
+    ]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _read_variable(path: Path, text: str, name: str, shape: tuple[int, ...]) -> Array:
+    expected = "numbers " + "".join(f"[{n}]" if n >= 0 else "[N]" for n in shape) if shape else "a number"
+    statement = re.search(rf"\b{name}\b[^=;]*=([^;]*);", text)
+    if statement is None:
+        found = "it incomplete" if re.search(rf"\b{name}\b", text) else "no such variable"
+        raise _malformed(path, name, expected, found)
+    try:
+        values = np.asarray(json.loads(_to_json(statement.group(1))), dtype=np.float64)
+    except (ValueError, RecursionError) as error:
+        raise _malformed(path, name, expected, "something else") from error
+    if values.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, values.shape, strict=True)):
+        raise _malformed(path, name, expected, f"shape {values.shape}")
+    # Single precision is what the header declares and what frames hold.
+    if not (np.abs(values) <= np.finfo(np.float32).max).all():
+        raise _malformed(path, name, expected, "a number too large for single precision")
+    return values
+
+
+def _to_json(initialiser: str) -> str:
+    """Turn ``{{1.f, -.5}}`` into ``[[1.0,-0.5]]``."""
+    parts: list[str] = []
+    position = 0
+    initialiser = initialiser.strip()
+    while position < len(initialiser):
+        match = _LITERAL.match(initialiser, position)
+        if match is None:
+            raise ValueError("neither a number nor a brace nor a comma")
+        position = match.end()
+        mark, number = match.groups()
+        if mark == "}" and parts and parts[-1] == ",":
+            parts.pop()  # C allows a comma after the last element, JSON does not.
+        parts.append({"{": "[", "}": "]", ",": ","}[mark] if mark else repr(float(number)))
+    return "".join(parts)
+
+
+def _literal(value: float | list[Any]) -> str:
+    if isinstance(value, list):
+        separator = ", " if not value or not isinstance(value[0], list) else ",\n"
+        return "{" + separator.join(_literal(item) for item in value) + "}"
+    text = f"{value:.9g}"
+    return f"{text}f" if any(mark in text for mark in ".e") else f"{text}.0f"
+
+
+def _malformed(path: Path, name: str, expected: str, found: str) -> InputError:
+    return InputError(f"{path}: expected '{name}' to be {expected}, found {found}; write the file again")

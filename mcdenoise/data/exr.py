@@ -1,0 +1,200 @@
+"""EXR files through OpenImageIO: float images in and out, every failure told in one line."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from mcdenoise.data.files import atomic_path
+from mcdenoise.errors import InputError
+
+Image: TypeAlias = NDArray[np.float32]
+MetadataValue: TypeAlias = str | int | float | tuple[float, ...]
+Metadata: TypeAlias = dict[str, MetadataValue]
+
+LARGEST_HALF = 65504.0
+_LARGEST_PIXEL_COUNT = 2**28
+# These describe how one file stores its pixels, not what they show; the next file has its own.
+_STORAGE_PREFIXES = ("oiio:", "openexr:", "compression")
+_TUPLE_TYPES = {"FramesPerSecond": "rational", "smpte:TimeCode": "timecode"}
+
+
+@dataclass(frozen=True)
+class ExrHeader:
+    """What an EXR file says about its image before any pixel is read.
+
+    Args:
+        size: height and width of the data window in pixels.
+        channels: channel names, in the order in which :func:`read_exr` returns them (R, G, B first).
+        metadata: attributes that describe the picture: texts, numbers and tuples of numbers.
+    """
+
+    size: tuple[int, int]
+    channels: list[str]
+    metadata: Metadata
+
+
+def read_exr_header(path: Path) -> ExrHeader:
+    """Read the header of an EXR file.
+
+    Args:
+        path: the file. Of a file with several parts, the first one is read.
+
+    Raises:
+        InputError: as :func:`read_exr`, except for damaged pixels, which are not looked at.
+    """
+    file, header = _open(path)
+    file.close()
+    return header
+
+
+def read_exr(path: Path) -> tuple[Image, list[str], Metadata]:
+    """Read an EXR file.
+
+    Args:
+        path: the file. Of a file with several parts, the first one is read.
+
+    Returns:
+        The pixels of the data window as float32 ``(H, W, C)``, top row first; the C channel names; the attributes
+        that describe the picture.
+
+    Raises:
+        InputError: the file is missing, no EXR, deep, damaged or of absurd size.
+    """
+    file, header = _open(path)
+    try:
+        pixels = file.read_image(0, 0, 0, len(header.channels), oiio.FLOAT)
+        reason = _reason(file)
+    except MemoryError:
+        pixels, reason = None, "not enough memory"
+    finally:
+        file.close()
+    # A file cut short has an intact header, and its missing rows would otherwise be black.
+    if pixels is None or reason:
+        raise _unreadable(path, f"damaged or missing pixels ({reason})", "render or copy the file again")
+    return np.asarray(pixels, dtype=np.float32).reshape(*header.size, -1), header.channels, header.metadata
+
+
+def write_exr(
+    path: Path,
+    image: NDArray[Any],
+    channels: Sequence[str],
+    *,
+    half: bool = True,
+    metadata: Mapping[str, MetadataValue] | None = None,
+) -> None:
+    """Write an EXR file with ZIP compression, whole or not at all.
+
+    Args:
+        path: the file to be written. Its folder must exist.
+        image: ``(H, W, C)`` pixels, top row first.
+        channels: C channel names.
+        half: store half floats; values beyond 65504 are stored as 65504. Otherwise 32-bit floats.
+        metadata: attributes to keep, as :func:`read_exr` returns them.
+
+    Raises:
+        InputError: the file cannot be written.
+        ValueError: ``image`` and ``channels`` do not fit together.
+    """
+    if image.ndim != 3 or 0 in image.shape or image.shape[2] != len(channels):
+        raise ValueError(
+            f"image: expected shape (H, W, {len(channels)}) for channels {list(channels)}, found {image.shape}"
+        )
+    pixels = np.ascontiguousarray(image, dtype=np.float32)
+    if half:
+        # Rounding would turn a firefly into infinity, which spreads through every filter downstream; NaN stays NaN.
+        pixels = np.clip(pixels, -LARGEST_HALF, LARGEST_HALF)
+    height, width, count = pixels.shape
+    spec = oiio.ImageSpec(width, height, count, "half" if half else "float")
+    spec.channelnames = tuple(channels)
+    for name, value in (metadata or {}).items():
+        if not name.startswith(_STORAGE_PREFIXES):
+            _set_attribute(spec, name, value)
+    spec.attribute("compression", "zip")
+    with atomic_path(path) as temporary:
+        reason = _write(temporary, spec, pixels).replace(str(temporary), path.name)
+        if reason:
+            raise InputError(f"{path}: cannot be written ({reason}); check the folder, its permissions and free space")
+
+
+def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
+    # os.path, because Path.is_file raises for a name that is too long or a folder that may not be entered.
+    if not os.path.isfile(path):
+        raise _unreadable(path, "a folder" if os.path.isdir(path) else "no such file", "check the path")
+    file = oiio.ImageInput.open(str(path))
+    if file is None:
+        reason = _reason(oiio).replace(f"EXR Error ({path}): ", "")
+        raise _unreadable(path, f"what cannot be opened ({reason})", "check that the file is an EXR and complete")
+    spec = file.spec()
+    found = ""
+    if file.format_name() != "openexr":
+        found = f"a {file.format_name()} file"
+    elif spec.deep:
+        found = "a deep image"
+    elif spec.nchannels < 1:
+        found = "no channels"
+    elif min(spec.width, spec.height) < 1 or spec.width * spec.height > _LARGEST_PIXEL_COUNT:
+        found = f"{spec.width} x {spec.height} pixels"
+    if found:
+        file.close()
+        raise _unreadable(path, found, "render a flat EXR of at most 2^28 pixels")
+    return file, ExrHeader((spec.height, spec.width), list(spec.channelnames), _metadata(spec))
+
+
+def _metadata(spec: oiio.ImageSpec) -> Metadata:
+    kept: Metadata = {}
+    for attribute in spec.extra_attribs:
+        value = attribute.value
+        if isinstance(value, tuple) and not all(isinstance(item, int | float) for item in value):
+            continue
+        if isinstance(value, str | int | float | tuple) and not attribute.name.startswith(_STORAGE_PREFIXES):
+            kept[attribute.name] = value
+    return kept
+
+
+def _set_attribute(spec: oiio.ImageSpec, name: str, value: MetadataValue) -> None:
+    if isinstance(value, tuple):
+        spec.attribute(name, oiio.TypeDesc(_TUPLE_TYPES.get(name, f"float[{len(value)}]")), value)
+    else:
+        spec.attribute(name, value)
+
+
+def _write(path: Path, spec: oiio.ImageSpec, pixels: Image) -> str:
+    """Write the file and return why that failed, or an empty text."""
+    file = oiio.ImageOutput.create("openexr")
+    if file is None:
+        return _reason(oiio)
+    if not file.open(str(path), spec):
+        return _reason(file)
+    written = file.write_image(pixels)
+    reason = _reason(file)
+    if not file.close() or not written:
+        return reason or "writing failed"
+    # OpenImageIO does not notice when the last few kilobytes no longer fit on the disk: see whether they are there.
+    check = oiio.ImageInput.open(str(path))
+    if check is None:
+        return f"incomplete: {_reason(oiio)}"
+    last = check.read_scanlines(0, 0, spec.height - 1, spec.height, 0, 0, spec.nchannels, oiio.FLOAT)
+    reason = _reason(check)
+    check.close()
+    return "" if last is not None and not reason else f"incomplete: {reason}"
+
+
+def _reason(source: Any) -> str:
+    """The pending error of OpenImageIO in one line; a damaged header can put bytes into it that are no text."""
+    try:
+        lines = source.geterror().split("\n")
+    except UnicodeDecodeError:
+        return "damaged header"
+    return str(lines[-1]).strip()
+
+
+def _unreadable(path: Path, found: str, advice: str) -> InputError:
+    return InputError(f"{path}: expected an EXR image, found {found}; {advice}")

@@ -1,0 +1,206 @@
+"""Sequences: folders of frames in known layouts, opened and checked in one call."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Protocol
+
+from mcdenoise.buffers import Frame
+from mcdenoise.data.bmfr import find_frames, open_bmfr
+from mcdenoise.data.exr import Metadata
+from mcdenoise.errors import InputError
+
+_LARGEST_FRAME_COUNT = 1_000_000
+_KNOWN_LAYOUTS = "bmfr: color0.exr, color1.exr, ... in it or in its 'inputs'"
+
+
+class Layout(Protocol):
+    """What a layout has to know about the frames that were chosen from a folder."""
+
+    @property
+    def numbers(self) -> list[int]:
+        """Frames in use, ascending."""
+        ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        ...
+
+    @property
+    def buffers(self) -> frozenset[str]:
+        """Names of the buffers that every frame has."""
+        ...
+
+    @property
+    def reference_numbers(self) -> list[int]:
+        """Frames in use that have a reference."""
+        ...
+
+    @property
+    def color_has_albedo(self) -> bool:
+        """Whether color is stored with the albedo in it."""
+        ...
+
+    def frame(self, number: int, *, reference: bool = True) -> Frame:
+        """Read one frame."""
+        ...
+
+    def metadata(self, number: int) -> Metadata:
+        """Attributes of one frame's color file."""
+        ...
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """The frames of one folder.
+
+    Args:
+        root: the folder as it was given.
+        name: the name of the scene's folder.
+        layout: the layout that was detected: ``"bmfr"``.
+        numbers: frame numbers, ascending.
+        size: height and width in pixels, the same for every buffer and frame.
+        buffers: names of the buffers that every frame of the sequence has.
+        reference_numbers: frames that have a reference; possibly only some.
+        color_has_albedo: whether the files hold color with the albedo in it. Frames always do.
+    """
+
+    root: Path
+    name: str
+    layout: str
+    numbers: list[int]
+    size: tuple[int, int]
+    buffers: frozenset[str]
+    reference_numbers: list[int]
+    color_has_albedo: bool
+    _source: Layout = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def frame(self, number: int, reference: bool = True) -> Frame:
+        """Read one frame: a batch of 1, float32, on the CPU; values are not validated.
+
+        ``color`` is radiance with the albedo in it, whatever the files hold. ``depth`` is that of the depth file or
+        else the clip w of the position; it is ``inf`` where nothing was hit. ``view_projection`` has the pixel
+        offset of the files folded in: ``u W - 0.5, v H - 0.5`` is the pixel index.
+
+        Args:
+            number: one of ``numbers``.
+            reference: whether to read the reference too, where there is one.
+
+        Raises:
+            InputError: there is no such frame, or a file is damaged.
+        """
+        self._check(number)
+        return self._source.frame(number, reference=reference)
+
+    def metadata(self, number: int) -> Metadata:
+        """Attributes of the color file of one frame: texts, numbers and tuples of numbers.
+
+        Raises:
+            InputError: there is no such frame, or its file is damaged.
+        """
+        self._check(number)
+        return self._source.metadata(number)
+
+    def _check(self, number: int) -> None:
+        if number not in self.numbers:
+            raise InputError(
+                f"{self.root}: expected a frame of the sequence ({_summary(self.numbers)}), found {number}"
+            )
+
+
+def open_sequence(path: Path, frames: str | None = None) -> Sequence:
+    """Open a folder of frames; headers of all chosen files are checked, pixels are not read.
+
+    Args:
+        path: the folder of a scene, or the folder ``inputs`` inside it.
+        frames: which frames to use, such as ``"0-59,70"``; all of them by default.
+
+    Raises:
+        InputError: there is no such folder, its layout is unknown, a frame or buffer is missing, or files do not fit
+            together.
+    """
+    path = Path(path)
+    if not os.path.isdir(path):
+        found = "a file" if os.path.isfile(path) else "no such folder"
+        raise InputError(f"{path}: expected the folder of a sequence, found {found}; check the path")
+    for folder in (path, path / "inputs"):
+        files = find_frames(folder) if os.path.isdir(folder) else None
+        if files is not None:
+            numbers = _choose(folder, sorted(files["color"]), frames)
+            return _wrap(path, "bmfr", open_bmfr(folder, files, numbers))
+    raise InputError(
+        f"{path}: expected frames in a known layout ({_KNOWN_LAYOUTS}), found no color file; check the path"
+    )
+
+
+def parse_frames(text: str) -> list[int]:
+    """Read a choice of frames.
+
+    Args:
+        text: numbers and ranges, such as ``"0-59,70"``.
+
+    Returns:
+        The frame numbers, ascending, each once.
+
+    Raises:
+        InputError: the text is something else, or names more than a million frames.
+
+    Example:
+        >>> parse_frames("0-3, 70")
+        [0, 1, 2, 3, 70]
+    """
+    numbers: set[int] = set()
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*([0-9]{1,9})(?:\s*-\s*([0-9]{1,9}))?\s*", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if not first <= last < first + _LARGEST_FRAME_COUNT - len(numbers):
+            raise InputError(f"frames: expected numbers and ascending ranges such as '0-59,70', found {text[:80]!r}")
+        numbers.update(range(first, last + 1))
+    return sorted(numbers)
+
+
+def _choose(folder: Path, present: list[int], frames: str | None) -> list[int]:
+    if frames is not None:
+        chosen = parse_frames(frames)
+        absent = sorted(set(chosen) - set(present))
+        if absent:
+            raise InputError(
+                f"{folder}: expected frame {absent[0]}, found frames {_summary(present)}; choose among these"
+            )
+        return chosen
+    for before, after in pairwise(present):
+        if after != before + 1:
+            raise InputError(
+                f"{folder}: expected frame {before + 1} after frame {before}, found {after}; "
+                f"render the missing frames, or choose frames such as '{present[0]}-{before}'"
+            )
+    return present
+
+
+def _summary(numbers: list[int]) -> str:
+    return f"{numbers[0]} to {numbers[-1]}"
+
+
+def _wrap(root: Path, layout: str, source: Layout) -> Sequence:
+    name = root.resolve().name
+    if name == "inputs":
+        name = root.resolve().parent.name
+    return Sequence(
+        root=root,
+        name=name,
+        layout=layout,
+        numbers=source.numbers,
+        size=source.size,
+        buffers=source.buffers,
+        reference_numbers=source.reference_numbers,
+        color_has_albedo=source.color_has_albedo,
+        _source=source,
+    )

@@ -1,0 +1,25 @@
+"""The zoo: denoisers assembled from the operators, by name."""
+
+from mcdenoise.models import cascaded as _cascaded  # entering itself in the register
+from mcdenoise.models._registry import list_models, register_model
+from mcdenoise.models._weights import create_model, describe_weights, load_weights, pretrained_models, save_weights
+from mcdenoise.models.cascaded import Cascade, Denoised, FusionModule, KernelPredictor, PixelPredictor
+from mcdenoise.models.unet import UNet
+
+__all__ = [
+    "Cascade",
+    "Denoised",
+    "FusionModule",
+    "KernelPredictor",
+    "PixelPredictor",
+    "UNet",
+    "create_model",
+    "describe_weights",
+    "list_models",
+    "load_weights",
+    "pretrained_models",
+    "register_model",
+    "save_weights",
+]
+
+del _cascaded

@@ -1,0 +1,226 @@
+"""The cascaded pixel-kernel network, and by composition K, P, K+P, K+K and P+K."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.unet import UNet
+from mcdenoise.ops import cross_bilateral_weights, downsample, kernel_conv, laplacian_fusion, upsample
+
+FEATURES = 7  # albedo 3, normal 3, depth 1
+SCALE_UNITS = (10.0, 1000.0, 1.0)  # of f1, f2, f3
+
+
+class Denoised(NamedTuple):
+    """What a cascade returns.
+
+    Args:
+        initial: ``(B, 3, H, W)`` result of the first network, the paper's R'.
+        final: ``(B, 3, H, W)`` result of the whole cascade, the paper's R''.
+    """
+
+    initial: Tensor
+    final: Tensor
+
+
+class Predictor(Protocol):
+    """A network that takes an image and guiding features and returns a better image."""
+
+    def __call__(self, image: Tensor, features: Tensor) -> Tensor:
+        """``(B, 3, H, W)`` radiance and ``(B, 7, H, W)`` features in [0, 1] to ``(B, 3, H, W)`` radiance."""
+
+
+class FusionModule(nn.Module):
+    """FM of the paper's Fig. 2: predicts the blending weight of Eq. 2 from both images, and blends.
+
+    ``alpha = sigmoid(conv3x3([i_f, U i_c]))`` on the logarithms of the images, which are scene-linear.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(6, 1, 3, padding=1)
+
+    def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
+        """``(B, 3, H, W)`` fine and ``(B, 3, ceil(H / 2), ceil(W / 2))`` coarse image to their fusion."""
+        both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)
+        alpha = torch.sigmoid(self.conv(torch.log1p(both.clamp_min(0))))
+        return laplacian_fusion(fine, coarse, alpha.to(fine.dtype))
+
+
+class PixelPredictor(nn.Module):
+    """P: predicts the image itself at three scales and fuses them, coarse to fine.
+
+    Args:
+        width: feature channels of the U-Net.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.unet = UNet(3 + FEATURES, width)
+        self.heads = nn.ModuleList(nn.Conv2d(width, 3, 3, padding=1) for _ in range(UNet.scales))
+        self.fusions = nn.ModuleList(FusionModule() for _ in range(UNet.scales - 1))
+        for head in self.heads:
+            nn.init.zeros_(head.weight)  # type: ignore[arg-type]
+            nn.init.zeros_(head.bias)  # type: ignore[arg-type]
+
+    def forward(self, image: Tensor, features: Tensor) -> Tensor:
+        """See :class:`Predictor`."""
+        logs = torch.log1p(image)
+        levels = self.unet(torch.cat([logs, features], 1))
+        # The heads predict the logarithm of the radiance, on top of the input's: a network at rest is the identity,
+        # and errors are relative, as the eye and the loss see them. No pixel grows beyond the brightest of the input.
+        top = logs.amax((1, 2, 3), keepdim=True)
+        images: list[Tensor] = []
+        for head, level in zip(self.heads, levels, strict=True):
+            images.append(torch.expm1(torch.minimum((head(level).float() + logs).clamp_min(0), top)))
+            logs = downsample(logs)
+        return _fuse(images, self.fusions)
+
+
+class KernelPredictor(nn.Module):
+    """K: predicts kernels at three scales, filters the image's pyramid with them, and fuses, coarse to fine.
+
+    With bilateral weights each scale has ``K*K + 3`` channels (28 in the paper): the kernel's logits and the scales
+    f1 (normal), f2 (depth) and f3 (distance) of Eqs. 5-8, kept non-negative by a softplus and counted in units in which
+    1 is a plausible value: normals and depths in [0, 1] differ by much less than pixel coordinates.
+
+    Args:
+        width: feature channels of the U-Net.
+        kernel_size: K, 5 in the paper.
+        bilateral: adjust the kernels by normal, depth and distance.
+    """
+
+    def __init__(self, width: int, kernel_size: int = 5, bilateral: bool = True) -> None:
+        super().__init__()
+        self.taps = kernel_size * kernel_size
+        self.bilateral = bilateral
+        self.unet = UNet(3 + FEATURES, width)
+        channels = self.taps + (3 if bilateral else 0)
+        self.heads = nn.ModuleList(nn.Conv2d(width, channels, 3, padding=1) for _ in range(UNet.scales))
+        self.fusions = nn.ModuleList(FusionModule() for _ in range(UNet.scales - 1))
+
+    def forward(self, image: Tensor, features: Tensor) -> Tensor:
+        """See :class:`Predictor`."""
+        levels = self.unet(torch.cat([torch.log1p(image), features], 1))
+        normal, depth = features[:, 3:6], features[:, 6:7]
+        images: list[Tensor] = []
+        for head, level in zip(self.heads, levels, strict=True):
+            # The filter reads tap after tap: planes, not channels-last pixels.
+            prediction = head(level).float().contiguous()
+            logits = prediction[:, : self.taps]
+            if self.bilateral:
+                f1_f2_f3 = F.softplus(prediction[:, self.taps :]).split(1, 1)
+                scales = [f * unit for f, unit in zip(f1_f2_f3, SCALE_UNITS, strict=True)]
+                weights = cross_bilateral_weights(logits, [normal, depth], scales[:2], scales[2], border="renormalize")
+            else:
+                weights = cross_bilateral_weights(logits, border="renormalize")
+            images.append(kernel_conv(image, weights, border="zeros"))
+            image, normal, depth = downsample(image), downsample(normal), downsample(depth)
+        return _fuse(images, self.fusions)
+
+
+class Cascade(nn.Module):
+    """One predictor after another: the second sees the first's image and the same features.
+
+    Args:
+        first: predicts the initial image R'.
+        second: predicts the final image R'' from R'; ``None`` makes the initial image the final one.
+    """
+
+    def __init__(self, first: nn.Module, second: nn.Module | None = None) -> None:
+        super().__init__()
+        self.first = first
+        self.second = second
+
+    def forward(self, color: Tensor, albedo: Tensor, normal: Tensor, depth: Tensor) -> Denoised:
+        """Denoise one frame of any size.
+
+        Args:
+            color: ``(B, 3, H, W)`` demodulated accumulated radiance, scene-linear, finite, non-negative.
+            albedo: ``(B, 3, H, W)`` in [0, 1].
+            normal: ``(B, 3, H, W)`` world-space unit normals in [-1, 1].
+            depth: ``(B, 1, H, W)`` distance along the view axis, scene units, ``inf`` where nothing was hit.
+
+        Returns:
+            The initial and the final image, demodulated as ``color`` is.
+        """
+        exposure = auto_exposure(color)
+        features = torch.cat([albedo, normal * 0.5 + 0.5, normalize_depth(depth)], 1)
+        initial = self.first(color * exposure, features)
+        final = initial if self.second is None else self.second(initial, features)
+        return Denoised(initial / exposure, final / exposure)
+
+
+def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
+    """The factor that brings an image's typical radiance to ``key``, so that no network depends on a scene's unit.
+
+    ``key / exp(mean(log(blocks)))`` over the means of 16x16-pixel blocks: a block mean is hardly moved by the noise,
+    the logarithm by a lamp in view.
+
+    Args:
+        color: ``(B, C, H, W)`` radiance.
+        key: radiance that the typical block is brought to.
+
+    Returns:
+        ``(B, 1, 1, 1)`` positive factor; 1 for a black image. The factor has no gradient.
+    """
+    luminance = color.detach().float().mean(1, keepdim=True)
+    blocks = F.avg_pool2d(luminance, 16, ceil_mode=True, count_include_pad=False)
+    mean = blocks.mean((1, 2, 3), keepdim=True)
+    # Black blocks count as a thousandth of the mean.
+    typical = torch.exp(torch.log(torch.maximum(blocks, mean * 1e-3).clamp_min(1e-30)).mean((1, 2, 3), keepdim=True))
+    return torch.where(mean > 0, key / typical, 1).to(color.dtype)
+
+
+def normalize_depth(depth: Tensor) -> Tensor:
+    """Depth in [0, 1), whatever the scene's unit: ``d / (d + typical d)``, and 1 where nothing was hit.
+
+    Args:
+        depth: ``(B, 1, H, W)`` distance, scene units, ``inf`` where nothing was hit.
+
+    Returns:
+        ``(B, 1, H, W)`` in [0, 1]. The typical depth is the image's geometric mean over what was hit.
+    """
+    hit = torch.isfinite(depth)
+    finite = torch.where(hit, depth, 1).float().clamp_min(1e-30)
+    count = hit.sum((1, 2, 3), keepdim=True).clamp_min(1)
+    typical = torch.exp((torch.log(finite) * hit).sum((1, 2, 3), keepdim=True) / count)
+    return torch.where(hit, finite / (finite + typical), 1).to(depth.dtype)
+
+
+def _fuse(images: list[Tensor], fusions: nn.ModuleList) -> Tensor:
+    fused = images[-1]
+    for fine, fusion in zip(images[-2::-1], fusions, strict=True):
+        fused = fusion(fine, fused)
+    # Adding detail to another scale's base can undershoot zero; radiance cannot.
+    return fused.clamp_min(0)
+
+
+def _register(name: str, cascade: str, bilateral: bool, width: int) -> None:
+    """Enter the cascade spelt as in the paper's Table 3, such as ``P+K``."""
+
+    def construct(width: int = width, **settings: Any) -> Cascade:
+        parts = [
+            PixelPredictor(width) if part == "P" else KernelPredictor(width, bilateral=bilateral, **settings)
+            for part in cascade.split("+")
+        ]
+        return Cascade(*parts)
+
+    construct.__doc__ = f"{cascade}, width {width}, {'with' if bilateral else 'without'} bilateral weights."
+    register_model(name)(construct)
+
+
+_register("cascaded", "P+K", bilateral=True, width=40)
+_register("cascaded_plain", "P+K", bilateral=False, width=40)
+_register("pixel", "P", bilateral=False, width=64)
+_register("kernel", "K", bilateral=True, width=64)
+_register("kernel_plain", "K", bilateral=False, width=64)
+_register("kernel_pixel", "K+P", bilateral=True, width=40)
+_register("kernel_pixel_plain", "K+P", bilateral=False, width=40)
+_register("kernel_kernel", "K+K", bilateral=True, width=40)
+_register("kernel_kernel_plain", "K+K", bilateral=False, width=40)

@@ -1,0 +1,70 @@
+"""The U-Net backbone of the pixel and the kernel network."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class UNet(nn.Module):
+    """A U-Net of constant width that hands out the features of its last three decoder levels.
+
+    Each level is two 3x3 convolutions with ReLU; 2x2 max-pooling goes down, a 2x2 transposed convolution goes up, and
+    the encoder's features of the same scale are concatenated before the decoder's convolutions (Ronneberger et al.
+    2015; the paper's Sec. 3.2 and Fig. 2). Any image size: the image is padded to a multiple of ``2 ** (levels - 1)``
+    by repeating its edge, and the features are cropped.
+
+    Args:
+        in_channels: channels of the input.
+        width: feature channels of every convolution (the paper's 40).
+        levels: number of scales, 4 in the paper.
+    """
+
+    scales = 3
+
+    def __init__(self, in_channels: int, width: int, levels: int = 4) -> None:
+        super().__init__()
+        if levels < self.scales:
+            raise ValueError(f"levels: expected at least {self.scales}, found {levels}")
+        self.multiple = 2 ** (levels - 1)
+        self.encoder = nn.ModuleList(_block(in_channels if level == 0 else width, width) for level in range(levels))
+        self.up = nn.ModuleList(nn.ConvTranspose2d(width, width, 2, stride=2) for _ in range(levels - 1))
+        self.decoder = nn.ModuleList(_block(2 * width, width) for _ in range(levels - 1))
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Features at full, half and quarter resolution.
+
+        Args:
+            x: ``(B, in_channels, H, W)``.
+
+        Returns:
+            Three tensors ``(B, width, ceil(H / s), ceil(W / s))`` for ``s`` = 1, 2, 4.
+        """
+        height, width = x.shape[-2:]
+        x = F.pad(x, (0, -width % self.multiple, 0, -height % self.multiple), mode="replicate")
+        skips: list[Tensor] = []
+        for level, block in enumerate(self.encoder):
+            x = block(x if level == 0 else F.max_pool2d(x, 2))
+            skips.append(x)
+        skips.pop()
+        features: list[Tensor] = []
+        for up, block in zip(self.up, self.decoder, strict=True):
+            x = block(torch.cat([up(x), skips.pop()], 1))
+            features.append(x)
+        finest_first = features[: -self.scales - 1 : -1]
+        return [f[..., : -(-height // 2**s), : -(-width // 2**s)] for s, f in enumerate(finest_first)]
+
+
+def _block(in_channels: int, out_channels: int) -> nn.Sequential:
+    block = nn.Sequential(
+        nn.Conv2d(in_channels, out_channels, 3, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(out_channels, out_channels, 3, padding=1),
+        nn.ReLU(),
+    )
+    for layer in block:
+        if isinstance(layer, nn.Conv2d):
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+            nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+    return block

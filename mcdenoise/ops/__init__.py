@@ -1,0 +1,29 @@
+"""Differentiable image operators: tensor in, tensor out; no weights, no files."""
+
+from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
+from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
+from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
+from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
+from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
+
+__all__ = [
+    "Accumulate",
+    "CrossBilateralWeights",
+    "Demodulate",
+    "KernelConv",
+    "KernelSplat",
+    "LaplacianFusion",
+    "Remodulate",
+    "Surface",
+    "accumulate",
+    "cross_bilateral_weights",
+    "demodulate",
+    "downsample",
+    "kernel_conv",
+    "kernel_splat",
+    "laplacian_fusion",
+    "motion_from_position",
+    "remodulate",
+    "reproject",
+    "upsample",
+]

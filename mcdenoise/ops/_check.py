@@ -1,0 +1,43 @@
+"""Named-axis shape checks at the door of every op."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+
+def check_shapes(**arguments: tuple[Tensor, str]) -> dict[str, int]:
+    """Check shapes against named axes and bind the names across all arguments.
+
+    Args:
+        arguments: for each name a tensor and its axes, such as ``image=(image, "B C H W")``. An axis that is a number
+            must have that size; an axis that is a name must have the same size wherever the name appears.
+
+    Returns:
+        The size of every named axis.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: a rank or a size does not fit; the message has the argument's name, what is expected and found.
+    """
+    sizes: dict[str, int] = {}
+    owner: dict[str, str] = {}
+    for name, (tensor, layout) in arguments.items():
+        if not isinstance(tensor, Tensor):
+            raise TypeError(f"{name}: expected a torch.Tensor, found {type(tensor).__name__}")
+        if not tensor.is_floating_point():
+            raise TypeError(f"{name}: expected a floating-point dtype, found {tensor.dtype}")
+        axes = layout.split()
+        if tensor.ndim != len(axes):
+            raise ValueError(f"{name}: expected shape ({', '.join(axes)}), found {tuple(tensor.shape)}")
+        for axis, size in zip(axes, tensor.shape, strict=True):
+            if axis.isdigit():
+                if size != int(axis):
+                    raise ValueError(f"{name}: expected shape ({', '.join(axes)}), found {tuple(tensor.shape)}")
+            elif axis not in sizes:
+                sizes[axis], owner[axis] = size, name
+            elif sizes[axis] != size:
+                raise ValueError(
+                    f"{name}: expected {axis} = {sizes[axis]} as in {owner[axis]}, "
+                    f"found {size} (shape {tuple(tensor.shape)}, layout {layout})"
+                )
+    return sizes

@@ -1,0 +1,84 @@
+"""The square window that every per-pixel kernel speaks of: its taps, and what lies beyond the image's border."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+Border = Literal["replicate", "zeros", "renormalize"]
+BORDERS: tuple[Border, ...] = ("replicate", "zeros", "renormalize")
+
+
+def check_border(border: str) -> None:
+    """``ValueError`` for an unknown border mode."""
+    if border not in BORDERS:
+        raise ValueError(f"border: expected one of {', '.join(BORDERS)}, found {border!r}")
+
+
+def kernel_size_of(taps: int, name: str) -> int:
+    """The odd ``K`` of ``taps = K * K``; ``ValueError`` for any other number of taps."""
+    size = round(taps**0.5)
+    if size * size != taps or size % 2 == 0:
+        raise ValueError(f"{name}: expected K*K channels with odd K (1, 9, 25, 49, ...), found {taps}")
+    return size
+
+
+def pad(image: Tensor, radius: int, border: Border) -> Tensor:
+    """``image`` with ``radius`` more pixels on each side: its edge repeated, or zeros for the other modes."""
+    if radius == 0 or image.numel() == 0:
+        return F.pad(image, (radius,) * 4)
+    if border == "replicate":
+        return F.pad(image, (radius,) * 4, mode="replicate")
+    return F.pad(image, (radius,) * 4)
+
+
+def unpad(padded: Tensor, radius: int, border: Border) -> Tensor:
+    """The transpose of :func:`pad`: what fell on the margin is added back where it was read from, or dropped."""
+    height, width = padded.shape[-2] - 2 * radius, padded.shape[-1] - 2 * radius
+    if border != "replicate" or radius == 0:
+        return padded[..., radius : radius + height, radius : radius + width]
+    rows = _fold_edges(padded, radius, height, -2)
+    return _fold_edges(rows, radius, width, -1)
+
+
+def _fold_edges(padded: Tensor, radius: int, size: int, dim: int) -> Tensor:
+    inner = padded.narrow(dim, radius, size)
+    before = padded.narrow(dim, 0, radius).sum(dim, keepdim=True)
+    after = padded.narrow(dim, radius + size, radius).sum(dim, keepdim=True)
+    rest = list(inner.shape)
+    rest[dim] = size - 1
+    zeros = inner.new_zeros(rest)
+    return inner + torch.cat([before, zeros], dim) + torch.cat([zeros, after], dim)
+
+
+def offsets(kernel_size: int) -> Iterator[tuple[int, int, int]]:
+    """Index, row offset and column offset of every tap, row by row from the top left."""
+    radius = kernel_size // 2
+    for tap in range(kernel_size * kernel_size):
+        yield tap, tap // kernel_size - radius, tap % kernel_size - radius
+
+
+def shifted(padded: Tensor, radius: int, dy: int, dx: int, height: int, width: int) -> Tensor:
+    """The view of ``padded`` in which pixel ``p`` shows the image's pixel ``p + (dy, dx)``."""
+    return padded[..., radius + dy : radius + dy + height, radius + dx : radius + dx + width]
+
+
+def inside(height: int, width: int, kernel_size: int, device: torch.device) -> Tensor:
+    """``(1, K*K, H, W)`` bool: whether each tap of each pixel lies inside the image."""
+    radius = kernel_size // 2
+    offset = torch.arange(kernel_size, device=device) - radius
+    row = torch.arange(height, device=device) + offset[:, None]
+    column = torch.arange(width, device=device) + offset[:, None]
+    row_inside = (row >= 0) & (row < height)
+    column_inside = (column >= 0) & (column < width)
+    both = row_inside[:, None, :, None] & column_inside[None, :, None, :]
+    return both.reshape(1, kernel_size * kernel_size, height, width)
+
+
+def accumulator_dtype(dtype: torch.dtype) -> torch.dtype:
+    """The dtype in which sums over taps are kept: half precision is summed in float32."""
+    return torch.float32 if dtype in (torch.float16, torch.bfloat16) else dtype

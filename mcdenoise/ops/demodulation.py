@@ -1,0 +1,114 @@
+"""Albedo demodulation: divide the texture out before filtering, multiply it back after."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.ops._check import check_shapes
+
+FLOOR = 1e-2
+
+
+def demodulate(color: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor:
+    """Divide radiance by albedo, which leaves the (smooth) incident light where the surface is diffuse.
+
+    ``out = color / m`` with the modulation ``m = max(albedo, floor)`` where some channel of the pixel's albedo
+    reaches ``floor``, and ``m = 1`` where none does: emitters, mirrors, glass and background have no texture to
+    divide out and pass unchanged. :func:`remodulate` multiplies with the same ``m`` and is the exact inverse
+    everywhere, up to rounding.
+
+    Args:
+        color: ``(B, C, H, W)`` radiance, scene-linear, unclamped.
+        albedo: ``(B, C, H, W)`` diffuse reflectance, usually in [0, 1].
+        floor: smallest albedo that is divided by, above 0; no value grows by more than ``1 / floor``.
+
+    Returns:
+        ``(B, C, H, W)`` demodulated radiance.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: shapes disagree or ``floor`` is not positive.
+
+    Differentiable in ``color`` and ``albedo``, to any order; where ``albedo`` is below ``floor`` its derivative is 0.
+
+    Source: Koskela et al. 2019, "Blockwise multi-order feature regression for real-time path-tracing
+    reconstruction", Sec. 3; the paper's Sec. 4.1.
+
+    Example:
+        >>> color = torch.tensor([0.2, 0.1, 5.0]).reshape(1, 3, 1, 1)
+        >>> demodulate(color, torch.tensor([0.5, 0.5, 0.0]).reshape(1, 3, 1, 1)).flatten().tolist()
+        [0.4000000059604645, 0.20000000298023224, 500.0]
+        >>> demodulate(color, torch.zeros(1, 3, 1, 1)).equal(color)
+        True
+    """
+    return color / _modulation(color, albedo, floor)
+
+
+def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor:
+    """Multiply albedo back: the inverse of :func:`demodulate` with the same ``albedo`` and ``floor``.
+
+    ``out = image * m``, ``m`` as in :func:`demodulate`.
+
+    Args:
+        image: ``(B, C, H, W)`` demodulated radiance.
+        albedo: ``(B, C, H, W)`` diffuse reflectance, usually in [0, 1].
+        floor: as given to :func:`demodulate`.
+
+    Returns:
+        ``(B, C, H, W)`` radiance.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: shapes disagree or ``floor`` is not positive.
+
+    Differentiable in ``image`` and ``albedo``, to any order; where ``albedo`` is below ``floor`` its derivative is 0.
+
+    Source: as :func:`demodulate`.
+
+    Example:
+        >>> color, albedo = torch.rand(1, 3, 4, 4), torch.rand(1, 3, 4, 4)
+        >>> torch.allclose(remodulate(demodulate(color, albedo), albedo), color)
+        True
+    """
+    return image * _modulation(image, albedo, floor)
+
+
+class Demodulate(nn.Module):
+    """:func:`demodulate` with its floor stored.
+
+    Args:
+        floor: see :func:`demodulate`.
+    """
+
+    def __init__(self, floor: float = FLOOR) -> None:
+        super().__init__()
+        self.floor = floor
+
+    def forward(self, color: Tensor, albedo: Tensor) -> Tensor:
+        """See :func:`demodulate`."""
+        return demodulate(color, albedo, floor=self.floor)
+
+
+class Remodulate(nn.Module):
+    """:func:`remodulate` with its floor stored.
+
+    Args:
+        floor: see :func:`remodulate`.
+    """
+
+    def __init__(self, floor: float = FLOOR) -> None:
+        super().__init__()
+        self.floor = floor
+
+    def forward(self, image: Tensor, albedo: Tensor) -> Tensor:
+        """See :func:`remodulate`."""
+        return remodulate(image, albedo, floor=self.floor)
+
+
+def _modulation(image: Tensor, albedo: Tensor, floor: float) -> Tensor:
+    check_shapes(image=(image, "B C H W"), albedo=(albedo, "B C H W"))
+    if not floor > 0:
+        raise ValueError(f"floor: expected a positive number, found {floor}")
+    textured = (albedo >= floor).any(1, keepdim=True)
+    return torch.where(textured, albedo.clamp_min(floor), 1)

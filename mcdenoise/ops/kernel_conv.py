@@ -1,0 +1,225 @@
+"""Per-pixel kernel convolution (gather) and its transpose (splat)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._window import (
+    Border,
+    accumulator_dtype,
+    check_border,
+    inside,
+    kernel_size_of,
+    offsets,
+    pad,
+    shifted,
+    unpad,
+)
+
+
+def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
+    """Filter an image with a kernel of its own at every pixel; all channels share the pixel's kernel.
+
+    ``out[p] = sum_t kernel[t, p] * image[p + o_t]`` over the offsets ``o_t`` of the ``K x K`` window.
+
+    Args:
+        image: ``(B, C, H, W)``, any unit and range.
+        kernel: ``(B, K*K, H, W)`` weights, odd ``K``, taps row by row from top left; used as they are.
+        border: what a tap outside the image reads: ``"replicate"`` the nearest edge pixel, ``"zeros"`` zero;
+            ``"renormalize"`` leaves such taps out and divides by the sum of the weights that are left
+            (0 where that sum is 0), so that the result is a weighted mean everywhere.
+
+    Returns:
+        ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: shapes disagree, ``K`` is even, or ``border`` is unknown.
+
+    Differentiable in ``image`` and ``kernel``, to any order. Memory beyond the result is a padded copy of ``image``.
+
+    Source: the paper's Eq. 4; Bako et al. 2017, "Kernel-predicting convolutional networks for denoising Monte Carlo
+    renderings", Eq. 9.
+
+    Example:
+        >>> image = torch.arange(12.0).reshape(1, 1, 3, 4)
+        >>> box = torch.full((1, 9, 3, 4), 1 / 9)
+        >>> kernel_conv(image, box)[0, 0, 1, 1].item()
+        5.0
+    """
+    kernel_size = _check(image, kernel, border)
+    radius = kernel_size // 2
+    total = _Gather.apply(pad(image, radius, border), kernel)
+    if border != "renormalize":
+        return total
+    share = _renormalizer(kernel, kernel_size)
+    return (total * share).to(image.dtype)
+
+
+def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
+    """Spread every pixel over its neighbours with a kernel of its own: the transpose of :func:`kernel_conv`.
+
+    ``out[q] = sum_t kernel[t, q - o_t] * image[q - o_t]``, so that for any two images and every border mode
+    ``<kernel_conv(x, k), y> = <x, kernel_splat(y, k)>``.
+
+    Args:
+        image: ``(B, C, H, W)``, any unit and range.
+        kernel: ``(B, K*K, H, W)`` weights, odd ``K``: tap ``t`` of pixel ``p`` says how much of ``p`` goes to
+            ``p + o_t``.
+        border: where a share goes that leaves the image: ``"replicate"`` to the nearest edge pixel, ``"zeros"``
+            nowhere; ``"renormalize"`` first divides each pixel's weights by the sum of those inside the image, so
+            that all of every pixel stays inside.
+
+    Returns:
+        ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: shapes disagree, ``K`` is even, or ``border`` is unknown.
+
+    Differentiable in ``image`` and ``kernel``, to any order.
+
+    Source: Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network", Eq. 3.
+
+    Example:
+        >>> image = torch.zeros(1, 1, 3, 3)
+        >>> image[0, 0, 1, 1] = 9.0
+        >>> kernel_splat(image, torch.full((1, 9, 3, 3), 1 / 9)).flatten().tolist()
+        [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+    """
+    kernel_size = _check(image, kernel, border)
+    radius = kernel_size // 2
+    if border == "renormalize":
+        image = (image * _renormalizer(kernel, kernel_size)).to(image.dtype)
+    return unpad(_Splat.apply(image, kernel), radius, border)
+
+
+class KernelConv(nn.Module):
+    """:func:`kernel_conv` with its border mode stored.
+
+    Args:
+        border: see :func:`kernel_conv`.
+    """
+
+    def __init__(self, border: Border = "replicate") -> None:
+        super().__init__()
+        check_border(border)
+        self.border: Border = border
+
+    def forward(self, image: Tensor, kernel: Tensor) -> Tensor:
+        """See :func:`kernel_conv`."""
+        return kernel_conv(image, kernel, border=self.border)
+
+
+class KernelSplat(nn.Module):
+    """:func:`kernel_splat` with its border mode stored.
+
+    Args:
+        border: see :func:`kernel_splat`.
+    """
+
+    def __init__(self, border: Border = "replicate") -> None:
+        super().__init__()
+        check_border(border)
+        self.border: Border = border
+
+    def forward(self, image: Tensor, kernel: Tensor) -> Tensor:
+        """See :func:`kernel_splat`."""
+        return kernel_splat(image, kernel, border=self.border)
+
+
+def _check(image: Tensor, kernel: Tensor, border: str) -> int:
+    sizes = check_shapes(image=(image, "B C H W"), kernel=(kernel, "B T H W"))
+    check_border(border)
+    return kernel_size_of(sizes["T"], "kernel")
+
+
+def _renormalizer(kernel: Tensor, kernel_size: int) -> Tensor:
+    """One over the sum of the weights whose taps are inside the image; 0 where that sum is 0."""
+    mask = inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
+    total = torch.where(mask, kernel, 0).sum(1, keepdim=True, dtype=accumulator_dtype(kernel.dtype))
+    empty = total == 0
+    return torch.where(empty, 0, 1 / torch.where(empty, 1, total))
+
+
+# Gather, splat and correlate are the three bilinear maps of one trilinear form, sum_{t,p,c} k[t,p] y[c,p] x[c,p+o_t]:
+# the derivative of each is the other two. Written as loops over the taps with that derivative, none of them ever holds
+# K*K copies of the image, and gradients of any order come for free.
+
+
+class _Gather(torch.autograd.Function):
+    @staticmethod
+    def forward(padded: Tensor, kernel: Tensor) -> Tensor:
+        kernel_size = kernel_size_of(kernel.shape[1], "kernel")
+        height, width = kernel.shape[-2:]
+        dtype = accumulator_dtype(padded.dtype)
+        source = padded.to(dtype)
+        total = source.new_zeros(*padded.shape[:2], height, width)
+        for tap, dy, dx in offsets(kernel_size):
+            total.addcmul_(kernel[:, tap : tap + 1].to(dtype), shifted(source, kernel_size // 2, dy, dx, height, width))
+        return total.to(padded.dtype)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        padded, kernel = ctx.saved_tensors
+        to_image = _Splat.apply(gradient, kernel) if ctx.needs_input_grad[0] else None
+        to_kernel = _Correlate.apply(gradient, padded).to(kernel.dtype) if ctx.needs_input_grad[1] else None
+        return to_image, to_kernel
+
+
+class _Splat(torch.autograd.Function):
+    @staticmethod
+    def forward(image: Tensor, kernel: Tensor) -> Tensor:
+        kernel_size = kernel_size_of(kernel.shape[1], "kernel")
+        radius = kernel_size // 2
+        height, width = kernel.shape[-2:]
+        dtype = accumulator_dtype(image.dtype)
+        source = image.to(dtype)
+        total = source.new_zeros(*image.shape[:2], height + 2 * radius, width + 2 * radius)
+        for tap, dy, dx in offsets(kernel_size):
+            shifted(total, radius, dy, dx, height, width).addcmul_(kernel[:, tap : tap + 1].to(dtype), source)
+        return total.to(image.dtype)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        image, kernel = ctx.saved_tensors
+        to_image = _Gather.apply(gradient, kernel) if ctx.needs_input_grad[0] else None
+        to_kernel = _Correlate.apply(image, gradient).to(kernel.dtype) if ctx.needs_input_grad[1] else None
+        return to_image, to_kernel
+
+
+class _Correlate(torch.autograd.Function):
+    @staticmethod
+    def forward(image: Tensor, padded: Tensor) -> Tensor:
+        height, width = image.shape[-2:]
+        radius = (padded.shape[-2] - height) // 2
+        kernel_size = 2 * radius + 1
+        dtype = accumulator_dtype(image.dtype)
+        source, other = image.to(dtype), padded.to(dtype)
+        result = source.new_empty(image.shape[0], kernel_size * kernel_size, height, width)
+        for tap, dy, dx in offsets(kernel_size):
+            result[:, tap] = (source * shifted(other, radius, dy, dx, height, width)).sum(1)
+        return result.to(image.dtype)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        image, padded = ctx.saved_tensors
+        to_image = _Gather.apply(padded, gradient) if ctx.needs_input_grad[0] else None
+        to_padded = _Splat.apply(image, gradient) if ctx.needs_input_grad[1] else None
+        return to_image, to_padded

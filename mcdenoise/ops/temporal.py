@@ -1,0 +1,363 @@
+"""Reproject the previous frame, test which of it still holds, and accumulate."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from kornia.geometry.grid import create_meshgrid
+from torch import Tensor, nn
+
+from mcdenoise.ops._check import check_shapes
+
+Rule = Literal["relative", "bmfr"]
+
+# Of the depth: how far a tap's point may lie off the tangent plane, and (no positions) how far its depth may differ.
+PLANE_LIMIT = 0.02
+DEPTH_LIMIT = 0.1
+# Of two unit normals: |difference|^2 < 0.5 allows an angle of 41 degrees.
+NORMAL_LIMIT_SQUARED = 0.5
+
+
+class Surface(NamedTuple):
+    """What tells one surface from another; each ``(B, C, H, W)`` or ``None``.
+
+    Args:
+        position: ``(B, 3, H, W)`` world-space hit points, scene units.
+        normal: ``(B, 3, H, W)`` world-space unit normals.
+        depth: ``(B, 1, H, W)`` distance along the view axis, scene units, ``inf`` where nothing was hit.
+    """
+
+    position: Tensor | None = None
+    normal: Tensor | None = None
+    depth: Tensor | None = None
+
+
+def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
+    """Where each static surface point was in the previous frame, relative to where it is now.
+
+    ``clip = [x y z 1] @ M``, ``(u, v) = (clip.xy / clip.w + 1) / 2``, ``motion = (u W, v H) - current pixel centre``.
+
+    Args:
+        position: ``(B, 3, H, W)`` world-space hit points of the current frame, scene units.
+        previous_view_projection: ``(B, 4, 4)`` row-vector world-to-clip matrix of the previous frame, clip y down.
+
+    Returns:
+        ``(B, 2, H, W)`` motion in pixels, x right and y down, ``previous = current + motion``; infinite where the
+        point was behind the previous camera.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: shapes disagree.
+
+    Differentiable in ``position`` and ``previous_view_projection``, to any order, where the point was in front.
+    Half precision is projected in float32 (a pixel of a wide image needs more than 11 bits).
+
+    Source: Koskela et al. 2019 (BMFR), ``accumulate_noisy_data``.
+
+    Example:
+        >>> position = torch.tensor([0.5, 0.0, 1.0]).reshape(1, 3, 1, 1)
+        >>> motion_from_position(position, torch.eye(4)[None]).flatten().tolist()  # u = 0.75 of one pixel
+        [0.25, 0.0]
+    """
+    sizes = check_shapes(position=(position, "B 3 H W"), previous_view_projection=(previous_view_projection, "B 4 4"))
+    height, width = sizes["H"], sizes["W"]
+    dtype = torch.promote_types(position.dtype, torch.float32)
+    matrix = previous_view_projection.to(dtype)
+    clip = torch.einsum("bchw,bcd->bdhw", position.to(dtype), matrix[:, :3]) + matrix[:, 3, :, None, None]
+    w = clip[:, 3:]
+    in_front = w > 0
+    scale = torch.tensor([width, height], dtype=dtype, device=position.device).reshape(1, 2, 1, 1)
+    previous = (clip[:, :2] / torch.where(in_front, w, 1) + 1) / 2 * scale
+    centre = _pixel_grid(height, width, position.device, dtype) + 0.5
+    return torch.where(in_front, previous - centre, torch.inf)
+
+
+def reproject(
+    previous: Tensor,
+    motion: Tensor,
+    surface: Surface | None = None,
+    previous_surface: Surface | None = None,
+    *,
+    rule: Rule = "relative",
+    position_limit: float | None = None,
+    normal_limit: float | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Fetch the previous frame at the place each pixel was, from those bilinear taps that show the same surface.
+
+    Around ``q = p + motion[p]`` each of the four pixels ``q_k`` with bilinear weight ``b_k`` is kept if it lies in
+    the image and passes the consistency test; then ``weight = sum_kept b_k`` and
+    ``value = sum_kept b_k previous[q_k] / weight`` (0 where nothing is kept).
+
+    The test compares whatever both surfaces have:
+
+    - ``rule="relative"``: limits scale with depth. ``|dot(P_k - P, N)| <= position_limit * depth``, the distance off
+      the tangent plane (``|P_k - P|`` without normals; default 0.02); with depths only,
+      ``|d_k - d| <= position_limit * d`` (default 0.1); ``|N_k - N|^2 <= normal_limit`` (default 0.5). Depth comes
+      from ``depth``; without it the plane test is left out. A pixel that hit nothing matches only such pixels.
+    - ``rule="bmfr"``: ``|P_k - P|^2 < position_limit`` and ``|N_k - N|^2 < normal_limit``, squared limits in scene
+      units, which the scene must supply.
+
+    Args:
+        previous: ``(B, C, H, W)`` anything of the previous frame.
+        motion: ``(B, 2, H, W)`` pixels, ``previous position = current position + motion``; a non-finite value means
+            that there is no previous position.
+        surface: the current frame's surface; ``None`` tests only for the image border.
+        previous_surface: the previous frame's surface.
+        rule: ``"relative"`` or ``"bmfr"``.
+        position_limit: see above; required by ``"bmfr"`` where positions are given.
+        normal_limit: see above; required by ``"bmfr"`` where normals are given.
+
+    Returns:
+        ``(B, C, H, W)`` value in the dtype of ``previous``, and ``(B, 1, H, W)`` kept weight in [0, 1].
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: shapes disagree, the rule is unknown, or ``"bmfr"`` lacks a limit.
+
+    Differentiable in ``previous`` (to any order) and, between the pixel centres, in ``motion``; the test is a
+    decision and has no derivative. Without a test it is ``kornia.geometry.transform.remap`` inside the image.
+
+    Source: Koskela et al. 2019 (BMFR), ``accumulate_noisy_data``; Schied et al. 2017 (SVGF), Sec. 4.1.
+
+    Example:
+        >>> previous = torch.tensor([[[[1.0, 2.0, 3.0]]]])
+        >>> motion = torch.tensor([0.5, 0.0]).reshape(1, 2, 1, 1).expand(1, 2, 1, 3)
+        >>> value, weight = reproject(previous, motion)
+        >>> value.flatten().tolist(), weight.flatten().tolist()
+        ([1.5, 2.5, 3.0], [1.0, 1.0, 0.5])
+    """
+    sizes = check_shapes(previous=(previous, "B C H W"), motion=(motion, "B 2 H W"))
+    if rule not in ("relative", "bmfr"):
+        raise ValueError(f"rule: expected 'relative' or 'bmfr', found {rule!r}")
+    here, there = _comparable(surface, previous_surface, previous)
+    _check_limits(rule, here, position_limit, normal_limit)
+    height, width = sizes["H"], sizes["W"]
+    dtype = torch.promote_types(previous.dtype, torch.float32)
+
+    known = torch.isfinite(motion).all(1, keepdim=True)
+    motion = torch.where(known, motion.to(dtype), 0)
+    q = _pixel_grid(height, width, motion.device, dtype) + motion
+    # Far outside is as good as just outside, and stays exact as an integer.
+    limit = torch.tensor([width + 1, height + 1], dtype=dtype, device=q.device).reshape(1, 2, 1, 1)
+    base = torch.minimum(torch.maximum(q.detach().floor(), torch.full_like(limit, -2)), limit)
+    fraction = q - base
+    x0, y0 = base[:, :1].long(), base[:, 1:].long()
+    fx, fy = fraction[:, :1], fraction[:, 1:]
+
+    values = torch.zeros_like(previous, dtype=dtype)
+    weight = torch.zeros_like(fx)
+    # One gather a tap fetches all there is to compare and to sum.
+    tested = [x for x in there if x is not None]
+    stack = torch.cat([previous.to(dtype), *(x.to(dtype) for x in tested)], 1).flatten(2)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            x, y = x0 + dx, y0 + dy
+            kept = known & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            index = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
+            tap = stack.gather(2, index.flatten(2).expand(-1, stack.shape[1], -1)).unflatten(2, (height, width))
+            parts = iter(tap.split([previous.shape[1], *(t.shape[1] for t in tested)], 1))
+            value = next(parts)
+            tap_surface = Surface(*(None if x is None else next(parts) for x in there))
+            if rule == "bmfr":
+                kept = kept & _bmfr_test(here, tap_surface, position_limit, normal_limit)
+            else:
+                kept = kept & _relative_test(here, tap_surface, position_limit, normal_limit)
+            bilinear = (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
+            bilinear = torch.where(kept, bilinear, 0)
+            # A tap that is left out may hold anything, NaN too.
+            values = values + bilinear * torch.where(kept, value, 0)
+            weight = weight + bilinear
+    found = weight > 0
+    values = torch.where(found, values / torch.where(found, weight, 1), 0)
+    return values.to(previous.dtype), weight.to(previous.dtype)
+
+
+def accumulate(
+    color: Tensor,
+    previous: Tensor,
+    previous_length: Tensor,
+    motion: Tensor,
+    surface: Surface | None = None,
+    previous_surface: Surface | None = None,
+    *,
+    alpha_min: float = 0.1,
+    rule: Rule = "relative",
+    position_limit: float | None = None,
+    normal_limit: float | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Blend a noisy frame with its reprojected history: an average at first, an exponential window later.
+
+    With the reprojected history ``h`` and its length ``n`` (:func:`reproject`), ``alpha = max(1 / (n + 1), alpha_min)``,
+    ``accumulated = alpha color + (1 - alpha) h`` and ``length = n + 1``; where no tap is kept,
+    ``accumulated = color`` and ``length = 1``. With ``rule="bmfr"`` the length is rounded before 1 is added and
+    saturates at 255, as in the published code, which stores it in a byte (and uses ``alpha_min=0.2``).
+
+    Args:
+        color: ``(B, C, H, W)`` noisy radiance of the current frame, usually demodulated.
+        previous: ``(B, C, H, W)`` accumulated radiance of the previous frame.
+        previous_length: ``(B, 1, H, W)`` history length of the previous frame, in frames, at least 1.
+        motion: ``(B, 2, H, W)`` pixels, ``previous position = current position + motion``.
+        surface: see :func:`reproject`.
+        previous_surface: see :func:`reproject`.
+        alpha_min: smallest weight of the current frame, in (0, 1].
+        rule: see :func:`reproject`.
+        position_limit: see :func:`reproject`.
+        normal_limit: see :func:`reproject`.
+
+    Returns:
+        ``(B, C, H, W)`` accumulated radiance in the dtype of ``color``, and ``(B, 1, H, W)`` history length in that of
+        ``previous_length``.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: shapes disagree, ``alpha_min`` is outside (0, 1], or as in :func:`reproject`.
+
+    Differentiable in ``color``, ``previous``, ``previous_length`` (not with ``"bmfr"``, which rounds it) and
+    ``motion``, to any order.
+
+    Source: Koskela et al. 2019 (BMFR), ``accumulate_noisy_data``.
+
+    Example:
+        >>> color, previous = torch.full((1, 3, 2, 2), 4.0), torch.zeros(1, 3, 2, 2)
+        >>> accumulated, length = accumulate(color, previous, torch.full((1, 1, 2, 2), 3.0), torch.zeros(1, 2, 2, 2))
+        >>> accumulated.unique().tolist(), length.unique().tolist()
+        ([1.0], [4.0])
+    """
+    check_shapes(
+        color=(color, "B C H W"),
+        previous=(previous, "B C H W"),
+        previous_length=(previous_length, "B 1 H W"),
+        motion=(motion, "B 2 H W"),
+    )
+    if not 0 < alpha_min <= 1:
+        raise ValueError(f"alpha_min: expected in (0, 1], found {alpha_min}")
+    dtype = torch.promote_types(color.dtype, torch.float32)
+    channels = color.shape[1]
+    both, weight = reproject(
+        torch.cat([previous.to(dtype), previous_length.to(dtype)], 1),
+        motion,
+        surface,
+        previous_surface,
+        rule=rule,
+        position_limit=position_limit,
+        normal_limit=normal_limit,
+    )
+    history, length = both[:, :channels], both[:, channels:]
+    found = weight > 0
+    alpha = torch.where(found, (1 / (length + 1)).clamp_min(alpha_min), 1)
+    accumulated = torch.lerp(history, color.to(dtype), alpha)
+    accumulated = torch.where(found, accumulated, color.to(dtype))
+    length = (length.round() + 1).clamp_max(255) if rule == "bmfr" else length + 1
+    length = torch.where(found, length, 1)
+    return accumulated.to(color.dtype), length.to(previous_length.dtype)
+
+
+class Accumulate(nn.Module):
+    """:func:`accumulate` with its rule and limits stored.
+
+    Args:
+        alpha_min: see :func:`accumulate`.
+        rule: see :func:`accumulate`.
+        position_limit: see :func:`accumulate`.
+        normal_limit: see :func:`accumulate`.
+    """
+
+    def __init__(
+        self,
+        alpha_min: float = 0.1,
+        rule: Rule = "relative",
+        position_limit: float | None = None,
+        normal_limit: float | None = None,
+    ) -> None:
+        super().__init__()
+        self.alpha_min = alpha_min
+        self.rule: Rule = rule
+        self.position_limit = position_limit
+        self.normal_limit = normal_limit
+
+    def forward(
+        self,
+        color: Tensor,
+        previous: Tensor,
+        previous_length: Tensor,
+        motion: Tensor,
+        surface: Surface | None = None,
+        previous_surface: Surface | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """See :func:`accumulate`."""
+        return accumulate(
+            color,
+            previous,
+            previous_length,
+            motion,
+            surface,
+            previous_surface,
+            alpha_min=self.alpha_min,
+            rule=self.rule,
+            position_limit=self.position_limit,
+            normal_limit=self.normal_limit,
+        )
+
+
+def _pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """``(1, 2, H, W)`` integer pixel indices, x first."""
+    return create_meshgrid(height, width, normalized_coordinates=False, device=device, dtype=dtype).permute(0, 3, 1, 2)
+
+
+def _comparable(surface: Surface | None, previous: Surface | None, like: Tensor) -> tuple[Surface, Surface]:
+    """Both surfaces, reduced to what both have and free of gradients, with shapes checked."""
+    if surface is None or previous is None:
+        return Surface(), Surface()
+    pairs = []
+    for name, channels, a, b in zip(Surface._fields, (3, 3, 1), surface, previous, strict=True):
+        if a is None or b is None:
+            pairs.append((None, None))
+            continue
+        check_shapes(
+            previous=(like, "B C H W"),
+            **{f"surface.{name}": (a, f"B {channels} H W"), f"previous_surface.{name}": (b, f"B {channels} H W")},
+        )
+        pairs.append((a.detach(), b.detach()))
+    return Surface(*(a for a, _ in pairs)), Surface(*(b for _, b in pairs))
+
+
+def _check_limits(rule: Rule, surface: Surface, position_limit: float | None, normal_limit: float | None) -> None:
+    if rule == "bmfr":
+        if surface.position is not None and position_limit is None:
+            raise ValueError("position_limit: the rule 'bmfr' needs the scene's squared limit in scene units, found None")
+        if surface.normal is not None and normal_limit is None:
+            raise ValueError("normal_limit: the rule 'bmfr' needs the scene's squared limit, found None")
+
+
+def _bmfr_test(here: Surface, tap: Surface, position_limit: float | None, normal_limit: float | None) -> Tensor | bool:
+    kept: Tensor | bool = True
+    for a, b, limit in ((here.position, tap.position, position_limit), (here.normal, tap.normal, normal_limit)):
+        if a is not None and b is not None and limit is not None:
+            kept = kept & ((b - a).square().sum(1, keepdim=True) < limit)
+    return kept
+
+
+def _relative_test(
+    here: Surface, tap: Surface, position_limit: float | None, normal_limit: float | None
+) -> Tensor | bool:
+    kept: Tensor | bool = True
+    if here.normal is not None and tap.normal is not None:
+        limit = NORMAL_LIMIT_SQUARED if normal_limit is None else normal_limit
+        kept = kept & ((tap.normal - here.normal).square().sum(1, keepdim=True) <= limit)
+    if here.depth is None or tap.depth is None:
+        return kept
+    hit, tap_hit = torch.isfinite(here.depth), torch.isfinite(tap.depth)
+    # Where nothing was hit there is no distance to compare: background matches background.
+    depth = torch.where(hit, here.depth, 0)
+    if here.position is not None and tap.position is not None:
+        offset = tap.position - here.position
+        if here.normal is not None:
+            distance = (offset * here.normal).sum(1, keepdim=True).abs()
+        else:
+            distance = torch.linalg.vector_norm(offset, dim=1, keepdim=True)
+        near = distance <= (PLANE_LIMIT if position_limit is None else position_limit) * depth
+    else:
+        distance = (torch.where(tap_hit, tap.depth, 0) - depth).abs()
+        near = distance <= (DEPTH_LIMIT if position_limit is None else position_limit) * depth
+    return kept & torch.where(hit, tap_hit & near, ~tap_hit)

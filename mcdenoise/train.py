@@ -1,0 +1,331 @@
+"""Train a denoiser of the zoo on rendered sequences."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from kornia.color import linear_rgb_to_rgb
+from kornia.metrics import psnr
+from torch import Tensor, nn
+
+from mcdenoise.data import open_sequence
+from mcdenoise.data.clips import Clip, ClipSampler, accumulated_shots
+from mcdenoise.data.files import atomic_path, write_text
+from mcdenoise.data.sequences import Sequence
+from mcdenoise.errors import InputError
+from mcdenoise.losses import cascade_loss, smape
+from mcdenoise.models import create_model, save_weights
+from mcdenoise.ops import remodulate
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
+
+Precision = Literal["32-true", "bf16-mixed"]
+Schedule = Literal["constant", "cosine"]
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides what a training run computes.
+
+    The defaults are the paper's setting (Sec. 4.2): clips of 8 frames, 128x128 patches, batches of 8 clips, Adam with
+    a learning rate of 1e-4, a temporal loss weight of 0.1.
+
+    Args:
+        model: name of the model in the zoo.
+        width: feature channels; 0 takes the model's own.
+        steps: optimiser steps.
+        batch: clips in a step.
+        frames: frames in a clip.
+        crop: side of the square patches, pixels.
+        learning_rate: of Adam, at its highest.
+        schedule: ``"constant"``, or ``"cosine"`` down to 0 after a warm-up of 200 steps.
+        temporal_weight: of the temporal loss.
+        gradient_norm: largest norm of a step's gradient; 0 does not limit it.
+        alpha_min: of the accumulation, see :func:`mcdenoise.ops.accumulate`.
+        start_every: a shot also starts at every n-th frame, to train on short histories.
+        validation_frames: the last frames of each sequence, kept for validation (the paper's 4).
+        precision: ``"bf16-mixed"`` runs convolutions in bfloat16.
+        seed: of weights and clips.
+    """
+
+    model: str = "cascaded"
+    width: int = 0
+    steps: int = 10_000
+    batch: int = 8
+    frames: int = 8
+    crop: int = 128
+    learning_rate: float = 1e-4
+    schedule: Schedule = "constant"
+    temporal_weight: float = 0.1
+    gradient_norm: float = 0.0
+    alpha_min: float = 0.1
+    start_every: int = 4
+    validation_frames: int = 4
+    precision: Precision = "32-true"
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a training run reports.
+
+    Args:
+        step: optimiser steps done.
+        loss: mean training loss since the last report.
+        seconds: time since the run was started or resumed.
+        validation: error of the final image on the validation frames, by name, where it was measured.
+    """
+
+    step: int
+    loss: float
+    seconds: float
+    validation: dict[str, float]
+
+
+_LOG_EVERY = 50
+_WARM_UP = 200
+
+
+def train(
+    config: TrainConfig,
+    sequences: list[Path],
+    out: Path,
+    *,
+    accelerator: str = "cpu",
+    checkpoint_every: int = 500,
+    credits: str = "",
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> Path:
+    """Train a model, from the start or from where an earlier run of the same config in ``out`` stopped.
+
+    Every step draws its clips from its own seed, so that a run that was interrupted and resumed computes the same as
+    one that was not.
+
+    Args:
+        config: what to train.
+        sequences: folders of sequences with references and features.
+        out: folder of the run: ``config.json``, ``data.json``, ``log.jsonl``, TensorBoard events, ``checkpoint.pt``,
+            and at the end ``MODEL.safetensors``.
+        accelerator: ``"cpu"`` or ``"cuda"``.
+        checkpoint_every: steps between checkpoints and validations.
+        credits: authors and licences of the training scenes, stored with the weights.
+        report: called with the progress every 50 steps.
+
+    Returns:
+        Path of the weights.
+
+    Raises:
+        InputError: no data, data without references, a run of another config in ``out``, or an optional dependency is
+            missing.
+    """
+    if not sequences:
+        raise InputError("training data: expected at least one sequence folder, found none; name one or more")
+    fabric = _fabric(accelerator, config.precision)
+    opened = [open_sequence(path) for path in sequences]
+    run = _Run(config, opened, out)
+    run.begin()
+
+    torch.manual_seed(config.seed)
+    settings = {"width": config.width} if config.width else {}
+    network = create_model(config.model, **settings).train().to(memory_format=torch.channels_last)
+    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(config, step))
+    first = run.load_checkpoint(network, optimizer, scheduler)
+
+    sampler, validation = _data(config, opened)
+    model, fabric_optimizer = fabric.setup(network, optimizer)
+    from torch.utils.tensorboard import SummaryWriter  # here because importing it takes a second
+
+    with SummaryWriter(str(out), purge_step=first) as board:
+        started, losses = time.monotonic(), []
+        for step in range(first, config.steps):
+            torch.manual_seed(config.seed * 1_000_003 + step)
+            loss = _loss(model, sampler.draw(config.batch), config.temporal_weight)
+            fabric_optimizer.zero_grad()
+            fabric.backward(loss)
+            if config.gradient_norm:
+                fabric.clip_gradients(model, fabric_optimizer, max_norm=config.gradient_norm)
+            fabric_optimizer.step()
+            scheduler.step()
+            losses.append(loss.item())
+            done = step + 1
+            save = done % checkpoint_every == 0 or done == config.steps
+            if save or done % _LOG_EVERY == 0:
+                scores: dict[str, float] = {}
+                if save:
+                    run.save_checkpoint(done, network, optimizer, scheduler)
+                    scores = _validate(model, validation, board, done)
+                progress = Progress(done, sum(losses) / len(losses), time.monotonic() - started, scores)
+                losses.clear()
+                run.log(progress)
+                board.add_scalar("train/loss", progress.loss, done)
+                report(progress)
+    return run.finish(network, settings, credits)
+
+
+def _fabric(accelerator: str, precision: Precision) -> Fabric:
+    try:
+        from lightning_fabric import Fabric
+    except ImportError as error:
+        raise InputError(
+            f"training: expected the optional packages of mcdenoise[train], found no '{error.name}'; "
+            "install them with pip install 'mcdenoise[train]'"
+        ) from error
+    return Fabric(accelerator=accelerator, devices=1, precision=precision)
+
+
+def _rate(config: TrainConfig, step: int) -> float:
+    """The learning rate of a step, in parts of the highest."""
+    if config.schedule == "constant":
+        return 1.0
+    warm_up = min(1.0, (step + 1) / _WARM_UP)
+    return warm_up * 0.5 * (1 + math.cos(math.pi * min(1.0, step / config.steps)))
+
+
+def _data(config: TrainConfig, sequences: list[Sequence]) -> tuple[ClipSampler, list[Clip]]:
+    """The sampler of training clips, and for each sequence the clip of its validation frames."""
+    shots: list[Tensor] = []
+    validation: list[Clip] = []
+    for sequence in sequences:
+        held = config.validation_frames if len(sequence) >= config.frames + config.validation_frames else 0
+        for i, shot in enumerate(accumulated_shots(sequence, config.alpha_min, config.start_every)):
+            shots.append(shot[: len(shot) - held])
+            if i == 0 and held:
+                validation.append(Clip.from_stack(shot[None, -held:]))
+    return ClipSampler(shots, config.frames, config.crop), validation
+
+
+def _denoise(model: nn.Module, clip: Clip) -> tuple[Tensor, Tensor]:
+    """Initial and final image of every frame, with albedo, ``(B, T, 3, H, W)``."""
+    batch = clip.color.shape[:2]
+    inputs = (getattr(clip, name).flatten(0, 1) for name in ("color", "albedo", "normal", "depth"))
+    initial, final = model(*inputs)
+    albedo = clip.albedo.flatten(0, 1)
+    return remodulate(initial, albedo).unflatten(0, batch), remodulate(final, albedo).unflatten(0, batch)
+
+
+def _loss(model: nn.Module, clip: Clip, temporal_weight: float) -> Tensor:
+    initial, final = _denoise(model, clip)
+    return cascade_loss(initial, final, clip.reference, temporal_weight=temporal_weight)
+
+
+@torch.no_grad()
+def _validate(model: nn.Module, clips: list[Clip], board: Any, step: int) -> dict[str, float]:
+    """Mean SMAPE and display PSNR on the validation clips; pictures of one frame of each for TensorBoard."""
+    if not clips:
+        return {}
+    model.eval()
+    errors, decibels = [], []
+    for i, clip in enumerate(clips):
+        _, final = _denoise(model, clip)
+        noisy = remodulate(clip.color.flatten(0, 1), clip.albedo.flatten(0, 1)).unflatten(0, clip.color.shape[:2])
+        errors.append(smape(final, clip.reference).item())
+        shown = [linear_rgb_to_rgb(x[0, -1].clamp(0, 1)) for x in (noisy, final, clip.reference)]
+        decibels.append(psnr(shown[1], shown[2], 1.0).item())
+        board.add_image(f"validation/{i}", torch.cat(shown, -1), step)
+    model.train()
+    scores = {"smape": sum(errors) / len(errors), "psnr": sum(decibels) / len(decibels)}
+    for name, score in scores.items():
+        board.add_scalar(f"validation/{name}", score, step)
+    return scores
+
+
+@dataclass(frozen=True)
+class _Run:
+    """The folder of a run."""
+
+    config: TrainConfig
+    sequences: list[Sequence]
+    out: Path
+
+    def begin(self) -> None:
+        """Write what is going to be trained on what, or check that an earlier run did just that."""
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.out}: expected a folder to write the run to: {error.strerror}") from error
+        for name, content in (("config.json", dataclasses.asdict(self.config)), ("data.json", self._data_list())):
+            path = self.out / name
+            text = json.dumps(content, indent=2) + "\n"
+            if not path.exists():
+                write_text(path, text)
+            elif path.read_text(encoding="utf-8") != text:
+                raise InputError(
+                    f"{path}: expected the same as in this run, found another; choose a new folder for a new run"
+                )
+
+    def _data_list(self) -> list[dict[str, Any]]:
+        entries = []
+        for sequence in self.sequences:
+            digest = hashlib.sha256()
+            for number in sequence.numbers:
+                frame = sequence.frame(number)
+                digest.update(frame.color.numpy().tobytes())
+                if frame.reference is not None:
+                    digest.update(frame.reference.numpy().tobytes())
+            size = f"{sequence.size[1]}x{sequence.size[0]}"
+            entries.append(
+                {"name": sequence.name, "frames": len(sequence), "size": size, "sha256": digest.hexdigest()}
+            )
+        return entries
+
+    @property
+    def _checkpoint(self) -> Path:
+        return self.out / "checkpoint.pt"
+
+    def save_checkpoint(self, step: int, *parts: Any) -> None:
+        with atomic_path(self._checkpoint) as temporary:
+            torch.save({"step": step, "parts": [part.state_dict() for part in parts]}, temporary)
+
+    def load_checkpoint(self, *parts: Any) -> int:
+        """Restore what :meth:`save_checkpoint` saved; returns the number of steps done, 0 without a checkpoint."""
+        if not self._checkpoint.exists():
+            return 0
+        try:
+            saved = torch.load(self._checkpoint, weights_only=True)
+            for part, state in zip(parts, saved["parts"], strict=True):
+                part.load_state_dict(state)
+            return int(saved["step"])
+        except Exception as error:
+            raise InputError(
+                f"{self._checkpoint}: expected a checkpoint of this run, found one that cannot be loaded "
+                f"({str(error).splitlines()[0]}); remove it to start again"
+            ) from error
+
+    def log(self, progress: Progress) -> None:
+        with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(dataclasses.asdict(progress)) + "\n")
+
+    def finish(self, network: nn.Module, settings: dict[str, Any], credits: str) -> Path:
+        path = self.out / f"{self.config.model}.safetensors"
+        about = {
+            "config": json.dumps(dataclasses.asdict(self.config)),
+            "data": json.dumps(self._data_list()),
+            "steps": str(self.config.steps),
+            "commit": _commit(),
+            "licence": "Apache-2.0",
+            "credits": credits,
+        }
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(save_weights(network, self.config.model, settings, about))
+        return path
+
+
+def _commit() -> str:
+    """The commit of the source tree that trains, ``"unknown"`` where it is not a git checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

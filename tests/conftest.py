@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from mcdenoise.buffers import Frame
+from mcdenoise.data.bmfr import write_bmfr_frame
+from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
+
+HEIGHT, WIDTH, FRAMES = 20, 24, 4
+
+
+@pytest.fixture
+def small_sequence(tmp_path: Path) -> Path:
+    """A scene folder in the bmfr layout: 4 frames, 24 x 20 pixels, a moving camera above a floor, sky at the top.
+
+    A strip of the floor is a mirror (no albedo, but a normal). Color is noisy radiance; its mean is the reference.
+    """
+    inputs = tmp_path / "plane" / "inputs"
+    cameras = [_camera(number) for number in range(FRAMES)]
+    for number, (eye, axes, focal, _) in enumerate(cameras):
+        write_bmfr_frame(inputs, number, _render(eye, axes, focal, seed=number))
+    matrices = np.stack([matrix for *_, matrix in cameras])
+    write_camera_matrices(
+        inputs / "camera_matrices.h", CameraMatrices(matrices, np.full((FRAMES, 2), 0.5), 0.01, 0.25), "plane"
+    )
+    return inputs.parent
+
+
+def _camera(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Eye, rows (right, down, forward), focal lengths in clip units, row-vector world-to-clip matrix."""
+    eye = np.array([0.1 * number, 1.0, 0.05 * number])
+    yaw, pitch = 0.02 * number, 0.3
+    forward = np.array([np.sin(yaw) * np.cos(pitch), -np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
+    right = np.array([np.cos(yaw), 0.0, -np.sin(yaw)])
+    axes = np.stack([right, np.cross(right, forward), forward])
+    axes[1] *= -np.sign(axes[1, 1])  # down
+    focal = np.array([1.2, 1.2 * WIDTH / HEIGHT])
+    near, far = 0.01, 100.0
+    columns = [focal[0] * axes[0], focal[1] * axes[1], far / (far - near) * axes[2], axes[2]]
+    offsets = [0.0, 0.0, -near * far / (far - near), 0.0]
+    matrix = np.zeros((4, 4))
+    for index, (column, offset) in enumerate(zip(columns, offsets, strict=True)):
+        matrix[:3, index], matrix[3, index] = column, offset - column @ eye
+    return eye, axes, focal, matrix
+
+
+def _render(eye: np.ndarray, axes: np.ndarray, focal: np.ndarray, seed: int) -> Frame:
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    x, y = (2 * columns / WIDTH - 1) / focal[0], (2 * rows / HEIGHT - 1) / focal[1]
+    rays = axes[2] + x[..., None] * axes[0] + y[..., None] * axes[1]
+    hit = rays[..., 1] < -0.02
+    depth = np.where(hit, -eye[1] / np.where(hit, rays[..., 1], -1.0), 50.0)
+    position = eye + depth[..., None] * rays
+    mirror = hit & (np.abs(position[..., 0]) < 0.2)
+    checker = (np.floor(position[..., 0] * 2) + np.floor(position[..., 2] * 2)) % 2
+    albedo = np.where(checker[..., None] > 0, [0.8, 0.6, 0.4], [0.2, 0.3, 0.4]) * (hit & ~mirror)[..., None]
+    irradiance = 1 + 0.5 * np.cos(position[..., 2:])
+    sky = np.array([0.3, 0.5, 0.9])
+    reference = np.where((hit & ~mirror)[..., None], albedo * irradiance, sky)
+    noise = np.random.default_rng(seed).exponential(size=reference.shape)
+    return Frame(
+        color=_tensor(reference * np.where(hit[..., None], noise, 1)),
+        albedo=_tensor(albedo),
+        normal=_tensor(np.array([0.0, 1.0, 0.0]) * hit[..., None]),
+        depth=_tensor(np.where(hit, depth, np.inf)[..., None]),
+        position=_tensor(position),
+        reference=_tensor(reference),
+    )
+
+
+def _tensor(image: np.ndarray) -> Tensor:
+    return torch.from_numpy(image).float().permute(2, 0, 1)[None].contiguous()

@@ -1,0 +1,420 @@
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mcdenoise.buffers import Frame
+from mcdenoise.data import open_sequence, read_exr, write_exr
+from mcdenoise.data.bmfr import write_bmfr_frame
+from mcdenoise.data.camera_matrices import CameraMatrices, read_camera_matrices, write_camera_matrices
+from mcdenoise.data.sequences import parse_frames
+from mcdenoise.errors import InputError
+
+SHARED_DATA = Path(__file__).parents[3] / "shared" / "data" / "train"
+RGB = ["R", "G", "B"]
+
+
+def refused(action: Callable[[], object]) -> str:
+    """The one-line message with which an action is refused."""
+    with pytest.raises(InputError) as error:
+        action()
+    message = str(error.value)
+    assert "\n" not in message
+    assert len(message) < 600
+    return message
+
+
+def pixel_index(position: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
+    """(row, column) of every world position, written out as in the file format's description."""
+    _, height, width = position.shape
+    clip = torch.cat([position, torch.ones(1, height, width)]).double().permute(1, 2, 0) @ matrix.double()
+    u, v = (clip[..., 0] / clip[..., 3] + 1) / 2, (clip[..., 1] / clip[..., 3] + 1) / 2
+    return torch.stack([v * height - 0.5, u * width - 0.5])
+
+
+def pixel_centres(height: int, width: int) -> torch.Tensor:
+    return torch.stack(torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")).double()
+
+
+def test_what_a_sequence_says_about_itself(small_sequence: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    assert (sequence.root, sequence.name, sequence.layout) == (small_sequence, "plane", "bmfr")
+    assert (sequence.numbers, sequence.size, len(sequence)) == ([0, 1, 2, 3], (20, 24), 4)
+    names = {"color", "albedo", "normal", "position", "depth", "reference", "view_projection"}
+    assert sequence.buffers == names
+    assert sequence.reference_numbers == [0, 1, 2, 3]
+    assert sequence.color_has_albedo
+    assert {name for name, _ in sequence.frame(0).items()} == names
+    assert sequence.frame(0, reference=False).reference is None
+
+
+def test_inputs_folder_is_the_same_sequence(small_sequence: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    inside = open_sequence(small_sequence / "inputs")
+    assert (inside.name, inside.numbers) == ("plane", [0, 1, 2, 3])
+    monkeypatch.chdir(small_sequence / "inputs")
+    assert open_sequence(Path(".")).name == "plane"
+
+
+def test_frames_are_valid_and_float32(small_sequence: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    for number in sequence.numbers:
+        clean, replaced = sequence.frame(number).validate()
+        assert replaced == 0
+        assert {value.dtype for _, value in clean.items()} == {torch.float32}
+        assert clean.color.shape == (1, 3, 20, 24)
+
+
+def test_convention_position_projects_to_its_pixel_centre(small_sequence: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    for number in sequence.numbers:
+        frame = sequence.frame(number)
+        index = pixel_index(frame.position[0], frame.view_projection[0])
+        assert (index - pixel_centres(*sequence.size)).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize(("offset_x", "offset_y"), [(0.5, 0.5), (0.25, 0.5), (0.5, 0.9), (0.1, 0.3)])
+def test_pixel_offsets_are_folded_into_the_matrix(small_sequence: Path, offset_x: float, offset_y: float) -> None:
+    path = small_sequence / "inputs" / "camera_matrices.h"
+    cameras = read_camera_matrices(path)
+    position = open_sequence(small_sequence).frame(1).position[0]
+    shifted = CameraMatrices(cameras.matrices, np.tile([offset_x, offset_y], (4, 1)), 0.01, 0.25)
+    write_camera_matrices(path, shifted)
+    # The format says: pixel index = (u W - ox, v H - (1 - oy)), with the matrix as it stands in the file.
+    plain = pixel_index(position, torch.from_numpy(cameras.matrices[1]))
+    expected = plain + 0.5 - torch.tensor([1 - offset_y, offset_x])[:, None, None]
+    found = pixel_index(position, open_sequence(small_sequence).frame(1).view_projection[0])
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+
+
+def test_depth_from_clip_w_is_the_depth_file(small_sequence: Path) -> None:
+    with_file = open_sequence(small_sequence).frame(2).depth
+    for path in (small_sequence / "inputs").glob("depth*.exr"):
+        path.unlink()
+    sequence = open_sequence(small_sequence)
+    assert "depth" in sequence.buffers
+    torch.testing.assert_close(sequence.frame(2).depth, with_file, rtol=1e-3, atol=0)
+
+
+def test_negated_matrix_gives_the_same_frame(small_sequence: Path) -> None:
+    path = small_sequence / "inputs" / "camera_matrices.h"
+    expected = open_sequence(small_sequence).frame(1)
+    cameras = read_camera_matrices(path)
+    write_camera_matrices(path, CameraMatrices(-cameras.matrices, cameras.pixel_offsets, 0.01, 0.25))
+    for depth_file in (small_sequence / "inputs").glob("depth*.exr"):
+        depth_file.unlink()
+    found = open_sequence(small_sequence).frame(1)
+    torch.testing.assert_close(found.view_projection, expected.view_projection)
+    torch.testing.assert_close(found.depth, expected.depth, rtol=1e-3, atol=0)
+
+
+def test_convention_depth_is_infinite_only_where_nothing_was_hit(small_sequence: Path) -> None:
+    for with_file in (True, False):
+        frame = open_sequence(small_sequence).frame(0)
+        sky = (frame.normal == 0).all(dim=1, keepdim=True)
+        mirror = (frame.albedo == 0).all(dim=1, keepdim=True) & ~sky
+        assert sky.any(), with_file
+        assert mirror.any()
+        assert torch.equal(frame.depth.isinf(), sky)
+        for path in (small_sequence / "inputs").glob("depth*.exr"):
+            path.unlink()
+
+
+def test_depth_zero_becomes_infinite(tmp_path: Path) -> None:
+    write_exr(tmp_path / "color0.exr", np.ones((2, 2, 3)), RGB)
+    write_exr(tmp_path / "depth0.exr", np.array([[[0.0], [1.0]], [[2.0], [0.0]]]), ["Y"])
+    assert open_sequence(tmp_path).frame(0).depth.flatten().tolist() == [torch.inf, 1, 2, torch.inf]
+
+
+def test_color_alone_is_a_sequence(tmp_path: Path) -> None:
+    write_exr(tmp_path / "color7.exr", np.full((4, 5, 3), 2.0), RGB, metadata={"owner of it": "me"})
+    sequence = open_sequence(tmp_path)
+    assert (sequence.numbers, sequence.size, sequence.buffers) == ([7], (4, 5), {"color"})
+    assert sequence.reference_numbers == []
+    assert sequence.frame(7).color.unique().tolist() == [2]
+    assert sequence.metadata(7)["owner of it"] == "me"
+
+
+def test_published_data_gets_its_albedo_back(small_sequence: Path) -> None:
+    expected = open_sequence(small_sequence).frame(1)
+    inputs = small_sequence / "inputs"
+    for number in range(4):
+        color, albedo = (read_exr(inputs / f"{name}{number}.exr")[0] for name in ("color", "albedo"))
+        write_exr(inputs / f"color{number}.exr", color / np.maximum(albedo, 1e-3), RGB, half=False)
+    for content in (None, {"color_includes_albedo": False}):
+        (inputs / "camera.json").unlink()
+        if content is not None:
+            (inputs / "camera.json").write_text(json.dumps(content))
+        sequence = open_sequence(small_sequence)
+        assert not sequence.color_has_albedo
+        found = sequence.frame(1).color
+        somewhere = (expected.albedo > 0).expand_as(found)
+        torch.testing.assert_close(found[somewhere], expected.color[somewhere], rtol=1e-3, atol=0)
+        (inputs / "camera.json").write_text("{}")
+
+
+def test_references_of_some_frames(small_sequence: Path) -> None:
+    (small_sequence / "inputs" / "reference2.exr").unlink()
+    sequence = open_sequence(small_sequence)
+    assert sequence.reference_numbers == [0, 1, 3]
+    assert "reference" not in sequence.buffers
+    assert sequence.frame(2).reference is None
+    assert sequence.frame(3).reference is not None
+    assert "reference" in open_sequence(small_sequence, "0-1").buffers
+
+
+def test_chosen_frames(small_sequence: Path) -> None:
+    assert open_sequence(small_sequence, "1,3").numbers == [1, 3]
+    (small_sequence / "inputs" / "albedo3.exr").unlink()
+    assert open_sequence(small_sequence, "0-2").numbers == [0, 1, 2]
+    assert "frames 0 to 3" in refused(lambda: open_sequence(small_sequence, "0-9"))
+    assert "found 7" in refused(lambda: open_sequence(small_sequence, "0-2").frame(7))
+    assert "found 7" in refused(lambda: open_sequence(small_sequence, "0-2").metadata(7))
+
+
+def test_zero_padded_names(small_sequence: Path) -> None:
+    for path in (small_sequence / "inputs").glob("*.exr"):
+        path.rename(path.with_name(re.sub(r"(\d+)\.exr", lambda match: f"{int(match[1]):04d}.exr", path.name)))
+    assert open_sequence(small_sequence).frame(3).reference is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("0", [0]), ("0-3", [0, 1, 2, 3]), ("0-1,70", [0, 1, 70]), (" 5 , 3 - 4,3 ", [3, 4, 5]), ("007", [7])],
+)
+def test_parse_frames(text: str, expected: list[int]) -> None:
+    assert parse_frames(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["", ",", "a", "-1", "3-1", "1-", "0--1", "0-999999999", "1" * 5000, "0-600000,600001-1200000", "٣", "1.5"]
+)
+def test_parse_frames_refuses(text: str) -> None:
+    assert "frames: expected" in refused(lambda: parse_frames(text))
+
+
+def _rewrite(path: Path, change: Callable[[np.ndarray], np.ndarray], channels: list[str]) -> None:
+    write_exr(path, change(read_exr(path)[0]), channels)
+
+
+def _no_matrix_for_the_last_frame(inputs: Path) -> None:
+    cameras = read_camera_matrices(inputs / "camera_matrices.h")
+    fewer = CameraMatrices(cameras.matrices[:3], cameras.pixel_offsets[:3], 0.01, 0.25)
+    write_camera_matrices(inputs / "camera_matrices.h", fewer)
+
+
+def _alpha(inputs: Path) -> None:
+    _rewrite(inputs / "color1.exr", lambda image: np.concatenate([image, image[..., :1]], axis=2), [*RGB, "A"])
+
+
+def _without_albedo(inputs: Path) -> None:
+    for path in inputs.glob("albedo*.exr"):
+        path.unlink()
+    (inputs / "camera.json").write_text('{"color_includes_albedo": false}')
+
+
+BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
+    "gap": (lambda inputs: (inputs / "color2.exr").unlink(), "expected frame 2 after frame 1, found 3"),
+    "buffer of one frame": (
+        lambda inputs: (inputs / "shading_normal2.exr").unlink(),
+        r"shading_normal2\.exr: expected buffer 'normal' for every frame",
+    ),
+    "size of one buffer": (
+        lambda inputs: _rewrite(inputs / "albedo1.exr", lambda image: image[1:], RGB),
+        r"albedo1\.exr: expected 24 x 20 pixels.*found 24 x 19",
+    ),
+    "size of one frame": (
+        lambda inputs: _rewrite(inputs / "color2.exr", lambda image: image[:, 1:], RGB),
+        r"color2\.exr: expected 24 x 20 pixels.*found 23 x 20",
+    ),
+    "size of a reference": (
+        lambda inputs: _rewrite(inputs / "reference1.exr", lambda image: image[1:], RGB),
+        r"reference1\.exr: expected 24 x 20",
+    ),
+    "alpha": (_alpha, r"color1\.exr: expected 3 channels for buffer 'color', found 4 \(R, G, B, A\)"),
+    "depth in three channels": (
+        lambda inputs: _rewrite(inputs / "depth0.exr", lambda image: image.repeat(3, axis=2), RGB),
+        r"depth0\.exr: expected 1 channels",
+    ),
+    "too few matrices": (_no_matrix_for_the_last_frame, "expected a matrix for frame 3, found 3"),
+    "no EXR": (lambda inputs: (inputs / "albedo3.exr").write_bytes(b"hello"), r"albedo3\.exr: expected an EXR image"),
+    "twice": (
+        lambda inputs: shutil.copy(inputs / "color1.exr", inputs / "color01.exr"),
+        r"found color01\.exr and color1\.exr",
+    ),
+    "camera.json cut short": (lambda inputs: (inputs / "camera.json").write_text('{"a'), "expected a JSON object"),
+    "camera.json no object": (lambda inputs: (inputs / "camera.json").write_text("[1]"), "expected a JSON object"),
+    "camera.json unclear": (
+        lambda inputs: (inputs / "camera.json").write_text('{"color_includes_albedo": "yes"}'),
+        "to be true or false, found 'yes'",
+    ),
+    "albedo to multiply is missing": (_without_albedo, "expected albedo files"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_sequence_is_refused_in_one_line(small_sequence: Path, case: str) -> None:
+    change, pattern = BROKEN[case]
+    change(small_sequence / "inputs")
+    before = sorted(small_sequence.rglob("*"))
+    message = refused(lambda: open_sequence(small_sequence))
+    assert re.search(pattern, message), message
+    assert str(small_sequence) in message
+    assert sorted(small_sequence.rglob("*")) == before
+
+
+def test_damaged_pixels_are_refused_when_the_frame_is_read(small_sequence: Path) -> None:
+    path = small_sequence / "inputs" / "world_position1.exr"
+    path.write_bytes(path.read_bytes()[:-1])
+    sequence = open_sequence(small_sequence)
+    assert sequence.frame(0).position is not None
+    assert str(path) in refused(lambda: sequence.frame(1))
+
+
+def test_folder_that_is_no_sequence(tmp_path: Path) -> None:
+    assert "no such folder" in refused(lambda: open_sequence(tmp_path / "missing"))
+    (tmp_path / "notes.txt").write_text("color0.exr")
+    message = refused(lambda: open_sequence(tmp_path))
+    assert "bmfr" in message
+    assert "color0.exr" in message
+    assert "found a file" in refused(lambda: open_sequence(tmp_path / "notes.txt"))
+
+
+HEADER = """
+// const float camera_matrices[9][4][4] = { nonsense };
+const float position_limit_squared = 0.0016f; /* scene units;
+squared */ const float normal_limit_squared=.25;
+static const float camera_matrices[1][4][4] = { // first
+  {{1.2f, -3e-10f, 5, 0.f}, {+1, 2., -.5F, 1e2}, {0,0,1,0,}, {0.0f, 1.0f, 2E-1f, 1}},
+};
+const float pixel_offsets[1][2] = {{0.5f, /* y */ 0.25f}};
+"""
+
+
+def test_camera_header_is_read_as_c(tmp_path: Path) -> None:
+    path = tmp_path / "camera_matrices.h"
+    path.write_text(HEADER)
+    cameras = read_camera_matrices(path)
+    expected = [[1.2, -3e-10, 5, 0], [1, 2, -0.5, 100], [0, 0, 1, 0], [0, 1, 0.2, 1]]
+    assert cameras.matrices.dtype == np.float64
+    assert cameras.matrices.tolist() == [expected]
+    assert cameras.pixel_offsets.tolist() == [[0.5, 0.25]]
+    assert (cameras.position_limit_squared, cameras.normal_limit_squared) == (0.0016, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("1.2f", "nan"),
+        ("1.2f", "1e39f"),
+        ("1.2f", "1e999"),
+        ("1.2f", "sqrt(2)"),
+        ("1.2f", "1.2.3"),
+        ("1.2f", "1 2"),
+        ("1.2f, ", ""),
+        ("1.2f", "{1.2f}"),
+        ("0.0016f", "{0.0016f}"),
+        ("0.0016f", "FLT_MAX"),
+        ("0.0016f", ""),
+        ("{{0.5f, /* y */ 0.25f}}", "{{0.5f, 0.25f}, {0.5f, 0.25f}}"),
+        ("{{0.5f, /* y */ 0.25f}}", "{" * 100_000 + "}" * 100_000),
+        ("normal_limit_squared", "normal_limit"),
+        ("/* y */", "/* y"),
+        ("};\n", ""),
+    ],
+)
+def test_malformed_camera_header_is_refused(tmp_path: Path, old: str, new: str) -> None:
+    path = tmp_path / "camera_matrices.h"
+    assert old in HEADER
+    path.write_text(HEADER.replace(old, new))
+    assert str(path) in refused(lambda: read_camera_matrices(path))
+
+
+def test_camera_header_cut_short_is_refused_wherever_it_is_cut(tmp_path: Path) -> None:
+    path = tmp_path / "camera_matrices.h"
+    for length in range(len(HEADER.rstrip()) - 1):
+        path.write_text(HEADER[:length])
+        refused(lambda: read_camera_matrices(path))
+
+
+def test_unreadable_camera_header_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "camera_matrices.h"
+    assert "cannot be read" in refused(lambda: read_camera_matrices(path))
+    with path.open("wb") as file:
+        file.truncate(60 * 2**20)
+    assert "found more" in refused(lambda: read_camera_matrices(path))
+
+
+def test_camera_header_round_trip(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    matrices = generator.standard_normal((5, 4, 4)) * 10.0 ** generator.integers(-12, 12, (5, 4, 4))
+    written = CameraMatrices(matrices, np.full((5, 2), 0.5), 0.0016, 1)
+    write_camera_matrices(tmp_path / "camera_matrices.h", written, comment="five cameras")
+    found = read_camera_matrices(tmp_path / "camera_matrices.h")
+    np.testing.assert_array_equal(found.matrices.astype(np.float32), matrices.astype(np.float32))
+    assert found.pixel_offsets.tolist() == [[0.5, 0.5]] * 5
+    assert (len(found), found.normal_limit_squared) == (5, 1)
+    assert "1.0f" in (tmp_path / "camera_matrices.h").read_text()
+
+
+def test_written_frame_is_read_back(small_sequence: Path, tmp_path: Path) -> None:
+    frame = open_sequence(small_sequence).frame(1)
+    frame = frame.replace(motion=torch.randn(1, 2, 20, 24, generator=torch.Generator().manual_seed(0)).half().float())
+    write_bmfr_frame(tmp_path / "new", 0, frame, metadata={"owner of it": "me"})
+    sequence = open_sequence(tmp_path / "new")
+    assert sequence.metadata(0)["owner of it"] == "me"
+    assert not [path for path in (tmp_path / "new").iterdir() if path.name.startswith(".")]
+    found = sequence.frame(0)
+    for name, value in frame.items():
+        if name != "view_projection":
+            torch.testing.assert_close(getattr(found, name), value, rtol=0, atol=0, msg=name)
+
+
+def test_written_depth_beyond_half_is_kept(tmp_path: Path) -> None:
+    depth = torch.tensor([[[[1e5, torch.inf]]]])
+    write_bmfr_frame(tmp_path, 0, Frame(color=torch.ones(1, 3, 1, 2), depth=depth))
+    assert torch.equal(open_sequence(tmp_path).frame(0).depth, depth)
+
+
+def test_color_is_written_last(tmp_path: Path) -> None:
+    (tmp_path / "world_position0.exr").mkdir()
+    frame = Frame(color=torch.ones(1, 3, 2, 2), albedo=torch.ones(1, 3, 2, 2), position=torch.ones(1, 3, 2, 2))
+    assert "world_position0.exr" in refused(lambda: write_bmfr_frame(tmp_path, 0, frame))
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"world_position0.exr", "albedo0.exr", "camera.json"}
+
+
+def test_batch_and_unwritable_folder(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected a batch of 1"):
+        write_bmfr_frame(tmp_path, 0, Frame(color=torch.ones(2, 3, 2, 2)))
+    (tmp_path / "file").write_text("")
+    assert "cannot be made" in refused(
+        lambda: write_bmfr_frame(tmp_path / "file" / "x", 0, Frame(color=torch.ones(1, 3, 2, 2)))
+    )
+
+
+@pytest.mark.skipif(not SHARED_DATA.is_dir(), reason=f"needs the rendered sequences in {SHARED_DATA}")
+def test_rendered_sequences() -> None:
+    folders = sorted(SHARED_DATA.iterdir())
+    assert folders
+    for folder in folders:
+        sequence = open_sequence(folder)
+        assert sequence.color_has_albedo
+        assert sequence.reference_numbers == sequence.numbers
+        frame, replaced = sequence.frame(1).validate()
+        assert replaced == 0
+        hit = frame.depth.isfinite()[0, 0]
+        assert hit.any()
+        # Positions are rounded to a grid of median depth / 16384.
+        error = (pixel_index(frame.position[0], frame.view_projection[0]) - pixel_centres(*sequence.size)).abs()
+        assert error[:, hit].quantile(0.99) < 0.1, folder.name
+        w = (torch.cat([frame.position[0], torch.ones(1, *frame.size)]).permute(1, 2, 0) @ frame.view_projection[0])[
+            ..., 3
+        ]
+        torch.testing.assert_close(w[hit], frame.depth[0, 0][hit], rtol=5e-3, atol=1e-2)

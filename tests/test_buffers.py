@@ -1,0 +1,252 @@
+"""The vocabulary of buffers: what a frame refuses, what it repairs, and what it leaves alone."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from mcdenoise.buffers import BUFFERS, Frame, replace_invalid
+from mcdenoise.errors import InputError
+
+NAN, INF = float("nan"), float("inf")
+SIZE = (5, 7)
+
+
+def plane(channels: int, value: float = 0.5) -> Tensor:
+    return torch.full((2, channels, *SIZE), value)
+
+
+def full_frame() -> Frame:
+    buffers = {name: plane(spec.channels) for name, spec in BUFFERS.items()}
+    return Frame(**buffers, view_projection=torch.eye(4).expand(2, 4, 4))
+
+
+def complaint(error: pytest.ExceptionInfo[InputError]) -> str:
+    """The message of an error, which must be one line."""
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def test_a_good_frame_is_left_alone() -> None:
+    frame = full_frame()
+    clean, replaced = frame.validate()
+    assert replaced == 0
+    assert clean is frame
+    assert frame.size == SIZE
+    assert {name for name, _ in frame.items()} == {*BUFFERS, "view_projection"}
+
+
+def test_color_alone_is_a_frame() -> None:
+    assert [name for name, _ in Frame(color=plane(3)).items()] == ["color"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected", "found"),
+    [
+        ("color", plane(4), "(B, 3, H, W)", "(2, 4, 5, 7)"),
+        ("color", plane(3)[0], "(B, 3, H, W)", "(3, 5, 7)"),
+        ("color", plane(3)[..., :0], "(B, 3, H, W)", "(2, 3, 5, 0)"),
+        ("color", plane(3)[:0], "(B, 3, H, W)", "(0, 3, 5, 7)"),
+        ("color", None, "torch.Tensor", "NoneType"),
+        ("color", plane(3).to(torch.uint8), "floating-point", "torch.uint8"),
+        ("albedo", plane(3).numpy(), "torch.Tensor", "ndarray"),
+        ("albedo", plane(3)[..., 1:], "(2, 3, 5, 7)", "(2, 3, 5, 6)"),
+        ("normal", plane(3)[:1], "(2, 3, 5, 7)", "(1, 3, 5, 7)"),
+        ("depth", plane(3), "(2, 1, 5, 7)", "(2, 3, 5, 7)"),
+        ("depth", plane(1).to(torch.complex64), "floating-point", "torch.complex64"),
+        ("position", plane(3).to("meta"), "on cpu", "on meta"),
+        ("motion", plane(3), "(2, 2, 5, 7)", "(2, 3, 5, 7)"),
+        ("view_projection", torch.eye(4), "(2, 4, 4)", "(4, 4)"),
+        ("reference", plane(3).mT, "(2, 3, 5, 7)", "(2, 3, 7, 5)"),
+    ],
+)
+def test_a_mismatch_names_buffer_expected_and_found(name: str, value: object, expected: str, found: str) -> None:
+    with pytest.raises(InputError) as error:
+        Frame(**{"color": plane(3), name: value})  # type: ignore[arg-type]
+    message = complaint(error)
+    assert message.startswith(f"buffer '{name}': expected ")
+    wanted, _, got = message.partition(", found ")
+    assert expected in wanted
+    assert found in got
+
+
+@pytest.mark.parametrize("bad", [NAN, INF, -INF, -1.0, -1e-6])
+@pytest.mark.parametrize("channel", [0, 2])
+def test_an_invalid_color_becomes_the_mean_of_its_usable_neighbours(bad: float, channel: int) -> None:
+    color = torch.arange(25, dtype=torch.float32).reshape(1, 1, 5, 5).repeat(1, 3, 1, 1)
+    noisy = color.clone()
+    noisy[0, channel, 2, 2] = bad
+    noisy[0, channel, 2, 3] = bad
+    clean, replaced = Frame(color=noisy).validate()
+    assert replaced == 2
+    # All three channels: half a colour would be a wrong colour. 12 has the neighbours 6 7 8 11 16 17 18 left.
+    torch.testing.assert_close(clean.color[0, :, 2, 2], torch.full((3,), 83 / 7))
+    untouched = torch.ones(5, 5, dtype=torch.bool)
+    untouched[2, 2:4] = False
+    assert torch.equal(clean.color[..., untouched], color[..., untouched])
+    assert torch.isfinite(clean.color).all()
+    assert noisy[0, channel, 2, 2].isnan() or noisy[0, channel, 2, 2] == bad  # the input is not written to
+
+
+def test_an_invalid_corner_has_three_neighbours() -> None:
+    color = torch.tensor([[NAN, 1.0, 9.0], [2.0, 6.0, 9.0], [9.0, 9.0, 9.0]]).expand(1, 3, 3, 3)
+    clean, replaced = replace_invalid(color)
+    assert replaced == 1
+    assert clean[0, :, 0, 0].tolist() == [3.0, 3.0, 3.0]
+
+
+def test_invalid_pixels_without_usable_neighbours_become_black() -> None:
+    clean, replaced = replace_invalid(torch.full((2, 3, 4, 4), NAN))
+    assert replaced == 2 * 4 * 4
+    assert not clean.any()
+
+
+def test_invalid_pixels_stay_in_their_image_of_the_batch() -> None:
+    color = torch.ones(2, 3, 3, 3)
+    color[0, :, 1, 1] = NAN
+    color[1] = 5
+    clean, replaced = replace_invalid(color)
+    assert replaced == 1
+    assert (clean[0] == 1).all()
+    assert (clean[1] == 5).all()
+
+
+def test_valid_color_is_returned_without_a_copy() -> None:
+    color = torch.rand(1, 3, 4, 4)
+    assert replace_invalid(color)[0] is color
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_bright_neighbours_do_not_overflow(dtype: torch.dtype) -> None:
+    bright = 65504.0 if dtype == torch.float16 else 0.9 * torch.finfo(dtype).max
+    color = torch.full((1, 3, 3, 3), bright, dtype=dtype)
+    color[0, 0, 1, 1] = INF
+    clean, replaced = replace_invalid(color)
+    assert replaced == 1
+    assert clean.dtype == dtype
+    torch.testing.assert_close(clean, torch.full_like(clean, bright))
+
+
+def test_repair_keeps_double_precision() -> None:
+    value = 1 + 1e-12
+    color = torch.full((1, 3, 3, 3), value, dtype=torch.float64)
+    color[0, 0, 1, 1] = NAN
+    assert replace_invalid(color)[0][0, 0, 1, 1].item() == pytest.approx(value, abs=1e-15)
+
+
+def test_gradients_skip_replaced_pixels() -> None:
+    color = torch.ones(1, 3, 3, 3, dtype=torch.float64)
+    color[0, 0, 1, 1] = NAN
+    color.requires_grad_()
+    (gradient,) = torch.autograd.grad(replace_invalid(color)[0].sum(), color)
+    assert torch.isfinite(gradient).all()
+    assert not gradient[0, :, 1, 1].any()
+    torch.testing.assert_close(gradient.sum(), torch.tensor(27.0, dtype=torch.float64))
+
+
+def test_depth_may_be_infinite() -> None:
+    frame = Frame(color=plane(3), depth=plane(1, INF))
+    assert frame.validate()[0] is frame
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"),
+    [
+        ("albedo", NAN),
+        ("albedo", INF),
+        ("normal", NAN),
+        ("depth", NAN),
+        ("depth", -INF),
+        ("position", INF),
+        ("motion", NAN),
+        ("reference", INF),
+    ],
+)
+def test_values_that_are_not_finite_are_refused_with_their_place(name: str, bad: float) -> None:
+    value = plane(BUFFERS[name].channels)
+    value[1, 0, 3, 4] = bad
+    with pytest.raises(InputError) as error:
+        Frame(color=plane(3), **{name: value}).validate()
+    message = complaint(error)
+    assert message.startswith(f"buffer '{name}': expected finite")
+    assert "found 1 NaN or infinite ones, first at row 3, column 4" in message
+
+
+def test_a_matrix_that_is_not_finite_is_refused_with_its_place() -> None:
+    matrix = torch.eye(4).repeat(2, 1, 1)
+    matrix[1, 2, 3] = NAN
+    with pytest.raises(InputError) as error:
+        Frame(color=plane(3), view_projection=matrix).validate()
+    assert "buffer 'view_projection'" in complaint(error)
+    assert "first at [2, 3]" in complaint(error)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "clamped"),
+    [
+        ("albedo", 1.3, 1.0),
+        ("albedo", 2.0, 1.0),
+        ("albedo", -0.001, 0.0),
+        ("normal", 1.0005, 1.0),
+        ("normal", -1.0005, -1.0),
+        ("depth", -0.001, 0.0),
+        ("reference", -0.001, 0.0),
+    ],
+)
+def test_a_small_overshoot_is_clamped(name: str, value: float, clamped: float) -> None:
+    clean, replaced = Frame(color=plane(3), **{name: plane(BUFFERS[name].channels, value)}).validate()
+    assert replaced == 0
+    assert (dict(clean.items())[name] == clamped).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("albedo", 255.0), ("albedo", -0.5), ("normal", 128.0), ("normal", -1.5), ("depth", -1.0), ("reference", -1.0)],
+)
+def test_values_far_outside_their_range_are_refused(name: str, value: float) -> None:
+    with pytest.raises(InputError) as error:
+        Frame(color=plane(3), **{name: plane(BUFFERS[name].channels, value)}).validate()
+    spec = BUFFERS[name]
+    message = complaint(error)
+    assert message.startswith(f"buffer '{name}': expected values in [{spec.low:g}, {spec.high:g}]")
+    assert message.endswith(f"found [{value:g}, {value:g}]")
+
+
+@pytest.mark.parametrize("name", ["position", "motion"])
+def test_unbounded_buffers_take_any_finite_value(name: str) -> None:
+    frame = Frame(color=plane(3), **{name: plane(BUFFERS[name].channels, -1e30)})
+    assert frame.validate()[0] is frame
+
+
+def test_validate_repairs_and_keeps_the_other_buffers() -> None:
+    frame = full_frame().replace(color=plane(3, NAN), albedo=plane(3, 1.5))
+    clean, replaced = frame.validate()
+    assert replaced == 2 * math.prod(SIZE)
+    assert clean.normal is frame.normal
+    assert clean.validate() == (clean, 0)
+
+
+def test_replace_checks_again() -> None:
+    with pytest.raises(InputError, match="buffer 'depth'"):
+        full_frame().replace(depth=plane(2))
+    assert full_frame().replace(reference=None).reference is None
+
+
+def test_to_moves_every_buffer() -> None:
+    frame = full_frame().to(torch.float64)
+    assert all(value.dtype == torch.float64 for _, value in frame.items())
+
+
+def test_frames_can_be_compared_and_hashed() -> None:
+    frame = full_frame()
+    assert frame != full_frame()
+    assert frame in {frame}
+
+
+def test_frames_cannot_be_changed() -> None:
+    with pytest.raises(AttributeError):
+        full_frame().color = plane(3)  # type: ignore[misc]

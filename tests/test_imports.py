@@ -1,0 +1,163 @@
+"""The architecture: which room may import which, and what importing the package costs."""
+
+from __future__ import annotations
+
+import ast
+import graphlib
+import importlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "mcdenoise"
+MODULES = {
+    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+
+# What each room (a module or folder right below mcdenoise/) may import besides itself. A room that is not in the table
+# fails: place it deliberately.
+SIGNAL = {"errors", "buffers", "ops"}
+LIBRARY = SIGNAL | {"metrics", "losses", "models", "data", "plan", "demo_scene", "render", "denoiser"}
+REPORTS = {"evaluate", "report"}
+TOOLS = REPORTS | {"benchmark", "demo", "export", "gradcheck", "stability", "train"}
+ALLOWED: dict[str, set[str]] = {
+    "errors": set(),
+    "ops": set(),
+    "buffers": {"errors"},
+    "metrics": SIGNAL,
+    "losses": SIGNAL | {"metrics"},
+    "models": SIGNAL,
+    "data": SIGNAL,
+    "plan": SIGNAL | {"data"},
+    "demo_scene": SIGNAL | {"data"},
+    "render": SIGNAL | {"data", "demo_scene"},
+    "denoiser": SIGNAL | {"models", "data", "plan"},
+    "evaluate": LIBRARY,
+    "report": LIBRARY,
+    **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS),
+    "cli": LIBRARY | TOOLS,
+    "__main__": {"cli"},
+    # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.
+    "": LIBRARY,
+}
+OPS_KNOW = {"torch", "kornia"}
+# `import mcdenoise` leaves these alone: optional, slow to load, or of use to the command line only.
+LAZY = {"OpenImageIO", "matplotlib", "typer"}
+LAZY |= {"drjit", "mitsuba", "pyoidn", "lightning", "lightning_fabric", "tensorboard"}
+SECONDS = 0.5
+
+
+def room_of(module: str) -> str:
+    return module.partition(".")[2].partition(".")[0]
+
+
+def imported(module: str, source: str) -> Iterator[str]:
+    """Absolute names of what a module imports, anywhere in it, also for type checking only."""
+    is_package = MODULES[module].name == "__init__.py"
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parents = module.split(".")
+                above = parents[: len(parents) - node.level + is_package]
+                base = ".".join([*above, base] if base else above)
+            # `from mcdenoise import ops` imports a room, `from mcdenoise import Frame` the package itself.
+            for alias in node.names:
+                name = f"{base}.{alias.name}"
+                yield name if name in MODULES else base
+
+
+def arrows(module: str, source: str) -> Iterator[str]:
+    """Imports of a module that the table forbids."""
+    room = room_of(module)
+    for name in imported(module, source):
+        outermost = name.partition(".")[0]
+        if outermost != "mcdenoise":
+            if room == "ops" and outermost not in OPS_KNOW | sys.stdlib_module_names:
+                yield f"{module} imports {name}: ops know torch, kornia and the standard library only"
+        elif room_of(name) not in ALLOWED[room] | {room}:
+            yield f"{module} imports {name}: not allowed by the table in {Path(__file__).name}"
+
+
+def python(code: str) -> str:
+    """What a fresh interpreter prints, stderr included, with warnings as errors."""
+    command = [sys.executable, "-W", "error", "-c", code]
+    result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    assert result.returncode == 0, result.stdout
+    return result.stdout
+
+
+def test_every_room_has_a_place_in_the_table() -> None:
+    assert {room_of(module) for module in MODULES} <= set(ALLOWED)
+
+
+def test_the_table_has_no_cycle() -> None:
+    graphlib.TopologicalSorter(ALLOWED).prepare()
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_import_goes_up(module: str) -> None:
+    assert not list(arrows(module, MODULES[module].read_text()))
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "caught"),
+    [
+        ("mcdenoise.ops._check", "import numpy", True),
+        ("mcdenoise.ops._check", "import OpenImageIO as oiio", True),
+        ("mcdenoise.ops._check", "from mcdenoise.buffers import Frame", True),
+        ("mcdenoise.ops._check", "from ..buffers import Frame", True),
+        ("mcdenoise.ops._check", "def f():\n    from mcdenoise import buffers", True),
+        ("mcdenoise.ops._check", "import math, torch.nn.functional as F, kornia", False),
+        ("mcdenoise.ops._check", "from mcdenoise.ops import _check", False),
+        ("mcdenoise.ops._check", "from . import _check", False),
+        ("mcdenoise.ops", "from ._check import check_shapes", False),
+        ("mcdenoise.ops", "from . import _check", False),
+        ("mcdenoise.ops", "from ..errors import InputError", True),
+        ("mcdenoise.buffers", "from mcdenoise.errors import InputError", False),
+        ("mcdenoise.buffers", "import mcdenoise.ops", True),
+        ("mcdenoise.buffers", "from mcdenoise import Frame", True),
+        ("mcdenoise", "from mcdenoise.buffers import Frame", False),
+        ("mcdenoise", "from mcdenoise.cli import main", True),
+    ],
+)
+def test_arrows_are_recognised(module: str, source: str, caught: bool) -> None:
+    assert bool(list(arrows(module, source))) is caught
+
+
+def test_no_star_imports() -> None:
+    stars = [
+        f"{module}:{node.lineno}"
+        for module, path in MODULES.items()
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom) and node.names[0].name == "*"
+    ]
+    assert not stars
+
+
+@pytest.mark.parametrize("module", [module for module, path in MODULES.items() if "__all__" in path.read_text()])
+def test_all_is_true_and_sorted(module: str) -> None:
+    loaded = importlib.import_module(module)
+    names = list(loaded.__all__)
+    assert not [name for name in names if not hasattr(loaded, name)]
+    # The order that ruff keeps (RUF022): constants, classes, functions.
+    assert names == sorted(set(names), key=lambda name: (not name.isupper(), not name[0].isupper(), name))
+
+
+def test_importing_is_silent_and_loads_nothing_optional() -> None:
+    code = f"import mcdenoise, sys\nprint(*sorted({LAZY!r} & set(sys.modules)))"
+    assert python(code).strip() == ""
+
+
+def test_importing_is_quick() -> None:
+    # Processor time, because others may use the machine; torch and kornia are not ours to shorten.
+    code = (
+        "import kornia, torch, time\nstart = time.process_time()\nimport mcdenoise\nprint(time.process_time() - start)"
+    )
+    assert float(python(code)) < SECONDS

@@ -1,0 +1,104 @@
+"""What the repository may hold: no paths of one machine, no pickles, weights of a modest size."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+MACHINE_PATH = re.compile(r"(^|[^A-Za-z0-9_.])/(home|root|tmp|opt|srv|work)/[a-z]")
+PICKLERS = {"cloudpickle", "dill", "joblib", "pickle", "shelve"}
+PICKLED = {".bin", ".ckpt", ".npy", ".npz", ".pickle", ".pkl", ".pt", ".pth"}
+WEIGHTS_LIMIT = 40e6
+
+
+@pytest.fixture(scope="module")
+def files() -> list[Path]:
+    """Every file that git tracks, or would on the next `git add`."""
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout")
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    paths = [ROOT / name for name in listed.split("\0") if name]
+    return [path for path in paths if path.is_file()]
+
+
+def text_of(path: Path) -> str:
+    """The text of a file, empty for a binary one."""
+    data = path.read_bytes()
+    if b"\0" in data:
+        return ""
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        return ""
+
+
+def test_no_file_names_a_path_of_one_machine(files: list[Path]) -> None:
+    found = [
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()[:160]}"
+        for path in files
+        for number, line in enumerate(text_of(path).splitlines(), start=1)
+        if MACHINE_PATH.search(line)
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_weights_are_small_and_no_pickles(files: list[Path]) -> None:
+    assert not [path.name for path in files if path.suffix in PICKLED]
+    weights = [path for path in files if "weights" in path.parent.parts or path.suffix == ".safetensors"]
+    assert sum(path.stat().st_size for path in weights) < WEIGHTS_LIMIT
+
+
+def unpicklers(source: str) -> list[str]:
+    """Lines of Python source that can read a pickle."""
+    nodes = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.stmt | ast.expr))
+    return [f"{node.lineno}: {ast.unparse(node)}" for node in nodes if reads_pickles(node)]
+
+
+def reads_pickles(node: ast.AST) -> bool:
+    match node:
+        case ast.Import(names=names):
+            return any(alias.name.partition(".")[0] in PICKLERS for alias in names)
+        case ast.ImportFrom(module=str(module), level=0):
+            return module.partition(".")[0] in PICKLERS
+        case ast.Call(func=ast.Attribute(value=ast.Name(id="torch"), attr="load"), keywords=keywords):
+            return not any(keyword.arg == "weights_only" and is_true(keyword.value) for keyword in keywords)
+        case ast.Call(keywords=keywords):
+            return any(keyword.arg == "allow_pickle" and is_true(keyword.value) for keyword in keywords)
+    return False
+
+
+def is_true(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and node.value is True
+
+
+@pytest.mark.parametrize(
+    ("source", "caught"),
+    [
+        ("import pickle", True),
+        ("import joblib.memory as m", True),
+        ("from pickle import loads", True),
+        ("torch.load(path)", True),
+        ("torch.load(path, weights_only=False)", True),
+        ("torch.load(path, weights_only=True)", False),
+        ("numpy.load(path, allow_pickle=True)", True),
+        ("numpy.load(path)", False),
+    ],
+)
+def test_unpicklers_are_recognised(source: str, caught: bool) -> None:
+    assert bool(unpicklers(source)) is caught
+
+
+def test_no_code_reads_a_pickle(files: list[Path]) -> None:
+    found = [
+        f"{path.relative_to(ROOT)}:{line}"
+        for path in files
+        if path.suffix == ".py"
+        for line in unpicklers(text_of(path))
+    ]
+    assert not found, "\n".join(found)
