@@ -1,0 +1,13 @@
+"""Interactive Monte Carlo denoising you can open up: differentiable operators, and denoisers assembled from them."""
+
+from importlib.metadata import version
+
+from mcdenoise import ops
+from mcdenoise.buffers import Frame
+from mcdenoise.denoiser import Denoiser
+from mcdenoise.errors import InputError
+from mcdenoise.models import create_model, list_models
+
+__version__ = version("mcdenoise")
+
+__all__ = ["Denoiser", "Frame", "InputError", "create_model", "list_models", "ops"]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mcdenoise.render import Array, Camera
+from mcdenoise.data.camera_path import Array, Camera
 
 Color = tuple[float, float, float]
 
@@ -43,7 +43,7 @@ def demo_cameras(frames: int = 16) -> list[Camera]:
         phase = 2 * math.pi * frame / 64
         x = -0.62 * math.cos(phase)
         origin = (x, 1.35 + 0.02 * math.sin(5 * phase), 3.05 - 0.3 * math.sin(phase))
-        cameras.append(Camera.look_at(origin, (0.25 * x, 0.86, -1.2), fov_x=58))
+        cameras.append(Camera.look_at(origin, (0.25 * x, 0.82, -1.2), fov_x=58))
     return cameras
 
 
@@ -65,7 +65,7 @@ def _lights() -> dict[str, Any]:
         "type": "rectangle",
         "to_world": _place((-2.96, 1.6, -0.9), (1.1, 0.8, 1), _rotate_y(90)),
         "bsdf": _diffuse((0, 0, 0)),
-        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [13.0, 14.0, 15.5]}},
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [10.5, 11.5, 13.0]}},
     }
     bulb = {
         "type": "sphere",
@@ -90,7 +90,14 @@ def _shelf() -> dict[str, Any]:
     rng = np.random.default_rng(7)
     wood = _diffuse((0.33, 0.2, 0.11))
     parts: dict[str, Any] = {}
-    palette = [(0.6, 0.12, 0.08), (0.1, 0.25, 0.42), (0.75, 0.6, 0.25), (0.12, 0.36, 0.25), (0.7, 0.68, 0.6), (0.3, 0.12, 0.3)]
+    palette = [
+        (0.6, 0.12, 0.08),
+        (0.1, 0.25, 0.42),
+        (0.75, 0.6, 0.25),
+        (0.12, 0.36, 0.25),
+        (0.7, 0.68, 0.6),
+        (0.3, 0.12, 0.3),
+    ]
     for level, base in enumerate((1.1, 1.65)):
         parts[f"board_{level}"] = _box((-1.35, base - 0.02, -2.83), (1.8, 0.04, 0.3), wood)
         left = -2.2
@@ -108,13 +115,17 @@ def _shelf() -> dict[str, Any]:
 
 def _still_life() -> dict[str, Any]:
     return {
-        "rug": {"type": "disk", "to_world": _place((0.1, 0.012, -0.7), (1.5, 1.5, 1), _rotate_x(-90)), "bsdf": _textured(_rings())},
+        "rug": {
+            "type": "disk",
+            "to_world": _place((0.1, 0.012, -0.7), (1.5, 1.5, 1), _rotate_x(-90)),
+            "bsdf": _textured(_rings()),
+        },
         "plinth": _box((0.75, 0.3, -1.25), (0.6, 0.6, 0.6), _textured(_tiles()), turn=25),
         "glass_ball": _sphere((0.75, 0.8, -1.25), 0.2, {"type": "dielectric", "int_ior": 1.5}),
         "copper_ball": _sphere((-0.3, 0.47, -0.95), 0.46, _metal("Cu", 0.18)),
         "blue_ball": _sphere((0.42, 0.235, -0.2), 0.22, _plastic((0.04, 0.16, 0.5), 0.05)),
-        "green_ball": _sphere((-0.95, 0.185, -0.15), 0.17, _plastic((0.1, 0.42, 0.12), 0.3)),
-        "mirror_ball": _sphere((-0.22, 0.15, 0.12), 0.13, {"type": "conductor", "material": "Ag"}),
+        "green_ball": _sphere((-0.95, 0.185, -0.3), 0.17, _plastic((0.1, 0.42, 0.12), 0.3)),
+        "mirror_ball": _sphere((-0.08, 0.143, -0.1), 0.13, {"type": "conductor", "material": "Ag"}),
         "yellow_cube": _box((-1.5, 0.2, -1.3), (0.4, 0.4, 0.4), _plastic((0.75, 0.45, 0.05), 0.2), turn=35),
         "bench": _box((-1.5, 0.42, -2.5), (1.7, 0.06, 0.5), _diffuse((0.5, 0.33, 0.18))),
         "bench_leg_0": _box((-2.2, 0.2, -2.5), (0.08, 0.4, 0.4), _diffuse((0.5, 0.33, 0.18))),
@@ -159,7 +170,11 @@ def _painting() -> Array:
     y, x = np.mgrid[170:0:-1, 0:240] / np.array((170, 240)).reshape(2, 1, 1)
     image = np.stack((0.95 - 0.4 * y, 0.75 - 0.25 * y, 0.45 + 0.25 * y), axis=-1)
     image[(x - 0.68) ** 2 * 2 + (y - 0.38) ** 2 < 0.025] = (0.85, 0.12, 0.05)
-    hills = (((0.2, 0.32, 0.42), 0.55, 7.0, 0.0), ((0.12, 0.25, 0.25), 0.68, 5.0, 1.5), ((0.05, 0.12, 0.1), 0.84, 9.0, 4.0))
+    hills = (
+        ((0.2, 0.32, 0.42), 0.55, 7.0, 0.0),
+        ((0.12, 0.25, 0.25), 0.68, 5.0, 1.5),
+        ((0.05, 0.12, 0.1), 0.84, 9.0, 4.0),
+    )
     for color, height, frequency, phase in hills:
         image[y > height + 0.09 * np.sin(frequency * x + phase)] = color
     return image
@@ -170,7 +185,7 @@ def _rings() -> Array:
     colors = np.array([(0.55, 0.08, 0.07), (0.75, 0.66, 0.5), (0.08, 0.13, 0.25), (0.7, 0.42, 0.12), (0.75, 0.66, 0.5)])
     radius = np.arange(256)
     petals = np.sin(np.linspace(0, 2 * math.pi * 24, 768, endpoint=False))[:, None] * 3
-    return colors[((radius[None] + petals) // 18).astype(int) % len(colors)]
+    return np.asarray(colors[((radius[None] + petals) // 18).astype(int) % len(colors)])
 
 
 def _tiles() -> Array:
@@ -181,12 +196,12 @@ def _tiles() -> Array:
 
 def _lattice() -> Array:
     y, x = np.mgrid[0:320, 0:150]
-    bar = (x % 50 < 4) | (y % 40 < 4) | (x > 146) | (y > 316)
+    bar = (x % 50 < 8) | (y % 80 < 8) | (x > 142) | (y > 312)
     return np.where(bar[..., None], (0.1, 0.05, 0.03), (0.75, 0.7, 0.58))
 
 
 def _tint(brightness: Array, color: Color) -> Array:
-    return np.clip(brightness[..., None] * np.array(color), 0, 0.9)
+    return np.asarray(np.clip(brightness[..., None] * np.array(color), 0, 0.9))
 
 
 def _textured(texture: Array) -> dict[str, Any]:
@@ -194,7 +209,10 @@ def _textured(texture: Array) -> dict[str, Any]:
 
 
 def _varnish(texture: Array) -> dict[str, Any]:
-    return {"type": "twosided", "bsdf": {"type": "roughplastic", "diffuse_reflectance": _bitmap(texture), "alpha": 0.15}}
+    return {
+        "type": "twosided",
+        "bsdf": {"type": "roughplastic", "diffuse_reflectance": _bitmap(texture), "alpha": 0.15},
+    }
 
 
 def _bitmap(texture: Array) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Mitsuba 3: a scene and a camera path in, a noisy sequence with features and references out, in the BMFR layout.
 
-Everything is sampled at the pixel centre: features, noisy colour and reference, so that the expectation of the colour is
-the reference, and dividing by the albedo is consistent. Mitsuba's own renderer always jitters inside the pixel;
+Everything is sampled at the pixel centre: features, noisy colour and reference, so that the expectation of the colour
+is the reference, and dividing by the albedo is consistent. Mitsuba's own renderer always jitters inside the pixel;
 therefore the rays are built here, and Mitsuba traces them. Mitsuba is optional and imported on first use.
 """
 
@@ -14,7 +14,6 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -25,11 +24,13 @@ from numpy.typing import NDArray
 from mcdenoise.buffers import Frame
 from mcdenoise.data.bmfr import write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
+from mcdenoise.data.camera_path import Array, Camera, PixelRays, load_camera_path, pixel_rays, view_projection
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 
-Array: TypeAlias = NDArray[np.float64]
 Scene: TypeAlias = str | Path | Mapping[str, Any]
+
+__all__ = ["VARIANTS", "Camera", "Scene", "load_camera_path", "render_sequence", "view_projection"]
 
 VARIANTS = ("scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb")
 _FRAME_FILES = ("color", "albedo", "shading_normal", "world_position", "depth")
@@ -37,107 +38,6 @@ _RR_DEPTH = 5
 _LARGEST_SIDE = 16384
 _SEE_THROUGH_LAYERS = 8
 _WAVEFRONT = 2**20  # paths traced at once: enough to fill the vector units, small enough for a laptop's memory
-
-
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """A pinhole camera.
-
-    Args:
-        to_world: ``(4, 4)`` camera-to-world matrix for column vectors; camera frame +x left, +y up, +z forward.
-        fov_x: angle between the left and right image edge, degrees.
-    """
-
-    to_world: Array
-    fov_x: float
-
-    @classmethod
-    def look_at(
-        cls, origin: Sequence[float], target: Sequence[float], fov_x: float, up: Sequence[float] = (0, 1, 0)
-    ) -> Camera:
-        """A camera at ``origin`` that looks at ``target``, all in world space.
-
-        Raises:
-            InputError: the viewing direction is zero or parallel to ``up``.
-
-        Example:
-            >>> Camera.look_at((0, 0, 4), (0, 0, 0), fov_x=40).to_world[:3, 2]
-            array([ 0.,  0., -1.])
-        """
-        forward = np.subtract(target, origin, dtype=np.float64)
-        left = np.cross(np.asarray(up, dtype=np.float64), forward)
-        if not np.linalg.norm(left) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up):
-            raise InputError(f"camera: expected a viewing direction that is not parallel to up {list(up)}, found {forward.tolist()}")
-        forward = forward / np.linalg.norm(forward)
-        left /= np.linalg.norm(left)
-        to_world = np.eye(4)
-        to_world[:3] = np.stack((left, np.cross(forward, left), forward, np.asarray(origin, dtype=np.float64)), axis=1)
-        return cls(to_world + 0.0, float(fov_x))  # + 0.0 turns -0 into 0
-
-
-def load_camera_path(path: Path) -> list[Camera]:
-    """Read a camera path, one camera per frame.
-
-    Two JSON layouts are known: ``{"fov": ..., "to_world": [4x4, ...]}``, with matrices as in :class:`Camera`, and
-    ``{"fov": ..., "frames": [{"position": ..., "look_at": ..., "up": ...}, ...]}``. ``fov`` is in degrees and across the
-    image width; with ``"fov_axis": "y"`` it is across the height, and ``"aspect": "16:9"`` converts it.
-
-    Raises:
-        InputError: the file is missing, no JSON, or a camera in it is unusable.
-    """
-    path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: expected a camera path, found nothing readable ({error.strerror}); check the path") from error
-    except ValueError as error:
-        raise InputError(f"{path}: expected JSON, found something else ({error}); check that it is a camera path") from error
-    if not isinstance(content, dict) or not any(isinstance(content.get(key), list) for key in ("to_world", "frames")):
-        raise InputError(f"{path}: expected a list 'to_world' (matrices) or 'frames' (look_at), found neither")
-    where = "'fov'"
-    try:
-        fov = _fov_x(content)
-        cameras = []
-        if isinstance(content.get("to_world"), list):
-            for number, matrix in enumerate(content["to_world"]):
-                where = f"'to_world' of frame {number}"
-                cameras.append(Camera(_check_pose(np.array(matrix, dtype=np.float64)), fov))
-        else:
-            for number, entry in enumerate(content["frames"]):
-                where = f"camera of frame {number}"
-                camera = Camera.look_at(entry["position"], entry["look_at"], fov, entry.get("up", (0, 1, 0)))
-                cameras.append(Camera(_check_pose(camera.to_world), fov))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        missing = f"nothing under {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{path}: {where} is unusable: {missing}") from error
-    if not cameras:
-        raise InputError(f"{path}: expected at least one camera, found none")
-    return cameras
-
-
-def view_projection(camera: Camera, width: int, height: int, near: float, far: float) -> Array:
-    """The world-to-clip matrix of a camera.
-
-    ``clip = [x y z 1] @ M``; ``u = (clip.x / clip.w + 1) / 2`` runs from left to right, ``v = (clip.y / clip.w + 1) / 2``
-    from top to bottom, ``clip.z / clip.w`` from 0 at ``near`` to 1 at ``far``; ``clip.w`` is the linear view depth.
-
-    Args:
-        camera: the camera.
-        width: image width in pixels.
-        height: image height in pixels; pixels are square.
-        near: distance of the near plane, scene units.
-        far: distance of the far plane, scene units.
-
-    Returns:
-        ``(4, 4)`` matrix for row vectors.
-    """
-    tan_x, tan_y = _half_extent(camera, width, height)
-    projection = np.zeros((4, 4))
-    projection[0, 0] = -1 / tan_x
-    projection[1, 1] = -1 / tan_y
-    projection[2, 2:] = far / (far - near), -far * near / (far - near)
-    projection[3, 2] = 1
-    return np.asarray((projection @ np.linalg.inv(camera.to_world)).T)
 
 
 def render_sequence(
@@ -177,16 +77,16 @@ def render_sequence(
         The folder with the files, ``out/inputs``.
 
     Raises:
-        InputError: Mitsuba is missing, the scene cannot be loaded, a setting is unusable, or ``out`` cannot be written or
-            holds a sequence with other settings.
+        InputError: Mitsuba is missing, the scene cannot be loaded, a setting is unusable, or ``out`` cannot be written
+            or holds a sequence with other settings.
     """
     width, height = size
     cameras = list(cameras)[:frames]
     references = set(range(len(cameras)) if reference_frames is None else reference_frames)
-    _check_settings(size, len(cameras), references, spp, reference_spp, seed, max_depth)
+    _check_settings(size, frames, len(cameras), references, spp, reference_spp, seed, max_depth)
     tracer = _Tracer(scene, _choose_variant(variant), max_depth)
     reach = tracer.reach(cameras[0])
-    distance = tracer.features(_pixel_rays(cameras[0], width, height))[0]
+    distance = tracer.features(pixel_rays(cameras[0], width, height))[0]
     scale = float(np.median(np.minimum(distance, reach)))
     near, far = 0.01 * scale, 2 * reach
     matrices = np.stack([view_projection(camera, width, height, near, far) for camera in cameras])
@@ -228,28 +128,25 @@ def render_sequence(
         if all((folder / f"{name}{number}.exr").is_file() for name in names):
             advance(spp + (reference_spp if number in references else 0))
             continue
-        rays = _pixel_rays(camera, width, height)
+        rays = pixel_rays(camera, width, height)
         distance, normal, albedo = tracer.features(rays)
         position = rays.origin + np.minimum(distance, reach)[:, None] * rays.directions
         depth = (position - rays.origin) @ camera.to_world[:3, 2]
-        color = tracer.radiance(rays, spp, seed * 1000003 + number, advance)
+        color = tracer.radiance(rays, spp, (seed, number, 0), advance)
         reference = None
         if number in references:
-            reference = tracer.radiance(rays, reference_spp, seed * 1000003 + 500000 + 1000 * number, advance)
+            reference = tracer.radiance(rays, reference_spp, (seed, number, 1), advance)
         buffers = {
-            "color": color, "albedo": albedo, "normal": normal, "depth": depth, "position": position, "reference": reference
+            "color": color,
+            "albedo": albedo,
+            "normal": normal,
+            "depth": depth,
+            "position": position,
+            "reference": reference,
         }
         images = {name: _image(value, width, height) for name, value in buffers.items() if value is not None}
         write_bmfr_frame(folder, number, Frame(**images))
     return folder
-
-
-@dataclass(frozen=True, eq=False)
-class _Rays:
-    """Rays through the pixel centres, row by row: one origin ``(3,)``, unit directions ``(H*W, 3)``, world space."""
-
-    origin: Array
-    directions: Array
 
 
 class _Tracer:
@@ -277,20 +174,22 @@ class _Tracer:
         low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
         return float(np.linalg.norm(high - low) + np.linalg.norm((low + high) / 2 - camera.to_world[:3, 3]))
 
-    def features(self, rays: _Rays) -> tuple[Array, Array, Array]:
-        """Distance ``(N,)`` (``inf`` where nothing is hit), normal ``(N, 3)`` and albedo ``(N, 3)`` of what rays hit."""
+    def features(self, rays: PixelRays) -> tuple[Array, Array, Array]:
+        """Distance ``(N,)`` (``inf`` without a hit), normal ``(N, 3)`` and albedo ``(N, 3)`` of what the rays hit."""
         if self._scalar:
             found = [self._hit(ray) for ray in self._scalar_rays(rays)]
             table = np.array([(distance, *normal, *albedo) for distance, normal, albedo in found], dtype=np.float64)
         else:
             distance, normal, albedo = self._hit(self._wavefront(rays, 1))
             columns = (distance, *normal, *albedo)
-            table = np.stack([np.array(column, dtype=np.float64) for column in columns], axis=1)
+            count = len(rays.directions)  # a constant column has one entry
+            table = np.stack([np.broadcast_to(np.array(c, dtype=np.float64), count) for c in columns], axis=1)
         # A few BSDFs only approximate their albedo, by a value that can exceed 1.
         return table[:, 0], table[:, 1:4], np.clip(np.nan_to_num(table[:, 4:7]), 0, 1)
 
-    def radiance(self, rays: _Rays, spp: int, seed: int, advance: Callable[[int], None]) -> Array:
+    def radiance(self, rays: PixelRays, spp: int, seed: tuple[int, ...], advance: Callable[[int], None]) -> Array:
         """Mean radiance ``(N, 3)`` of ``spp`` paths per ray; ``advance`` hears of each finished pass."""
+        mi = self._mi
         count = len(rays.directions)
         paths_per_pass = min(spp, 8 if self._scalar else max(1, _WAVEFRONT // count))
         one_by_one = self._scalar_rays(rays) if self._scalar else []
@@ -298,7 +197,9 @@ class _Tracer:
         done = 0
         for number in range(math.ceil(spp / paths_per_pass)):
             paths = min(paths_per_pass, spp - done)
-            self._sampler.seed((seed + number) % 2**32, 1 if self._scalar else count * paths)
+            # Hashed: with sums of seed, frame and pass, two frames could share their noise.
+            state = int(np.random.SeedSequence((*seed, number)).generate_state(1)[0])
+            self._sampler.seed(self._runtime_value(mi.UInt32, state), 1 if self._scalar else count * paths)
             if self._scalar:
                 samples = self._scalar_radiance(one_by_one, paths)
             else:
@@ -311,7 +212,7 @@ class _Tracer:
             advance(paths)
         return total / spp
 
-    def _scalar_rays(self, rays: _Rays) -> list[Any]:
+    def _scalar_rays(self, rays: PixelRays) -> list[Any]:
         origin = self._mi.Point3f(*rays.origin.tolist())
         return [
             self._mi.RayDifferential3f(self._mi.Ray3f(origin, self._mi.Vector3f(*direction)))
@@ -326,11 +227,16 @@ class _Tracer:
                 values.extend(sample(scene, sampler, ray)[0])
         return np.array(values, dtype=np.float32).reshape(-1, 3)
 
-    def _wavefront(self, rays: _Rays, copies: int) -> Any:
+    def _wavefront(self, rays: PixelRays, copies: int) -> Any:
         mi = self._mi
         columns = np.tile(rays.directions.astype(np.float32), (copies, 1)).T
         direction = mi.Vector3f(*(mi.Float(np.ascontiguousarray(column)) for column in columns))
-        return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(*rays.origin.tolist()), direction))
+        origin = mi.Point3f(*(self._runtime_value(mi.Float, value) for value in rays.origin.tolist()))
+        return mi.RayDifferential3f(mi.Ray3f(origin, direction))
+
+    def _runtime_value(self, kind: Any, value: float) -> Any:
+        # A number known to the compiler would become part of the kernel: seconds of compilation for each frame.
+        return value if self._scalar else self._dr.opaque(kind, value)
 
     def _hit(self, ray: Any) -> tuple[Any, Any, Any]:
         """Distance, normal and albedo of the first surface that is not see-through; the same code for all variants."""
@@ -361,7 +267,7 @@ class _Tracer:
         return dr.select(valid, dr.dot(hit.p - ray.o, ray.d), dr.inf), normal, albedo
 
     def _directional_albedo(self, bsdf: Any, hit: Any, active: Any) -> Any:
-        """What a rough metal reflects of a uniformly white world towards the viewer; a fixed 4x4 grid, so without noise."""
+        """What a rough metal reflects of a white world towards the viewer: a fixed 4x4 grid of samples, so no noise."""
         total = self._mi.Color3f(0)
         grid = [(i + 0.5) / 4 for i in range(4)]
         for x in grid:
@@ -373,8 +279,8 @@ class _Tracer:
 _CONVENTIONS: dict[str, Any] = {
     "color_includes_albedo": True,
     "reference_includes_albedo": True,
-    "noisy_seed": "(seed * 1000003 + frame + pass) mod 2^32",
-    "reference_seed": "(seed * 1000003 + 500000 + 1000 * frame + pass) mod 2^32",
+    "noisy_seed": "numpy.random.SeedSequence((seed, frame, 0, pass)).generate_state(1)",
+    "reference_seed": "numpy.random.SeedSequence((seed, frame, 1, pass)).generate_state(1)",
     "pixel_sampling": "colour, features and reference all at the pixel centre (no jitter, box filter)",
     "colour_space": "linear RGB, sRGB primaries",
     "shading_normal": "world space, turned to the side the camera sees",
@@ -442,7 +348,9 @@ def _import_mitsuba() -> Any:
     try:
         return importlib.import_module("mitsuba")
     except ImportError as error:
-        raise InputError("rendering needs Mitsuba 3, which is not installed; pip install 'mcdenoise[render]'") from error
+        raise InputError(
+            "rendering needs Mitsuba 3, which is not installed; pip install 'mcdenoise[render]'"
+        ) from error
 
 
 def _choose_variant(variant: str | None) -> str:
@@ -457,9 +365,13 @@ def _choose_variant(variant: str | None) -> str:
 @functools.cache
 def _llvm_works() -> bool:
     """Whether the LLVM variant can render here. An LLVM too old for the CPU aborts the process, so a child tries it."""
-    trial = "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.render(mi.load_dict(mi.cornell_box()), spp=1).numpy()"
+    trial = (
+        "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.render(mi.load_dict(mi.cornell_box()), spp=1).numpy()"
+    )
     try:
-        return subprocess.run([sys.executable, "-c", trial], capture_output=True, timeout=60, check=False).returncode == 0
+        return (
+            subprocess.run([sys.executable, "-c", trial], capture_output=True, timeout=60, check=False).returncode == 0
+        )
     except (OSError, subprocess.TimeoutExpired):
         return False
 
@@ -475,7 +387,9 @@ def _load_scene(mi: Any, scene: Scene) -> Any:
         where = "scene dictionary" if isinstance(scene, Mapping) else scene
         raise InputError(f"{where}: Mitsuba cannot load it: {_first_line(error)}") from error
     if not isinstance(loaded, mi.Scene):
-        raise InputError(f"expected a Mitsuba scene, found a {type(loaded).__name__}; its outermost type must be 'scene'")
+        raise InputError(
+            f"expected a Mitsuba scene, found a {type(loaded).__name__}; its outermost type must be 'scene'"
+        )
     return loaded
 
 
@@ -496,58 +410,35 @@ def _scene_name(scene: Scene) -> str:
     return path.parent.name if path.stem == "scene" else path.stem
 
 
-def _half_extent(camera: Camera, width: int, height: int) -> tuple[float, float]:
-    tan_x = math.tan(math.radians(camera.fov_x) / 2)
-    return tan_x, tan_x * height / width
-
-
-def _pixel_rays(camera: Camera, width: int, height: int) -> _Rays:
-    tan_x, tan_y = _half_extent(camera, width, height)
-    x = (1 - (2 * np.arange(width) + 1) / width) * tan_x  # camera x points left, camera y up
-    y = (1 - (2 * np.arange(height) + 1) / height) * tan_y
-    directions = np.ones((height, width, 3))
-    directions[..., 0], directions[..., 1] = x, y[:, None]
-    directions = directions.reshape(-1, 3) @ camera.to_world[:3, :3].T
-    return _Rays(camera.to_world[:3, 3], directions / np.linalg.norm(directions, axis=1, keepdims=True))
-
-
 def _image(values: Array, width: int, height: int) -> torch.Tensor:
     return torch.from_numpy(values.reshape(height, width, -1).astype(np.float32)).permute(2, 0, 1)[None]
 
 
-def _check_pose(matrix: Array) -> Array:
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise ValueError(f"expected a finite 4x4 matrix, found shape {matrix.shape}")
-    rotation = matrix[:3, :3]
-    straight = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
-    if not straight or not np.allclose(matrix[3], (0, 0, 0, 1)):
-        raise ValueError("expected a rotation and a translation, without scaling or mirroring")
-    return matrix
-
-
-def _fov_x(content: dict[str, Any]) -> float:
-    fov = float(content["fov"])
-    if not 0 < fov < 180:
-        raise ValueError(f"expected an angle between 0 and 180 degrees, found {fov:g}")
-    if content.get("fov_axis", "x") == "x":
-        return fov
-    if content["fov_axis"] != "y":
-        raise ValueError(f"expected fov_axis 'x' or 'y', found '{content['fov_axis']}'")
-    across, down = (float(part) for part in content["aspect"].split(":"))
-    return math.degrees(2 * math.atan(math.tan(math.radians(fov) / 2) * across / down))
-
-
 def _check_settings(
-    size: tuple[int, int], count: int, references: set[int], spp: int, reference_spp: int, seed: int, max_depth: int
+    size: tuple[int, int],
+    frames: int | None,
+    count: int,
+    references: set[int],
+    spp: int,
+    reference_spp: int,
+    seed: int,
+    max_depth: int,
 ) -> None:
-    if count < 1:
+    if count < 1 or (frames is not None and frames < 1):
         raise InputError("expected at least one camera and one frame to render, found none")
     if not all(isinstance(side, int) and 1 <= side <= _LARGEST_SIDE for side in size):
-        raise InputError(f"size: expected width and height between 1 and {_LARGEST_SIDE} pixels, found {size[0]}x{size[1]}")
+        raise InputError(
+            f"size: expected width and height between 1 and {_LARGEST_SIDE} pixels, found {size[0]}x{size[1]}"
+        )
     outside = sorted(number for number in references if not 0 <= number < count)
     if outside:
         raise InputError(f"reference frames: expected numbers from 0 to {count - 1}, found {outside[0]}")
-    for name, value, lowest in (("spp", spp, 1), ("reference_spp", reference_spp, 1), ("seed", seed, 0), ("max_depth", max_depth, 1)):
+    for name, value, lowest in (
+        ("spp", spp, 1),
+        ("reference_spp", reference_spp, 1),
+        ("seed", seed, 0),
+        ("max_depth", max_depth, 1),
+    ):
         if value < lowest:
             raise InputError(f"{name}: expected at least {lowest}, found {value}")
 

@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from kornia.color import linear_rgb_to_rgb
-from kornia.metrics import psnr
 from torch import Tensor, nn
 
 from mcdenoise.data import open_sequence
@@ -23,7 +21,8 @@ from mcdenoise.data.clips import Clip, ClipSampler, accumulated_shots
 from mcdenoise.data.files import atomic_path, write_text
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
-from mcdenoise.losses import cascade_loss, smape
+from mcdenoise.losses import cascade_loss
+from mcdenoise.metrics import displayed, psnr_srgb, smape_linear
 from mcdenoise.models import create_model, save_weights
 from mcdenoise.ops import remodulate
 
@@ -137,8 +136,9 @@ def train(
     run.begin()
 
     torch.manual_seed(config.seed)
-    settings = {"width": config.width} if config.width else {}
-    network = create_model(config.model, **settings).train().to(memory_format=torch.channels_last)
+    settings: dict[str, Any] = {"width": config.width} if config.width else {}
+    network = create_model(config.model, **settings).train()
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(config, step))
     first = run.load_checkpoint(network, optimizer, scheduler)
@@ -230,9 +230,9 @@ def _validate(model: nn.Module, clips: list[Clip], board: Any, step: int) -> dic
     for i, clip in enumerate(clips):
         _, final = _denoise(model, clip)
         noisy = remodulate(clip.color.flatten(0, 1), clip.albedo.flatten(0, 1)).unflatten(0, clip.color.shape[:2])
-        errors.append(smape(final, clip.reference).item())
-        shown = [linear_rgb_to_rgb(x[0, -1].clamp(0, 1)) for x in (noisy, final, clip.reference)]
-        decibels.append(psnr(shown[1], shown[2], 1.0).item())
+        errors.append(smape_linear(final, clip.reference).mean().item())
+        decibels.append(psnr_srgb(final, clip.reference).mean().item())
+        shown = [displayed(image[0, -1]) for image in (noisy, final, clip.reference)]
         board.add_image(f"validation/{i}", torch.cat(shown, -1), step)
     model.train()
     scores = {"smape": sum(errors) / len(errors), "psnr": sum(decibels) / len(decibels)}
@@ -275,9 +275,7 @@ class _Run:
                 if frame.reference is not None:
                     digest.update(frame.reference.numpy().tobytes())
             size = f"{sequence.size[1]}x{sequence.size[0]}"
-            entries.append(
-                {"name": sequence.name, "frames": len(sequence), "size": size, "sha256": digest.hexdigest()}
-            )
+            entries.append({"name": sequence.name, "frames": len(sequence), "size": size, "sha256": digest.hexdigest()})
         return entries
 
     @property

@@ -46,7 +46,7 @@ ALLOWED: dict[str, set[str]] = {
 }
 OPS_KNOW = {"torch", "kornia"}
 # `import mcdenoise` leaves these alone: optional, slow to load, or of use to the command line only.
-LAZY = {"OpenImageIO", "matplotlib", "typer"}
+LAZY = {"OpenImageIO", "matplotlib", "tyro"}
 LAZY |= {"drjit", "mitsuba", "pyoidn", "lightning", "lightning_fabric", "tensorboard"}
 SECONDS = 0.5
 

@@ -1,6 +1,7 @@
 """The zoo: denoisers assembled from the operators, by name."""
 
 from mcdenoise.models import cascaded as _cascaded  # entering itself in the register
+from mcdenoise.models._overview import ModelOverview, overview
 from mcdenoise.models._registry import list_models, register_model
 from mcdenoise.models._weights import create_model, describe_weights, load_weights, pretrained_models, save_weights
 from mcdenoise.models.cascaded import Cascade, Denoised, FusionModule, KernelPredictor, PixelPredictor
@@ -11,12 +12,14 @@ __all__ = [
     "Denoised",
     "FusionModule",
     "KernelPredictor",
+    "ModelOverview",
     "PixelPredictor",
     "UNet",
     "create_model",
     "describe_weights",
     "list_models",
     "load_weights",
+    "overview",
     "pretrained_models",
     "register_model",
     "save_weights",

@@ -35,3 +35,8 @@ def build_model(name: str, **settings: Any) -> nn.Module:
     if name not in _MODELS:
         raise InputError(f"model '{name}': expected one of {', '.join(list_models())}; see `mcdenoise models`")
     return _MODELS[name](**settings)
+
+
+def describe_model(name: str) -> str:
+    """The first line of the docstring of a registered model's constructor."""
+    return (_MODELS[name].__doc__ or "").strip().partition("\n")[0]

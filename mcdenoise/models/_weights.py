@@ -18,7 +18,9 @@ from mcdenoise.models._registry import build_model
 _SHIPPED = Path(__file__).parent / "weights"
 
 
-def create_model(name: str, *, pretrained: bool = False, weights: Path | str | None = None, **settings: Any) -> nn.Module:
+def create_model(
+    name: str, *, pretrained: bool = False, weights: Path | str | None = None, **settings: Any
+) -> nn.Module:
     """A model of the zoo.
 
     Args:

@@ -38,7 +38,8 @@ class Predictor(Protocol):
 class FusionModule(nn.Module):
     """FM of the paper's Fig. 2: predicts the blending weight of Eq. 2 from both images, and blends.
 
-    ``alpha = sigmoid(conv3x3([i_f, U i_c]))`` on the logarithms of the images, which are scene-linear.
+    ``alpha = sigmoid(conv3x3([i_f, U i_c]))``. The images are logarithms of radiance: in linear radiance the low
+    frequencies of a lamp, exchanged between scales, would drag the pixels beside it far below zero.
     """
 
     def __init__(self) -> None:
@@ -48,7 +49,7 @@ class FusionModule(nn.Module):
     def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
         """``(B, 3, H, W)`` fine and ``(B, 3, ceil(H / 2), ceil(W / 2))`` coarse image to their fusion."""
         both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)
-        alpha = torch.sigmoid(self.conv(torch.log1p(both.clamp_min(0))))
+        alpha = torch.sigmoid(self.conv(both))
         return laplacian_fusion(fine, coarse, alpha.to(fine.dtype))
 
 
@@ -77,9 +78,9 @@ class PixelPredictor(nn.Module):
         top = logs.amax((1, 2, 3), keepdim=True)
         images: list[Tensor] = []
         for head, level in zip(self.heads, levels, strict=True):
-            images.append(torch.expm1(torch.minimum((head(level).float() + logs).clamp_min(0), top)))
+            images.append(head(level).float() + logs)
             logs = downsample(logs)
-        return _fuse(images, self.fusions)
+        return torch.expm1(torch.minimum(_fuse(images, self.fusions).clamp_min(0), top))
 
 
 class KernelPredictor(nn.Module):
@@ -119,9 +120,10 @@ class KernelPredictor(nn.Module):
                 weights = cross_bilateral_weights(logits, [normal, depth], scales[:2], scales[2], border="renormalize")
             else:
                 weights = cross_bilateral_weights(logits, border="renormalize")
-            images.append(kernel_conv(image, weights, border="zeros"))
+            # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
+            images.append(torch.log1p(kernel_conv(image, weights, border="zeros")))
             image, normal, depth = downsample(image), downsample(normal), downsample(depth)
-        return _fuse(images, self.fusions)
+        return torch.expm1(_fuse(images, self.fusions).clamp_min(0))
 
 
 class Cascade(nn.Module):
@@ -197,8 +199,7 @@ def _fuse(images: list[Tensor], fusions: nn.ModuleList) -> Tensor:
     fused = images[-1]
     for fine, fusion in zip(images[-2::-1], fusions, strict=True):
         fused = fusion(fine, fused)
-    # Adding detail to another scale's base can undershoot zero; radiance cannot.
-    return fused.clamp_min(0)
+    return fused
 
 
 def _register(name: str, cascade: str, bilateral: bool, width: int) -> None:

@@ -21,7 +21,7 @@ def check_border(border: str) -> None:
 
 def kernel_size_of(taps: int, name: str) -> int:
     """The odd ``K`` of ``taps = K * K``; ``ValueError`` for any other number of taps."""
-    size = round(taps**0.5)
+    size: int = round(taps**0.5)
     if size * size != taps or size % 2 == 0:
         raise ValueError(f"{name}: expected K*K channels with odd K (1, 9, 25, 49, ...), found {taps}")
     return size

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from mcdenoise.ops._autograd import Function
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._window import (
     Border,
@@ -18,7 +19,6 @@ from mcdenoise.ops._window import (
     offsets,
     pad,
     shifted,
-    unpad,
 )
 
 Normalize = Literal["softmax", "none"]
@@ -139,7 +139,7 @@ def _check(
     return kernel_size_of(sizes["T"], "kernel")
 
 
-class _Exponent(torch.autograd.Function):
+class _Exponent(Function):
     """``kernel - sum_g f_g |difference of g|^2 - f_d |offset|^2`` in one pass over the taps, with no stack of them."""
 
     @staticmethod

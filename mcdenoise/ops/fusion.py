@@ -67,7 +67,9 @@ def upsample(image: Tensor, size: tuple[int, int]) -> Tensor:
     check_shapes(image=(image, "B C H W"))
     expected = tuple((side + 1) // 2 for side in size)
     if tuple(image.shape[-2:]) != expected:
-        raise ValueError(f"image: expected height and width {expected} for size {size}, found {tuple(image.shape[-2:])}")
+        raise ValueError(
+            f"image: expected height and width {expected} for size {size}, found {tuple(image.shape[-2:])}"
+        )
     if 0 in image.shape:
         return image.repeat_interleave(2, -2).repeat_interleave(2, -1)[..., : size[0], : size[1]]
     return F.interpolate(image, scale_factor=2, mode="nearest")[..., : size[0], : size[1]]

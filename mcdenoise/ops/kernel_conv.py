@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from mcdenoise.ops._autograd import Function
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._window import (
     Border,
@@ -151,7 +152,7 @@ def _renormalizer(kernel: Tensor, kernel_size: int) -> Tensor:
 # K*K copies of the image, and gradients of any order come for free.
 
 
-class _Gather(torch.autograd.Function):
+class _Gather(Function):
     @staticmethod
     def forward(padded: Tensor, kernel: Tensor) -> Tensor:
         kernel_size = kernel_size_of(kernel.shape[1], "kernel")
@@ -175,7 +176,7 @@ class _Gather(torch.autograd.Function):
         return to_image, to_kernel
 
 
-class _Splat(torch.autograd.Function):
+class _Splat(Function):
     @staticmethod
     def forward(image: Tensor, kernel: Tensor) -> Tensor:
         kernel_size = kernel_size_of(kernel.shape[1], "kernel")
@@ -200,7 +201,7 @@ class _Splat(torch.autograd.Function):
         return to_image, to_kernel
 
 
-class _Correlate(torch.autograd.Function):
+class _Correlate(Function):
     @staticmethod
     def forward(image: Tensor, padded: Tensor) -> Tensor:
         height, width = image.shape[-2:]

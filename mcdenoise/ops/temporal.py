@@ -155,8 +155,10 @@ def reproject(
             x, y = x0 + dx, y0 + dy
             kept = known & (x >= 0) & (x < width) & (y >= 0) & (y < height)
             index = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
-            tap = stack.gather(2, index.flatten(2).expand(-1, stack.shape[1], -1)).unflatten(2, (height, width))
-            parts = iter(tap.split([previous.shape[1], *(t.shape[1] for t in tested)], 1))
+            tap = stack.gather(2, index.flatten(2).expand(-1, stack.shape[1], -1)).reshape(
+                *stack.shape[:2], height, width
+            )
+            parts = iter(torch.split(tap, [previous.shape[1], *(t.shape[1] for t in tested)], 1))
             value = next(parts)
             tap_surface = Surface(*(None if x is None else next(parts) for x in there))
             if rule == "bmfr":
@@ -188,10 +190,10 @@ def accumulate(
 ) -> tuple[Tensor, Tensor]:
     """Blend a noisy frame with its reprojected history: an average at first, an exponential window later.
 
-    With the reprojected history ``h`` and its length ``n`` (:func:`reproject`), ``alpha = max(1 / (n + 1), alpha_min)``,
-    ``accumulated = alpha color + (1 - alpha) h`` and ``length = n + 1``; where no tap is kept,
-    ``accumulated = color`` and ``length = 1``. With ``rule="bmfr"`` the length is rounded before 1 is added and
-    saturates at 255, as in the published code, which stores it in a byte (and uses ``alpha_min=0.2``).
+    With the reprojected history ``h`` and its length ``n`` (:func:`reproject`),
+    ``alpha = max(1 / (n + 1), alpha_min)``, ``accumulated = alpha color + (1 - alpha) h`` and ``length = n + 1``;
+    where no tap is kept, ``accumulated = color`` and ``length = 1``. With ``rule="bmfr"`` the length is rounded before
+    1 is added and saturates at 255, as in the published code, which stores it in a byte (and uses ``alpha_min=0.2``).
 
     Args:
         color: ``(B, C, H, W)`` noisy radiance of the current frame, usually demodulated.
@@ -309,7 +311,7 @@ def _comparable(surface: Surface | None, previous: Surface | None, like: Tensor)
     """Both surfaces, reduced to what both have and free of gradients, with shapes checked."""
     if surface is None or previous is None:
         return Surface(), Surface()
-    pairs = []
+    pairs: list[tuple[Tensor | None, Tensor | None]] = []
     for name, channels, a, b in zip(Surface._fields, (3, 3, 1), surface, previous, strict=True):
         if a is None or b is None:
             pairs.append((None, None))
@@ -325,9 +327,9 @@ def _comparable(surface: Surface | None, previous: Surface | None, like: Tensor)
 def _check_limits(rule: Rule, surface: Surface, position_limit: float | None, normal_limit: float | None) -> None:
     if rule == "bmfr":
         if surface.position is not None and position_limit is None:
-            raise ValueError("position_limit: the rule 'bmfr' needs the scene's squared limit in scene units, found None")
+            raise ValueError("position_limit: the rule 'bmfr' needs its squared limit in scene units, found None")
         if surface.normal is not None and normal_limit is None:
-            raise ValueError("normal_limit: the rule 'bmfr' needs the scene's squared limit, found None")
+            raise ValueError("normal_limit: the rule 'bmfr' needs its squared limit, found None")
 
 
 def _bmfr_test(here: Surface, tap: Surface, position_limit: float | None, normal_limit: float | None) -> Tensor | bool:

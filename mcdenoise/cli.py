@@ -1,0 +1,376 @@
+"""The command line: parses, calls, prints."""
+
+# No postponed annotations here: tyro evaluates them, and those of a command's own imports are not global.
+
+import json as jsonlib
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from mcdenoise.errors import InputError
+
+Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+Json = Path | None
+
+_SUMMARY = """usage: mcdenoise COMMAND [OPTIONS]
+
+Interactive Monte Carlo denoising you can open up.
+
+commands:
+{commands}
+
+`mcdenoise COMMAND --help` says everything about a command."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run a command; exit status 0, 1 where a check failed, 2 for bad usage or bad input."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_summary())
+        sys.exit(0 if arguments else 2)
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(version("mcdenoise"))
+        return
+    name, rest = arguments[0], arguments[1:]
+    if name not in COMMANDS:
+        print(f"mcdenoise: unknown command '{name}'; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
+        sys.exit(2)
+    try:
+        status = tyro.cli(COMMANDS[name](), args=rest, prog=f"mcdenoise {name}")
+    except InputError as error:
+        print(f"mcdenoise {name}: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print(f"mcdenoise {name}: interrupted; finished files are kept", file=sys.stderr)
+        sys.exit(130)
+    sys.exit(status or 0)
+
+
+def _summary() -> str:
+    lines = [f"  {name:<10} {(make.__doc__ or '').splitlines()[0]}" for name, make in COMMANDS.items()]
+    return _SUMMARY.format(commands="\n".join(lines))
+
+
+# Each command is made by a function of its own, so that only the chosen one pays for its imports.
+
+
+def _demo() -> Callable[..., int | None]:
+    """Render a short animation at one sample a pixel, denoise it, and show the result."""
+    from mcdenoise.demo import FRAMES, run_demo
+
+    def demo(out: Out = Path("demo"), model: str = "cascaded", json: Json = None) -> None:
+        """Render 16 frames of a small scene at one sample a pixel, denoise them, print errors and times.
+
+        Args:
+            out: folder to write to; what an earlier run rendered there is used again.
+            model: name of a model with shipped weights.
+            json: write the printed figures to this file too.
+        """
+        with _progress() as progress:
+            rendering = progress.add_task("render", total=None)
+            denoising = progress.add_task("denoise", total=FRAMES)
+            result = run_demo(
+                out,
+                model=model,
+                on_render=lambda done, total: progress.update(rendering, completed=done, total=total),
+                on_frame=lambda number: progress.advance(denoising),
+            )
+        _print_scores(asdict(score) for score in result.scores)
+        _print_times(result.report.milliseconds)
+        print(f"clean frames: {result.denoised}\npicture: {result.picture}")
+        figures = {"scores": [asdict(s) for s in result.scores], "milliseconds": result.report.milliseconds}
+        _write_json(json, figures)
+
+    return demo
+
+
+def _denoise() -> Callable[..., int | None]:
+    """Denoise a folder of frames."""
+    import torch
+
+    from mcdenoise.data import open_sequence
+    from mcdenoise.denoise import denoise_sequence
+    from mcdenoise.denoiser import Denoiser
+
+    def denoise(
+        sequence: tyro.conf.Positional[Path],
+        out: Out,
+        model: str = "cascaded",
+        weights: Path | None = None,
+        frames: str | None = None,
+        device: str = "cpu",
+        threads: int | None = None,
+        alpha_min: float = 0.1,
+        full_float: bool = False,
+        json: Json = None,
+    ) -> None:
+        """Denoise a folder of frames: writes OUT/denoisedN.exr and OUT/denoise.json.
+
+        Args:
+            sequence: folder of a sequence in a known layout.
+            out: folder to write to.
+            model: name of a model, see `mcdenoise models`.
+            weights: safetensors file of your own weights for that model.
+            frames: which frames, such as 0-59,70; all by default.
+            device: cpu or cuda.
+            threads: CPU threads; torch's choice by default.
+            alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
+            full_float: write 32-bit instead of half floats.
+            json: write the run times to this file too.
+        """
+        if threads is not None:
+            if threads < 1:
+                raise InputError(f"--threads: expected at least 1, found {threads}")
+            torch.set_num_threads(threads)
+        if not 0 < alpha_min <= 1:
+            raise InputError(f"--alpha-min: expected in (0, 1], found {alpha_min}")
+        opened = open_sequence(sequence, frames)
+        denoiser = Denoiser(model, weights=weights, device=device, alpha_min=alpha_min)
+        height, width = opened.size
+        print(f"{opened.name}: {opened.layout} layout, {len(opened)} frames of {width}x{height}")
+        with _progress() as progress:
+            task = progress.add_task("denoise", total=len(opened))
+            report = denoise_sequence(
+                opened,
+                out,
+                denoiser,
+                str(weights or model),
+                half=not full_float,
+                on_frame=lambda number: progress.advance(task),
+            )
+        for stage, plan in report.stages.items():
+            print(f"  {stage}: {'kept' if plan['kept'] else 'left out'} ({plan['reason']})")
+        if report.replaced_pixels:
+            print(f"replaced {report.replaced_pixels} NaN, infinite or negative pixels of the noisy color")
+        _print_times(report.milliseconds)
+        _write_json(json, {"model": report.model, "milliseconds": report.milliseconds})
+
+    return denoise
+
+
+def _render() -> Callable[..., int | None]:
+    """Render a Mitsuba 3 scene along a camera path to a noisy sequence with references."""
+    from mcdenoise.render import load_camera_path, render_sequence
+
+    def render(
+        scene: tyro.conf.Positional[Path],
+        camera_path: Path,
+        out: Out,
+        frames: int | None = None,
+        spp: int = 1,
+        reference_spp: int = 512,
+        size: str = "640x360",
+        seed: int = 0,
+        variant: str | None = None,
+    ) -> None:
+        """Render a Mitsuba 3 scene along a camera path to a sequence in the BMFR layout.
+
+        Args:
+            scene: Mitsuba 3 scene.xml.
+            camera_path: camera path, JSON: a list of camera-to-world matrices or of look-at cameras.
+            out: folder of the sequence; finished frames in it are kept.
+            frames: render the first so many cameras; all by default.
+            spp: samples a pixel of the noisy color.
+            reference_spp: samples a pixel of the references; 0 renders none.
+            size: WIDTHxHEIGHT in pixels.
+            seed: of the noise.
+            variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
+        """
+        cameras = load_camera_path(camera_path)
+        with _progress() as progress:
+            task = progress.add_task("render", total=None)
+            written = render_sequence(
+                scene,
+                cameras,
+                out,
+                size=_size(size),
+                frames=frames,
+                spp=spp,
+                reference_spp=max(reference_spp, 1),
+                reference_frames=None if reference_spp > 0 else [],
+                seed=seed,
+                variant=variant,
+                progress=lambda done, total: progress.update(task, completed=done, total=total),
+            )
+        print(written)
+
+    return render
+
+
+def _train() -> Callable[..., int | None]:
+    """Train a model on sequences with references."""
+    from mcdenoise.train import Progress as Report
+    from mcdenoise.train import TrainConfig
+    from mcdenoise.train import train as run
+
+    def train(
+        sequences: tyro.conf.Positional[list[Path]],
+        out: Out,
+        config: tyro.conf.OmitArgPrefixes[TrainConfig],
+        accelerator: str = "cpu",
+        checkpoint_every: int = 500,
+        credits: str = "",
+    ) -> None:
+        """Train a model on sequences with references; the same command again resumes a run that was stopped.
+
+        Args:
+            sequences: folders of sequences with references, albedo, normal and depth.
+            out: folder of the run: checkpoint, log, TensorBoard events, and at the end the weights.
+            config: what to train.
+            accelerator: cpu or cuda.
+            checkpoint_every: steps between checkpoints.
+            credits: authors and licences of the training scenes, stored with the weights.
+        """
+        console = Console(stderr=True)
+
+        def report(progress: Report) -> None:
+            scores = "".join(f"  validation {name} {value:.4f}" for name, value in progress.validation.items())
+            console.print(f"step {progress.step}  loss {progress.loss:.4f}  {progress.seconds:.0f} s{scores}")
+
+        print(
+            run(
+                config,
+                sequences,
+                out,
+                accelerator=accelerator,
+                checkpoint_every=checkpoint_every,
+                credits=credits,
+                report=report,
+            )
+        )
+
+    return train
+
+
+def _gradcheck() -> Callable[..., int | None]:
+    """Check first and second derivatives of the operators in float64."""
+    from mcdenoise.gradcheck import check
+
+    def gradcheck(ops: tyro.conf.Positional[list[str]] = [], json: Json = None) -> int:  # noqa: B006 - tyro reads it
+        """Check first and second derivatives of the operators against finite differences, in float64, slow mode.
+
+        Args:
+            ops: names of operators; all by default.
+            json: write the results to this file too.
+        """
+        table = Table("op", "case", "inputs", "result", "seconds")
+        results = check(ops or None)
+        for result in results:
+            outcome = "ok" if result.passed else f"FAILED {result.message}"
+            table.add_row(result.op, result.case, ", ".join(result.inputs), outcome, f"{result.seconds:.2f}")
+        _show(table)
+        _write_json(json, [asdict(result) for result in results])
+        failed = sum(not result.passed for result in results)
+        print(f"{len(results)} checks, {failed} failed")
+        return 1 if failed else 0
+
+    return gradcheck
+
+
+def _models() -> Callable[..., int | None]:
+    """List the models with their size and cost."""
+    from mcdenoise.models import overview
+
+    def models(json: Json = None) -> None:
+        """List the models with parameters, operations per pixel, and whether weights are shipped.
+
+        Args:
+            json: write the list to this file too.
+        """
+        entries = overview()
+        table = Table("model", "parameters", "kMAC per pixel", "weights", "what")
+        for entry in entries:
+            shipped = "shipped" if entry.pretrained else "-"
+            table.add_row(
+                entry.name, f"{entry.parameters:,}", f"{entry.kmacs_per_pixel:.1f}", shipped, entry.description
+            )
+        _show(table)
+        _write_json(json, [asdict(entry) for entry in entries])
+
+    return models
+
+
+def _ops() -> Callable[..., int | None]:
+    """List the operators with their error against the equations written out."""
+    from mcdenoise.gradcheck import overview
+
+    def ops(json: Json = None) -> None:
+        """List the operators: what they do, what they are differentiable in, and their error in each precision.
+
+        Args:
+            json: write the list to this file too.
+        """
+        entries = overview()
+        table = Table("op", "what", "differentiable in", "cases", "float32", "bfloat16", "float16")
+        for entry in entries:
+            errors = (f"{entry.errors[name]:.0e}" for name in ("float32", "bfloat16", "float16"))
+            table.add_row(entry.name, entry.summary, ", ".join(entry.differentiable), str(entry.cases), *errors)
+        _show(table)
+        _write_json(json, [asdict(entry) for entry in entries])
+
+    return ops
+
+
+COMMANDS: dict[str, Callable[[], Callable[..., int | None]]] = {
+    "demo": _demo,
+    "denoise": _denoise,
+    "render": _render,
+    "train": _train,
+    "gradcheck": _gradcheck,
+    "models": _models,
+    "ops": _ops,
+}
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{text}'")
+    return int(width), int(height)
+
+
+def _progress() -> Progress:
+    """A progress bar on stderr; silent when that is no terminal."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeRemainingColumn(),
+    )
+    return Progress(*columns, console=console, disable=not console.is_terminal)
+
+
+def _show(table: Table) -> None:
+    # A pipe has no width: never fold what a script may read.
+    console = Console()
+    Console(width=None if console.is_terminal else 200).print(table)
+
+
+def _print_scores(scores: Any) -> None:
+    rows = list(scores)
+    table = Table("image", *rows[0]["values"], "frames")
+    for row in rows:
+        table.add_row(row["method"], *(f"{value:.4g}" for value in row["values"].values()), str(row["frames"]))
+    _show(table)
+
+
+def _print_times(milliseconds: dict[str, float]) -> None:
+    stages = ", ".join(f"{stage} {value:.1f}" for stage, value in milliseconds.items())
+    print(f"milliseconds a frame (median): {stages}; together {sum(milliseconds.values()):.1f}")
+
+
+def _write_json(path: Path | None, content: Any) -> None:
+    if path is not None:
+        from mcdenoise.data.files import write_text
+
+        write_text(path, jsonlib.dumps(content, indent=2) + "\n")

@@ -1,0 +1,111 @@
+"""The demonstration: render a noisy animation, denoise it, and show what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.data.png import Picture, caption, enlarge, write_png
+from mcdenoise.demo_scene import demo_cameras, demo_scene
+from mcdenoise.denoise import SequenceReport, denoise_sequence, make_folder
+from mcdenoise.denoiser import Denoiser
+from mcdenoise.evaluate import Score, score_sequence
+from mcdenoise.metrics import displayed
+from mcdenoise.render import render_sequence
+
+FRAMES = 16
+SIZE = (320, 180)
+REFERENCE_SPP = 256
+REFERENCE_FRAMES = (14, 15)
+# Where the picture looks closer: left, top, width and height in parts of the image.
+_CLOSE_UP = (0.42, 0.40, 0.25, 0.25)
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demonstration made.
+
+    Args:
+        scores: errors of the noisy, accumulated, initial and denoised images over the frames with references.
+        report: run times by stage, and what was done.
+        picture: noisy, accumulated, denoised and reference side by side, with close-ups.
+        denoised: folder of the clean EXRs.
+    """
+
+    scores: list[Score]
+    report: SequenceReport
+    picture: Path
+    denoised: Path
+
+
+def run_demo(
+    out: Path,
+    *,
+    model: str = "cascaded",
+    variant: str | None = "scalar_rgb",
+    on_render: Callable[[int, int], None] = lambda done, total: None,
+    on_frame: Callable[[int], None] = lambda number: None,
+) -> DemoResult:
+    """Render 16 frames at one sample a pixel, denoise them, and compare the last ones with references.
+
+    What an earlier run has rendered into the same folder is used again.
+
+    Args:
+        out: folder to write to: ``sequence/``, ``denoised/`` and ``demo.png``.
+        model: name of a model with shipped weights.
+        variant: of Mitsuba; ``"scalar_rgb"`` needs nothing but its package.
+        on_render: called with finished and total paths a pixel.
+        on_frame: called with the number of each denoised frame.
+
+    Raises:
+        InputError: Mitsuba is missing, the model is unknown, or the folder cannot be written to.
+    """
+    denoiser = Denoiser(model)
+    make_folder(out)
+    render_sequence(
+        demo_scene(),
+        demo_cameras(FRAMES),
+        out / "sequence",
+        size=SIZE,
+        reference_spp=REFERENCE_SPP,
+        reference_frames=REFERENCE_FRAMES,
+        variant=variant,
+        progress=on_render,
+    )
+    sequence = open_sequence(out / "sequence")
+    report = denoise_sequence(sequence, out / "denoised", denoiser, model, on_frame=on_frame)
+    scores = score_sequence(sequence, denoiser, sweep=False)
+    picture = out / "demo.png"
+    write_png(picture, _sheet(sequence, denoiser))
+    return DemoResult(scores, report, picture, out / "denoised")
+
+
+def _sheet(sequence: Sequence, denoiser: Denoiser) -> Picture:
+    """The last frame four times side by side, and under each image a close-up."""
+    denoiser.reset()
+    for number in sequence.numbers:
+        frame = sequence.frame(number)
+        images = denoiser.images(frame)
+    shown = {
+        "1 sample a pixel": images.noisy,
+        "accumulated": images.accumulated,
+        "denoised": images.denoised,
+        f"reference, {REFERENCE_SPP} samples": frame.reference,
+    }
+    return np.concatenate([_column(text, image) for text, image in shown.items() if image is not None], 1)
+
+
+def _column(text: str, image: Tensor) -> Picture:
+    picture = (displayed(image[0]).permute(1, 2, 0).cpu().numpy() * 255 + 0.5).astype(np.uint8)
+    height, width, _ = picture.shape
+    left, top, wide, high = _CLOSE_UP
+    x, y = int(left * width), int(top * height)
+    close_up = enlarge(picture[y : y + int(high * height), x : x + int(wide * width)], round(1 / wide))
+    gap = np.zeros((4, width, 3), np.uint8)
+    column = np.concatenate([caption(picture, text), gap, close_up[:, :width]])
+    return np.pad(column, ((2, 2), (2, 2), (0, 0)))

@@ -1,0 +1,144 @@
+"""Denoise a folder of frames: clean EXRs, and a report of what was done and how long each stage took."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mcdenoise.data import Sequence, write_exr
+from mcdenoise.data.files import write_text
+from mcdenoise.denoiser import Denoiser, FrameReport
+from mcdenoise.errors import InputError
+
+
+@dataclass
+class SequenceReport:
+    """What was done to a sequence.
+
+    Args:
+        model: name of the model or path of its weights.
+        stages: for each stage whether it was kept, and why.
+        frames: what happened to each frame, by number; its run times include reading and writing.
+    """
+
+    model: str
+    stages: dict[str, dict[str, Any]]
+    frames: dict[int, FrameReport] = field(default_factory=dict)
+
+    @property
+    def milliseconds(self) -> dict[str, float]:
+        """Median run time of each stage over the frames after the first, which pays for warming up."""
+        reports = list(self.frames.values())
+        reports = reports[1:] or reports
+        return {
+            stage: sorted(report.milliseconds[stage] for report in reports)[len(reports) // 2]
+            for stage in reports[0].milliseconds
+        }
+
+    @property
+    def replaced_pixels(self) -> int:
+        """Pixels of the noisy color, over all frames, that were NaN, infinite or negative."""
+        return sum(report.replaced_pixels for report in self.frames.values())
+
+
+def denoise_sequence(
+    sequence: Sequence,
+    out: Path,
+    denoiser: Denoiser,
+    model: str,
+    *,
+    half: bool = True,
+    on_frame: Callable[[int], None] = lambda number: None,
+) -> SequenceReport:
+    """Denoise a sequence and write ``OUT/denoisedN.exr`` and ``OUT/denoise.json``.
+
+    Args:
+        sequence: the frames.
+        out: folder to write to; made if it does not exist.
+        denoiser: is reset first.
+        model: what to call the model in the report.
+        half: write half floats, else 32-bit floats.
+        on_frame: called with the number of each finished frame.
+
+    Raises:
+        InputError: a file is damaged, a buffer has invalid values, or the folder cannot be written to.
+    """
+    make_folder(out)
+    denoiser.reset()
+    report = SequenceReport(model, _stages(sequence))
+    for number in sequence.numbers:
+        start = time.perf_counter()
+        frame = sequence.frame(number, reference=False)
+        read = time.perf_counter()
+        try:
+            image = denoiser(frame)
+        except InputError as error:
+            raise InputError(f"{sequence.root}, frame {number}: {error}") from error
+        denoised = time.perf_counter()
+        pixels = image[0].permute(1, 2, 0).float().cpu().numpy()
+        write_exr(out / f"denoised{number}.exr", pixels, ["R", "G", "B"], half=half, metadata=sequence.metadata(number))
+        written = time.perf_counter()
+        done = denoiser.report
+        done.milliseconds = {
+            "read": (read - start) * 1e3,
+            **done.milliseconds,
+            "write": (written - denoised) * 1e3,
+        }
+        report.frames[number] = done
+        on_frame(number)
+    write_text(out / "denoise.json", json.dumps(_as_json(sequence, denoiser, report), indent=2) + "\n")
+    return report
+
+
+def make_folder(out: Path) -> None:
+    """Make a folder to write results to; ``InputError`` where that cannot be."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: expected a folder that can be written to, found: {error.strerror}") from error
+
+
+def _stages(sequence: Sequence) -> dict[str, dict[str, Any]]:
+    """Which stages run on this sequence, and why."""
+    buffers = sequence.buffers
+    if "motion" in buffers:
+        accumulate = (True, "motion vectors")
+    elif {"position", "view_projection"} <= buffers:
+        accumulate = (True, "positions and cameras")
+    else:
+        accumulate = (False, "no motion, and no positions with cameras: single frames")
+    has_albedo = "albedo" in buffers
+    stages = {
+        "demodulate": (has_albedo, "albedo" if has_albedo else "no albedo"),
+        "accumulate": accumulate,
+        "network": (True, "always"),
+    }
+    return {stage: {"kept": kept, "reason": reason} for stage, (kept, reason) in stages.items()}
+
+
+def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> dict[str, Any]:
+    return {
+        "model": report.model,
+        "versions": {name: version(name) for name in ("mcdenoise", "torch", "kornia")},
+        "device": str(denoiser.device),
+        "threads": torch.get_num_threads(),
+        "sequence": {"name": sequence.name, "layout": sequence.layout, "size": list(sequence.size)},
+        "plan": report.stages,
+        "milliseconds": report.milliseconds,
+        "frames": {
+            str(number): {
+                "milliseconds": done.milliseconds,
+                "reset": done.reset,
+                "replaced_pixels": done.replaced_pixels,
+                "missing": done.missing,
+            }
+            for number, done in report.frames.items()
+        },
+    }

@@ -1,0 +1,164 @@
+"""Streaming denoising: a frame in, a clean image out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.buffers import Frame
+from mcdenoise.errors import InputError
+from mcdenoise.history import Accumulated, History
+from mcdenoise.models import create_model
+from mcdenoise.ops import remodulate
+
+
+@dataclass
+class FrameReport:
+    """What happened to one frame.
+
+    Args:
+        reset: why the history was thrown away, or ``""`` where it was used.
+        replaced_pixels: pixels of the noisy color that were NaN, infinite or negative.
+        missing: features that the network takes and the frame has not; it sees a constant instead.
+        milliseconds: run time of each stage: validate, accumulate, network, remodulate.
+    """
+
+    reset: str = ""
+    replaced_pixels: int = 0
+    missing: list[str] = field(default_factory=list)
+    milliseconds: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class Images:
+    """What a denoiser knows of one frame, all ``(B, 3, H, W)`` scene-linear radiance with albedo.
+
+    Args:
+        noisy: the frame's color, with invalid pixels replaced.
+        accumulated: with the history blended in.
+        initial: result of the cascade's first network.
+        denoised: the final image.
+    """
+
+    noisy: Tensor
+    accumulated: Tensor
+    initial: Tensor
+    denoised: Tensor
+
+
+class Denoiser:
+    """Denoises the frames of a shot one after the other: accumulate, demodulate, network, remodulate.
+
+    Args:
+        model: a model's name in the zoo (its shipped weights are loaded), or a module that takes demodulated color,
+            albedo, normal and depth and returns :class:`mcdenoise.models.Denoised`.
+        weights: a safetensors file of other weights for a model given by name.
+        device: where to run; frames may come from anywhere and images stay here.
+        alpha_min: smallest weight of the current frame in the accumulation, see :func:`mcdenoise.ops.accumulate`.
+
+    Raises:
+        InputError: the model is unknown, has no weights, or the device is not there.
+
+    Example:
+        >>> denoiser = Denoiser("cascaded")
+        >>> frame = Frame(color=torch.rand(1, 3, 24, 32), depth=torch.ones(1, 1, 24, 32))
+        >>> denoiser(frame).shape
+        torch.Size([1, 3, 24, 32])
+        >>> denoiser.report.missing
+        ['albedo', 'normal']
+    """
+
+    def __init__(
+        self,
+        model: str | nn.Module = "cascaded",
+        *,
+        weights: Path | str | None = None,
+        device: torch.device | str = "cpu",
+        alpha_min: float = 0.1,
+    ) -> None:
+        self.device = _device(device)
+        if isinstance(model, str):
+            model = create_model(model, pretrained=weights is None, weights=weights)
+        # Channels-last convolutions are about 1.5 times faster on a CPU.
+        model.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.model = model.eval()
+        self.history = History(alpha_min)
+        self.report = FrameReport()
+
+    def reset(self) -> None:
+        """Forget the past: the next frame is the first of a shot. A cut and a change of size do so by themselves."""
+        self.history.reset()
+
+    def __call__(self, frame: Frame) -> Tensor:
+        """Denoise the next frame of the shot.
+
+        Args:
+            frame: a renderer's outputs; NaN, infinite and negative pixels of ``color`` are replaced and counted.
+
+        Returns:
+            ``(B, 3, H, W)`` scene-linear radiance on the denoiser's device; ``report`` says what was done.
+
+        Raises:
+            InputError: a feature buffer holds NaN, an illegal infinity or a value far out of range.
+        """
+        return self.images(frame).denoised
+
+    @torch.inference_mode()
+    def images(self, frame: Frame) -> Images:
+        """As calling the denoiser, with the images on the way to the result."""
+        self.report = report = FrameReport()
+        with self._timed("validate"):
+            frame, report.replaced_pixels = frame.to(self.device).validate()
+        with self._timed("accumulate"):
+            past = self.history.update(frame)
+        report.reset = past.reset
+        with self._timed("network"):
+            initial, final = self.model(*self._inputs(frame, past))
+        with self._timed("remodulate"):
+            accumulated, initial, final = (
+                image if frame.albedo is None else remodulate(image, frame.albedo)
+                for image in (past.color, initial, final)
+            )
+        return Images(frame.color, accumulated, initial, final)
+
+    def _inputs(self, frame: Frame, past: Accumulated) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The network's inputs; a feature that the frame lacks is constant, which guides nothing."""
+        color = past.color
+        features = {"albedo": frame.albedo, "normal": frame.normal, "depth": frame.depth}
+        self.report.missing = [name for name, value in features.items() if value is None]
+        albedo, normal, depth = features.values()
+        return (
+            color,
+            torch.ones_like(color) if albedo is None else albedo,
+            torch.zeros_like(color) if normal is None else normal,
+            torch.ones_like(color[:, :1]) if depth is None else depth,
+        )
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = self._clock()
+        yield
+        self.report.milliseconds[stage] = self._clock() - start
+
+    def _clock(self) -> float:
+        """Milliseconds, after the device has finished."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        return time.perf_counter() * 1e3
+
+
+def _device(device: torch.device | str) -> torch.device:
+    try:
+        device = torch.device(device)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(
+            f"device '{device}': expected one that torch can use, found: {str(error).splitlines()[0]}"
+        ) from error
+    return device

@@ -1,0 +1,101 @@
+"""Errors of every way to denoise a sequence, against its references."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import torch
+from kornia.filters import joint_bilateral_blur
+from torch import Tensor
+
+from mcdenoise.buffers import Frame
+from mcdenoise.data.sequences import Sequence
+from mcdenoise.denoiser import Denoiser, Images
+from mcdenoise.errors import InputError
+from mcdenoise.metrics import psnr_srgb, smape_linear
+from mcdenoise.models.cascaded import normalize_depth
+from mcdenoise.ops import demodulate, remodulate
+
+METRICS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"SMAPE": smape_linear, "PSNR": psnr_srgb}
+
+
+@dataclass(frozen=True)
+class Score:
+    """Mean errors of one method on one sequence.
+
+    Args:
+        sequence: name of the sequence.
+        method: what made the images.
+        frames: number of frames in the mean.
+        values: mean over the frames, by metric: ``SMAPE`` (linear, lower is better), ``PSNR`` (sRGB, dB).
+    """
+
+    sequence: str
+    method: str
+    frames: int
+    values: dict[str, float]
+
+
+def score(image: Tensor, reference: Tensor) -> dict[str, float]:
+    """All metrics of one image ``(1, 3, H, W)``."""
+    return {name: float(metric(image, reference)) for name, metric in METRICS.items()}
+
+
+def score_sequence(sequence: Sequence, denoiser: Denoiser, *, sweep: bool = True) -> list[Score]:
+    """Scores of the noisy, accumulated, initial and denoised images, and of the best plain filter.
+
+    The plain filter is ``kornia.filters.joint_bilateral_blur`` of the same accumulated and demodulated input, guided
+    by albedo, normal and depth; of a small sweep over its settings the one with the lowest error is taken, for each
+    metric by itself, which favours the filter.
+
+    Args:
+        sequence: frames with references.
+        denoiser: is reset first.
+        sweep: whether to run the plain filter.
+
+    Raises:
+        InputError: the sequence has no references.
+    """
+    if not sequence.reference_numbers:
+        raise InputError(f"{sequence.root}: expected references to compare with, found none; render them")
+    denoiser.reset()
+    scores: dict[str, list[dict[str, float]]] = {}
+    for number in sequence.numbers:
+        frame = sequence.frame(number)
+        images = denoiser.images(frame)
+        if frame.reference is None:
+            continue
+        reference = frame.reference.to(denoiser.device)
+        for method in ("noisy", "accumulated", "initial", "denoised"):
+            scores.setdefault(method, []).append(score(getattr(images, method), reference))
+        if sweep:
+            for settings, image in _joint_bilateral(frame.to(denoiser.device), images):
+                scores.setdefault(f"joint bilateral {settings}", []).append(score(image, reference))
+    means = {method: _mean(values) for method, values in scores.items()}
+    swept = {method: means.pop(method) for method in list(means) if method.startswith("joint bilateral")}
+    if swept:
+        means["joint bilateral, best"] = {
+            name: (max if name == "PSNR" else min)(value[name] for value in swept.values()) for name in METRICS
+        }
+    count = len(sequence.reference_numbers)
+    return [Score(sequence.name, method, count, values) for method, values in means.items()]
+
+
+def _mean(values: list[dict[str, float]]) -> dict[str, float]:
+    return {name: sum(value[name] for value in values) / len(values) for name in values[0]}
+
+
+@torch.inference_mode()
+def _joint_bilateral(frame: Frame, images: Images) -> Iterable[tuple[str, Tensor]]:
+    """Every setting of the sweep and its image."""
+    guides = [x for x in (frame.albedo, frame.normal) if x is not None]
+    if frame.depth is not None:
+        guides.append(normalize_depth(frame.depth))
+    albedo = torch.ones_like(images.noisy) if frame.albedo is None else frame.albedo
+    guide = torch.cat(guides, 1)
+    image = demodulate(images.accumulated, albedo)
+    for size, color, space in itertools.product((5, 9, 13), (0.1, 0.3, 1.0), (1.5, 3.0, 6.0)):
+        blurred = joint_bilateral_blur(image, guide, size, color, (space, space), color_distance_type="l2")
+        yield f"{size} {color} {space}", remodulate(blurred, albedo)

@@ -1,0 +1,99 @@
+"""Prove the derivatives of every op against difference quotients."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mcdenoise.errors import InputError
+from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
+
+# Only to make a failure repeatable: any upstream gradient must do.
+SEED = 0
+
+
+@dataclass(frozen=True)
+class GradcheckResult:
+    """What became of one case of one op.
+
+    Args:
+        op: name of the op.
+        case: name of the case.
+        inputs: the arguments whose first and second derivatives were checked.
+        passed: whether all of them agree.
+        seconds: time it took.
+        message: first line of what is wrong; empty if nothing is.
+    """
+
+    op: str
+    case: str
+    inputs: tuple[str, ...]
+    passed: bool
+    seconds: float
+    message: str
+
+
+def check(names: Sequence[str] | None = None) -> list[GradcheckResult]:
+    """Compare first and second derivatives with difference quotients, in float64 and number by number.
+
+    Args:
+        names: ops to check; ``None`` means all.
+
+    Returns:
+        One result for each case of each op that has a differentiable input.
+
+    Raises:
+        InputError: there is no op of such a name.
+    """
+    known = {op.name: op for op in OPS}
+    unknown = [name for name in names or () if name not in known]
+    if unknown:
+        raise InputError(f"op: expected one of {', '.join(known)}, found {', '.join(unknown)}")
+    ops = OPS if names is None else [known[name] for name in names]
+    return [check_case(op, case) for op in ops for case in op.cases if case.differentiable]
+
+
+def check_case(op: Op, case: Case) -> GradcheckResult:
+    """:func:`check` of one case."""
+    start, message = time.perf_counter(), ""
+    function, arguments = _of_differentiable(op, case)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(SEED)
+            torch.autograd.gradcheck(function, arguments, fast_mode=False)
+            torch.autograd.gradgradcheck(function, arguments, fast_mode=False)
+    except Exception as error:  # whatever an op raises belongs in the report of that op, and the others go on
+        message = next(iter(str(error).splitlines()), type(error).__name__)
+    seconds = time.perf_counter() - start
+    return GradcheckResult(op.name, case.name, case.differentiable, not message, seconds, message)
+
+
+def _of_differentiable(op: Op, case: Case) -> tuple[Callable[..., Any], tuple[Tensor, ...]]:
+    """The op as a function of its differentiable tensors alone, and those tensors."""
+    fixed = case.inputs()
+    arguments: list[Tensor] = []
+
+    def collect(tensor: Tensor) -> Tensor:
+        arguments.append(tensor.requires_grad_())
+        return tensor
+
+    map_tensors(collect, {name: fixed[name] for name in case.differentiable})
+
+    def function(*tensors: Tensor) -> Any:
+        remaining = iter(tensors)
+        given: Inputs = {name: fixed[name] for name in case.differentiable}
+        result = op.function(**{**fixed, **map_tensors(lambda _: next(remaining), given)}, **case.settings)
+        return _finite(result) if isinstance(result, Tensor) else tuple(_finite(part) for part in result)
+
+    return function, tuple(arguments)
+
+
+def _finite(result: Tensor) -> Tensor:
+    # A constant infinity (the motion of a point behind the camera) has no difference quotient. Cut out, it still must
+    # not leave a NaN in the gradient of anything else.
+    return torch.where(torch.isfinite(result), result, 0)

@@ -1,0 +1,47 @@
+"""Size and cost of every model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from mcdenoise.models._registry import describe_model, list_models
+from mcdenoise.models._weights import create_model, pretrained_models
+
+_SIDE = 64  # a multiple of every model's padding, so that no padded pixel is counted
+
+
+@dataclass(frozen=True)
+class ModelOverview:
+    """What `mcdenoise models` prints of one model.
+
+    Args:
+        name: in the register.
+        description: one line.
+        parameters: number of weights.
+        kmacs_per_pixel: thousands of multiply-adds a pixel in convolutions, which are nearly all of the work.
+        pretrained: whether weights are shipped.
+    """
+
+    name: str
+    description: str
+    parameters: int
+    kmacs_per_pixel: float
+    pretrained: bool
+
+
+def overview() -> list[ModelOverview]:
+    """An entry for every registered model, sorted by name."""
+    shipped = pretrained_models()
+    inputs = [torch.rand(1, channels, _SIDE, _SIDE) for channels in (3, 3, 3, 1)]
+    entries = []
+    for name in list_models():
+        model = create_model(name)
+        with FlopCounterMode(display=False) as counter, torch.no_grad():
+            model(*inputs)
+        macs = counter.get_total_flops() / 2 / _SIDE**2
+        parameters = sum(parameter.numel() for parameter in model.parameters())
+        entries.append(ModelOverview(name, describe_model(name), parameters, macs / 1e3, name in shipped))
+    return entries

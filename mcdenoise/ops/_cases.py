@@ -1,0 +1,479 @@
+"""The table of ops and the inputs to try each of them on; gradient check, stability, speed and tests all read it.
+
+To add an op, add an ``Op`` to ``OPS``. Sizes are tiny, because gradients are checked one number at a time, and odd,
+because that is where borders go wrong.
+
+Inputs stay away from points without a derivative, where a difference quotient proves nothing: albedo from ``floor``,
+motion from whole pixels, history length from the one where ``alpha`` reaches ``alpha_min``, surfaces from the limits
+of the consistency test, kernel sums from zero. Where a case sits on such a point on purpose, the inputs concerned are
+not among its ``differentiable`` ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from torch import Generator, Tensor, nn
+
+from mcdenoise.ops import _reference, bilateral, demodulation, fusion, kernel_conv, temporal
+from mcdenoise.ops.temporal import Surface
+
+Kind = Literal["ordinary", "stiff", "extreme"]
+Value = Tensor | list[Tensor] | Surface | None
+Inputs = dict[str, Value]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One set of inputs of an op.
+
+    Args:
+        name: what is special about it; unique within its op.
+        kind: ``"ordinary"``, ``"stiff"`` (results change fast with the inputs) or ``"extreme"`` (valid, but at the end
+            of what is).
+        tensors: draws the tensor arguments by name, in float64.
+        differentiable: the arguments among them that have a derivative here.
+        settings: the other arguments, those that the Module twin stores.
+    """
+
+    name: str
+    kind: Kind
+    tensors: Callable[[Generator], Inputs]
+    differentiable: tuple[str, ...]
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def inputs(self, dtype: torch.dtype = torch.float64, seed: int = 0) -> Inputs:
+        """The tensor arguments: the same numbers for the same seed, in any dtype."""
+        drawn = self.tensors(torch.Generator().manual_seed(seed))
+        return map_tensors(lambda tensor: tensor.to(dtype), drawn)
+
+
+@dataclass(frozen=True)
+class Op:
+    """An op and what is known about it.
+
+    Args:
+        function: the public function.
+        reference: the same as its equation, in float64; see :mod:`mcdenoise.ops._reference`.
+        cases: at least four, among them ordinary ones.
+        module: the Module twin, if there is one.
+        least_dtype: results are at least as precise as this; other results have the dtype of the inputs.
+    """
+
+    function: Callable[..., Any]
+    reference: Callable[..., Any]
+    cases: tuple[Case, ...]
+    module: type[nn.Module] | None = None
+    least_dtype: torch.dtype | None = None
+
+    @property
+    def name(self) -> str:
+        """The function's name."""
+        return self.function.__name__
+
+
+def map_tensors(function: Callable[[Tensor], Tensor], inputs: Inputs) -> Inputs:
+    """``inputs`` with ``function`` applied to each tensor in them."""
+
+    def apply(value: Value) -> Value:
+        if isinstance(value, Surface):
+            return Surface(*(None if part is None else function(part) for part in value))
+        if isinstance(value, list):
+            return [function(part) for part in value]
+        return None if value is None else function(value)
+
+    return {name: apply(value) for name, value in inputs.items()}
+
+
+def _uniform(g: Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
+    return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
+
+
+def _normal(g: Generator, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+
+def _radiance(g: Generator, *shape: int) -> Tensor:
+    """Over six decades, as 1-spp renderings are: mostly dark, fireflies up to 1e4."""
+    return 10 ** _uniform(g, *shape, low=-2, high=4)
+
+
+def _filter_cases() -> tuple[Case, ...]:
+    both = ("image", "kernel")
+
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        kernel_size: int,
+        border: str,
+        image: Callable[..., Tensor] = _normal,
+        weights: Callable[[Tensor], Tensor] = lambda kernel: kernel + 0.5,
+        differentiable: tuple[str, ...] = both,
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            kernel = _uniform(g, size[0], kernel_size**2, *size[2:])
+            return {"image": image(g, *size), "kernel": weights(kernel)}
+
+        return Case(name, kind, tensors, differentiable, {"border": border})
+
+    def softmax(kernel: Tensor) -> Tensor:
+        return torch.softmax(50 * (2 * kernel - 1), 1)
+
+    def one_pixel_without_weights(kernel: Tensor) -> Tensor:
+        kernel[..., 0, 0] = 0
+        return kernel
+
+    return (
+        case("replicate", "ordinary", (1, 1, 5, 7), 3, "replicate", weights=lambda kernel: 2 * kernel - 1),
+        case("zeros, batch of 2, RGB", "ordinary", (2, 3, 2, 3), 3, "zeros", weights=lambda kernel: 2 * kernel - 1),
+        case("renormalize, 5 channels", "ordinary", (1, 5, 3, 3), 3, "renormalize"),
+        case("replicate, smaller than the kernel", "ordinary", (1, 3, 2, 3), 5, "replicate"),
+        case("renormalize, smaller than the kernel", "ordinary", (1, 1, 3, 2), 5, "renormalize"),
+        case("zeros, one row", "ordinary", (1, 1, 1, 6), 5, "zeros"),
+        case("replicate, one pixel", "ordinary", (1, 3, 1, 1), 3, "replicate"),
+        case("kernel of one tap", "ordinary", (1, 3, 3, 2), 1, "renormalize"),
+        case("fireflies, peaked weights", "stiff", (1, 3, 2, 3), 3, "replicate", _radiance, softmax),
+        case("fireflies, weights of sum 9", "extreme", (1, 3, 2, 3), 3, "renormalize", _radiance),
+        # The sum of the weights jumps at zero, so there is no derivative in the kernel.
+        case(
+            "a pixel without weights",
+            "extreme",
+            (1, 3, 2, 3),
+            3,
+            "renormalize",
+            weights=one_pixel_without_weights,
+            differentiable=("image",),
+        ),
+    )
+
+
+def _bilateral_cases() -> tuple[Case, ...]:
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int],
+        kernel_size: int,
+        normalize: str,
+        border: str = "replicate",
+        *,
+        channels: tuple[int, ...] = (3, 1),
+        distance: bool = True,
+        contrast: float = 1.0,
+        largest_scale: float = 3.0,
+        logit: float = 2.0,
+    ) -> Case:
+        batch, height, width = size
+
+        def scale(g: Generator) -> Tensor:
+            return largest_scale * _uniform(g, batch, 1, height, width)
+
+        def tensors(g: Generator) -> Inputs:
+            kernel = logit * _uniform(g, batch, kernel_size**2, height, width, low=-1)
+            return {
+                "kernel": kernel,
+                "guides": [contrast * _uniform(g, batch, c, height, width) for c in channels],
+                "scales": [scale(g) for _ in channels],
+                "distance_scale": 0.5 * _uniform(g, batch, 1, height, width) if distance else None,
+            }
+
+        differentiable = ("kernel", *(("guides", "scales") if channels else ()))
+        differentiable += ("distance_scale",) if distance else ()
+        return Case(name, kind, tensors, differentiable, {"normalize": normalize, "border": border})
+
+    return (
+        case("the paper's Eq. 5", "ordinary", (1, 2, 3), 3, "none"),
+        case("softmax", "ordinary", (1, 3, 3), 3, "softmax", channels=(1,)),
+        case("softmax, zeros, batch of 2", "ordinary", (2, 2, 3), 3, "softmax", "zeros", channels=(3,), distance=False),
+        case("softmax, renormalize", "ordinary", (1, 3, 3), 3, "softmax", "renormalize", channels=(1, 1)),
+        case("Eq. 5, zeros", "ordinary", (1, 2, 3), 3, "none", "zeros", channels=(5,)),
+        case("Eq. 5, renormalize, one row", "ordinary", (1, 1, 5), 3, "none", "renormalize", channels=(3,)),
+        case("no guides, 5x7", "ordinary", (1, 5, 7), 3, "softmax", channels=(), distance=False),
+        case("distance only", "ordinary", (1, 3, 2), 3, "softmax", channels=()),
+        case("smaller than the kernel", "ordinary", (1, 2, 1), 5, "softmax", "renormalize", channels=(1,)),
+        case("one pixel", "ordinary", (1, 1, 1), 3, "softmax"),
+        case("scales up to 1e3", "stiff", (1, 2, 3), 3, "softmax", contrast=0.1, largest_scale=1e3),
+        case("Eq. 5, scales up to 1e3", "stiff", (1, 2, 3), 3, "none", contrast=0.1, largest_scale=1e3, channels=(1,)),
+        case("zero scales", "ordinary", (1, 2, 3), 3, "softmax", largest_scale=0.0),
+        case("logits of 50", "extreme", (1, 2, 3), 3, "softmax", logit=50.0, channels=(1,)),
+        case("all but the centre vanish", "extreme", (1, 2, 3), 3, "softmax", "zeros", largest_scale=1e8),
+    )
+
+
+def _image_cases(sizes: Callable[[int, int], tuple[int, int]], with_size: bool) -> tuple[Case, ...]:
+    """Of ops of one image, which has the size ``sizes`` gives for the one in the case's name."""
+
+    def case(
+        kind: Kind, batch: int, channels: int, height: int, width: int, draw: Callable[..., Tensor] = _normal
+    ) -> Case:
+        name = f"{height}x{width}, batch of {batch}, {channels} channels" + (", fireflies" if draw is _radiance else "")
+        return Case(
+            name,
+            kind,
+            lambda g: {"image": draw(g, batch, channels, *sizes(height, width))},
+            ("image",),
+            {"size": (height, width)} if with_size else {},
+        )
+
+    return (
+        case("ordinary", 1, 1, 5, 7),
+        case("ordinary", 2, 3, 4, 6),
+        case("ordinary", 1, 5, 1, 5),
+        case("ordinary", 1, 3, 1, 1),
+        case("extreme", 1, 3, 3, 4, _radiance),
+    )
+
+
+def _half(height: int, width: int) -> tuple[int, int]:
+    return (height + 1) // 2, (width + 1) // 2
+
+
+def _fusion_cases() -> tuple[Case, ...]:
+    def case(
+        name: str, kind: Kind, size: tuple[int, int, int, int], alphas: int, draw: Callable[..., Tensor] = _normal
+    ) -> Case:
+        batch, channels, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            return {
+                "fine": draw(g, *size),
+                "coarse": draw(g, batch, channels, *_half(height, width)),
+                "alpha": _uniform(g, batch, alphas, height, width),
+            }
+
+        return Case(name, kind, tensors, ("fine", "coarse", "alpha"))
+
+    return (
+        case("5x7", "ordinary", (1, 1, 5, 7), 1),
+        case("batch of 2, RGB", "ordinary", (2, 3, 2, 4), 1),
+        case("an alpha for each channel", "ordinary", (1, 3, 3, 2), 3),
+        case("one row, 5 channels", "ordinary", (1, 5, 1, 5), 1),
+        case("one pixel", "ordinary", (1, 3, 1, 1), 1),
+        case("fireflies", "extreme", (1, 3, 3, 3), 1, _radiance),
+    )
+
+
+def _demodulation_cases(image: str) -> tuple[Case, ...]:
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        albedo: Callable[[Tensor], Tensor] = lambda values: values,
+        draw: Callable[..., Tensor] = _uniform,
+        **settings: float,
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            return {image: draw(g, *size), "albedo": albedo(_uniform(g, *size, low=0.05))}
+
+        return Case(name, kind, tensors, (image, "albedo"), settings)
+
+    def half_zero(values: Tensor) -> Tensor:
+        values[..., ::2] = 0
+        return values
+
+    def one_channel_zero(values: Tensor) -> Tensor:
+        values[:, 0] = 0
+        return values
+
+    def near_floor(values: Tensor) -> Tensor:
+        # 5e-4 to either side of the floor, which is a kink, and further out where another channel is textured.
+        values[:, :2] = torch.where(values[:, :2] < 0.5, 0.0095, 0.0105)
+        return values
+
+    return (
+        case("5x7", "ordinary", (1, 1, 5, 7)),
+        case("batch of 2, RGB", "ordinary", (2, 3, 3, 2)),
+        case("one row, 5 channels", "ordinary", (1, 5, 1, 3)),
+        case("one pixel, floor 0.5", "ordinary", (1, 3, 1, 1), floor=0.5),
+        case("no albedo in every other column", "ordinary", (1, 3, 2, 5), half_zero),
+        case("no red in the albedo", "ordinary", (1, 3, 3, 3), one_channel_zero),
+        case("albedo of 3", "extreme", (1, 3, 2, 3), lambda values: 3 * values),
+        case("fireflies", "stiff", (1, 3, 3, 3), draw=_radiance),
+        case("fireflies, albedo near the floor", "extreme", (1, 3, 3, 3), near_floor, _radiance),
+    )
+
+
+def _camera(batch: int, eye_z: float, unit: float) -> Tensor:
+    """Row-vector world-to-clip matrices that look along +z, with a little of everything in every entry."""
+    matrix = torch.tensor(
+        [[1.2, 0.05, 0.02, 0.03], [-0.04, 1.5, 0.01, -0.02], [0.06, -0.03, 1.01, 1.0], [0.1, 0.2, -0.5, -eye_z]],
+        dtype=torch.float64,
+    )
+    matrix[3] *= unit
+    return matrix.repeat(batch, 1, 1)
+
+
+def _motion_cases() -> tuple[Case, ...]:
+    def case(name: str, kind: Kind, batch: int, height: int, width: int, eye_z: float = 0.0, unit: float = 1.0) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            depth = _uniform(g, batch, 1, height, width, low=2, high=5)
+            position = torch.cat([_uniform(g, batch, 2, height, width, low=-1), depth], 1)
+            return {"position": unit * position, "previous_view_projection": _camera(batch, eye_z, unit)}
+
+        return Case(name, kind, tensors, ("position", "previous_view_projection"))
+
+    def nothing_hit(g: Generator) -> Inputs:
+        position = _uniform(g, 1, 3, 2, 3, low=2, high=5)
+        position[..., 0] = torch.inf
+        return {"position": position, "previous_view_projection": _camera(1, 0.0, 1.0)}
+
+    return (
+        case("5x7", "ordinary", 1, 5, 7),
+        case("batch of 2", "ordinary", 2, 2, 3),
+        case("one row", "ordinary", 1, 1, 5),
+        case("one pixel", "ordinary", 1, 1, 1),
+        case("scene in millimetres", "extreme", 1, 3, 3, unit=1000.0),
+        # The previous camera stood at z = 3.5 of 2 to 5; those near its plane are seen at large angles.
+        case("points behind the camera", "stiff", 1, 3, 3, eye_z=3.5),
+        Case("nothing hit", "extreme", nothing_hit, ("previous_view_projection",)),
+    )
+
+
+def _motion(g: Generator, batch: int, height: int, width: int, reach: int = 1) -> Tensor:
+    """Whole pixels up to ``reach``, and a fraction that stays away from the kinks at 0 and 1."""
+    whole = torch.randint(-reach, reach + 1, (batch, 2, height, width), generator=g)
+    return whole + _uniform(g, batch, 2, height, width, low=0.1, high=0.9)
+
+
+def _surfaces(g: Generator, batch: int, height: int, width: int) -> tuple[Surface, Surface]:
+    """Two frames of two walls: about half of the taps show the wrong one, all of them clearly."""
+    frames = []
+    facing = torch.tensor([[0.0, 0.6, -0.8], [0.8, 0.0, -0.6]], dtype=torch.float64)
+    for _ in range(2):
+        wall = torch.randint(0, 2, (batch, height, width), generator=g)
+        normal = facing[wall].movedim(-1, 1) + 0.02 * _uniform(g, batch, 3, height, width, low=-1)
+        depth = 5 + 5 * wall[:, None] + 0.03 * _uniform(g, batch, 1, height, width, low=-1)
+        position = torch.cat([0.03 * _uniform(g, batch, 2, height, width, low=-1), depth], 1)
+        frames.append(Surface(position, normal / normal.norm(dim=1, keepdim=True), depth))
+    return frames[0], frames[1]
+
+
+def _history_cases(accumulating: bool) -> tuple[Case, ...]:
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        surface: tuple[str, ...] = (),
+        change: Callable[[Inputs], None] | None = None,
+        *,
+        lengths: tuple[float, float] = (1.0, 6.0),
+        alpha_min: float = 0.1,
+        draw: Callable[..., Tensor] = _uniform,
+        smooth: tuple[str, ...] = ("color", "previous", "previous_length", "motion"),
+        **settings: Any,
+    ) -> Case:
+        batch, _, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            inputs: Inputs = {"previous": draw(g, *size), "motion": _motion(g, batch, height, width)}
+            if accumulating:
+                inputs["color"] = draw(g, *size)
+                low, high = lengths
+                inputs["previous_length"] = _uniform(g, batch, 1, height, width, low=low, high=high)
+            if surface:
+                for argument, whole in zip(
+                    ("surface", "previous_surface"), _surfaces(g, batch, height, width), strict=True
+                ):
+                    inputs[argument] = Surface(**{part: getattr(whole, part) for part in surface})
+            if change is not None:
+                change(inputs)
+            return inputs
+
+        if accumulating:
+            settings["alpha_min"] = alpha_min
+        arguments = ("color", "previous", "previous_length", "motion") if accumulating else ("previous", "motion")
+        return Case(name, kind, tensors, tuple(name for name in arguments if name in smooth), settings)
+
+    everything = ("position", "normal", "depth")
+
+    def far_out(inputs: Inputs) -> None:
+        motion = inputs["motion"]
+        assert isinstance(motion, Tensor)
+        motion[..., 0] = 1e4 + 0.5
+        motion[..., 1] = -1e4 - 0.5
+
+    def unknown(inputs: Inputs) -> None:
+        motion = inputs["motion"]
+        assert isinstance(motion, Tensor)
+        motion[:, 0, :, 0], motion[:, 1, :, 1], motion[..., 2] = torch.inf, torch.nan, -torch.inf
+
+    def still(inputs: Inputs) -> None:
+        motion = inputs["motion"]
+        assert isinstance(motion, Tensor)
+        motion.zero_()
+
+    def sky(inputs: Inputs) -> None:
+        for argument in ("surface", "previous_surface"):
+            surface = inputs[argument]
+            assert isinstance(surface, Surface)
+            for part in (surface.position, surface.depth):
+                if part is not None:
+                    part[..., :2, 1:] = torch.inf
+
+    def all_new(inputs: Inputs) -> None:
+        surface = inputs["surface"]
+        assert isinstance(surface, Surface)
+        assert surface.normal is not None
+        surface.normal.neg_()
+
+    def masked_nan(inputs: Inputs) -> None:
+        surface, previous = inputs["previous_surface"], inputs["previous"]
+        assert isinstance(surface, Surface)
+        assert isinstance(previous, Tensor)
+        assert surface.normal is not None
+        surface.normal[..., 1] = torch.nan
+        previous[..., 1] = torch.nan
+
+    # "bmfr" rounds the length, which then has no derivative.
+    rounded = ("color", "previous", "motion")
+    bmfr: dict[str, Any] = {"rule": "bmfr", "smooth": rounded, "alpha_min": 0.2, "lengths": (1.0, 3.4)}
+    return (
+        case("5x7, no surface", "ordinary", (1, 1, 5, 7)),
+        case("relative, all buffers, batch of 2, RGB", "ordinary", (2, 3, 2, 3), everything),
+        case("relative, depth", "ordinary", (1, 1, 3, 4), ("depth",)),
+        case("relative, position and depth", "ordinary", (1, 1, 3, 3), ("position", "depth"), position_limit=0.03),
+        case("relative, normal", "ordinary", (1, 1, 3, 3), ("normal",), normal_limit=0.3),
+        case("bmfr", "ordinary", (1, 3, 3, 3), ("position", "normal"), position_limit=0.5, normal_limit=0.25, **bmfr),
+        case("one row, 5 channels", "ordinary", (1, 5, 1, 5), ("depth",)),
+        case("one pixel", "ordinary", (1, 3, 1, 1)),
+        # Zero is a whole pixel, where the derivative in the motion jumps.
+        case("still", "ordinary", (1, 3, 2, 3), everything, still, smooth=("color", "previous", "previous_length")),
+        case("long history", "ordinary", (1, 1, 3, 3), lengths=(12.0, 40.0)),
+        case("length of a byte", "extreme", (1, 1, 3, 3), **{**bmfr, "lengths": (250.0, 255.0)}),
+        case("fireflies", "stiff", (1, 3, 2, 3), everything, draw=_radiance),
+        case("out of the image", "extreme", (1, 3, 2, 3), everything, far_out),
+        case("motion unknown", "extreme", (1, 1, 2, 4), (), unknown),
+        case("sky", "extreme", (1, 1, 3, 4), everything, sky),
+        case("nothing but new surfaces", "extreme", (1, 3, 2, 3), everything, all_new),
+        # A difference quotient of a NaN says nothing.
+        case("NaN on another surface", "extreme", (1, 3, 2, 3), everything, masked_nan, smooth=("color", "motion")),
+    )
+
+
+OPS: tuple[Op, ...] = (
+    Op(kernel_conv.kernel_conv, _reference.kernel_conv, _filter_cases(), kernel_conv.KernelConv),
+    Op(kernel_conv.kernel_splat, _reference.kernel_splat, _filter_cases(), kernel_conv.KernelSplat),
+    Op(
+        bilateral.cross_bilateral_weights,
+        _reference.cross_bilateral_weights,
+        _bilateral_cases(),
+        bilateral.CrossBilateralWeights,
+    ),
+    Op(fusion.downsample, _reference.downsample, _image_cases(lambda height, width: (height, width), with_size=False)),
+    Op(fusion.upsample, _reference.upsample, _image_cases(_half, with_size=True)),
+    Op(fusion.laplacian_fusion, _reference.laplacian_fusion, _fusion_cases(), fusion.LaplacianFusion),
+    Op(demodulation.demodulate, _reference.demodulate, _demodulation_cases("color"), demodulation.Demodulate),
+    Op(demodulation.remodulate, _reference.remodulate, _demodulation_cases("image"), demodulation.Remodulate),
+    Op(
+        temporal.motion_from_position,
+        _reference.motion_from_position,
+        _motion_cases(),
+        least_dtype=torch.float32,
+    ),
+    Op(temporal.reproject, _reference.reproject, _history_cases(accumulating=False)),
+    Op(temporal.accumulate, _reference.accumulate, _history_cases(accumulating=True), temporal.Accumulate),
+)

@@ -1,0 +1,303 @@
+"""Every op once more, as its equation: loops over pixels and taps on Python's float64 numbers.
+
+Slow, and meant to be read beside the formula. Nothing here is shared with the ops, so that an error in one of them
+cannot hide in the other. The arguments are those of the ops; results are float64 whatever the inputs are.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mcdenoise.ops.temporal import Surface
+
+# Nested lists of numbers, indexed [batch][channel][row][column].
+Image = list[Any]
+
+
+def kernel_conv(image: Tensor, kernel: Tensor, *, border: str = "replicate") -> Tensor:
+    """Eq. 4: ``out[p] = sum_t kernel[t, p] image[p + o_t]``; ``"renormalize"`` divides by the weights inside."""
+    source, weights, out = image.tolist(), kernel.tolist(), _zeros(image.shape)
+    for b, c, y, x in _indices(image.shape):
+        total = inside = 0.0
+        for t, _, row, column in _taps(kernel, y, x, border):
+            weight = weights[b][t][y][x]
+            if row is not None:
+                total += weight * source[b][c][row][column]
+                inside += weight
+        if border == "renormalize":
+            total = total / inside if inside != 0 else 0.0
+        out[b][c][y][x] = total
+    return _tensor(out, image.shape)
+
+
+def kernel_splat(image: Tensor, kernel: Tensor, *, border: str = "replicate") -> Tensor:
+    """``out[p + o_t] += kernel[t, p] image[p]``; ``"renormalize"`` first divides by the weights inside."""
+    source, weights, out = image.tolist(), kernel.tolist(), _zeros(image.shape)
+    for b, c, y, x in _indices(image.shape):
+        value = source[b][c][y][x]
+        if border == "renormalize":
+            inside = sum(weights[b][t][y][x] for t, _, row, _ in _taps(kernel, y, x, border) if row is not None)
+            value = value / inside if inside != 0 else 0.0
+        for t, _, row, column in _taps(kernel, y, x, border):
+            if row is not None:
+                out[b][c][row][column] += weights[b][t][y][x] * value
+    return _tensor(out, image.shape)
+
+
+def cross_bilateral_weights(
+    kernel: Tensor,
+    guides: Sequence[Tensor] = (),
+    scales: Sequence[Tensor] = (),
+    distance_scale: Tensor | None = None,
+    *,
+    normalize: str = "softmax",
+    border: str = "replicate",
+) -> Tensor:
+    """Eqs. 5-8: ``w' = w * prod_g exp(-f_g |g(q) - g(p)|^2) * exp(-f_d |q - p|^2)``.
+
+    ``"softmax"`` is the same with ``w = exp(logit)``, divided by the sum over the taps.
+    """
+    logits, out = kernel.tolist(), _zeros(kernel.shape)
+    images = [guide.tolist() for guide in guides]
+    factors = [scale.tolist() for scale in scales]
+    factor_of_distance = None if distance_scale is None else distance_scale.tolist()
+    batch, _, height, width = kernel.shape
+    for b, y, x in itertools.product(range(batch), range(height), range(width)):
+        for t, squared_distance, row, column in _taps(kernel, y, x, border):
+            weight = logits[b][t][y][x] if normalize == "none" else math.exp(logits[b][t][y][x])
+            if row is None and border == "renormalize":
+                weight = 0.0
+            for guide, factor in zip(images, factors, strict=True):
+                difference = sum(
+                    ((channel[row][column] if row is not None else 0.0) - channel[y][x]) ** 2 for channel in guide[b]
+                )
+                weight *= math.exp(-factor[b][0][y][x] * difference)
+            if factor_of_distance is not None:
+                weight *= math.exp(-factor_of_distance[b][0][y][x] * squared_distance)
+            out[b][t][y][x] = weight
+        if normalize == "softmax":
+            total = sum(taps[y][x] for taps in out[b])
+            for taps in out[b]:
+                taps[y][x] /= total
+    return _tensor(out, kernel.shape)
+
+
+def downsample(image: Tensor) -> Tensor:
+    """``D`` of Eq. 2: the mean of those pixels of each 2x2 block that exist."""
+    batch, channels, height, width = image.shape
+    shape = (batch, channels, (height + 1) // 2, (width + 1) // 2)
+    source, out = image.tolist(), _zeros(shape)
+    for b, c, y, x in _indices(shape):
+        block = [
+            source[b][c][row][column]
+            for row in range(2 * y, min(2 * y + 2, height))
+            for column in range(2 * x, min(2 * x + 2, width))
+        ]
+        out[b][c][y][x] = sum(block) / len(block)
+    return _tensor(out, shape)
+
+
+def upsample(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """``U`` of Eq. 2: ``out[y, x] = image[y // 2, x // 2]``."""
+    shape = (*image.shape[:2], *size)
+    source, out = image.tolist(), _zeros(shape)
+    for b, c, y, x in _indices(shape):
+        out[b][c][y][x] = source[b][c][y // 2][x // 2]
+    return _tensor(out, shape)
+
+
+def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
+    """Eq. 2: ``o = i_f - alpha U(D(i_f)) + alpha U(i_c)``."""
+    size = (fine.shape[2], fine.shape[3])
+    smooth, low = upsample(downsample(fine), size).tolist(), upsample(coarse, size).tolist()
+    source, blend, out = fine.tolist(), alpha.tolist(), _zeros(fine.shape)
+    for b, c, y, x in _indices(fine.shape):
+        a = blend[b][c if alpha.shape[1] > 1 else 0][y][x]
+        out[b][c][y][x] = source[b][c][y][x] - a * smooth[b][c][y][x] + a * low[b][c][y][x]
+    return _tensor(out, fine.shape)
+
+
+def demodulate(color: Tensor, albedo: Tensor, *, floor: float = 1e-2) -> Tensor:
+    """``color / max(albedo, floor)``; unchanged where the albedo is below ``floor`` in every channel."""
+    source, modulation = color.tolist(), _modulation(albedo, floor)
+    out = _zeros(color.shape)
+    for b, c, y, x in _indices(color.shape):
+        out[b][c][y][x] = source[b][c][y][x] / modulation[b][c][y][x]
+    return _tensor(out, color.shape)
+
+
+def remodulate(image: Tensor, albedo: Tensor, *, floor: float = 1e-2) -> Tensor:
+    """``image * max(albedo, floor)``; unchanged where the albedo is below ``floor`` in every channel."""
+    source, modulation = image.tolist(), _modulation(albedo, floor)
+    out = _zeros(image.shape)
+    for b, c, y, x in _indices(image.shape):
+        out[b][c][y][x] = source[b][c][y][x] * modulation[b][c][y][x]
+    return _tensor(out, image.shape)
+
+
+def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
+    """``clip = [x y z 1] @ M``; ``motion = ((clip.xy / clip.w + 1) / 2) (W, H) - centre``; infinite for ``w <= 0``."""
+    batch, _, height, width = position.shape
+    shape = (batch, 2, height, width)
+    points, matrices, out = position.tolist(), previous_view_projection.tolist(), _zeros(shape)
+    for b, y, x in itertools.product(range(batch), range(height), range(width)):
+        point = [*(channel[y][x] for channel in points[b]), 1.0]
+        clip = [sum(p * row[column] for p, row in zip(point, matrices[b], strict=True)) for column in range(4)]
+        in_front = clip[3] > 0
+        out[b][0][y][x] = (clip[0] / clip[3] + 1) / 2 * width - (x + 0.5) if in_front else math.inf
+        out[b][1][y][x] = (clip[1] / clip[3] + 1) / 2 * height - (y + 0.5) if in_front else math.inf
+    return _tensor(out, shape)
+
+
+def reproject(
+    previous: Tensor,
+    motion: Tensor,
+    surface: Surface | None = None,
+    previous_surface: Surface | None = None,
+    *,
+    rule: str = "relative",
+    position_limit: float | None = None,
+    normal_limit: float | None = None,
+) -> tuple[Tensor, Tensor]:
+    """``weight = sum_kept b_k`` and ``value = sum_kept b_k previous[q_k] / weight`` over the four bilinear taps."""
+    batch, channels, height, width = previous.shape
+    source, moved = previous.tolist(), motion.tolist()
+    here, there = _surface(surface), _surface(previous_surface)
+    value, kept_weight = _zeros(previous.shape), _zeros((batch, 1, height, width))
+    for b, y, x in itertools.product(range(batch), range(height), range(width)):
+        qx, qy = x + moved[b][0][y][x], y + moved[b][1][y][x]
+        if not (math.isfinite(qx) and math.isfinite(qy)):
+            continue
+        total, sums = 0.0, [0.0] * channels
+        for row, column in itertools.product(
+            (math.floor(qy), math.floor(qy) + 1), (math.floor(qx), math.floor(qx) + 1)
+        ):
+            if not (0 <= row < height and 0 <= column < width):
+                continue
+            current, tap = _at(here, b, y, x), _at(there, b, row, column)
+            if not _same_surface(current, tap, rule, position_limit, normal_limit):
+                continue
+            bilinear = (1 - abs(qx - column)) * (1 - abs(qy - row))
+            total += bilinear
+            for c in range(channels):
+                sums[c] += bilinear * source[b][c][row][column]
+        if total > 0:
+            kept_weight[b][0][y][x] = total
+            for c in range(channels):
+                value[b][c][y][x] = sums[c] / total
+    return _tensor(value, previous.shape), _tensor(kept_weight, (batch, 1, height, width))
+
+
+def accumulate(
+    color: Tensor,
+    previous: Tensor,
+    previous_length: Tensor,
+    motion: Tensor,
+    surface: Surface | None = None,
+    previous_surface: Surface | None = None,
+    *,
+    alpha_min: float = 0.1,
+    rule: str = "relative",
+    position_limit: float | None = None,
+    normal_limit: float | None = None,
+) -> tuple[Tensor, Tensor]:
+    """``alpha = max(1 / (n + 1), alpha_min)``, ``alpha color + (1 - alpha) history``, ``n + 1``; else ``color``, 1."""
+    fetch = functools.partial(reproject, rule=rule, position_limit=position_limit, normal_limit=normal_limit)
+    history, weight = (tensor.tolist() for tensor in fetch(previous, motion, surface, previous_surface))
+    lengths = fetch(previous_length, motion, surface, previous_surface)[0].tolist()
+    source, out, length = color.tolist(), _zeros(color.shape), _zeros(previous_length.shape)
+    for b, c, y, x in _indices(color.shape):
+        n = lengths[b][0][y][x]
+        found = weight[b][0][y][x] > 0
+        alpha = max(1 / (n + 1), alpha_min) if found else 1.0
+        out[b][c][y][x] = alpha * source[b][c][y][x] + (1 - alpha) * history[b][c][y][x]
+        # The published code keeps the length in a byte.
+        grown = min(round(n) + 1, 255) if rule == "bmfr" else n + 1
+        length[b][0][y][x] = grown if found else 1.0
+    return _tensor(out, color.shape), _tensor(length, previous_length.shape)
+
+
+def _tensor(values: Image, shape: Sequence[int]) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64).reshape(tuple(shape))
+
+
+def _zeros(shape: Sequence[int]) -> Image:
+    zeros: Image = torch.zeros(tuple(shape), dtype=torch.float64).tolist()
+    return zeros
+
+
+def _indices(shape: Sequence[int]) -> Iterator[tuple[int, ...]]:
+    return itertools.product(*(range(size) for size in shape))
+
+
+def _taps(kernel: Tensor, y: int, x: int, border: str) -> Iterator[tuple[int, int, int | None, int]]:
+    """Of each tap its index, squared distance from the centre, and row and column; row ``None``: reads no pixel."""
+    _, taps, height, width = kernel.shape
+    size = math.isqrt(taps)
+    for t in range(taps):
+        dy, dx = t // size - size // 2, t % size - size // 2
+        row, column = y + dy, x + dx
+        distance = dy * dy + dx * dx
+        if border == "replicate":
+            yield t, distance, min(max(row, 0), height - 1), min(max(column, 0), width - 1)
+        elif 0 <= row < height and 0 <= column < width:
+            yield t, distance, row, column
+        else:
+            yield t, distance, None, 0
+
+
+def _modulation(albedo: Tensor, floor: float) -> Image:
+    values, out = albedo.tolist(), _zeros(albedo.shape)
+    for b, c, y, x in _indices(albedo.shape):
+        textured = any(channel[y][x] >= floor for channel in values[b])
+        out[b][c][y][x] = max(values[b][c][y][x], floor) if textured else 1.0
+    return out
+
+
+def _surface(surface: Surface | None) -> tuple[Image | None, ...]:
+    return tuple(None if part is None else part.tolist() for part in surface or Surface())
+
+
+def _at(surface: tuple[Image | None, ...], b: int, y: int, x: int) -> list[list[float] | None]:
+    """Position, normal and depth of one pixel, each a vector or ``None``."""
+    return [None if part is None else [channel[y][x] for channel in part[b]] for part in surface]
+
+
+def _same_surface(
+    here: list[list[float] | None],
+    tap: list[list[float] | None],
+    rule: str,
+    position_limit: float | None,
+    normal_limit: float | None,
+) -> bool:
+    # What one of the two surfaces lacks cannot be compared.
+    both = [(a, b) if a is not None and b is not None else None for a, b in zip(here, tap, strict=True)]
+    positions, normals, depths = both
+    if rule == "bmfr":
+        limits = ((positions, position_limit), (normals, normal_limit))
+        return all(pair is None or limit is None or _squared_distance(*pair) < limit for pair, limit in limits)
+    if normals is not None and not _squared_distance(*normals) <= (0.5 if normal_limit is None else normal_limit):
+        return False
+    if depths is None:
+        return True
+    depth, tap_depth = depths[0][0], depths[1][0]
+    if not math.isfinite(depth) or not math.isfinite(tap_depth):
+        return not math.isfinite(depth) and not math.isfinite(tap_depth)
+    if positions is None:
+        return abs(tap_depth - depth) <= (0.1 if position_limit is None else position_limit) * depth
+    if normals is None:
+        distance = math.sqrt(_squared_distance(*positions))
+    else:
+        distance = abs(sum((q - p) * n for p, q, n in zip(*positions, normals[0], strict=True)))
+    return distance <= (0.02 if position_limit is None else position_limit) * depth
+
+
+def _squared_distance(a: list[float], b: list[float]) -> float:
+    return sum((q - p) ** 2 for p, q in zip(a, b, strict=True))
