@@ -2,6 +2,10 @@
 
 # No postponed annotations here: tyro evaluates them, and those of a command's own imports are not global.
 
+import contextlib
+import functools
+import io
+import itertools
 import json as jsonlib
 import sys
 from collections.abc import Callable
@@ -18,6 +22,9 @@ from mcdenoise.errors import InputError
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Json = Path | None
+
+# With very many threads torch does not fail but crashes.
+_MOST_THREADS = 1024
 
 _SUMMARY = """usage: mcdenoise COMMAND [OPTIONS]
 
@@ -45,7 +52,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"mcdenoise: unknown command '{name}'; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(2)
     try:
-        status = tyro.cli(COMMANDS[name](), args=rest, prog=f"mcdenoise {name}")
+        status = _parse(COMMANDS[name](), rest, f"mcdenoise {name}")()
     except InputError as error:
         print(f"mcdenoise {name}: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
@@ -53,6 +60,26 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"mcdenoise {name}: interrupted; finished files are kept", file=sys.stderr)
         sys.exit(130)
     sys.exit(status or 0)
+
+
+def _parse(command: Callable[..., int | None], arguments: list[str], prog: str) -> Callable[[], int | None]:
+    """A command with its arguments, ready to be called."""
+
+    @functools.wraps(command)
+    def bind(*args: Any, **kwargs: Any) -> Callable[[], int | None]:
+        return functools.partial(command, *args, **kwargs)
+
+    messages = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(messages):
+            return tyro.cli(bind, args=arguments, prog=prog)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        # tyro frames its messages: a title, what is wrong, a rule, and more help.
+        lines = [line.strip("│╭╮╰╯ ") for line in messages.getvalue().splitlines()]
+        wrong = itertools.takewhile(lambda line: line.strip("─"), lines[1:])
+        raise InputError(f"{' '.join(wrong).rstrip('.')}; see `{prog} --help`") from stop
 
 
 def _summary() -> str:
@@ -128,8 +155,8 @@ def _denoise() -> Callable[..., int | None]:
             json: write the run times to this file too.
         """
         if threads is not None:
-            if threads < 1:
-                raise InputError(f"--threads: expected at least 1, found {threads}")
+            if not 1 <= threads <= _MOST_THREADS:
+                raise InputError(f"--threads: expected 1 to {_MOST_THREADS}, found {threads}")
             torch.set_num_threads(threads)
         if not 0 < alpha_min <= 1:
             raise InputError(f"--alpha-min: expected in (0, 1], found {alpha_min}")
@@ -176,7 +203,8 @@ def _render() -> Callable[..., int | None]:
 
         Args:
             scene: Mitsuba 3 scene.xml.
-            camera_path: camera path, JSON: a list of camera-to-world matrices or of look-at cameras.
+            camera_path: JSON with 'fov' in degrees, and a list 'to_world' of 4x4 camera-to-world matrices or a list
+                'frames' of cameras with 'position' and 'look_at'.
             out: folder of the sequence; finished frames in it are kept.
             frames: render the first so many cameras; all by default.
             spp: samples a pixel of the noisy color.
@@ -301,7 +329,7 @@ def _models() -> Callable[..., int | None]:
 
 def _ops() -> Callable[..., int | None]:
     """List the operators with their error against the equations written out."""
-    from mcdenoise.gradcheck import overview
+    from mcdenoise.ops_overview import overview
 
     def ops(json: Json = None) -> None:
         """List the operators: what they do, what they are differentiable in, and their error in each precision.

@@ -20,7 +20,7 @@ from mcdenoise.render import render_sequence
 
 FRAMES = 16
 SIZE = (320, 180)
-REFERENCE_SPP = 256
+REFERENCE_SPP = 128
 REFERENCE_FRAMES = (14, 15)
 # Where the picture looks closer: left, top, width and height in parts of the image.
 _CLOSE_UP = (0.42, 0.40, 0.25, 0.25)

@@ -99,10 +99,11 @@ class Denoiser:
         """Denoise the next frame of the shot.
 
         Args:
-            frame: a renderer's outputs; NaN, infinite and negative pixels of ``color`` are replaced and counted.
+            frame: a renderer's outputs, any float dtype; NaN, infinite and negative pixels of ``color`` are replaced
+                and counted.
 
         Returns:
-            ``(B, 3, H, W)`` scene-linear radiance on the denoiser's device; ``report`` says what was done.
+            ``(B, 3, H, W)`` float32 scene-linear radiance on the denoiser's device; ``report`` says what was done.
 
         Raises:
             InputError: a feature buffer holds NaN, an illegal infinity or a value far out of range.
@@ -114,7 +115,7 @@ class Denoiser:
         """As calling the denoiser, with the images on the way to the result."""
         self.report = report = FrameReport()
         with self._timed("validate"):
-            frame, report.replaced_pixels = frame.to(self.device).validate()
+            frame, report.replaced_pixels = frame.to(self.device).to(torch.float32).validate()
         with self._timed("accumulate"):
             past = self.history.update(frame)
         report.reset = past.reset
@@ -156,8 +157,8 @@ class Denoiser:
 def _device(device: torch.device | str) -> torch.device:
     try:
         device = torch.device(device)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
+        torch.zeros((), device=device).item()
+    except (RuntimeError, AssertionError, ImportError) as error:
         raise InputError(
             f"device '{device}': expected one that torch can use, found: {str(error).splitlines()[0]}"
         ) from error

@@ -80,7 +80,7 @@ def relmse_linear(image: Tensor, reference: Tensor, *, epsilon: float = 1e-2) ->
     Source: Rousselle et al. 2011.
     """
     _check(image, reference)
-    scale = reference.mean(1, keepdim=True).square() + epsilon
+    scale = reference.mean(-3, keepdim=True).square() + epsilon
     return ((image - reference).square() / scale).mean((-3, -2, -1))
 
 

@@ -130,10 +130,10 @@ def train(
     """
     if not sequences:
         raise InputError("training data: expected at least one sequence folder, found none; name one or more")
+    _check(config, checkpoint_every)
     fabric = _fabric(accelerator, config.precision)
     opened = [open_sequence(path) for path in sequences]
-    run = _Run(config, opened, out)
-    run.begin()
+    sampler, validation = _data(config, opened)
 
     torch.manual_seed(config.seed)
     settings: dict[str, Any] = {"width": config.width} if config.width else {}
@@ -141,9 +141,13 @@ def train(
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(config, step))
+    # Only now, so that input that cannot be trained on leaves no trace of a run.
+    run = _Run(config, opened, out)
+    run.begin()
     first = run.load_checkpoint(network, optimizer, scheduler)
+    commit = _commit()  # now: the source tree may change while the run goes on
+    run.log({"first_step": first, "commit": commit, "threads": torch.get_num_threads()})
 
-    sampler, validation = _data(config, opened)
     model, fabric_optimizer = fabric.setup(network, optimizer)
     from torch.utils.tensorboard import SummaryWriter  # here because importing it takes a second
 
@@ -168,10 +172,10 @@ def train(
                     scores = _validate(model, validation, board, done)
                 progress = Progress(done, sum(losses) / len(losses), time.monotonic() - started, scores)
                 losses.clear()
-                run.log(progress)
+                run.log(dataclasses.asdict(progress))
                 board.add_scalar("train/loss", progress.loss, done)
                 report(progress)
-    return run.finish(network, settings, credits)
+    return run.finish(network, settings, commit, credits)
 
 
 def _fabric(accelerator: str, precision: Precision) -> Fabric:
@@ -182,7 +186,25 @@ def _fabric(accelerator: str, precision: Precision) -> Fabric:
             f"training: expected the optional packages of mcdenoise[train], found no '{error.name}'; "
             "install them with pip install 'mcdenoise[train]'"
         ) from error
-    return Fabric(accelerator=accelerator, devices=1, precision=precision)
+    try:
+        return Fabric(accelerator=accelerator, devices=1, precision=precision)
+    except (RuntimeError, ValueError, ImportError) as error:
+        raise InputError(f"accelerator '{accelerator}': expected one that works here, such as cpu or cuda") from error
+
+
+def _check(config: TrainConfig, checkpoint_every: int) -> None:
+    lowest = {"width": 0, "steps": 1, "batch": 1, "crop": 1, "start_every": 1, "validation_frames": 0}
+    lowest |= {"temporal_weight": 0, "gradient_norm": 0, "frames": 2 if config.temporal_weight else 1}
+    settings = {**dataclasses.asdict(config), "checkpoint_every": checkpoint_every}
+    for name, low in {**lowest, "checkpoint_every": 1}.items():
+        if not settings[name] >= low:
+            raise InputError(f"{name}: expected at least {low}, found {settings[name]}")
+    if not 0 <= config.seed < 2**32:
+        raise InputError(f"seed: expected 0 to 2^32 - 1, found {config.seed}")
+    if not config.learning_rate > 0:
+        raise InputError(f"learning_rate: expected a positive number, found {config.learning_rate}")
+    if not 0 < config.alpha_min <= 1:
+        raise InputError(f"alpha_min: expected in (0, 1], found {config.alpha_min}")
 
 
 def _rate(config: TrainConfig, step: int) -> float:
@@ -200,7 +222,7 @@ def _data(config: TrainConfig, sequences: list[Sequence]) -> tuple[ClipSampler, 
     for sequence in sequences:
         held = config.validation_frames if len(sequence) >= config.frames + config.validation_frames else 0
         for i, shot in enumerate(accumulated_shots(sequence, config.alpha_min, config.start_every)):
-            shots.append(shot[: len(shot) - held])
+            shots.append(shot[: max(0, len(shot) - held)])
             if i == 0 and held:
                 validation.append(Clip.from_stack(shot[None, -held:]))
     return ClipSampler(shots, config.frames, config.crop), validation
@@ -260,7 +282,7 @@ class _Run:
             text = json.dumps(content, indent=2) + "\n"
             if not path.exists():
                 write_text(path, text)
-            elif path.read_text(encoding="utf-8") != text:
+            elif not path.is_file() or path.read_bytes() != text.encode():
                 raise InputError(
                     f"{path}: expected the same as in this run, found another; choose a new folder for a new run"
                 )
@@ -297,21 +319,21 @@ class _Run:
             return int(saved["step"])
         except Exception as error:
             raise InputError(
-                f"{self._checkpoint}: expected a checkpoint of this run, found one that cannot be loaded "
-                f"({str(error).splitlines()[0]}); remove it to start again"
+                f"{self._checkpoint}: expected a checkpoint of this run, found one that cannot be loaded; "
+                "remove it to start again"
             ) from error
 
-    def log(self, progress: Progress) -> None:
+    def log(self, entry: dict[str, Any]) -> None:
         with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(dataclasses.asdict(progress)) + "\n")
+            file.write(json.dumps(entry) + "\n")
 
-    def finish(self, network: nn.Module, settings: dict[str, Any], credits: str) -> Path:
+    def finish(self, network: nn.Module, settings: dict[str, Any], commit: str, credits: str) -> Path:
         path = self.out / f"{self.config.model}.safetensors"
         about = {
             "config": json.dumps(dataclasses.asdict(self.config)),
             "data": json.dumps(self._data_list()),
             "steps": str(self.config.steps),
-            "commit": _commit(),
+            "commit": commit,
             "licence": "Apache-2.0",
             "credits": credits,
         }

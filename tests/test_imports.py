@@ -21,9 +21,9 @@ MODULES = {
 # What each room (a module or folder right below mcdenoise/) may import besides itself. A room that is not in the table
 # fails: place it deliberately.
 SIGNAL = {"errors", "buffers", "ops"}
-LIBRARY = SIGNAL | {"metrics", "losses", "models", "data", "plan", "demo_scene", "render", "denoiser"}
-REPORTS = {"evaluate", "report"}
-TOOLS = REPORTS | {"benchmark", "demo", "export", "gradcheck", "stability", "train"}
+LIBRARY = SIGNAL | {"metrics", "losses", "models", "history", "data", "plan", "demo_scene", "render", "denoiser"}
+REPORTS = {"denoise", "evaluate", "report"}
+TOOLS = REPORTS | {"benchmark", "demo", "export", "gradcheck", "ops_overview", "stability", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "ops": set(),
@@ -31,11 +31,13 @@ ALLOWED: dict[str, set[str]] = {
     "metrics": SIGNAL,
     "losses": SIGNAL | {"metrics"},
     "models": SIGNAL,
-    "data": SIGNAL,
+    "history": SIGNAL,
+    "data": SIGNAL | {"history"},
     "plan": SIGNAL | {"data"},
     "demo_scene": SIGNAL | {"data"},
     "render": SIGNAL | {"data", "demo_scene"},
-    "denoiser": SIGNAL | {"models", "data", "plan"},
+    "denoiser": SIGNAL | {"models", "history", "plan"},
+    "denoise": LIBRARY,
     "evaluate": LIBRARY,
     "report": LIBRARY,
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS),

@@ -66,11 +66,15 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> nn.Mod
     found = description["architecture"]
     if name is not None and found != name:
         raise InputError(f"{path}: expected weights of model '{name}', found those of '{found}'")
-    model = build_model(found, **{**description["settings"], **settings})
+    settings = {**description["settings"], **settings}
+    try:
+        model = build_model(found, **settings)
+    except (TypeError, RuntimeError) as error:
+        raise InputError(f"{path}: expected settings of model '{found}', found {settings}") from error
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - a safetensors handle is no dict
     own = model.state_dict()
-    for key in own.keys() | tensors.keys():
+    for key in sorted(own.keys() | tensors.keys()):
         expected = tuple(own[key].shape) if key in own else "no such layer"
         actual = tuple(tensors[key].shape) if key in tensors else "no such layer"
         if expected != actual:
@@ -92,9 +96,13 @@ def describe_weights(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected a safetensors file, found: {str(error).splitlines()[0]}") from error
     if "architecture" not in metadata:
         raise InputError(f"{path}: expected weights saved by mcdenoise, found no 'architecture' in the header")
+    try:
+        settings = dict(json.loads(metadata.get("settings", "{}")))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: header 'settings': expected a JSON object, found other text") from error
     return {
         "architecture": metadata["architecture"],
-        "settings": json.loads(metadata.get("settings", "{}")),
+        "settings": settings,
         **{key: value for key, value in metadata.items() if key not in ("architecture", "settings")},
     }
 

@@ -109,6 +109,7 @@ class KernelPredictor(nn.Module):
         """See :class:`Predictor`."""
         levels = self.unet(torch.cat([torch.log1p(image), features], 1))
         normal, depth = features[:, 3:6], features[:, 6:7]
+        top = torch.log1p(image).amax((1, 2, 3), keepdim=True)
         images: list[Tensor] = []
         for head, level in zip(self.heads, levels, strict=True):
             # The filter reads tap after tap: planes, not channels-last pixels.
@@ -123,7 +124,8 @@ class KernelPredictor(nn.Module):
             # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
             images.append(torch.log1p(kernel_conv(image, weights, border="zeros")))
             image, normal, depth = downsample(image), downsample(normal), downsample(depth)
-        return torch.expm1(_fuse(images, self.fusions).clamp_min(0))
+        # Each scale is a weighted mean; their fusion could leave the range of the input.
+        return torch.expm1(torch.minimum(_fuse(images, self.fusions).clamp_min(0), top))
 
 
 class Cascade(nn.Module):

@@ -18,15 +18,19 @@ class UNet(nn.Module):
     Args:
         in_channels: channels of the input.
         width: feature channels of every convolution (the paper's 40).
-        levels: number of scales, 4 in the paper.
+        levels: number of scales, at least 4; 4 in the paper.
+
+    Raises:
+        ValueError: there are too few levels.
     """
 
     scales = 3
 
     def __init__(self, in_channels: int, width: int, levels: int = 4) -> None:
         super().__init__()
-        if levels < self.scales:
-            raise ValueError(f"levels: expected at least {self.scales}, found {levels}")
+        # The coarsest level is the encoder's alone.
+        if levels <= self.scales:
+            raise ValueError(f"levels: expected at least {self.scales + 1}, found {levels}")
         self.multiple = 2 ** (levels - 1)
         self.encoder = nn.ModuleList(_block(in_channels if level == 0 else width, width) for level in range(levels))
         self.up = nn.ModuleList(nn.ConvTranspose2d(width, width, 2, stride=2) for _ in range(levels - 1))

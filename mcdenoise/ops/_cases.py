@@ -11,16 +11,19 @@ not among its ``differentiable`` ones.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Generator, Tensor, nn
 
-from mcdenoise.ops import _reference, bilateral, demodulation, fusion, kernel_conv, temporal
-from mcdenoise.ops.temporal import Surface
+from mcdenoise.ops import _reference
+from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
+from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
+from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
+from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
+from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
 
 Kind = Literal["ordinary", "stiff", "extreme"]
 Value = Tensor | list[Tensor] | Surface | None
@@ -138,7 +141,15 @@ def _filter_cases() -> tuple[Case, ...]:
         case("replicate, one pixel", "ordinary", (1, 3, 1, 1), 3, "replicate"),
         case("kernel of one tap", "ordinary", (1, 3, 3, 2), 1, "renormalize"),
         case("fireflies, peaked weights", "stiff", (1, 3, 2, 3), 3, "replicate", _radiance, softmax),
-        case("fireflies, weights of sum 9", "extreme", (1, 3, 2, 3), 3, "renormalize", _radiance),
+        case(
+            "fireflies, weights of sum 90",
+            "extreme",
+            (1, 3, 2, 3),
+            3,
+            "renormalize",
+            _radiance,
+            lambda kernel: 10 * (kernel + 0.5),
+        ),
         # The sum of the weights jumps at zero, so there is no derivative in the kernel.
         case(
             "a pixel without weights",
@@ -186,8 +197,8 @@ def _bilateral_cases() -> tuple[Case, ...]:
         return Case(name, kind, tensors, differentiable, {"normalize": normalize, "border": border})
 
     return (
-        case("the paper's Eq. 5", "ordinary", (1, 2, 3), 3, "none"),
         case("softmax", "ordinary", (1, 3, 3), 3, "softmax", channels=(1,)),
+        case("the paper's Eq. 5", "ordinary", (1, 2, 3), 3, "none"),
         case("softmax, zeros, batch of 2", "ordinary", (2, 2, 3), 3, "softmax", "zeros", channels=(3,), distance=False),
         case("softmax, renormalize", "ordinary", (1, 3, 3), 3, "softmax", "renormalize", channels=(1, 1)),
         case("Eq. 5, zeros", "ordinary", (1, 2, 3), 3, "none", "zeros", channels=(5,)),
@@ -200,7 +211,7 @@ def _bilateral_cases() -> tuple[Case, ...]:
         case("Eq. 5, scales up to 1e3", "stiff", (1, 2, 3), 3, "none", contrast=0.1, largest_scale=1e3, channels=(1,)),
         case("zero scales", "ordinary", (1, 2, 3), 3, "softmax", largest_scale=0.0),
         case("logits of 50", "extreme", (1, 2, 3), 3, "softmax", logit=50.0, channels=(1,)),
-        case("all but the centre vanish", "extreme", (1, 2, 3), 3, "softmax", "zeros", largest_scale=1e8),
+        case("all but the centre vanish", "extreme", (1, 2, 3), 3, "softmax", "zeros", largest_scale=6e4),
     )
 
 
@@ -339,17 +350,23 @@ def _motion(g: Generator, batch: int, height: int, width: int, reach: int = 1) -
     return whole + _uniform(g, batch, 2, height, width, low=0.1, high=0.9)
 
 
-def _surfaces(g: Generator, batch: int, height: int, width: int) -> tuple[Surface, Surface]:
-    """Two frames of two walls: about half of the taps show the wrong one, all of them clearly."""
-    frames = []
+class _History(NamedTuple):
+    """What a history case may change after it is drawn, in place."""
+
+    previous: Tensor
+    motion: Tensor
+    here: dict[str, Tensor]
+    there: dict[str, Tensor]
+
+
+def _surface(g: Generator, batch: int, height: int, width: int) -> dict[str, Tensor]:
+    """One of two walls in every pixel: of two such surfaces about half of the taps show the wrong wall, and clearly."""
     facing = torch.tensor([[0.0, 0.6, -0.8], [0.8, 0.0, -0.6]], dtype=torch.float64)
-    for _ in range(2):
-        wall = torch.randint(0, 2, (batch, height, width), generator=g)
-        normal = facing[wall].movedim(-1, 1) + 0.02 * _uniform(g, batch, 3, height, width, low=-1)
-        depth = 5 + 5 * wall[:, None] + 0.03 * _uniform(g, batch, 1, height, width, low=-1)
-        position = torch.cat([0.03 * _uniform(g, batch, 2, height, width, low=-1), depth], 1)
-        frames.append(Surface(position, normal / normal.norm(dim=1, keepdim=True), depth))
-    return frames[0], frames[1]
+    wall = torch.randint(0, 2, (batch, height, width), generator=g)
+    normal = facing[wall].movedim(-1, 1) + 0.02 * _uniform(g, batch, 3, height, width, low=-1)
+    depth = 5 + 5 * wall[:, None] + 0.03 * _uniform(g, batch, 1, height, width, low=-1)
+    position = torch.cat([0.03 * _uniform(g, batch, 2, height, width, low=-1), depth], 1)
+    return {"position": position, "normal": normal / normal.norm(dim=1, keepdim=True), "depth": depth}
 
 
 def _history_cases(accumulating: bool) -> tuple[Case, ...]:
@@ -358,7 +375,7 @@ def _history_cases(accumulating: bool) -> tuple[Case, ...]:
         kind: Kind,
         size: tuple[int, int, int, int],
         surface: tuple[str, ...] = (),
-        change: Callable[[Inputs], None] | None = None,
+        change: Callable[[_History], None] | None = None,
         *,
         lengths: tuple[float, float] = (1.0, 6.0),
         alpha_min: float = 0.1,
@@ -369,18 +386,22 @@ def _history_cases(accumulating: bool) -> tuple[Case, ...]:
         batch, _, height, width = size
 
         def tensors(g: Generator) -> Inputs:
-            inputs: Inputs = {"previous": draw(g, *size), "motion": _motion(g, batch, height, width)}
-            if accumulating:
-                inputs["color"] = draw(g, *size)
-                low, high = lengths
-                inputs["previous_length"] = _uniform(g, batch, 1, height, width, low=low, high=high)
-            if surface:
-                for argument, whole in zip(
-                    ("surface", "previous_surface"), _surfaces(g, batch, height, width), strict=True
-                ):
-                    inputs[argument] = Surface(**{part: getattr(whole, part) for part in surface})
+            drawn = _History(
+                draw(g, *size),
+                _motion(g, batch, height, width),
+                _surface(g, batch, height, width),
+                _surface(g, batch, height, width),
+            )
             if change is not None:
-                change(inputs)
+                change(drawn)
+            inputs: Inputs = {"previous": drawn.previous, "motion": drawn.motion}
+            if surface:
+                inputs["surface"] = Surface(**{part: drawn.here[part] for part in surface})
+                inputs["previous_surface"] = Surface(**{part: drawn.there[part] for part in surface})
+            if accumulating:
+                low, high = lengths
+                inputs["color"] = draw(g, *size)
+                inputs["previous_length"] = _uniform(g, batch, 1, height, width, low=low, high=high)
             return inputs
 
         if accumulating:
@@ -390,43 +411,24 @@ def _history_cases(accumulating: bool) -> tuple[Case, ...]:
 
     everything = ("position", "normal", "depth")
 
-    def far_out(inputs: Inputs) -> None:
-        motion = inputs["motion"]
-        assert isinstance(motion, Tensor)
-        motion[..., 0] = 1e4 + 0.5
-        motion[..., 1] = -1e4 - 0.5
+    def far_out(drawn: _History) -> None:
+        drawn.motion[..., 0], drawn.motion[..., 1] = 1e4 + 0.5, -1e4 - 0.5
 
-    def unknown(inputs: Inputs) -> None:
-        motion = inputs["motion"]
-        assert isinstance(motion, Tensor)
-        motion[:, 0, :, 0], motion[:, 1, :, 1], motion[..., 2] = torch.inf, torch.nan, -torch.inf
+    def unknown(drawn: _History) -> None:
+        drawn.motion[:, 0, :, 0], drawn.motion[:, 1, :, 1], drawn.motion[..., 2] = torch.inf, torch.nan, -torch.inf
 
-    def still(inputs: Inputs) -> None:
-        motion = inputs["motion"]
-        assert isinstance(motion, Tensor)
-        motion.zero_()
+    def still(drawn: _History) -> None:
+        drawn.motion.zero_()
 
-    def sky(inputs: Inputs) -> None:
-        for argument in ("surface", "previous_surface"):
-            surface = inputs[argument]
-            assert isinstance(surface, Surface)
-            for part in (surface.position, surface.depth):
-                if part is not None:
-                    part[..., :2, 1:] = torch.inf
+    def sky(drawn: _History) -> None:
+        for surface in (drawn.here, drawn.there):
+            surface["position"][..., :2, 1:] = surface["depth"][..., :2, 1:] = torch.inf
 
-    def all_new(inputs: Inputs) -> None:
-        surface = inputs["surface"]
-        assert isinstance(surface, Surface)
-        assert surface.normal is not None
-        surface.normal.neg_()
+    def all_new(drawn: _History) -> None:
+        drawn.here["normal"].neg_()
 
-    def masked_nan(inputs: Inputs) -> None:
-        surface, previous = inputs["previous_surface"], inputs["previous"]
-        assert isinstance(surface, Surface)
-        assert isinstance(previous, Tensor)
-        assert surface.normal is not None
-        surface.normal[..., 1] = torch.nan
-        previous[..., 1] = torch.nan
+    def nan_elsewhere(drawn: _History) -> None:
+        drawn.there["normal"][..., 1] = drawn.previous[..., 1] = torch.nan
 
     # "bmfr" rounds the length, which then has no derivative.
     rounded = ("color", "previous", "motion")
@@ -450,30 +452,20 @@ def _history_cases(accumulating: bool) -> tuple[Case, ...]:
         case("sky", "extreme", (1, 1, 3, 4), everything, sky),
         case("nothing but new surfaces", "extreme", (1, 3, 2, 3), everything, all_new),
         # A difference quotient of a NaN says nothing.
-        case("NaN on another surface", "extreme", (1, 3, 2, 3), everything, masked_nan, smooth=("color", "motion")),
+        case("NaN on another surface", "extreme", (1, 3, 2, 3), everything, nan_elsewhere, smooth=("color", "motion")),
     )
 
 
 OPS: tuple[Op, ...] = (
-    Op(kernel_conv.kernel_conv, _reference.kernel_conv, _filter_cases(), kernel_conv.KernelConv),
-    Op(kernel_conv.kernel_splat, _reference.kernel_splat, _filter_cases(), kernel_conv.KernelSplat),
-    Op(
-        bilateral.cross_bilateral_weights,
-        _reference.cross_bilateral_weights,
-        _bilateral_cases(),
-        bilateral.CrossBilateralWeights,
-    ),
-    Op(fusion.downsample, _reference.downsample, _image_cases(lambda height, width: (height, width), with_size=False)),
-    Op(fusion.upsample, _reference.upsample, _image_cases(_half, with_size=True)),
-    Op(fusion.laplacian_fusion, _reference.laplacian_fusion, _fusion_cases(), fusion.LaplacianFusion),
-    Op(demodulation.demodulate, _reference.demodulate, _demodulation_cases("color"), demodulation.Demodulate),
-    Op(demodulation.remodulate, _reference.remodulate, _demodulation_cases("image"), demodulation.Remodulate),
-    Op(
-        temporal.motion_from_position,
-        _reference.motion_from_position,
-        _motion_cases(),
-        least_dtype=torch.float32,
-    ),
-    Op(temporal.reproject, _reference.reproject, _history_cases(accumulating=False)),
-    Op(temporal.accumulate, _reference.accumulate, _history_cases(accumulating=True), temporal.Accumulate),
+    Op(kernel_conv, _reference.kernel_conv, _filter_cases(), KernelConv),
+    Op(kernel_splat, _reference.kernel_splat, _filter_cases(), KernelSplat),
+    Op(cross_bilateral_weights, _reference.cross_bilateral_weights, _bilateral_cases(), CrossBilateralWeights),
+    Op(downsample, _reference.downsample, _image_cases(lambda height, width: (height, width), with_size=False)),
+    Op(upsample, _reference.upsample, _image_cases(_half, with_size=True)),
+    Op(laplacian_fusion, _reference.laplacian_fusion, _fusion_cases(), LaplacianFusion),
+    Op(demodulate, _reference.demodulate, _demodulation_cases("color"), Demodulate),
+    Op(remodulate, _reference.remodulate, _demodulation_cases("image"), Remodulate),
+    Op(motion_from_position, _reference.motion_from_position, _motion_cases(), least_dtype=torch.float32),
+    Op(reproject, _reference.reproject, _history_cases(accumulating=False)),
+    Op(accumulate, _reference.accumulate, _history_cases(accumulating=True), Accumulate),
 )

@@ -150,7 +150,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
     for b, y, x in itertools.product(range(batch), range(height), range(width)):
         point = [*(channel[y][x] for channel in points[b]), 1.0]
         clip = [sum(p * row[column] for p, row in zip(point, matrices[b], strict=True)) for column in range(4)]
-        in_front = clip[3] > 0
+        in_front = clip[3] > 0 and all(map(math.isfinite, point))
         out[b][0][y][x] = (clip[0] / clip[3] + 1) / 2 * width - (x + 0.5) if in_front else math.inf
         out[b][1][y][x] = (clip[1] / clip[3] + 1) / 2 * height - (y + 0.5) if in_front else math.inf
     return _tensor(out, shape)

@@ -74,9 +74,8 @@ def cross_bilateral_weights(
     kernel_size = _check(kernel, guides, scales, distance_scale, normalize, border)
     radius = kernel_size // 2
     log_domain = normalize == "softmax"
-    margins = [pad(guide, radius, border) for guide in guides]
     start = kernel if log_domain else torch.zeros_like(kernel)
-    exponent = _Exponent.apply(start, distance_scale, radius, *margins, *scales)
+    exponent = _exponent(start, guides, scales, distance_scale, radius, border)
     if border == "renormalize":
         mask = inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
         exponent = torch.where(mask, exponent, -torch.inf)
@@ -139,64 +138,80 @@ def _check(
     return kernel_size_of(sizes["T"], "kernel")
 
 
+def _exponent(
+    start: Tensor,
+    guides: Sequence[Tensor],
+    scales: Sequence[Tensor],
+    distance_scale: Tensor | None,
+    radius: int,
+    border: Border,
+) -> Tensor:
+    """``start - sum_g f_g |difference of g|^2 - f_d |offset|^2``, in the dtype in which sums are kept."""
+    dtype = accumulator_dtype(start.dtype)
+    channels = tuple(guide.shape[1] for guide in guides)
+    # One tensor for all guides: torch.compile takes no function with a variable number of arguments.
+    margin = pad(torch.cat([guide.to(dtype) for guide in guides], 1), radius, border) if guides else None
+    factors = torch.cat([scale.to(dtype) for scale in scales], 1) if scales else None
+    distance = None if distance_scale is None else distance_scale.to(dtype)
+    return _Exponent.apply(start, distance, margin, factors, channels, radius)
+
+
 class _Exponent(Function):
-    """``kernel - sum_g f_g |difference of g|^2 - f_d |offset|^2`` in one pass over the taps, with no stack of them."""
+    """:func:`_exponent` of padded, concatenated guides in one pass over the taps, with no stack of them."""
 
     @staticmethod
-    def forward(kernel: Tensor, distance_scale: Tensor | None, radius: int, *rest: Tensor) -> Tensor:
-        height, width = kernel.shape[-2:]
-        dtype = accumulator_dtype(kernel.dtype)
-        guides, scales = _split(rest, dtype)
-        distance = None if distance_scale is None else distance_scale.to(dtype)
-        result = kernel.to(dtype, copy=True)
+    def forward(
+        start: Tensor,
+        distance_scale: Tensor | None,
+        guides: Tensor | None,
+        scales: Tensor | None,
+        channels: tuple[int, ...],
+        radius: int,
+    ) -> Tensor:
+        height, width = start.shape[-2:]
+        # One plane after the other, whatever the layout of the kernel: every tap is updated on its own.
+        dtype = accumulator_dtype(start.dtype)
+        result = start.to(dtype, copy=True, memory_format=torch.contiguous_format)
         for tap, dy, dx in offsets(2 * radius + 1):
             out = result[:, tap : tap + 1]
             if dy == 0 and dx == 0:
                 continue
-            for padded, scale in zip(guides, scales, strict=True):
+            for padded, scale in _each(guides, scales, channels):
                 out.addcmul_(scale, _squared_distance(padded, radius, dy, dx, height, width), value=-1)
-            if distance is not None:
-                out.sub_(distance, alpha=dy * dy + dx * dx)
+            if distance_scale is not None:
+                out.sub_(distance_scale, alpha=dy * dy + dx * dx)
         return result
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Tensor) -> None:
-        kernel, distance_scale, radius, *rest = inputs
-        ctx.radius, ctx.has_distance, ctx.dtypes = radius, distance_scale is not None, [x.dtype for x in rest]
-        ctx.kernel_dtype = kernel.dtype
-        ctx.distance_dtype = None if distance_scale is None else distance_scale.dtype
-        ctx.save_for_backward(*rest)
+        start, _, guides, scales, ctx.channels, ctx.radius = inputs
+        ctx.dtype = start.dtype
+        ctx.save_for_backward(guides, scales)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         # Plain differentiable torch: recorded only when a second derivative is asked for.
         radius = ctx.radius
-        height, width = gradient.shape[-2:]
-        guides, scales = _split(ctx.saved_tensors, gradient.dtype)
-        n = len(guides)
-        need_guide, need_scale = ctx.needs_input_grad[3 : 3 + n], ctx.needs_input_grad[3 + n :]
-        to_guides: list[Tensor | None] = []
-        to_scales: list[Tensor | None] = []
-        for padded, scale, for_guide, for_scale in zip(guides, scales, need_guide, need_scale, strict=True):
-            to_guides.append(_guide_gradient(gradient, padded, scale, radius) if for_guide else None)
-            total = torch.zeros_like(scale) if for_scale else None
-            if total is not None:
-                for tap, dy, dx in offsets(2 * radius + 1):
-                    distance = _squared_distance(padded, radius, dy, dx, height, width)
-                    total = torch.addcmul(total, gradient[:, tap : tap + 1], distance, value=-1)
-            to_scales.append(total)
-        to_distance = None
-        if ctx.has_distance and ctx.needs_input_grad[1]:
-            squares = torch.tensor([dy * dy + dx * dx for _, dy, dx in offsets(2 * radius + 1)], dtype=gradient.dtype)
-            to_distance = -torch.einsum("bthw,t->bhw", gradient, squares.to(gradient.device)).unsqueeze(1)
-            to_distance = to_distance.to(ctx.distance_dtype)
-        out = [None if g is None else g.to(t) for g, t in zip(to_guides + to_scales, ctx.dtypes, strict=True)]
-        return gradient.to(ctx.kernel_dtype), to_distance, None, *out
+        _, need_distance, need_guides, need_scales, *_ = ctx.needs_input_grad
+        guides, scales = ctx.saved_tensors
+        pairs = _each(guides, scales, ctx.channels)
+        to_distance = to_guides = to_scales = None
+        if need_distance:
+            squares = [dy * dy + dx * dx for _, dy, dx in offsets(2 * radius + 1)]
+            weights = torch.tensor(squares, dtype=gradient.dtype, device=gradient.device)
+            to_distance = -torch.einsum("bthw,t->bhw", gradient, weights).unsqueeze(1)
+        if need_guides:
+            to_guides = torch.cat([_guide_gradient(gradient, padded, scale, radius) for padded, scale in pairs], 1)
+        if need_scales:
+            to_scales = torch.cat([_scale_gradient(gradient, padded, radius) for padded, _ in pairs], 1)
+        return gradient.to(ctx.dtype), to_distance, to_guides, to_scales, None, None
 
 
-def _split(rest: Sequence[Tensor], dtype: torch.dtype) -> tuple[list[Tensor], list[Tensor]]:
-    tensors = [tensor.to(dtype) for tensor in rest]
-    return tensors[: len(tensors) // 2], tensors[len(tensors) // 2 :]
+def _each(guides: Tensor | None, scales: Tensor | None, channels: tuple[int, ...]) -> list[tuple[Tensor, Tensor]]:
+    """Each guide with its scale."""
+    if guides is None or scales is None:
+        return []
+    return list(zip(torch.split(guides, list(channels), 1), torch.split(scales, 1, 1), strict=True))
 
 
 def _squared_distance(padded: Tensor, radius: int, dy: int, dx: int, height: int, width: int) -> Tensor:
@@ -217,4 +232,13 @@ def _guide_gradient(gradient: Tensor, padded: Tensor, scale: Tensor, radius: int
         shifted(total, radius, dy, dx, height, width).add_(pull)
         centre_total = centre_total - pull
     shifted(total, radius, 0, 0, height, width).add_(centre_total)
+    return total
+
+
+def _scale_gradient(gradient: Tensor, padded: Tensor, radius: int) -> Tensor:
+    height, width = gradient.shape[-2:]
+    total = torch.zeros_like(gradient[:, :1])
+    for tap, dy, dx in offsets(2 * radius + 1):
+        distance = _squared_distance(padded, radius, dy, dx, height, width)
+        total = torch.addcmul(total, gradient[:, tap : tap + 1], distance, value=-1)
     return total

@@ -42,7 +42,8 @@ def demodulate(color: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         >>> demodulate(color, torch.zeros(1, 3, 1, 1)).equal(color)
         True
     """
-    return color / _modulation(color, albedo, floor)
+    check_shapes(color=(color, "B C H W"), albedo=(albedo, "B C H W"))
+    return color / _modulation(albedo, floor)
 
 
 def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor:
@@ -71,7 +72,8 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         >>> torch.allclose(remodulate(demodulate(color, albedo), albedo), color)
         True
     """
-    return image * _modulation(image, albedo, floor)
+    check_shapes(image=(image, "B C H W"), albedo=(albedo, "B C H W"))
+    return image * _modulation(albedo, floor)
 
 
 class Demodulate(nn.Module):
@@ -106,8 +108,7 @@ class Remodulate(nn.Module):
         return remodulate(image, albedo, floor=self.floor)
 
 
-def _modulation(image: Tensor, albedo: Tensor, floor: float) -> Tensor:
-    check_shapes(image=(image, "B C H W"), albedo=(albedo, "B C H W"))
+def _modulation(albedo: Tensor, floor: float) -> Tensor:
     if not floor > 0:
         raise ValueError(f"floor: expected a positive number, found {floor}")
     textured = (albedo >= floor).any(1, keepdim=True)

@@ -105,9 +105,12 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
         True
     """
     sizes = check_shapes(fine=(fine, "B C H W"), coarse=(coarse, "B C h w"), alpha=(alpha, "B A H W"))
+    size = (sizes["H"], sizes["W"])
+    half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
+    if (sizes["h"], sizes["w"]) != half:
+        raise ValueError(f"coarse: expected height and width {half} for {size} of fine, found {sizes['h'], sizes['w']}")
     if sizes["A"] not in (1, sizes["C"]):
         raise ValueError(f"alpha: expected 1 or {sizes['C']} channels, found {sizes['A']}")
-    size = (sizes["H"], sizes["W"])
     # Linear in what is upsampled, so one upsampling serves both terms.
     return fine + alpha * upsample(coarse - downsample(fine), size)
 

@@ -54,11 +54,11 @@ def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") 
     """
     kernel_size = _check(image, kernel, border)
     radius = kernel_size // 2
-    total = _Gather.apply(pad(image, radius, border), kernel)
     if border != "renormalize":
-        return total
-    share = _renormalizer(kernel, kernel_size)
-    return (total * share).to(image.dtype)
+        return _Gather.apply(pad(image, radius, border), kernel)
+    # The mean of a few large values fits where their sum does not.
+    total = _Gather.apply(pad(image.to(accumulator_dtype(image.dtype)), radius, border), kernel)
+    return (total * _renormalizer(kernel, kernel_size)).to(image.dtype)
 
 
 def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
@@ -94,9 +94,10 @@ def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate")
     """
     kernel_size = _check(image, kernel, border)
     radius = kernel_size // 2
+    source = image.to(accumulator_dtype(image.dtype))
     if border == "renormalize":
-        image = (image * _renormalizer(kernel, kernel_size)).to(image.dtype)
-    return unpad(_Splat.apply(image, kernel), radius, border)
+        source = source * _renormalizer(kernel, kernel_size).to(source.dtype)
+    return unpad(_Splat.apply(source, kernel), radius, border).to(image.dtype)
 
 
 class KernelConv(nn.Module):

@@ -44,7 +44,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
 
     Returns:
         ``(B, 2, H, W)`` motion in pixels, x right and y down, ``previous = current + motion``; infinite where the
-        point was behind the previous camera.
+        point was behind the previous camera or is not finite. Half precision gives float32.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -64,9 +64,12 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
     height, width = sizes["H"], sizes["W"]
     dtype = torch.promote_types(position.dtype, torch.float32)
     matrix = previous_view_projection.to(dtype)
-    clip = torch.einsum("bchw,bcd->bdhw", position.to(dtype), matrix[:, :3]) + matrix[:, 3, :, None, None]
+    # Where nothing was hit the position may be infinite, which would reach the matrix as a NaN gradient.
+    hit = torch.isfinite(position).all(1, keepdim=True)
+    point = torch.where(hit, position.to(dtype), 0)
+    clip = torch.einsum("bchw,bcd->bdhw", point, matrix[:, :3]) + matrix[:, 3, :, None, None]
     w = clip[:, 3:]
-    in_front = w > 0
+    in_front = hit & (w > 0)
     scale = torch.tensor([width, height], dtype=dtype, device=position.device).reshape(1, 2, 1, 1)
     previous = (clip[:, :2] / torch.where(in_front, w, 1) + 1) / 2 * scale
     centre = _pixel_grid(height, width, position.device, dtype) + 0.5
@@ -351,7 +354,7 @@ def _relative_test(
         return kept
     hit, tap_hit = torch.isfinite(here.depth), torch.isfinite(tap.depth)
     # Where nothing was hit there is no distance to compare: background matches background.
-    depth = torch.where(hit, here.depth, 0)
+    depth = torch.where(hit, here.depth, 0).to(tap.depth.dtype)
     if here.position is not None and tap.position is not None:
         offset = tap.position - here.position
         if here.normal is not None:

@@ -1,0 +1,85 @@
+"""Compose a denoiser from operators: no network, no weights, nothing but this page.
+
+    python examples/compose_denoiser.py path/to/sequence
+
+The albedo is divided out, the frames of the shot are accumulated, and what noise is left is filtered at three scales
+by cross-bilateral weights over normals, albedo, depth and the color itself; a Laplacian fusion carries each coarse
+result into the next finer scale, and the albedo is multiplied back. Prints the error of the noisy, the accumulated and
+the composed image for the last frames that have a reference. Change SCALES, the guides, or the order of the steps, and
+see what it does. What no guide shows, such as the image in a mirror, a filter like this one blurs.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mcdenoise.buffers import Frame
+from mcdenoise.data import open_sequence
+from mcdenoise.history import History
+from mcdenoise.metrics import psnr_srgb, smape_linear
+from mcdenoise.models.cascaded import auto_exposure, normalize_depth
+from mcdenoise.ops import cross_bilateral_weights, downsample, kernel_conv, laplacian_fusion, remodulate, upsample
+
+# How fast a neighbour's weight falls off with the squared difference of normal, albedo, depth and color, and with the
+# squared distance in pixels; one row for each scale, finest first. Coarse scales are stricter, since what leaks across
+# an edge there spreads over many pixels. fit_filter_parameters.py finds such numbers by gradient descent.
+SCALES = torch.tensor([[5, 1, 2000, 0.1, 0.1], [50, 2, 6000, 0.7, 0.03], [100, 20, 6000, 2.5, 0.05]])
+FUSION = torch.tensor(0.9)  # share of the low frequencies that comes from the coarser scale
+KERNEL_SIZE = 5
+
+
+def prepare(color: Tensor, frame: Frame) -> tuple[Tensor, list[Tensor]]:
+    """Accumulated color without fireflies, and what tells one surface from another, in units that fit any scene."""
+    ring = color.new_full((1, KERNEL_SIZE**2, *frame.size), 1 / (KERNEL_SIZE**2 - 1))
+    ring[:, KERNEL_SIZE**2 // 2] = 0
+    brightness = color.mean(1, keepdim=True)
+    # Eight times brighter than all around it: one lucky path, which would leave a pale square at the coarse scales.
+    color = color * (8 * kernel_conv(brightness, ring) / brightness.clamp_min(1e-6)).clamp_max(1)
+    return color, [frame.normal, frame.albedo, normalize_depth(frame.depth), torch.log1p(color * auto_exposure(color))]
+
+
+def denoise(color: Tensor, length: Tensor, guides: list[Tensor], scales: Tensor, fusion: Tensor) -> Tensor:
+    """Filter demodulated, accumulated color; a pixel counts as often as it has frames in its history `length`."""
+    # Where there is hardly any history, a neighbour that is not quite alike is still better than noise.
+    falloffs = [scale * (length / 4).clamp_max(1) for scale in scales[0, :-1]]
+    if len(scales) > 1:
+        coarse_length = downsample(length)
+        coarse_color = downsample(color * length) / coarse_length
+        coarse = denoise(coarse_color, coarse_length, [downsample(guide) for guide in guides], scales[1:], fusion)
+        # A pixel unlike the mean of its 2x2 block (an edge, a thin thing) has nothing to take from the coarse image.
+        means = [upsample(downsample(guide), guide.shape[-2:]) for guide in guides]
+        unlike = [
+            f * (guide - mean).square().sum(1, True) for f, guide, mean in zip(falloffs, guides, means, strict=True)
+        ]
+        color = laplacian_fusion(color, coarse, fusion * torch.exp(-sum(unlike)))
+    # With logits of zero, only the guides and the distance shape the kernel.
+    logits = color.new_zeros(1, KERNEL_SIZE**2, *color.shape[-2:])
+    distance = scales[0, -1].expand_as(length)
+    weights = cross_bilateral_weights(logits, guides, falloffs, distance, border="renormalize")
+    return kernel_conv(color * length, weights) / kernel_conv(length, weights)
+
+
+@torch.inference_mode()
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("sequence", type=Path, help="folder with color, albedo, normals, positions and references")
+    parser.add_argument("--last", type=int, default=3, metavar="N", help="score the last N frames with a reference")
+    options = parser.parse_args()
+
+    sequence, history = open_sequence(options.sequence), History()
+    print("SMAPE / PSNR      noisy           accumulated        composed")
+    for number in sequence.numbers:
+        frame, _ = sequence.frame(number).validate()
+        past = history.update(frame)
+        if number in sequence.reference_numbers[-options.last :]:
+            color, guides = prepare(past.color, frame)
+            filtered = denoise(color, past.length, guides, SCALES, FUSION)
+            images = [frame.color, remodulate(past.color, frame.albedo), remodulate(filtered, frame.albedo)]
+            errors = [(float(smape_linear(x, frame.reference)), float(psnr_srgb(x, frame.reference))) for x in images]
+            print(f"frame {number:<6}", "   ".join(f"{smape:.4f} {psnr:5.2f} dB" for smape, psnr in errors))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""Denoise a shot frame by frame, as a renderer would: the shortest use of `Denoiser`.
+
+    python examples/denoise_sequence.py path/to/sequence out
+    python examples/denoise_sequence.py path/to/sequence out --weights runs/mine/cascaded.safetensors
+
+Writes out/denoised0.exr, out/denoised1.exr, ... (scene-linear), and out/last.png: the last frame before and after, as a
+display shows it. A denoiser remembers: give it the frames in order, one `Denoiser` for each shot. With frames from
+somewhere else than a folder, build `mcdenoise.buffers.Frame(color=..., albedo=..., ...)` and pass that.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mcdenoise import Denoiser
+from mcdenoise.data import open_sequence, write_exr
+from mcdenoise.data.png import write_png
+from mcdenoise.metrics import displayed
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("sequence", type=Path, help="folder of a renderer's frames")
+    parser.add_argument("out", type=Path, help="folder to write to")
+    parser.add_argument("--model", default="cascaded", help="a name that `mcdenoise models` lists")
+    parser.add_argument("--weights", type=Path, help="weights of your own training; by default the shipped ones")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    options = parser.parse_args()
+
+    sequence = open_sequence(options.sequence)
+    denoiser = Denoiser(options.model, weights=options.weights, device=options.device)
+    options.out.mkdir(parents=True, exist_ok=True)
+    for number in sequence.numbers:
+        frame = sequence.frame(number, reference=False)
+        image = denoiser(frame)
+        pixels = image[0].permute(1, 2, 0).cpu().numpy()
+        write_exr(options.out / f"denoised{number}.exr", pixels, ["R", "G", "B"])
+        milliseconds = sum(denoiser.report.milliseconds.values())
+        print(f"frame {number}: {milliseconds:.0f} ms {denoiser.report.reset and f'({denoiser.report.reset})'}")
+
+    pair = torch.cat([frame.color, image.cpu()], 3)
+    picture = displayed(pair[0]).permute(1, 2, 0).numpy()
+    write_png(options.out / "last.png", (picture * 255 + 0.5).astype(np.uint8))
+    print(f"images and last.png (before and after) are in {options.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,390 @@
+"""What every model of the zoo promises, whatever its weights are; the tests read the register."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.models import (
+    Cascade,
+    KernelPredictor,
+    PixelPredictor,
+    UNet,
+    create_model,
+    describe_weights,
+    list_models,
+    load_weights,
+    overview,
+    pretrained_models,
+    register_model,
+    save_weights,
+)
+from mcdenoise.models.cascaded import auto_exposure, normalize_depth
+
+SHIPPED = Path(__file__).parents[2] / "mcdenoise" / "models" / "weights"
+WIDTH = 8
+
+
+def build(name: str, **settings: Any) -> nn.Module:
+    """A small model off its initial values: at rest, a pixel network's heads are zero and hide everything before."""
+    torch.manual_seed(1)
+    model = create_model(name, **{"width": WIDTH, **settings})
+    for part in model.modules():
+        if isinstance(part, PixelPredictor):
+            for head in part.heads:
+                nn.init.normal_(head.weight, std=0.02)
+    return model
+
+
+def inputs(height: int, width: int, batch: int = 1, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Color, albedo, normal and depth, with background in the first row of larger images."""
+    generator = torch.Generator().manual_seed(seed)
+    color, albedo, normal, depth = (
+        torch.rand(batch, channels, height, width, generator=generator) for channels in (3, 3, 3, 1)
+    )
+    depth = 1 + 9 * depth
+    if height > 1:
+        depth[:, :, 0] = torch.inf
+    return color.square() * 4, albedo, nn.functional.normalize(normal - 0.5, dim=1), depth
+
+
+def refused(action: Callable[[], object]) -> str:
+    with pytest.raises(InputError) as error:
+        action()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+# What a name stands for: the cascade as in the paper's Table 3, and whether kernels have bilateral weights.
+CASCADES = {
+    "pixel": ("P", None),
+    "kernel": ("K", True),
+    "kernel_plain": ("K", False),
+    "kernel_pixel": ("K+P", True),
+    "kernel_pixel_plain": ("K+P", False),
+    "kernel_kernel": ("K+K", True),
+    "kernel_kernel_plain": ("K+K", False),
+    "cascaded": ("P+K", True),
+    "cascaded_plain": ("P+K", False),
+}
+
+
+@pytest.mark.parametrize(("name", "cascade", "bilateral"), [(name, *what) for name, what in CASCADES.items()])
+def test_names_of_the_ablation(name: str, cascade: str, bilateral: bool | None) -> None:
+    model = build(name)
+    assert isinstance(model, Cascade)
+    parts = [part for part in (model.first, model.second) if part is not None]
+    assert "+".join("P" if isinstance(part, PixelPredictor) else "K" for part in parts) == cascade
+    assert all(part.bilateral is bilateral for part in parts if isinstance(part, KernelPredictor))
+
+
+def test_the_register() -> None:
+    assert set(CASCADES) <= set(list_models())
+    assert list_models("kernel_kernel*") == ["kernel_kernel", "kernel_kernel_plain"]
+    assert "cascaded" in refused(lambda: create_model("oidn"))
+    with pytest.raises(ValueError, match="'cascaded' is registered twice"):
+        register_model("cascaded")(nn.Identity)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 7), (17, 33)], ids=lambda size: f"{size[0]}x{size[1]}")
+@pytest.mark.parametrize("name", list_models())
+def test_odd_sizes(name: str, size: tuple[int, int]) -> None:
+    with torch.no_grad():
+        result = build(name)(*inputs(*size))
+    for image in result:
+        assert image.shape == (1, 3, *size)
+        assert torch.isfinite(image).all()
+        assert (image >= 0).all()
+
+
+def test_full_width_at_180x320() -> None:
+    with torch.no_grad():
+        initial, final = create_model("cascaded")(*inputs(180, 320))
+    assert initial.shape == final.shape == (1, 3, 180, 320)
+    assert torch.isfinite(final).all()
+
+
+@pytest.mark.parametrize("name", list_models())
+def test_a_gradient_reaches_every_parameter(name: str) -> None:
+    model = build(name)
+    color, *features = inputs(24, 24)
+    initial, final = model(color, *features)
+    ((initial - 1).square().mean() + (final - 1).square().mean()).backward()
+    for key, parameter in model.named_parameters():
+        assert parameter.grad is not None, key
+        assert torch.isfinite(parameter.grad).all(), key
+        assert parameter.grad.abs().max() > 0, key
+
+
+@pytest.mark.parametrize("name", list_models())
+def test_images_of_a_batch_do_not_see_each_other(name: str) -> None:
+    model = build(name)
+    color, *features = inputs(17, 20, batch=2)
+    color[1] *= 1000
+    with torch.no_grad():
+        together = model(color, *features).final
+        alone = [model(color[i : i + 1], *(x[i : i + 1] for x in features)).final for i in (0, 1)]
+    # 2e-6 was measured: another batch size may sum in another order.
+    torch.testing.assert_close(together, torch.cat(alone), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e-1, 1e3])
+@pytest.mark.parametrize("name", list_models())
+def test_exposure_only_scales_the_result(name: str, factor: float) -> None:
+    model = build(name)
+    color, *features = inputs(33, 20)
+    with torch.no_grad():
+        result, scaled = model(color, *features).final, model(color * factor, *features).final
+    torch.testing.assert_close(scaled / factor, result, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+@pytest.mark.parametrize("name", list_models())
+def test_the_unit_of_the_scene_does_not_matter(name: str, factor: float) -> None:
+    model = build(name)
+    color, albedo, normal, depth = inputs(17, 20)
+    with torch.no_grad():
+        result, scaled = (model(color, albedo, normal, d).final for d in (depth, depth * factor))
+    torch.testing.assert_close(scaled, result, rtol=1e-4, atol=1e-5)
+
+
+def test_auto_exposure_brings_a_constant_image_to_the_key() -> None:
+    color = torch.full((1, 3, 20, 20), 8.0)
+    torch.testing.assert_close(auto_exposure(color, key=0.5), torch.full((1, 1, 1, 1), 0.0625))
+    assert auto_exposure(torch.zeros(2, 3, 5, 5)).flatten().tolist() == [1, 1]
+
+
+def test_normalized_depth_written_out() -> None:
+    # The geometric mean of 1 and 4 is 2.
+    depth = torch.tensor([1.0, 4.0, torch.inf]).reshape(1, 1, 1, 3)
+    torch.testing.assert_close(normalize_depth(depth).flatten(), torch.tensor([1 / 3, 2 / 3, 1.0]))
+    assert normalize_depth(torch.full((1, 1, 2, 2), torch.inf)).unique().tolist() == [1]
+
+
+@pytest.mark.parametrize("bilateral", [True, False])
+def test_kernels_keep_a_constant_image(bilateral: bool) -> None:
+    torch.manual_seed(0)
+    predictor = KernelPredictor(WIDTH, bilateral=bilateral)
+    features = torch.rand(1, 7, 13, 18)
+    with torch.no_grad():
+        image = predictor(torch.full((1, 3, 13, 18), 0.7), features)
+    torch.testing.assert_close(image, torch.full_like(image, 0.7), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("bilateral", [True, False])
+def test_filtered_pixels_lie_between_those_of_the_input(bilateral: bool) -> None:
+    torch.manual_seed(0)
+    predictor = KernelPredictor(WIDTH, bilateral=bilateral)
+    # With alpha = 0 the fusion keeps the finest scale: what is left are weighted means of the input.
+    for fusion in predictor.fusions:
+        nn.init.zeros_(fusion.conv.weight)
+        nn.init.constant_(fusion.conv.bias, -1e4)
+    image = torch.rand(1, 3, 13, 18) + 0.5
+    with torch.no_grad():
+        filtered = predictor(image, torch.full((1, 7, 13, 18), 0.5))
+    low, high = image.amin((2, 3), keepdim=True), image.amax((2, 3), keepdim=True)
+    assert (filtered >= low - 1e-5).all()
+    assert (filtered <= high + 1e-5).all()
+    assert filtered.std() < image.std()
+
+
+def test_a_pixel_network_at_rest_keeps_a_constant_image_and_never_outshines_its_input() -> None:
+    torch.manual_seed(0)
+    predictor = PixelPredictor(WIDTH)
+    features = torch.rand(1, 7, 13, 18)
+    constant = torch.full((1, 3, 13, 18), 0.7)
+    image = torch.rand(1, 3, 13, 18)
+    with torch.no_grad():
+        torch.testing.assert_close(predictor(constant, features), constant, rtol=0, atol=1e-5)
+        for head in predictor.heads:
+            nn.init.constant_(head.bias, 100.0)
+        assert predictor(image, features).max() <= image.max() + 1e-5
+
+
+def test_the_kernel_heads_are_those_of_the_paper() -> None:
+    model = create_model("cascaded")
+    heads = model.second.heads
+    assert [head.out_channels for head in heads] == [28, 28, 28]
+    assert [head.out_channels for head in model.first.heads] == [3, 3, 3]
+    assert {head.in_channels for head in [*heads, *model.first.heads]} == {40}
+    assert {create_model(name).first.heads[0].in_channels for name in ("pixel", "kernel")} == {64}
+    assert [head.out_channels for head in create_model("kernel_plain", kernel_size=3).first.heads] == [9, 9, 9]
+
+
+@pytest.mark.parametrize("levels", [4, 5])
+def test_unet_gives_three_scales_of_any_size(levels: int) -> None:
+    unet = UNet(5, 4, levels)
+    for height, width in ((1, 1), (7, 9), (16, 32)):
+        features = unet(torch.rand(2, 5, height, width))
+        sizes = [(-(-height // s), -(-width // s)) for s in (1, 2, 4)]
+        assert [tuple(f.shape) for f in features] == [(2, 4, *size) for size in sizes]
+
+
+@pytest.mark.parametrize("levels", [0, 2, 3])
+def test_unet_needs_a_decoder_level_for_each_scale(levels: int) -> None:
+    with pytest.raises(ValueError, match=f"levels: expected at least 4, found {levels}"):
+        UNet(5, 4, levels)
+
+
+def test_golden() -> None:
+    # Changes only together with the architecture or an initialisation, and then every file of weights is void.
+    # The snippet that made the numbers:
+    #   torch.manual_seed(0)
+    #   model = create_model("cascaded", width=8)
+    #   grid = torch.linspace(0, 1, 8 * 9).reshape(1, 1, 8, 9)
+    #   color = torch.cat([grid, 1 - grid, (7 * grid) % 1], 1)
+    #   initial, final = model(color, color.flip(1), color * 2 - 1, 1 + grid)
+    #   print(initial[0, :, 4, ::4], final[0, :, 4, ::4])
+    torch.manual_seed(0)
+    model = create_model("cascaded", width=8)
+    grid = torch.linspace(0, 1, 8 * 9).reshape(1, 1, 8, 9)
+    color = torch.cat([grid, 1 - grid, (7 * grid) % 1], 1)
+    with torch.no_grad():
+        initial, final = model(color, color.flip(1), color * 2 - 1, 1 + grid)
+    expected_initial = [[0.507042, 0.563380, 0.619718], [0.492958, 0.436620, 0.380282], [0.549296, 0.943662, 0.338028]]
+    expected_final = [[0.520052, 0.583374, 0.618124], [0.481955, 0.419585, 0.384642], [0.596163, 0.903410, 0.318730]]
+    torch.testing.assert_close(initial[0, :, 4, ::4], torch.tensor(expected_initial), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(final[0, :, 4, ::4], torch.tensor(expected_final), rtol=1e-4, atol=1e-5)
+
+
+# Saving and loading
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    path = tmp_path / "small.safetensors"
+    path.write_bytes(save_weights(build("cascaded"), "cascaded", {"width": WIDTH}, {"steps": "7", "licence": "none"}))
+    return path
+
+
+def altered(weights: Path, change: Callable[[dict[str, Tensor], dict[str, str]], object]) -> Path:
+    """The file with other tensors or another header."""
+    tensors = load_file(weights)
+    about = describe_weights(weights)
+    header = {key: value if isinstance(value, str) else json.dumps(value) for key, value in about.items()}
+    change(tensors, header)
+    save_file(tensors, weights, header)
+    return weights
+
+
+def test_saved_and_loaded_in_half_precision(weights: Path) -> None:
+    saved, loaded = build("cascaded"), create_model("cascaded", weights=weights)
+    assert not loaded.training
+    assert {tensor.dtype for tensor in load_file(weights).values()} == {torch.float16}
+    for (key, before), (same_key, after) in zip(saved.state_dict().items(), loaded.state_dict().items(), strict=True):
+        assert key == same_key
+        assert after.dtype == torch.float32
+        assert torch.equal(after, before.half().float())
+    with torch.no_grad():
+        before, after = (model(*inputs(17, 20)).final for model in (saved, loaded))
+    # 6e-4 of values up to 2 was measured.
+    torch.testing.assert_close(after, before, rtol=1e-2, atol=1e-2)
+
+
+def test_the_header_describes_the_weights(weights: Path) -> None:
+    about = describe_weights(weights)
+    digest = hashlib.sha256()
+    for key, tensor in sorted(load_file(weights).items()):
+        digest.update(key.encode() + tensor.numpy().tobytes())
+    assert about == {
+        "architecture": "cascaded",
+        "settings": {"width": WIDTH},
+        "steps": "7",
+        "licence": "none",
+        "sha256": digest.hexdigest(),
+    }
+
+
+def test_weights_of_another_model_are_refused(weights: Path) -> None:
+    message = refused(lambda: create_model("pixel", weights=weights))
+    assert "expected weights of model 'pixel', found those of 'cascaded'" in message
+
+
+def test_a_missing_layer_is_named(weights: Path) -> None:
+    path = altered(weights, lambda tensors, header: tensors.pop("first.heads.0.weight"))
+    message = refused(lambda: load_weights(path))
+    assert "layer 'first.heads.0.weight': model 'cascaded' expects (3, 8, 3, 3), found no such layer" in message
+
+
+def test_an_unknown_layer_is_named(weights: Path) -> None:
+    path = altered(weights, lambda tensors, header: tensors.update(third=torch.zeros(2)))
+    assert "layer 'third': model 'cascaded' expects no such layer, found (2,)" in refused(lambda: load_weights(path))
+
+
+def test_a_layer_of_another_shape_is_named(weights: Path) -> None:
+    message = refused(lambda: load_weights(weights, width=6))
+    assert "layer 'first.heads.0.weight': model 'cascaded' expects (3, 6, 3, 3), found (3, 8, 3, 3)" in message
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("architecture", "other", "model 'other': expected one of"),
+        ("settings", "{", "header 'settings': expected a JSON object"),
+        ("settings", "[1]", "header 'settings': expected a JSON object"),
+        ("settings", '{"colour": 1}', "expected settings of model 'cascaded', found {'colour': 1}"),
+        ("settings", '{"width": -1}', "expected settings of model 'cascaded', found {'width': -1}"),
+    ],
+)
+def test_a_header_that_means_nothing_is_refused(weights: Path, key: str, value: str, expected: str) -> None:
+    path = altered(weights, lambda tensors, header: header.update({key: value}))
+    assert expected in refused(lambda: load_weights(path))
+
+
+def test_files_that_are_no_weights_are_refused(weights: Path, tmp_path: Path) -> None:
+    whole = weights.read_bytes()
+    for content in (b"", b"a text, and no tensors", whole[:-100], whole[:100]):
+        weights.write_bytes(content)
+        assert str(weights) in refused(lambda: load_weights(weights))
+    save_file({"layer": torch.zeros(1)}, weights)
+    assert "found no 'architecture' in the header" in refused(lambda: load_weights(weights))
+    assert "No such file" in refused(lambda: load_weights(tmp_path / "nothing"))
+    refused(lambda: load_weights(tmp_path))
+
+
+def test_a_model_without_shipped_weights_says_so() -> None:
+    for name in set(list_models()) - set(pretrained_models()):
+        message = refused(lambda name=name: create_model(name, pretrained=True))
+        assert f"model '{name}': expected shipped weights" in message
+    assert "expected one of" in refused(lambda: create_model("oidn", pretrained=True))
+
+
+@pytest.mark.skipif(not (SHIPPED / "cascaded.safetensors").is_file(), reason="no cascaded.safetensors is shipped yet")
+def test_the_shipped_weights() -> None:
+    assert "cascaded" in pretrained_models()
+    model = create_model("cascaded", pretrained=True)
+    about = describe_weights(SHIPPED / "cascaded.safetensors")
+    assert {"config", "data", "steps", "commit", "licence", "credits", "sha256"} <= set(about)
+    with torch.no_grad():
+        assert torch.isfinite(model(*inputs(33, 20)).final).all()
+
+
+def test_overview() -> None:
+    entries = {entry.name: entry for entry in overview()}
+    assert list(entries) == list_models()
+    for name, entry in entries.items():
+        assert entry.parameters == sum(parameter.numel() for parameter in create_model(name).parameters())
+        assert entry.kmacs_per_pixel > 0
+        assert entry.description
+        assert "\n" not in entry.description
+        assert entry.pretrained is (name in pretrained_models())
+
+
+def test_the_cost_of_the_pixel_network_written_out() -> None:
+    width = 64
+    full = (10 + width) * width * 9
+    encoder = sum(2 * width * width * 9 / 4**level for level in (1, 2, 3))
+    # A 2x2 transposed convolution, two convolutions of which the first sees the encoder too, and a head.
+    decoder = sum((width**2 + 3 * width * width * 9 + 3 * width * 9) / 4**level for level in (0, 1, 2))
+    fusions = sum(6 * 9 / 4**level for level in (0, 1))
+    cost = next(entry.kmacs_per_pixel for entry in overview() if entry.name == "pixel")
+    assert cost == pytest.approx((full + encoder + decoder + fusions) / 1e3, rel=1e-6)

@@ -1,0 +1,307 @@
+"""What holds for every op, on every case of the table in ``mcdenoise/ops/_cases.py``."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from mcdenoise import gradcheck, ops
+from mcdenoise.errors import InputError
+from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
+from mcdenoise.ops_overview import DTYPES, overview, relative_error
+
+# Of the largest absolute value of a result. Half precision is rounded once, after a sum in float32, or a few times by
+# the ops that have no sum; float32 is rounded at every tap, and an exponent near 50 is known to 50 eps.
+# Measured at most: 0.6 eps for half precision, 3 eps for float32 and float64.
+TOLERANCE = {
+    torch.float64: 1e-10,
+    torch.float32: 16 * torch.finfo(torch.float32).eps,
+    torch.bfloat16: 2 * torch.finfo(torch.bfloat16).eps,
+    torch.float16: 2 * torch.finfo(torch.float16).eps,
+}
+
+every_op = pytest.mark.parametrize("op", OPS, ids=lambda op: op.name)
+every_case = pytest.mark.parametrize(
+    ("op", "case"), [pytest.param(op, case, id=f"{op.name}-{case.name}") for op in OPS for case in op.cases]
+)
+
+
+def results_of(op: Op, inputs: Inputs, case: Case) -> Sequence[Tensor]:
+    return as_sequence(op.function(**inputs, **case.settings))
+
+
+def as_sequence(results: Any) -> Sequence[Tensor]:
+    return (results,) if isinstance(results, Tensor) else results
+
+
+def tensors_in(inputs: Inputs) -> list[Tensor]:
+    found: list[Tensor] = []
+    map_tensors(lambda tensor: found.append(tensor) or tensor, inputs)
+    return found
+
+
+def assert_same(actual: Sequence[Tensor], expected: Sequence[Tensor], rtol: float = 1e-10) -> None:
+    for a, e in zip(actual, expected, strict=True):
+        # Sums that cancel are known to a fraction of their terms only.
+        scale = torch.where(torch.isfinite(e), e, 0).abs().max().item()
+        torch.testing.assert_close(a, e, rtol=rtol, atol=1e-4 * rtol * scale, equal_nan=True)
+
+
+def test_every_public_function_is_in_the_table() -> None:
+    public = [name for name in ops.__all__ if inspect.isfunction(getattr(ops, name))]
+    assert sorted(op.name for op in OPS) == sorted(public)
+    assert all(getattr(ops, op.name) is op.function for op in OPS)
+
+
+@every_op
+def test_cases_are_named_and_cover_what_is_differentiable(op: Op) -> None:
+    names = [case.name for case in op.cases]
+    assert len(names) == len(set(names)) >= 4
+    assert sum(case.kind == "ordinary" for case in op.cases) >= 4
+    tensors = {name for case in op.cases for name in case.inputs()}
+    differentiable = {name for case in op.cases for name in case.differentiable}
+    assert tensors - differentiable <= {"surface", "previous_surface"}
+
+
+@every_case
+def test_equals_the_equation_in_float64(op: Op, case: Case) -> None:
+    inputs = case.inputs()
+    references = as_sequence(op.reference(**inputs, **case.settings))
+    assert_same(results_of(op, inputs, case), references)
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+@every_case
+def test_error_is_that_of_rounding(op: Op, case: Case, dtype: torch.dtype) -> None:
+    assert relative_error(op, case, dtype) <= TOLERANCE[dtype]
+    expected = dtype if op.least_dtype is None else torch.promote_types(dtype, op.least_dtype)
+    assert {result.dtype for result in results_of(op, case.inputs(dtype), case)} == {expected}
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
+@every_op
+def test_gradients_in_half_precision(op: Op, dtype: torch.dtype) -> None:
+    case = op.cases[1]
+    gradients = {}
+    for kind in (dtype, torch.float64):
+        # The same numbers in both, so that only the arithmetic differs.
+        inputs = map_tensors(lambda tensor, kind=kind: tensor.to(kind), case.inputs(dtype))
+        leaves = [x.requires_grad_() for x in tensors_in({name: inputs[name] for name in case.differentiable})]
+        results = [result for result in results_of(op, inputs, case) if result.requires_grad]
+        gradients[kind] = torch.autograd.grad([result.sum() for result in results], leaves)
+        assert {gradient.dtype for gradient in gradients[kind]} == {kind}
+    for half, exact in zip(gradients[dtype], gradients[torch.float64], strict=True):
+        scale = max(exact.abs().max().item(), 1.0)
+        # A gradient is a sum of several products, each rounded, and autograd rounds between the steps of an op.
+        assert (half.double() - exact).abs().max().item() <= 8 * torch.finfo(dtype).eps * scale
+
+
+@every_op
+def test_gradcheck(op: Op) -> None:
+    results = gradcheck.check([op.name])
+    assert [result.case for result in results] == [case.name for case in op.cases if case.differentiable]
+    assert not [f"{result.case}: {result.message}" for result in results if not result.passed]
+
+
+def test_gradcheck_reports_a_wrong_derivative() -> None:
+    def detached(image: Tensor) -> Tensor:
+        return image * image.detach()
+
+    case = Case("square", "ordinary", lambda g: {"image": torch.rand(1, 1, 2, 2, generator=g).double()}, ("image",))
+    result = gradcheck.check_case(Op(detached, detached, (case,)), case)
+    assert (result.op, result.case, result.passed) == ("detached", "square", False)
+    assert "Jacobian mismatch" in result.message
+    assert "\n" not in result.message
+
+
+def test_gradcheck_of_an_unknown_op() -> None:
+    with pytest.raises(InputError, match=r"expected one of kernel_conv, .*accumulate, found sharpen"):
+        gradcheck.check(["kernel_conv", "sharpen"])
+
+
+def transposed(tensor: Tensor) -> Tensor:
+    return tensor.transpose(-1, -2).contiguous().transpose(-1, -2)
+
+
+def channels_last(tensor: Tensor) -> Tensor:
+    return tensor.movedim(1, -1).contiguous().movedim(-1, 1)
+
+
+def strided(tensor: Tensor) -> Tensor:
+    return torch.stack([tensor, torch.full_like(tensor, torch.nan)], -1).flatten(-2)[..., ::2]
+
+
+def expanded(tensor: Tensor) -> Tensor:
+    return tensor[:1].expand(2, *tensor.shape[1:])
+
+
+@pytest.mark.parametrize("layout", [transposed, channels_last, strided, expanded])
+@every_case
+def test_layout_in_memory_changes_nothing(op: Op, case: Case, layout: Callable[[Tensor], Tensor]) -> None:
+    inputs = map_tensors(layout, case.inputs())
+    contiguous = map_tensors(lambda tensor: tensor.contiguous(), inputs)
+    assert_same(results_of(op, inputs, case), results_of(op, contiguous, case), rtol=1e-12)
+
+
+@every_case
+def test_inputs_are_left_alone(op: Op, case: Case) -> None:
+    inputs = case.inputs()
+    results_of(op, inputs, case)
+    for after, before in zip(tensors_in(inputs), tensors_in(case.inputs()), strict=True):
+        torch.testing.assert_close(after, before, rtol=0, atol=0, equal_nan=True)
+
+
+# The compiler raises deprecation warnings of torch's own making.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize(
+    ("op", "case", "backend"),
+    [
+        pytest.param(op, case, backend, id=f"{op.name}-{case.name}-{backend}")
+        for op in OPS
+        for case, backend in [(op.cases[0], "inductor"), (op.cases[1], "aot_eager"), (op.cases[3], "aot_eager")]
+    ],
+)
+def test_compiles_to_the_same(op: Op, case: Case, backend: str) -> None:
+    torch.compiler.reset()
+    compiled = torch.compile(op.function, fullgraph=True, backend=backend)
+    outcomes = []
+    for function in (op.function, compiled):
+        inputs = case.inputs()
+        leaves = [x.requires_grad_() for x in tensors_in({name: inputs[name] for name in case.differentiable})]
+        results = as_sequence(function(**inputs, **case.settings))
+        total = sum((result * torch.arange(result.numel()).reshape(result.shape).cos()).sum() for result in results)
+        outcomes.append([*(result.detach() for result in results), *torch.autograd.grad(total, leaves)])
+    assert_same(outcomes[1], outcomes[0])
+    # Without gradients the compiler takes another way through a function that has its own.
+    assert_same(as_sequence(compiled(**case.inputs(), **case.settings)), outcomes[0][: len(results)])
+
+
+@pytest.mark.parametrize("op", [op for op in OPS if op.module is not None], ids=lambda op: op.name)
+def test_module_stores_settings_and_calls_the_function(op: Op) -> None:
+    for case in op.cases:
+        assert op.module is not None
+        module = op.module(**case.settings)
+        assert not list(module.parameters())
+        results = as_sequence(module(**case.inputs()))
+        for result, expected in zip(results, results_of(op, case.inputs(), case), strict=True):
+            torch.testing.assert_close(result, expected, rtol=0, atol=0, equal_nan=True)
+
+
+def test_overview() -> None:
+    entries = {entry.name: entry for entry in overview()}
+    assert list(entries) == [op.name for op in OPS]
+    for entry in entries.values():
+        assert entry.summary.endswith(".")
+        assert set(entry.errors) == {str(dtype).removeprefix("torch.") for dtype in DTYPES}
+        assert all(entry.errors[str(dtype).removeprefix("torch.")] <= TOLERANCE[dtype] for dtype in DTYPES)
+    assert entries["accumulate"].differentiable == ("color", "previous", "previous_length", "motion")
+    assert entries["accumulate"].module == "Accumulate"
+    assert entries["reproject"].module is None
+    # Copies numbers, so it cannot err.
+    assert set(entries["upsample"].errors.values()) == {0.0}
+
+
+def image(*shape: int) -> Tensor:
+    return torch.zeros(shape)
+
+
+ONE, THREE = image(1, 1, 4, 5), image(1, 3, 4, 5)
+SURFACE = ops.Surface(position=THREE, normal=THREE)
+
+REFUSED: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], type[Exception], str]] = [
+    (ops.kernel_conv, ("image", ONE), {}, TypeError, "image: expected a torch.Tensor, found str"),
+    (ops.kernel_conv, (THREE.int(), ONE), {}, TypeError, "image: expected a floating-point dtype, found torch.int32"),
+    (ops.kernel_conv, (THREE[0], ONE), {}, ValueError, "image: expected shape (B, C, H, W), found (3, 4, 5)"),
+    (ops.kernel_conv, (THREE, image(1, 9, 5, 4)), {}, ValueError, "kernel: expected H = 4 as in image, found 5"),
+    (ops.kernel_conv, (THREE, image(1, 4, 4, 5)), {}, ValueError, "kernel: expected K*K channels with odd K"),
+    (ops.kernel_conv, (THREE, image(1, 8, 4, 5)), {}, ValueError, "(1, 9, 25, 49, ...), found 8"),
+    (ops.kernel_conv, (THREE, ONE), {"border": "wrap"}, ValueError, "border: expected one of replicate, zeros"),
+    (ops.KernelConv, (), {"border": "wrap"}, ValueError, "renormalize, found 'wrap'"),
+    (ops.kernel_splat, (THREE, image(2, 9, 4, 5)), {}, ValueError, "kernel: expected B = 1 as in image, found 2"),
+    (ops.kernel_splat, (THREE, image(1, 16, 4, 5)), {}, ValueError, "kernel: expected K*K channels"),
+    (ops.KernelSplat, (), {"border": ""}, ValueError, "border: expected one of"),
+    (ops.cross_bilateral_weights, (ONE, [THREE]), {}, ValueError, "scales: expected one for each of the 1 guides"),
+    (ops.cross_bilateral_weights, (ONE, [THREE], [THREE]), {}, ValueError, "scales[0]: expected shape (B, 1, H, W)"),
+    (ops.cross_bilateral_weights, (ONE, [image(1, 3, 4, 4)], [ONE]), {}, ValueError, "guides[0]: expected W = 5"),
+    (ops.cross_bilateral_weights, (ONE, [THREE], [None]), {}, TypeError, "scales[0]: expected a torch.Tensor"),
+    (ops.cross_bilateral_weights, (ONE, (), (), THREE), {}, ValueError, "distance_scale: expected shape (B, 1, H, W)"),
+    (ops.cross_bilateral_weights, (image(1, 2, 4, 5),), {}, ValueError, "kernel: expected K*K channels"),
+    (ops.cross_bilateral_weights, (ONE,), {"normalize": "sum"}, ValueError, "normalize: expected 'softmax' or 'none'"),
+    (ops.cross_bilateral_weights, (ONE,), {"border": "wrap"}, ValueError, "border: expected one of"),
+    (ops.CrossBilateralWeights, (), {"normalize": "sum"}, ValueError, "found 'sum'"),
+    (ops.downsample, (THREE[0],), {}, ValueError, "image: expected shape (B, C, H, W), found (3, 4, 5)"),
+    (ops.downsample, (THREE.long(),), {}, TypeError, "image: expected a floating-point dtype"),
+    (ops.upsample, (THREE, (8, 11)), {}, ValueError, "expected height and width (4, 6) for size (8, 11), found (4, 5)"),
+    (ops.laplacian_fusion, (THREE, image(1, 3, 2, 2), ONE), {}, ValueError, "coarse: expected height and width (2, 3)"),
+    # One pixel would broadcast.
+    (ops.laplacian_fusion, (THREE, image(1, 3, 1, 1), ONE), {}, ValueError, "(2, 3) for (4, 5) of fine, found (1, 1)"),
+    (ops.laplacian_fusion, (THREE, image(1, 2, 2, 3), ONE), {}, ValueError, "coarse: expected C = 3 as in fine"),
+    (ops.laplacian_fusion, (THREE, image(1, 3, 2, 3), image(1, 2, 4, 5)), {}, ValueError, "alpha: expected 1 or 3"),
+    (ops.demodulate, (THREE, ONE), {}, ValueError, "albedo: expected C = 3 as in color, found 1"),
+    (ops.demodulate, (THREE.int(), THREE), {}, TypeError, "color: expected a floating-point dtype"),
+    (ops.demodulate, (THREE, THREE), {"floor": 0.0}, ValueError, "floor: expected a positive number, found 0.0"),
+    (ops.remodulate, (THREE, image(1, 3, 5, 5)), {}, ValueError, "albedo: expected H = 4 as in image, found 5"),
+    (ops.remodulate, (THREE, THREE), {"floor": float("nan")}, ValueError, "floor: expected a positive number"),
+    (ops.motion_from_position, (ONE, image(1, 4, 4)), {}, ValueError, "position: expected shape (B, 3, H, W)"),
+    (ops.motion_from_position, (THREE, image(4, 4)), {}, ValueError, "previous_view_projection: expected shape"),
+    (ops.motion_from_position, (THREE, image(2, 4, 4)), {}, ValueError, "previous_view_projection: expected B = 1"),
+    (ops.reproject, (THREE, THREE), {}, ValueError, "motion: expected shape (B, 2, H, W), found (1, 3, 4, 5)"),
+    (ops.reproject, (THREE, THREE[:, :2]), {"rule": "svgf"}, ValueError, "rule: expected 'relative' or 'bmfr'"),
+    (
+        ops.reproject,
+        (THREE, THREE[:, :2], SURFACE, SURFACE._replace(normal=ONE)),
+        {},
+        ValueError,
+        "previous_surface.normal: expected shape (B, 3, H, W), found (1, 1, 4, 5)",
+    ),
+    (ops.reproject, (THREE, THREE[:, :2], SURFACE, SURFACE), {"rule": "bmfr"}, ValueError, "position_limit: the rule"),
+    (
+        ops.reproject,
+        (THREE, THREE[:, :2], SURFACE, SURFACE),
+        {"rule": "bmfr", "position_limit": 1.0},
+        ValueError,
+        "normal_limit: the rule 'bmfr' needs its squared limit, found None",
+    ),
+    (ops.accumulate, (THREE, ONE, ONE, THREE[:, :2]), {}, ValueError, "previous: expected C = 3 as in color, found 1"),
+    (ops.accumulate, (THREE, THREE, THREE, THREE[:, :2]), {}, ValueError, "previous_length: expected shape (B, 1, H"),
+    (ops.accumulate, (THREE, THREE, ONE.int(), THREE[:, :2]), {}, TypeError, "previous_length: expected a floating"),
+    (
+        ops.accumulate,
+        (THREE, THREE, ONE, THREE[:, :2]),
+        {"alpha_min": 0.0},
+        ValueError,
+        "alpha_min: expected in (0, 1], found 0.0",
+    ),
+    (ops.accumulate, (THREE, THREE, ONE, THREE[:, :2]), {"rule": ""}, ValueError, "rule: expected 'relative' or"),
+]
+
+
+@pytest.mark.parametrize(("function", "arguments", "settings", "error", "message"), REFUSED)
+def test_refuses_with_name_expected_and_found(
+    function: Callable[..., Any],
+    arguments: tuple[Any, ...],
+    settings: dict[str, Any],
+    error: type[Exception],
+    message: str,
+) -> None:
+    with pytest.raises(error, match=re.escape(message)):
+        function(*arguments, **settings)
+
+
+def test_every_op_is_tried_with_something_to_refuse() -> None:
+    assert {op.function for op in OPS} <= {function for function, *_ in REFUSED}
+
+
+@every_op
+def test_docstring_has_every_part_of_the_contract(op: Op) -> None:
+    text = inspect.getdoc(op.function) or ""
+    parts = ["Args:", "Returns:", "Raises:", "Differentiable in", "Source:", "Example:"]
+    places = [text.find(part) for part in parts]
+    assert -1 not in places
+    assert places == sorted(places)

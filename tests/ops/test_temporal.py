@@ -1,0 +1,330 @@
+from __future__ import annotations
+
+from typing import Any
+
+import kornia
+import pytest
+import torch
+from torch import Tensor
+
+from mcdenoise.ops import Surface, accumulate, motion_from_position, reproject
+
+INF, NAN = torch.inf, torch.nan
+
+
+def draw(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def image(rows: list[list[float]]) -> Tensor:
+    """``(1, 1, H, W)``."""
+    return torch.tensor(rows, dtype=torch.float64)[None, None]
+
+
+def vectors(rows: list[list[tuple[float, ...]]]) -> Tensor:
+    """``(1, C, H, W)``."""
+    return torch.tensor(rows, dtype=torch.float64).movedim(-1, 0)[None]
+
+
+def still(height: int, width: int, batch: int = 1) -> Tensor:
+    return torch.zeros(batch, 2, height, width, dtype=torch.float64)
+
+
+class TestBmfrRule:
+    """By hand, on one pixel (the upper left of 2 x 2) that was at x = 0.25, y = 0.5 of the previous frame.
+
+    Its taps have the bilinear weights 0.375, 0.125 / 0.375, 0.125; the others moved in from outside.
+    """
+
+    motion = vectors([[(0.25, 0.5), (9.0, 0.0)], [(0.0, 9.0), (-9.0, 0.0)]])
+    color = image([[1.0, 10.0], [20.0, 30.0]])
+    # The upper right tap is 0.5 away, and 0.5^2 < 0.25 is false: it is discarded, whatever it holds.
+    position = vectors([[(0.0, 0.0, 5.0)] * 2] * 2)
+    previous_position = vectors([[(0.0, 0.0, 5.0), (0.5, 0.0, 5.0)], [(0.0, 0.49, 5.0), (0.3, 0.3, 5.1)]])
+    normal = vectors([[(0.0, 1.0, 0.0)] * 2] * 2)
+
+    def run(self, previous: Tensor, length: Tensor, previous_normal: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        there = self.normal if previous_normal is None else previous_normal
+        return accumulate(
+            self.color,
+            previous,
+            length,
+            self.motion,
+            Surface(self.position, self.normal),
+            Surface(self.previous_position, there),
+            alpha_min=0.2,
+            rule="bmfr",
+            position_limit=0.25,
+            normal_limit=1.0,
+        )
+
+    def test_mean_of_the_kept_taps(self) -> None:
+        accumulated, length = self.run(image([[8.0, 100.0], [2.0, 4.0]]), image([[3.0, 9.0], [4.0, 2.0]]))
+        # Kept weight 0.375 + 0.375 + 0.125 = 0.875.
+        # History (0.375 * 8 + 0.375 * 2 + 0.125 * 4) / 0.875 = 4.25 / 0.875 = 34 / 7.
+        # Length  (0.375 * 3 + 0.375 * 4 + 0.125 * 2) / 0.875 = 2.875 / 0.875 = 23 / 7, so alpha = 7 / 30 > 0.2.
+        # 7 / 30 * 1 + 23 / 30 * 34 / 7 = (49 + 782) / 210; length round(3.29) + 1.
+        torch.testing.assert_close(accumulated, image([[831 / 210, 10.0], [20.0, 30.0]]), rtol=1e-12, atol=0)
+        assert torch.equal(length, image([[4.0, 1.0], [1.0, 1.0]]))
+
+    def test_length_is_rounded_up_too(self) -> None:
+        _, length = self.run(image([[0.0] * 2] * 2), image([[4.0, 9.0], [3.0, 4.0]]))
+        # (0.375 * 4 + 0.375 * 3 + 0.125 * 4) / 0.875 = 25 / 7 = 3.57, and 1 is added to 4.
+        assert length[0, 0, 0, 0].item() == 5.0
+
+    def test_alpha_stays_above_a_fifth(self) -> None:
+        accumulated, length = self.run(image([[11.0] * 2] * 2), image([[40.0] * 2] * 2))
+        # 0.2 * 1 + 0.8 * 11.
+        torch.testing.assert_close(accumulated[0, 0, 0, 0].item(), 9.0, rtol=1e-12, atol=0)
+        assert length[0, 0, 0, 0].item() == 41.0
+
+    @pytest.mark.parametrize(("before", "after"), [(253.0, 254.0), (254.0, 255.0), (255.0, 255.0)])
+    def test_length_saturates_at_a_byte(self, before: float, after: float) -> None:
+        _, length = self.run(image([[0.0] * 2] * 2), image([[before] * 2] * 2))
+        assert length[0, 0, 0, 0].item() == after
+
+    def test_normal_limit_is_strict_as_well(self) -> None:
+        # Squared distances from (0, 1, 0): 2 in the upper left, exactly 1 in the lower left, 0.4 in the lower right.
+        normal = vectors([[(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], [(0.0, 1.0, 1.0), (0.6, 0.8, 0.0)]])
+        accumulated, length = self.run(image([[8.0, 100.0], [2.0, 4.0]]), image([[3.0, 9.0], [4.0, 1.0]]), normal)
+        # Only the last is below the limit of 1: 0.5 * 1 + 0.5 * 4.
+        torch.testing.assert_close(accumulated[0, 0, 0, 0].item(), 2.5, rtol=1e-12, atol=0)
+        assert length[0, 0, 0, 0].item() == 2.0
+
+    def test_no_tap_left(self) -> None:
+        accumulated, length = self.run(image([[8.0] * 2] * 2), image([[3.0] * 2] * 2), -self.normal)
+        assert torch.equal(accumulated, self.color)
+        assert torch.equal(length, torch.ones_like(length))
+
+
+def test_a_still_camera_averages() -> None:
+    frames = draw(12, 3, 5, 7)
+    history, length = frames[:1], torch.ones(1, 1, 5, 7, dtype=torch.float64)
+    expected = history
+    for n in range(2, 13):
+        frame = frames[n - 1 : n]
+        history, length = accumulate(frame, history, length, still(5, 7), alpha_min=1e-3)
+        expected = torch.lerp(expected, frame, 1 / torch.full((1, 1, 5, 7), n, dtype=torch.float64))
+        # To the last bit: nothing is lost by reprojecting onto the same pixel.
+        assert torch.equal(history, expected)
+        assert torch.equal(length, torch.full_like(length, n))
+    torch.testing.assert_close(history, frames.mean(0, keepdim=True), rtol=1e-12, atol=0)
+
+
+def test_alpha_min_makes_the_average_an_exponential_window() -> None:
+    color, history = draw(1, 3, 4, 5), draw(1, 3, 4, 5, seed=1)
+    for n in (10.0, 50.0, 1e4):
+        accumulated, length = accumulate(color, history, image([[n] * 5] * 4), still(4, 5), alpha_min=0.1)
+        torch.testing.assert_close(accumulated, 0.1 * color + 0.9 * history, rtol=1e-12, atol=0)
+        assert torch.equal(length, image([[n + 1] * 5] * 4))
+
+
+def test_disocclusion_starts_anew() -> None:
+    color, history = draw(1, 3, 1, 2), draw(1, 3, 1, 2, seed=1)
+    here, there = Surface(depth=image([[5.0, 5.0]])), Surface(depth=image([[5.0, 8.0]]))
+    accumulated, length = accumulate(color, history, image([[9.0, 9.0]]), still(1, 2), here, there)
+    assert torch.equal(length, image([[10.0, 1.0]]))
+    assert torch.equal(accumulated[..., 1], color[..., 1])
+
+
+def test_without_a_surface_it_is_kornias_remap_inside_the_image() -> None:
+    previous = draw(2, 3, 8, 9)
+    motion = 6 * draw(2, 2, 8, 9, seed=1) - 3
+    value, weight = reproject(previous, motion)
+    rows, columns = torch.meshgrid(torch.arange(8.0), torch.arange(9.0), indexing="ij")
+    x, y = columns + motion[:, 0], rows + motion[:, 1]
+    expected = kornia.geometry.transform.remap(previous, x, y, align_corners=True)
+    inside = ((x >= 0) & (x <= 8) & (y >= 0) & (y <= 7))[:, None]
+    assert 0.2 < inside.double().mean().item() < 0.9
+    torch.testing.assert_close(value[inside.expand_as(value)], expected[inside.expand_as(value)], rtol=1e-10, atol=0)
+    torch.testing.assert_close(weight[inside], torch.ones_like(weight[inside]), rtol=1e-12, atol=0)
+    # At the border kornia mixes in zeros; here they are left out, and the weight says how much was there.
+    torch.testing.assert_close(value * weight, expected, rtol=1e-10, atol=1e-12)
+
+
+def test_outside_the_image_nothing_is_found() -> None:
+    for dx, dy in ((3, 0), (-3, 0), (0, 2), (0, -2), (1e6, -1e30)):
+        motion = torch.tensor([dx, dy], dtype=torch.float64).reshape(1, 2, 1, 1).expand(1, 2, 2, 3)
+        value, weight = reproject(torch.ones(1, 1, 2, 3, dtype=torch.float64), motion)
+        assert value.eq(0).all()
+        assert weight.eq(0).all()
+
+
+@pytest.mark.parametrize("nowhere", [INF, -INF, NAN])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_no_motion_no_history(nowhere: float, axis: int) -> None:
+    motion = still(1, 3)
+    motion[0, axis, 0, 1] = nowhere
+    motion.requires_grad_()
+    previous = draw(1, 2, 1, 3).requires_grad_()
+    value, weight = reproject(previous, motion)
+    assert weight.flatten().tolist() == [1.0, 0.0, 1.0]
+    assert value[..., 1].eq(0).all()
+    gradients = torch.autograd.grad(value.sum() + weight.sum(), [previous, motion])
+    assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+class TestEachTap:
+    """All four taps weigh a quarter; one of them shows something else."""
+
+    motion = torch.full((1, 2, 2, 2), 0.5, dtype=torch.float64)
+    previous = image([[1.0, 2.0], [3.0, 100.0]])
+    plane = Surface(
+        position=vectors([[(0.0, 0.0, 5.0), (1.0, 0.0, 5.0)], [(0.0, 1.0, 5.0), (1.0, 1.0, 5.0)]]),
+        normal=vectors([[(0.0, 0.0, -1.0)] * 2] * 2),
+        depth=image([[5.0] * 2] * 2),
+    )
+
+    def other(self, **changes: float) -> Surface:
+        parts = {name: part.clone() for name, part in self.plane._asdict().items()}
+        for name, value in changes.items():
+            parts[name][0, -1, 1, 1] = value
+        return Surface(**parts)
+
+    def test_the_same_plane(self) -> None:
+        # Points a unit apart, far more than 2 % of the depth, but on one plane.
+        value, weight = reproject(self.previous, self.motion, self.plane, self.plane)
+        assert (value[0, 0, 0, 0].item(), weight[0, 0, 0, 0].item()) == (26.5, 1.0)
+
+    @pytest.mark.parametrize("change", [{"position": 5.11}, {"position": 4.89}, {"normal": 1.0}, {"depth": INF}])
+    @pytest.mark.parametrize("content", [100.0, NAN, INF])
+    def test_one_on_another_surface_is_left_out(self, change: dict[str, float], content: float) -> None:
+        previous = self.previous.clone()
+        previous[..., 1, 1] = content
+        previous.requires_grad_()
+        value, weight = reproject(previous, self.motion, self.plane, self.other(**change))
+        assert (value[0, 0, 0, 0].item(), weight[0, 0, 0, 0].item()) == (2.0, 0.75)
+        (gradient,) = torch.autograd.grad(value[0, 0, 0, 0], previous)
+        torch.testing.assert_close(gradient, image([[1 / 3, 1 / 3], [1 / 3, 0.0]]), rtol=1e-12, atol=0)
+
+    @pytest.mark.parametrize("change", [{"position": 5.09}, {"normal": -1.5}])
+    def test_one_within_the_limits_is_kept(self, change: dict[str, float]) -> None:
+        _, weight = reproject(self.previous, self.motion, self.plane, self.other(**change))
+        assert weight[0, 0, 0, 0].item() == 1.0
+
+    def test_limits_can_be_set(self) -> None:
+        arguments = (self.previous, self.motion, self.plane, self.other(position=5.09))
+        assert reproject(*arguments, position_limit=0.01)[1][0, 0, 0, 0].item() == 0.75
+        arguments = (self.previous, self.motion, self.plane, self.other(normal=-1.5))
+        assert reproject(*arguments, normal_limit=0.2)[1][0, 0, 0, 0].item() == 0.75
+
+    def test_without_normals_points_must_be_near(self) -> None:
+        flat = self.plane._replace(normal=None)
+        _, weight = reproject(self.previous, self.motion, flat, flat)
+        assert weight[0, 0, 0, 0].item() == 0.25
+
+    def test_with_depths_only(self) -> None:
+        for depth, kept in ((5.49, 1.0), (5.51, 0.75), (4.51, 1.0), (4.49, 0.75)):
+            there = Surface(depth=self.other(depth=depth).depth)
+            _, weight = reproject(self.previous, self.motion, Surface(depth=self.plane.depth), there)
+            assert weight[0, 0, 0, 0].item() == kept
+
+    def test_what_one_of_them_lacks_is_not_compared(self) -> None:
+        elsewhere = self.other(position=50.0)._replace(normal=None, depth=None)
+        _, weight = reproject(self.previous, self.motion, self.plane._replace(position=None), elsewhere)
+        assert weight[0, 0, 0, 0].item() == 1.0
+
+
+def random_surfaces() -> tuple[Surface, Surface]:
+    frames = []
+    for seed in (0, 1):
+        depth = 2 + 0.2 * draw(1, 1, 16, 16, seed=seed)
+        normal = torch.nn.functional.normalize(draw(1, 3, 16, 16, seed=seed + 2) - 0.2, dim=1)
+        position = torch.cat([0.2 * draw(1, 2, 16, 16, seed=seed + 4), depth], 1)
+        frames.append(Surface(position, normal, depth))
+    return frames[0], frames[1]
+
+
+@pytest.mark.parametrize("parts", [("position", "normal", "depth"), ("position", "depth"), ("depth",)])
+@pytest.mark.parametrize("factor", [1000.0, 1e-3])
+def test_relative_limits_do_not_depend_on_the_unit(parts: tuple[str, ...], factor: float) -> None:
+    def scene(surface: Surface, factor: float) -> Surface:
+        scales = {"position": factor, "normal": 1.0, "depth": factor}
+        return Surface(**{part: getattr(surface, part) * scales[part] for part in parts})
+
+    here, there = random_surfaces()
+    previous, motion = draw(1, 3, 16, 16), 4 * draw(1, 2, 16, 16, seed=9) - 2
+    limit = 0.05
+    outcome = reproject(previous, motion, scene(here, 1), scene(there, 1), position_limit=limit)
+    scaled = reproject(previous, motion, scene(here, factor), scene(there, factor), position_limit=limit)
+    decided = outcome[1][..., 2:-2, 2:-2]
+    assert 0.1 < decided.mean().item() < 0.9  # else nothing is tested
+    for a, b in zip(outcome, scaled, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("beyond", [INF, NAN, 0.0])
+def test_background_matches_background_only(beyond: float) -> None:
+    # Four pairs of here and there: hit and hit, hit and sky, sky and hit, sky and sky.
+    here = image([[5.0, 5.0, INF, INF]])
+    there = image([[5.0, INF, 5.0, INF]])
+    point = vectors([[(0.0, 0.0, 5.0)] * 4])
+    normal = vectors([[(0.0, 0.0, -1.0)] * 4])
+    surfaces = []
+    for depth in (here, there):
+        # Renderers write anything for the position of a miss.
+        position = torch.where(depth.isinf(), beyond, point)
+        surfaces.append(Surface(position, normal, depth))
+    _, weight = reproject(draw(1, 3, 1, 4), still(1, 4), *surfaces)
+    assert weight.flatten().tolist() == [1.0, 0.0, 0.0, 1.0]
+    _, weight = reproject(draw(1, 3, 1, 4), still(1, 4), Surface(depth=here), Surface(depth=there))
+    assert weight.flatten().tolist() == [1.0, 0.0, 0.0, 1.0]
+
+
+def test_a_new_frame_of_nan_does_not_hide_in_the_history() -> None:
+    color, previous = draw(1, 1, 1, 2), draw(1, 1, 1, 2, seed=1)
+    previous[..., 1] = NAN
+    here, there = Surface(depth=image([[5.0, 5.0]])), Surface(depth=image([[5.0, 9.0]]))
+    accumulated, _ = accumulate(color, previous, image([[1.0, 1.0]]), still(1, 2), here, there)
+    assert accumulated.isfinite().all()
+
+
+def perspective(batch: int = 1) -> Tensor:
+    """Row vectors: clip x = 2 x, y = 4 y, z = z - 1, w = z."""
+    matrix = torch.zeros(batch, 4, 4, dtype=torch.float64)
+    matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 2, 2], matrix[:, 2, 3], matrix[:, 3, 2] = 2.0, 4.0, 1.0, 1.0, -1.0
+    return matrix
+
+
+def test_motion_of_a_known_point() -> None:
+    position = vectors([[(0.5, 0.25, 4.0)] * 4] * 2)
+    # u = (2 * 0.5 / 4 + 1) / 2 = 0.625 and v = (4 * 0.25 / 4 + 1) / 2 = 0.625: x = 2.5 of 4, y = 1.25 of 2.
+    motion = motion_from_position(position, perspective())
+    expected_x = torch.tensor([2.0, 1.0, 0.0, -1.0]).double().expand(2, 4)
+    expected_y = torch.tensor([[0.75], [-0.25]]).double().expand(2, 4)
+    assert torch.equal(motion[0, 0], expected_x)
+    assert torch.equal(motion[0, 1], expected_y)
+
+
+@pytest.mark.parametrize(("height", "width"), [(5, 7), (1, 1), (8, 3)])
+def test_what_a_still_camera_sees_does_not_move(height: int, width: int) -> None:
+    centres = [torch.arange(size, dtype=torch.float64) + 0.5 for size in (height, width)]
+    rows, columns = torch.meshgrid(*centres, indexing="ij")
+    depth = 1 + 9 * draw(2, height, width)
+    x, y = (2 * columns / width - 1) / 2 * depth, (2 * rows / height - 1) / 4 * depth
+    motion = motion_from_position(torch.stack([x, y, depth], 1), perspective(2))
+    torch.testing.assert_close(motion, still(height, width, batch=2), rtol=0, atol=1e-13)
+
+
+def test_points_behind_the_camera_have_no_motion_and_no_history() -> None:
+    position = vectors([[(0.0, 0.0, 4.0), (0.0, 0.0, -4.0), (0.0, 0.0, 0.0), (INF, 0.0, 4.0), (NAN, 0.0, 4.0)]])
+    motion = motion_from_position(position, perspective())
+    assert motion.isfinite().flatten(2).tolist() == [[[True, False, False, False, False]] * 2]
+    _, weight = reproject(draw(1, 1, 1, 5), motion)
+    assert weight.flatten().tolist()[1:] == [0.0] * 4
+
+
+def test_motion_keeps_float32_for_half_precision() -> None:
+    # 1000.25 is no bfloat16.
+    position = torch.zeros(1, 3, 1, 2001, dtype=torch.bfloat16)
+    position[:, 2] = 1
+    motion = motion_from_position(position, perspective().bfloat16())
+    assert motion.dtype == torch.float32
+    assert motion[0, 0, 0].tolist() == [1000.0 - x for x in range(2001)]
+
+
+def test_settings_reach_the_test_of_the_surface() -> None:
+    arguments: tuple[Any, ...] = (draw(1, 3, 1, 2), draw(1, 3, 1, 2), image([[3.0, 3.0]]), still(1, 2))
+    surfaces = (Surface(depth=image([[5.0, 5.0]])), Surface(depth=image([[5.4, 5.6]])))
+    assert accumulate(*arguments, *surfaces)[1].flatten().tolist() == [4.0, 1.0]
+    assert accumulate(*arguments, *surfaces, position_limit=0.2)[1].flatten().tolist() == [4.0, 4.0]

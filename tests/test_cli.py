@@ -1,0 +1,425 @@
+"""The command line as a person meets it: help, exit status, and one clear line for whatever is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mcdenoise.cli import COMMANDS, main
+from mcdenoise.data import read_exr, write_exr
+from mcdenoise.models import create_model, list_models, pretrained_models, save_weights
+from mcdenoise.train import TrainConfig
+
+RGB = ["R", "G", "B"]
+POSITIONAL = {"sequence", "sequences", "scene", "ops"}
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Small images are quickest on one thread; and `--threads` must not outlive its test."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    torch.manual_seed(0)
+    path = tmp_path / "small.safetensors"
+    path.write_bytes(save_weights(create_model("cascaded", width=4), "cascaded", {"width": 4}, {}))
+    return path
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "out"
+
+
+@pytest.fixture
+def denoise(small_sequence: Path, weights: Path, out: Path) -> list[Any]:
+    """Arguments that work."""
+    return ["denoise", small_sequence, "-o", out, "--weights", weights]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Exit status, stdout and stderr of a command in this process."""
+
+    def call(*arguments: Any) -> tuple[int, str, str]:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            main([str(argument) for argument in arguments])
+        printed = capsys.readouterr()
+        return int(stop.value.code or 0), printed.out, printed.err
+
+    return call
+
+
+@pytest.fixture
+def refused(run: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
+    """The one line on stderr with which a command refuses its arguments."""
+
+    def call(*arguments: Any) -> str:
+        status, _, message = run(*arguments)
+        assert status == 2
+        assert message.startswith("mcdenoise")
+        assert message.endswith("\n")
+        assert message.count("\n") == 1
+        return message
+
+    return call
+
+
+def process(*arguments: Any) -> subprocess.CompletedProcess[str]:
+    """A command as a shell runs it."""
+    code = "from mcdenoise.cli import main; main()"
+    command = [sys.executable, "-c", code, *(str(argument) for argument in arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+
+
+def edit(path: Path, change: Callable[[np.ndarray[Any, Any]], object]) -> None:
+    """Change the pixels of an EXR in place."""
+    pixels, channels, _ = read_exr(path)
+    change(pixels)
+    write_exr(path, pixels, channels, half=False)
+
+
+def whole_images(folder: Path) -> list[str]:
+    """Names of what a folder holds, all of them readable images."""
+    for path in folder.iterdir():
+        read_exr(path)
+    return sorted(path.name for path in folder.iterdir())
+
+
+# Help
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_names_every_option(run: Callable[..., tuple[int, str, str]], command: str) -> None:
+    status, text, errors = run(command, "--help")
+    assert (status, errors) == (0, "")
+    parameters = inspect.signature(COMMANDS[command]()).parameters
+    names = set(parameters) - POSITIONAL
+    if "config" in names:
+        names = names - {"config"} | {field.name for field in dataclasses.fields(TrainConfig)}
+    for name in names:
+        assert f"--{name.replace('_', '-')}" in text, name
+    if "out" in names:
+        assert "-o PATH" in text
+    # Every option is explained.
+    assert not re.search(r"--[a-z-]+ [^ ]+ +\((?:default|required)", text)
+
+
+def test_summary_and_version(run: Callable[..., tuple[int, str, str]], capsys: pytest.CaptureFixture[str]) -> None:
+    status, text, _ = run("--help")
+    assert status == 0
+    assert all(re.search(rf"^  {command} +[A-Z].*\.$", text, re.MULTILINE) for command in COMMANDS)
+    assert run()[0] == 2
+    main(["--version"])
+    assert re.fullmatch(r"\d+\.\d+\.\d+\S*\n", capsys.readouterr().out)
+
+
+# Bad usage
+
+
+def test_unknown_command(refused: Callable[..., str]) -> None:
+    message = refused("denoize")
+    assert "unknown command 'denoize'" in message
+    assert "denoise" in message.partition("expected")[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["denoise"], "PATH"),
+        (["denoise", "somewhere"], "--out"),
+        (["denoise", "somewhere", "-o", "out", "--colour"], "--colour"),
+        (["denoise", "somewhere", "-o", "out", "--threads", "many"], "--threads"),
+        (["denoise", "somewhere", "-o", "out", "--alpha-min", "small"], "--alpha-min"),
+        (["denoise", "somewhere", "elsewhere", "-o", "out"], "elsewhere"),
+        (["models", "--json"], "--json"),
+        (["train", "somewhere", "-o", "out", "--precision", "exact"], "--precision"),
+    ],
+    ids=" ".join,
+)
+def test_bad_usage(refused: Callable[..., str], arguments: list[str], expected: str) -> None:
+    message = refused(*arguments)
+    assert expected in message
+    assert f"mcdenoise {arguments[0]} --help" in message
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("--frames", "3-1", "expected numbers and ascending ranges"),
+        ("--frames", "all", "expected numbers and ascending ranges"),
+        ("--frames", "2-9", "expected frame 4, found frames 0 to 3"),
+        ("--threads", "0", "--threads: expected 1 to 1024, found 0"),
+        ("--threads", "99999", "--threads: expected 1 to 1024, found 99999"),
+        ("--alpha-min", "0", "--alpha-min: expected in (0, 1], found 0.0"),
+        ("--alpha-min", "1.5", "--alpha-min: expected in (0, 1], found 1.5"),
+        ("--alpha-min", "nan", "--alpha-min: expected in (0, 1], found nan"),
+        ("--device", "abacus", "device 'abacus': expected one that torch can use"),
+        ("--model", "pixel", "expected weights of model 'pixel', found those of 'cascaded'"),
+        ("--weights", "nothing.safetensors", "nothing.safetensors: expected a safetensors file"),
+    ],
+)
+def test_bad_options_leave_nothing(
+    refused: Callable[..., str], denoise: list[Any], out: Path, option: str, value: str, expected: str
+) -> None:
+    assert expected in refused(*denoise, option, value)
+    assert not out.exists()
+
+
+def test_models_that_cannot_be_had(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
+    assert "model 'oidn': expected one of cascaded" in refused("denoise", small_sequence, "-o", out, "--model", "oidn")
+    for name in sorted(set(list_models()) - set(pretrained_models())):
+        assert "expected shipped weights" in refused("denoise", small_sequence, "-o", out, "--model", name)
+    assert not out.exists()
+
+
+def missing_buffer(inputs: Path) -> None:
+    (inputs / "albedo2.exr").unlink()
+
+
+def missing_frame(inputs: Path) -> None:
+    for path in inputs.glob("*1.exr"):
+        path.unlink()
+
+
+def another_size(inputs: Path) -> None:
+    write_exr(inputs / "shading_normal3.exr", np.zeros((20, 22, 3)), RGB)
+
+
+def no_cameras(inputs: Path) -> None:
+    (inputs / "camera_matrices.h").write_text("const float pi = 3;")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "expected"),
+    [
+        (missing_buffer, "albedo2.exr: expected buffer 'albedo' for every frame"),
+        (missing_frame, "expected frame 1 after frame 0, found 2"),
+        (another_size, "shading_normal3.exr: expected 24 x 20 pixels like the first color file, found 22 x 20"),
+        (no_cameras, "camera_matrices.h: expected 'camera_matrices'"),
+    ],
+)
+def test_a_sequence_that_does_not_fit_together_leaves_nothing(
+    refused: Callable[..., str],
+    denoise: list[Any],
+    small_sequence: Path,
+    out: Path,
+    spoil: Callable[[Path], None],
+    expected: str,
+) -> None:
+    spoil(small_sequence / "inputs")
+    assert expected in refused(*denoise)
+    assert not out.exists()
+
+
+def test_a_folder_that_is_no_sequence(refused: Callable[..., str], tmp_path: Path, weights: Path, out: Path) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    for folder, found in ((tmp_path / "nowhere", "no such folder"), (weights, "a file"), (empty, "no color file")):
+        message = refused("denoise", folder, "-o", out, "--weights", weights)
+        assert str(folder) in message
+        assert f"found {found}" in message
+    assert not out.exists()
+
+
+def test_a_truncated_image_leaves_only_whole_files(
+    refused: Callable[..., str], denoise: list[Any], small_sequence: Path, out: Path
+) -> None:
+    path = small_sequence / "inputs" / "world_position2.exr"
+    path.write_bytes(path.read_bytes()[:-200])
+    assert f"{path}: expected an EXR image, found damaged or missing pixels" in refused(*denoise)
+    assert whole_images(out) == ["denoised0.exr", "denoised1.exr"]
+
+
+@pytest.mark.parametrize(
+    ("stem", "buffer"), [("albedo", "albedo"), ("shading_normal", "normal"), ("world_position", "position")]
+)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_invalid_feature_leaves_only_whole_files(
+    refused: Callable[..., str],
+    denoise: list[Any],
+    small_sequence: Path,
+    out: Path,
+    stem: str,
+    buffer: str,
+    value: float,
+) -> None:
+    edit(small_sequence / "inputs" / f"{stem}1.exr", lambda pixels: pixels.__setitem__((3, 4), value))
+    message = refused(*denoise)
+    assert f"frame 1: buffer '{buffer}': expected finite values" in message
+    assert whole_images(out) == ["denoised0.exr"]
+
+
+def test_something_in_the_way_of_the_output(refused: Callable[..., str], denoise: list[Any], out: Path) -> None:
+    out.write_text("a file")
+    assert f"{out}: expected a folder that can be written to" in refused(*denoise)
+    assert out.read_text() == "a file"
+    out.unlink()
+    (out / "denoised0.exr").mkdir(parents=True)
+    assert "denoised0.exr: expected a file to write, found a folder" in refused(*denoise)
+    assert [path.name for path in out.iterdir()] == ["denoised0.exr"]
+
+
+def test_json_that_cannot_be_written(refused: Callable[..., str], tmp_path: Path) -> None:
+    path = tmp_path / "nowhere" / "models.json"
+    assert f"{path}: cannot be written" in refused("models", "--json", path)
+
+
+# What works
+
+
+def test_denoise(run: Callable[..., tuple[int, str, str]], denoise: list[Any], out: Path, tmp_path: Path) -> None:
+    figures = tmp_path / "times.json"
+    status, text, errors = run(*denoise, "--frames", "1,3", "--threads", "1", "--json", figures)
+    assert (status, errors) == (0, "")
+    assert "plane: bmfr layout, 2 frames of 24x20" in text
+    assert "accumulate: kept (positions and cameras)" in text
+    assert "milliseconds a frame" in text
+    assert sorted(path.name for path in out.iterdir()) == ["denoise.json", "denoised1.exr", "denoised3.exr"]
+    written, report = json.loads(figures.read_text()), json.loads((out / "denoise.json").read_text())
+    assert written == {"model": report["model"], "milliseconds": report["milliseconds"]}
+    assert report["threads"] == 1
+
+
+def test_invalid_colors_are_replaced_and_counted(
+    run: Callable[..., tuple[int, str, str]], denoise: list[Any], small_sequence: Path, out: Path
+) -> None:
+    def spoil(pixels: np.ndarray[Any, Any]) -> None:
+        pixels[3, 4] = np.nan
+        pixels[9, 9, 1] = np.inf
+        pixels[12, 0, 2] = -1
+
+    edit(small_sequence / "inputs" / "color1.exr", spoil)
+    status, text, errors = run(*denoise)
+    assert (status, errors) == (0, "")
+    assert "replaced 3 NaN, infinite or negative pixels" in text
+    for number in range(4):
+        assert np.isfinite(read_exr(out / f"denoised{number}.exr")[0]).all()
+    frames = json.loads((out / "denoise.json").read_text())["frames"]
+    assert [frames[str(number)]["replaced_pixels"] for number in range(4)] == [0, 3, 0, 0]
+
+
+def test_models(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
+    path = tmp_path / "models.json"
+    status, text, errors = run("models", "--json", path)
+    assert (status, errors) == (0, "")
+    entries = json.loads(path.read_text())
+    assert [entry["name"] for entry in entries] == list_models()
+    for entry in entries:
+        assert re.search(rf"\b{entry['name']} .* {entry['parameters']:,} ", text)
+
+
+def test_ops(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
+    path = tmp_path / "ops.json"
+    status, text, errors = run("ops", "--json", path)
+    assert (status, errors) == (0, "")
+    names = [entry["name"] for entry in json.loads(path.read_text())]
+    assert "kernel_conv" in names
+    assert all(name in text for name in names)
+
+
+def test_gradcheck(run: Callable[..., tuple[int, str, str]], refused: Callable[..., str], tmp_path: Path) -> None:
+    path = tmp_path / "gradcheck.json"
+    status, text, errors = run("gradcheck", "demodulate", "--json", path)
+    assert (status, errors) == (0, "")
+    results = json.loads(path.read_text())
+    assert {result["op"] for result in results} == {"demodulate"}
+    assert f"{len(results)} checks, 0 failed" in text
+    assert "cascade_loss" in refused("gradcheck", "cascade_loss")
+
+
+# Training and rendering
+
+
+def test_train(
+    run: Callable[..., tuple[int, str, str]], denoise: list[Any], small_sequence: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
+    small = ["--width", "4", "--crop", "16", "--frames", "2", "--batch", "1", "--validation-frames", "1"]
+    command = ["train", small_sequence, "-o", tmp_path / "run", *small, "--steps", "2", "--checkpoint-every", "1"]
+    status, text, errors = run(*command)
+    assert status == 0
+    weights = tmp_path / "run" / "cascaded.safetensors"
+    assert text == f"{weights}\n"
+    # Rich colours nothing where there is no terminal.
+    assert re.findall(r"^step (\d)  loss 0\.\d{4}  \d+ s  validation smape", errors, re.MULTILINE) == ["1", "2"]
+    assert run(*denoise, "--weights", weights)[0] == 0
+
+
+def test_train_without_data(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
+    assert "expected at least one sequence folder, found none" in refused("train", "-o", out)
+    assert "expected the folder of a sequence, found no such folder" in refused("train", "nowhere", "-o", out)
+    assert "expected images of at least 128 pixels" in refused("train", small_sequence, "-o", out, "--frames", "2")
+    assert "steps: expected at least 1, found 0" in refused("train", small_sequence, "-o", out, "--steps", "0")
+    assert not out.exists()
+
+
+@pytest.fixture
+def camera_path(tmp_path: Path) -> Path:
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"fov": 40, "frames": [{"position": [0, 0, 4], "look_at": [0, 0, 0]}]}))
+    return path
+
+
+@pytest.mark.parametrize("size", ["64", "64x", "x", "64x-3", "axb", "1e3x3"])
+def test_render_with_a_bad_size(refused: Callable[..., str], camera_path: Path, out: Path, size: str) -> None:
+    message = refused("render", "scene.xml", "--camera-path", camera_path, "-o", out, "--size", size)
+    assert f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{size}'" in message
+    assert not out.exists()
+
+
+def test_render_with_bad_paths(refused: Callable[..., str], camera_path: Path, tmp_path: Path, out: Path) -> None:
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    scalar = ["-o", out, "--size", "8x8", "--variant", "scalar_rgb"]
+    message = refused("render", tmp_path / "nothing.xml", "--camera-path", camera_path, *scalar)
+    assert "nothing.xml: expected a Mitsuba scene, found no such file" in message
+    scene = tmp_path / "scene.xml"
+    scene.write_text("<scene version='3.0.0'><shape type='teapot'/></scene>")
+    assert f"{scene}: Mitsuba cannot load it" in refused("render", scene, "--camera-path", camera_path, *scalar)
+    assert "nowhere.json" in refused("render", scene, "--camera-path", tmp_path / "nowhere.json", *scalar)
+    assert "0x8" in refused("render", scene, "--camera-path", camera_path, *scalar[:2], "--size", "0x8", *scalar[4:])
+    assert not out.exists()
+
+
+# As a process
+
+
+def test_a_process_denoises(denoise: list[Any], out: Path) -> None:
+    result = process(*denoise)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert (out / "denoised3.exr").is_file()
+
+
+def test_a_process_refuses_in_one_line(weights: Path, tmp_path: Path, out: Path) -> None:
+    result = process("denoise", tmp_path / "nowhere", "-o", out, "--weights", weights)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert re.fullmatch(r"mcdenoise denoise: .*nowhere: expected the folder of a sequence.*\n", result.stderr)
+
+
+def test_the_installed_command_helps() -> None:
+    command = Path(sys.executable).parent / "mcdenoise"
+    if not command.exists():
+        pytest.skip("the package's commands are not installed beside this Python")
+    result = subprocess.run([command, "denoise", "--help"], capture_output=True, text=True, check=False, timeout=120)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "--alpha-min" in result.stdout

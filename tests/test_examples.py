@@ -1,0 +1,142 @@
+"""Every example runs as its docstring says, and what it claims holds."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from mcdenoise.data import read_exr
+from mcdenoise.models import create_model, save_weights
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+SHARED_DATA = Path(__file__).parents[2] / "shared" / "data" / "train"
+SECONDS = 60
+
+
+def run(name: str, *arguments: Path | str) -> str:
+    """Run an example as a person would, and return what it prints; it must succeed within a minute."""
+    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def real_sequence(name: str) -> Path:
+    folder = SHARED_DATA / name
+    if not folder.is_dir():
+        pytest.skip(f"no rendered sequences beside the repository ({name})")
+    return folder
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """A small cascade that does next to nothing, for examples that need some network."""
+    torch.manual_seed(0)
+    model = create_model("cascaded", width=8)
+    for head in model.first.heads:
+        nn.init.normal_(head.weight, std=0.02)
+    path = tmp_path / "small.safetensors"
+    path.write_bytes(save_weights(model, "cascaded", {"width": 8}, {}))
+    return path
+
+
+def errors(line: str) -> list[tuple[float, float]]:
+    """SMAPE and PSNR of each image in one line of compose_denoiser.py."""
+    return [(float(smape), float(psnr)) for smape, psnr in re.findall(r"([\d.]+)\s+([\d.]+) dB", line)]
+
+
+def test_every_example_is_tested_and_says_how_to_run_it() -> None:
+    here = Path(__file__).read_text()
+    for path in sorted(EXAMPLES.glob("*.py")):
+        assert f'"{path.name}"' in here
+        assert f"python examples/{path.name}" in path.read_text()
+
+
+def test_composed_denoiser_improves_on_its_input(small_sequence: Path) -> None:
+    lines = run("compose_denoiser.py", small_sequence, "--last", "2").splitlines()[1:]
+    assert len(lines) == 2
+    for line in lines:
+        noisy, accumulated, composed = errors(line)
+        assert composed[0] < accumulated[0] < noisy[0]
+        assert composed[1] > accumulated[1] > noisy[1]
+
+
+# Measured: 0.63, 0.75, 0.56 and 0.55 times the SMAPE of the accumulated frame, and 3.6, 1.3, 4.0 and 4.8 dB more.
+@pytest.mark.parametrize("name", ["classroom", "staircase", "bathroom2", "sponza"])
+def test_composed_denoiser_improves_on_real_frames(name: str) -> None:
+    line = run("compose_denoiser.py", real_sequence(name), "--last", "1").splitlines()[-1]
+    _, accumulated, composed = errors(line)
+    assert composed[0] < 0.8 * accumulated[0]
+    assert composed[1] > accumulated[1] + 1
+
+
+def test_denoise_sequence_writes_every_frame(small_sequence: Path, weights: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    printed = run("denoise_sequence.py", small_sequence, out, "--weights", weights, "--device", "cpu")
+    assert "(first frame)" in printed.splitlines()[0]
+    assert sorted(path.name for path in out.iterdir()) == [*(f"denoised{i}.exr" for i in range(4)), "last.png"]
+    pixels, channels, _ = read_exr(out / "denoised3.exr")
+    assert pixels.shape == (20, 24, 3)
+    assert channels == ["R", "G", "B"]
+    assert pixels.min() >= 0
+
+
+def test_gradcheck_passes() -> None:
+    lines = run("gradcheck_ops.py").splitlines()
+    assert lines[0].startswith("passed  my_filter")
+    assert len(lines) > 10
+    assert all(line.startswith("passed") for line in lines)
+
+
+def fitted(printed: str) -> tuple[list[float], float, float]:
+    """Losses on the way, and the held-out error before and after."""
+    losses = [float(value) for value in re.findall(r"^step +\d+ +SMAPE ([\d.]+)$", printed, re.MULTILINE)]
+    held_out = re.search(r"held-out SMAPE +before ([\d.]+) +after ([\d.]+)", printed)
+    assert held_out
+    return losses, float(held_out[1]), float(held_out[2])
+
+
+def test_fitted_filter_is_better_on_frames_it_has_not_seen(small_sequence: Path) -> None:
+    losses, before, after = fitted(run("fit_filter_parameters.py", small_sequence))
+    assert losses[-1] < losses[0]
+    assert after < before
+
+
+# Measured: 0.126 before and 0.083 after.
+def test_fitted_filter_is_better_on_a_scene_it_has_not_seen() -> None:
+    arguments = (real_sequence("classroom"), "--held-out", real_sequence("bathroom2"), "--steps", "40")
+    losses, before, after = fitted(run("fit_filter_parameters.py", *arguments))
+    assert losses[-1] < 0.85 * losses[0]
+    assert after < 0.8 * before
+
+
+def test_unseen_scenes_compares_every_image(small_sequence: Path, weights: Path, tmp_path: Path) -> None:
+    file = tmp_path / "scores.json"
+    arguments = (small_sequence, small_sequence, "--weights", weights, "--json", file, "--markdown")
+    lines = run("unseen_scenes.py", *arguments).splitlines()
+    assert lines[0] == "| scene | frames | image | SMAPE | PSNR |"
+    scores = json.loads(file.read_text())
+    methods = ["noisy", "accumulated", "joint bilateral, best", "initial", "denoised"]
+    assert [score["method"] for score in scores] == methods * 3
+    assert len(lines) == 2 + len(scores)
+    first, second, mean = scores[:5], scores[5:10], scores[10:]
+    assert first == second
+    assert [score["sequence"] for score in mean] == ["mean of 2"] * 5
+    for one, both in zip(first, mean, strict=True):
+        assert both["values"] == pytest.approx(one["values"])
+    noisy, accumulated, filtered = (score["values"] for score in first[:3])
+    assert filtered["SMAPE"] < accumulated["SMAPE"] < noisy["SMAPE"]
+    assert filtered["PSNR"] > accumulated["PSNR"] > noisy["PSNR"]
+
+
+def test_unseen_scenes_prints_plain_columns_too(small_sequence: Path, weights: Path) -> None:
+    lines = run("unseen_scenes.py", small_sequence, "--weights", weights).splitlines()
+    assert len(lines) == 6
+    assert lines[0].split() == ["scene", "frames", "image", "SMAPE", "PSNR"]
