@@ -69,6 +69,8 @@ def main() -> None:
     options = parser.parse_args()
 
     sequence, history = open_sequence(options.sequence), History()
+    if not sequence.reference_numbers:
+        parser.error("expected frames with references to compare with")
     print("SMAPE / PSNR      noisy           accumulated        composed")
     for number in sequence.numbers:
         frame, _ = sequence.frame(number).validate()

@@ -4,9 +4,9 @@
 
 The filter is that of compose_denoiser.py: at each of three scales, how fast the weight of a neighbour falls off with
 the difference of normal, albedo, depth, color and distance, and the share of the coarse scales in the fusion. These 16
-numbers start as ones and a half, and the derivative of the error against references moves them. Prints the loss as it
-falls, and the error before and after on frames that the fit has not seen: those of another sequence, or by default the
-last quarter of the same one.
+numbers start at 1 (the share at a half), and the derivative of the error against references moves them. Prints the loss
+as it falls, the numbers it found, and the error before and after on frames that the fit has not seen: those of another
+sequence, or by default the last quarter of all.
 """
 
 import argparse
@@ -61,6 +61,8 @@ def main() -> None:
     quarter = max(1, len(frames) // 4)
     held_out = samples(options.held_out) if options.held_out else frames[-quarter:]
     train = frames if options.held_out else frames[:-quarter]
+    if not (train and held_out):
+        parser.error("expected at least two frames with references")
 
     parameters = [torch.zeros(3, len(NAMES), requires_grad=True), torch.zeros((), requires_grad=True)]
     before = mean_error(held_out, *parameters)

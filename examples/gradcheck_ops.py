@@ -1,13 +1,15 @@
 """Prove the derivatives of a filter of your own, and those of the package's operators.
 
     python examples/gradcheck_ops.py
+    python examples/gradcheck_ops.py kernel_conv reproject
 
 Composes demodulation, cross-bilateral weights, per-pixel kernel convolution and remodulation into one function, and
 compares its first and second derivatives in every input with difference quotients, number by number, in float64: what
-holds for each operator must hold for their composition. Then runs the package's own table of cases, as `mcdenoise
-gradcheck` does. Exits with 1 where a derivative is wrong.
+holds for each operator must hold for their composition. Then runs the package's own table of cases, of all operators or
+of those named, as `mcdenoise gradcheck` does. Exits with 1 where a derivative is wrong.
 """
 
+import argparse
 import sys
 import time
 
@@ -29,6 +31,10 @@ def my_filter(
 
 
 def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("ops", nargs="*", metavar="OP", help="operators of the table to check; all by default")
+    options = parser.parse_args()
+
     torch.manual_seed(0)
     # Small, because each number of each input is moved by itself, and with odd sides, which even code slips on.
     size = (3, 5)
@@ -48,7 +54,7 @@ def main() -> int:
     gradgradcheck(my_filter, arguments)
     print(f"passed  my_filter in {', '.join(inputs)}: {time.perf_counter() - start:.1f} s")
 
-    results = check()
+    results = check(options.ops or None)
     for result in results:
         verdict = "passed" if result.passed else "FAILED"
         print(f"{verdict}  {result.op}, {result.case} case, in {', '.join(result.inputs)}: {result.seconds:.1f} s")

@@ -21,7 +21,8 @@ from mcdenoise.ops import demodulate, remodulate
 
 _BEST = "joint bilateral, best"
 
-# The sweep of the plain filter: on 1-spp sequences of seven scenes no best setting was far from the middle of it.
+# The sweep of the plain filter: on nine 1-spp sequences, a step further on every side lowers the best SMAPE of one by
+# 0.8 %, and of no other.
 _SIGMA_COLOR = (0.05, 0.1, 0.2, 0.3, 0.5)
 _SIGMA_SPACE = (1.5, 2.5, 4.0, 6.0)
 # Depths in [0, 1] differ by much less than albedos and normals do: without a scale of its own, depth hardly guides.
