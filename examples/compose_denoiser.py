@@ -19,7 +19,7 @@ from mcdenoise.buffers import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.history import History
 from mcdenoise.metrics import psnr_srgb, smape_linear
-from mcdenoise.models.cascaded import auto_exposure, normalize_depth
+from mcdenoise.models import auto_exposure, normalize_depth
 from mcdenoise.ops import cross_bilateral_weights, downsample, kernel_conv, laplacian_fusion, remodulate, upsample
 
 # How fast a neighbour's weight falls off with the squared difference of normal, albedo, depth and color, and with the
@@ -50,15 +50,15 @@ def denoise(color: Tensor, length: Tensor, guides: list[Tensor], scales: Tensor,
         coarse = denoise(coarse_color, coarse_length, [downsample(guide) for guide in guides], scales[1:], fusion)
         # A pixel unlike the mean of its 2x2 block (an edge, a thin thing) has nothing to take from the coarse image.
         means = [upsample(downsample(guide), guide.shape[-2:]) for guide in guides]
-        unlike = [
-            f * (guide - mean).square().sum(1, True) for f, guide, mean in zip(falloffs, guides, means, strict=True)
-        ]
-        color = laplacian_fusion(color, coarse, fusion * torch.exp(-sum(unlike)))
+        parts = zip(falloffs, guides, means, strict=True)
+        unlike = sum(falloff * (guide - mean).square().sum(1, keepdim=True) for falloff, guide, mean in parts)
+        color = laplacian_fusion(color, coarse, fusion * torch.exp(-unlike))
     # With logits of zero, only the guides and the distance shape the kernel.
     logits = color.new_zeros(1, KERNEL_SIZE**2, *color.shape[-2:])
     distance = scales[0, -1].expand_as(length)
     weights = cross_bilateral_weights(logits, guides, falloffs, distance, border="renormalize")
-    return kernel_conv(color * length, weights) / kernel_conv(length, weights)
+    # Detail on another scale's base can undershoot zero; radiance cannot.
+    return (kernel_conv(color * length, weights) / kernel_conv(length, weights)).clamp_min(0)
 
 
 @torch.inference_mode()

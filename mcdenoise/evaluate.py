@@ -16,7 +16,7 @@ from mcdenoise.data.sequences import Sequence
 from mcdenoise.denoiser import Denoiser, Images
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import psnr_srgb, smape_linear
-from mcdenoise.models.cascaded import normalize_depth
+from mcdenoise.models import normalize_depth
 from mcdenoise.ops import demodulate, remodulate
 
 _BEST = "joint bilateral, best"

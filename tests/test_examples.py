@@ -110,7 +110,7 @@ def test_fitted_filter_is_better_on_frames_it_has_not_seen(small_sequence: Path)
     assert after < before
 
 
-# Measured: 0.126 before and 0.083 after.
+# Measured: 0.125 before and 0.082 after; the loss falls from 0.177 to 0.131.
 def test_fitted_filter_is_better_on_a_scene_it_has_not_seen() -> None:
     arguments = (real_sequence("classroom"), "--held-out", real_sequence("bathroom2"), "--steps", "40")
     losses, before, after = fitted(run("fit_filter_parameters.py", *arguments))

@@ -4,7 +4,15 @@ from mcdenoise.models import cascaded as _cascaded  # entering itself in the reg
 from mcdenoise.models._overview import ModelOverview, overview
 from mcdenoise.models._registry import list_models, register_model
 from mcdenoise.models._weights import create_model, describe_weights, load_weights, pretrained_models, save_weights
-from mcdenoise.models.cascaded import Cascade, Denoised, FusionModule, KernelPredictor, PixelPredictor
+from mcdenoise.models.cascaded import (
+    Cascade,
+    Denoised,
+    FusionModule,
+    KernelPredictor,
+    PixelPredictor,
+    auto_exposure,
+    normalize_depth,
+)
 from mcdenoise.models.unet import UNet
 
 __all__ = [
@@ -15,10 +23,12 @@ __all__ = [
     "ModelOverview",
     "PixelPredictor",
     "UNet",
+    "auto_exposure",
     "create_model",
     "describe_weights",
     "list_models",
     "load_weights",
+    "normalize_depth",
     "overview",
     "pretrained_models",
     "register_model",
