@@ -281,7 +281,7 @@ def _train() -> Callable[..., int | None]:
 
 def _gradcheck() -> Callable[..., int | None]:
     """Check first and second derivatives of the operators in float64."""
-    from mcdenoise.gradcheck import check
+    from mcdenoise.gradcheck import check_case, select
 
     def gradcheck(ops: tyro.conf.Positional[list[str]] = [], json: Json = None) -> int:  # noqa: B006 - tyro reads it
         """Check first and second derivatives of the operators against finite differences, in float64, slow mode.
@@ -291,7 +291,10 @@ def _gradcheck() -> Callable[..., int | None]:
             json: write the results to this file too.
         """
         table = Table("op", "case", "inputs", "result", "seconds")
-        results = check(ops or None)
+        with _progress() as progress:
+            results = [
+                check_case(op, case) for op, case in progress.track(select(ops or None), description="gradcheck")
+            ]
         for result in results:
             outcome = "ok" if result.passed else f"FAILED {result.message}"
             table.add_row(result.op, result.case, ", ".join(result.inputs), outcome, f"{result.seconds:.2f}")

@@ -50,12 +50,17 @@ def check(names: Sequence[str] | None = None) -> list[GradcheckResult]:
     Raises:
         InputError: there is no op of such a name.
     """
+    return [check_case(op, case) for op, case in select(names)]
+
+
+def select(names: Sequence[str] | None = None) -> list[tuple[Op, Case]]:
+    """The cases that :func:`check` goes through, each with its op; ``InputError`` as there."""
     known = {op.name: op for op in OPS}
     unknown = [name for name in names or () if name not in known]
     if unknown:
         raise InputError(f"op: expected one of {', '.join(known)}, found {', '.join(unknown)}")
     ops = OPS if names is None else [known[name] for name in names]
-    return [check_case(op, case) for op in ops for case in op.cases if case.differentiable]
+    return [(op, case) for op in ops for case in op.cases if case.differentiable]
 
 
 def check_case(op: Op, case: Case) -> GradcheckResult:

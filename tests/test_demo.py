@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+
+from mcdenoise.data import open_sequence, read_exr
+from mcdenoise.models import pretrained_models
+
+pytest.importorskip("mitsuba", reason="the demo renders with Mitsuba, which is not installed")
+
+
+@pytest.fixture
+def small_demo(monkeypatch):
+    from mcdenoise import demo
+
+    monkeypatch.setattr(demo, "FRAMES", 3)
+    monkeypatch.setattr(demo, "SIZE", (64, 36))
+    monkeypatch.setattr(demo, "REFERENCE_SPP", 64)
+    monkeypatch.setattr(demo, "REFERENCE_FRAMES", (1, 2))
+    return demo
+
+
+@pytest.mark.skipif("cascaded" not in pretrained_models(), reason="the weights of 'cascaded' are not there yet")
+def test_demo_renders_denoises_and_shows(small_demo, tmp_path):
+    rendered, denoised = [], []
+    result = small_demo.run_demo(
+        tmp_path, on_render=lambda done, total: rendered.append((done, total)), on_frame=denoised.append
+    )
+    assert rendered[-1][0] == rendered[-1][1] == 3 + 2 * 64
+    assert denoised == [0, 1, 2]
+    scores = {score.method: score for score in result.scores}
+    assert list(scores) == ["noisy", "accumulated", "initial", "denoised"]
+    assert all(score.frames == 2 for score in result.scores)
+    assert scores["denoised"].values["SMAPE"] < scores["accumulated"].values["SMAPE"]
+    assert scores["accumulated"].values["SMAPE"] < scores["noisy"].values["SMAPE"]
+    assert {path.name for path in result.denoised.iterdir()} == {
+        "denoised0.exr",
+        "denoised1.exr",
+        "denoised2.exr",
+        "denoise.json",
+    }
+    sheet = result.picture.read_bytes()
+    assert sheet.startswith(b"\x89PNG")
+
+    # What is there is used again: the noise, and with it every clean frame, stays the same to the last bit.
+    before = read_exr(result.denoised / "denoised2.exr")[0]
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "sequence" / "inputs").iterdir()}
+    again = small_demo.run_demo(tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in files} == files
+    np.testing.assert_array_equal(read_exr(again.denoised / "denoised2.exr")[0], before)
+    assert open_sequence(tmp_path / "sequence").reference_numbers == [1, 2]
