@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,13 +17,14 @@ from torch import Tensor, nn
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.clips import Clip, ClipSampler, accumulated_shots
-from mcdenoise.data.files import atomic_path, write_text
+from mcdenoise.data.files import atomic_path
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.losses import cascade_loss
 from mcdenoise.metrics import displayed, psnr_srgb, smape_linear
 from mcdenoise.models import create_model, save_weights
 from mcdenoise.ops import remodulate
+from mcdenoise.run_folder import RunFolder, source_commit
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -53,7 +53,8 @@ class TrainConfig:
         gradient_norm: largest norm of a step's gradient; 0 does not limit it.
         alpha_min: of the accumulation, see :func:`mcdenoise.ops.accumulate`.
         start_every: a shot also starts at every n-th frame, to train on short histories.
-        validation_frames: the last frames of each sequence, kept for validation (the paper's 4).
+        validation_frames: the last frames of each sequence, kept for validation (the paper's 4); none of a sequence
+            that would be left with less than one clip.
         precision: ``"bf16-mixed"`` runs convolutions in bfloat16.
         seed: of weights and clips.
     """
@@ -141,41 +142,62 @@ def train(
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(config, step))
-    # Only now, so that input that cannot be trained on leaves no trace of a run.
-    run = _Run(config, opened, out)
-    run.begin()
-    first = run.load_checkpoint(network, optimizer, scheduler)
-    commit = _commit()  # now: the source tree may change while the run goes on
-    run.log({"first_step": first, "commit": commit, "threads": torch.get_num_threads()})
-
     model, fabric_optimizer = fabric.setup(network, optimizer)
+    validation = [clip.to(fabric.device) for clip in validation]
+    # Only now, so that input that cannot be trained on leaves no trace of a run.
+    run = RunFolder(out)
+    data = {"credits": credits, "sequences": [_describe(config, sequence) for sequence in opened]}
+    run.claim(config=dataclasses.asdict(config), data=data)
+    first, provenance = run.load(network, optimizer, scheduler)
+    weights = out / f"{config.model}.safetensors"
+    if first == config.steps and weights.exists():
+        return weights
+    # The source tree may change while the run goes on, and between its parts.
+    provenance.append({"first_step": first, "commit": source_commit()})
+    run.log({**provenance[-1], "threads": torch.get_num_threads()})
+
     from torch.utils.tensorboard import SummaryWriter  # here because importing it takes a second
 
     with SummaryWriter(str(out), purge_step=first) as board:
         started, losses = time.monotonic(), []
         for step in range(first, config.steps):
             torch.manual_seed(config.seed * 1_000_003 + step)
-            loss = _loss(model, sampler.draw(config.batch), config.temporal_weight)
+            loss = _loss(model, sampler.draw(config.batch).to(fabric.device), config.temporal_weight)
+            losses.append(loss.item())
+            if not math.isfinite(losses[-1]):
+                raise InputError(
+                    f"training, step {step}: expected a finite loss, found {losses[-1]}; the last checkpoint is kept: "
+                    "start a new run with a lower learning rate or a limit on the gradient's norm"
+                )
             fabric_optimizer.zero_grad()
             fabric.backward(loss)
             if config.gradient_norm:
                 fabric.clip_gradients(model, fabric_optimizer, max_norm=config.gradient_norm)
             fabric_optimizer.step()
             scheduler.step()
-            losses.append(loss.item())
             done = step + 1
             save = done % checkpoint_every == 0 or done == config.steps
             if save or done % _LOG_EVERY == 0:
                 scores: dict[str, float] = {}
                 if save:
-                    run.save_checkpoint(done, network, optimizer, scheduler)
+                    run.save(done, provenance, network, optimizer, scheduler)
                     scores = _validate(model, validation, board, done)
                 progress = Progress(done, sum(losses) / len(losses), time.monotonic() - started, scores)
                 losses.clear()
                 run.log(dataclasses.asdict(progress))
                 board.add_scalar("train/loss", progress.loss, done)
                 report(progress)
-    return run.finish(network, settings, commit, credits)
+    about = {
+        "config": json.dumps(dataclasses.asdict(config)),
+        "data": json.dumps(data["sequences"]),
+        "credits": credits,
+        "steps": str(config.steps),
+        "commits": json.dumps(provenance),
+        "licence": "Apache-2.0",
+    }
+    with atomic_path(weights) as temporary:
+        temporary.write_bytes(save_weights(network, config.model, settings, about))
+    return weights
 
 
 def _fabric(accelerator: str, precision: Precision) -> Fabric:
@@ -193,10 +215,20 @@ def _fabric(accelerator: str, precision: Precision) -> Fabric:
 
 
 def _check(config: TrainConfig, checkpoint_every: int) -> None:
-    lowest = {"width": 0, "steps": 1, "batch": 1, "crop": 1, "start_every": 1, "validation_frames": 0}
-    lowest |= {"temporal_weight": 0, "gradient_norm": 0, "frames": 2 if config.temporal_weight else 1}
+    lowest = {
+        "width": 0,
+        "steps": 1,
+        "batch": 1,
+        "frames": 2 if config.temporal_weight else 1,
+        "crop": 1,
+        "temporal_weight": 0,
+        "gradient_norm": 0,
+        "start_every": 1,
+        "validation_frames": 0,
+        "checkpoint_every": 1,
+    }
     settings = {**dataclasses.asdict(config), "checkpoint_every": checkpoint_every}
-    for name, low in {**lowest, "checkpoint_every": 1}.items():
+    for name, low in lowest.items():
         if not settings[name] >= low:
             raise InputError(f"{name}: expected at least {low}, found {settings[name]}")
     if not 0 <= config.seed < 2**32:
@@ -215,17 +247,40 @@ def _rate(config: TrainConfig, step: int) -> float:
     return warm_up * 0.5 * (1 + math.cos(math.pi * min(1.0, step / config.steps)))
 
 
+def _held_out(config: TrainConfig, sequence: Sequence) -> list[int]:
+    """Numbers of the frames that are kept for validation: the last ones, none where too few would be left."""
+    enough = len(sequence) >= config.frames + config.validation_frames
+    return sequence.numbers[len(sequence) - config.validation_frames :] if enough else []
+
+
 def _data(config: TrainConfig, sequences: list[Sequence]) -> tuple[ClipSampler, list[Clip]]:
     """The sampler of training clips, and for each sequence the clip of its validation frames."""
     shots: list[Tensor] = []
     validation: list[Clip] = []
     for sequence in sequences:
-        held = config.validation_frames if len(sequence) >= config.frames + config.validation_frames else 0
+        held = len(_held_out(config, sequence))
         for i, shot in enumerate(accumulated_shots(sequence, config.alpha_min, config.start_every)):
             shots.append(shot[: max(0, len(shot) - held)])
             if i == 0 and held:
                 validation.append(Clip.from_stack(shot[None, -held:]))
     return ClipSampler(shots, config.frames, config.crop), validation
+
+
+def _describe(config: TrainConfig, sequence: Sequence) -> dict[str, Any]:
+    """What a run says of a sequence: enough to tell whether another one has the same pixels."""
+    digest = hashlib.sha256()
+    for number in sequence.numbers:
+        frame = sequence.frame(number)
+        for image in (frame.color, frame.reference):
+            if image is not None:
+                digest.update(image.numpy().tobytes())
+    return {
+        "name": sequence.name,
+        "frames": len(sequence),
+        "size": f"{sequence.size[1]}x{sequence.size[0]}",
+        "validation": _held_out(config, sequence),
+        "sha256": digest.hexdigest(),
+    }
 
 
 def _denoise(model: nn.Module, clip: Clip) -> tuple[Tensor, Tensor]:
@@ -261,91 +316,3 @@ def _validate(model: nn.Module, clips: list[Clip], board: Any, step: int) -> dic
     for name, score in scores.items():
         board.add_scalar(f"validation/{name}", score, step)
     return scores
-
-
-@dataclass(frozen=True)
-class _Run:
-    """The folder of a run."""
-
-    config: TrainConfig
-    sequences: list[Sequence]
-    out: Path
-
-    def begin(self) -> None:
-        """Write what is going to be trained on what, or check that an earlier run did just that."""
-        try:
-            self.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self.out}: expected a folder to write the run to: {error.strerror}") from error
-        for name, content in (("config.json", dataclasses.asdict(self.config)), ("data.json", self._data_list())):
-            path = self.out / name
-            text = json.dumps(content, indent=2) + "\n"
-            if not path.exists():
-                write_text(path, text)
-            elif not path.is_file() or path.read_bytes() != text.encode():
-                raise InputError(
-                    f"{path}: expected the same as in this run, found another; choose a new folder for a new run"
-                )
-
-    def _data_list(self) -> list[dict[str, Any]]:
-        entries = []
-        for sequence in self.sequences:
-            digest = hashlib.sha256()
-            for number in sequence.numbers:
-                frame = sequence.frame(number)
-                digest.update(frame.color.numpy().tobytes())
-                if frame.reference is not None:
-                    digest.update(frame.reference.numpy().tobytes())
-            size = f"{sequence.size[1]}x{sequence.size[0]}"
-            entries.append({"name": sequence.name, "frames": len(sequence), "size": size, "sha256": digest.hexdigest()})
-        return entries
-
-    @property
-    def _checkpoint(self) -> Path:
-        return self.out / "checkpoint.pt"
-
-    def save_checkpoint(self, step: int, *parts: Any) -> None:
-        with atomic_path(self._checkpoint) as temporary:
-            torch.save({"step": step, "parts": [part.state_dict() for part in parts]}, temporary)
-
-    def load_checkpoint(self, *parts: Any) -> int:
-        """Restore what :meth:`save_checkpoint` saved; returns the number of steps done, 0 without a checkpoint."""
-        if not self._checkpoint.exists():
-            return 0
-        try:
-            saved = torch.load(self._checkpoint, weights_only=True)
-            for part, state in zip(parts, saved["parts"], strict=True):
-                part.load_state_dict(state)
-            return int(saved["step"])
-        except Exception as error:
-            raise InputError(
-                f"{self._checkpoint}: expected a checkpoint of this run, found one that cannot be loaded; "
-                "remove it to start again"
-            ) from error
-
-    def log(self, entry: dict[str, Any]) -> None:
-        with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
-
-    def finish(self, network: nn.Module, settings: dict[str, Any], commit: str, credits: str) -> Path:
-        path = self.out / f"{self.config.model}.safetensors"
-        about = {
-            "config": json.dumps(dataclasses.asdict(self.config)),
-            "data": json.dumps(self._data_list()),
-            "steps": str(self.config.steps),
-            "commit": commit,
-            "licence": "Apache-2.0",
-            "credits": credits,
-        }
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(save_weights(network, self.config.model, settings, about))
-        return path
-
-
-def _commit() -> str:
-    """The commit of the source tree that trains, ``"unknown"`` where it is not a git checkout."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"

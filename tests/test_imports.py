@@ -22,7 +22,7 @@ MODULES = {
 # fails: place it deliberately.
 SIGNAL = {"errors", "buffers", "ops"}
 LIBRARY = SIGNAL | {"metrics", "losses", "models", "history", "data", "plan", "demo_scene", "render", "denoiser"}
-REPORTS = {"denoise", "evaluate", "report"}
+REPORTS = {"denoise", "evaluate", "report", "run_folder"}
 TOOLS = REPORTS | {"benchmark", "demo", "export", "gradcheck", "ops_overview", "stability", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
@@ -38,6 +38,7 @@ ALLOWED: dict[str, set[str]] = {
     "render": SIGNAL | {"data", "demo_scene"},
     "denoiser": SIGNAL | {"models", "history", "plan"},
     "denoise": LIBRARY,
+    "run_folder": SIGNAL | {"data"},
     "evaluate": LIBRARY,
     "report": LIBRARY,
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS),

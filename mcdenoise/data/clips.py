@@ -35,6 +35,10 @@ class Clip:
     depth: Tensor
     reference: Tensor
 
+    def to(self, device: torch.device) -> Clip:
+        """The clip on another device."""
+        return Clip(*(getattr(self, name).to(device) for name in _PARTS))
+
     @staticmethod
     def from_stack(stack: Tensor) -> Clip:
         """Take apart what :func:`accumulated_shots` stacked: ``(B, T, 13, H, W)``."""
@@ -79,7 +83,7 @@ def accumulated_shots(sequence: Sequence, alpha_min: float, start_every: int) ->
     return shots
 
 
-class ClipSampler(nn.Module):
+class ClipSampler:
     """Draws random clips from shots: position, frames, flips, 90-degree turns, and what else leaves physics intact.
 
     All randomness comes from torch's global generator, so that a seed before each draw makes every draw repeatable.
@@ -97,7 +101,6 @@ class ClipSampler(nn.Module):
     """
 
     def __init__(self, shots: Iterable[Tensor], frames: int, crop: int) -> None:
-        super().__init__()
         self.shots = [shot for shot in shots if len(shot) >= frames]
         self.frames, self.crop = frames, crop
         if not self.shots:

@@ -125,7 +125,7 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
 
 
 def demodulate(color: Tensor, albedo: Tensor, *, floor: float = 1e-2) -> Tensor:
-    """``color / max(albedo, floor)``; unchanged where the albedo is below ``floor`` in every channel."""
+    """``color / max(albedo, floor)``; unchanged where the albedo is below 1e-4 in every channel."""
     source, modulation = color.tolist(), _modulation(albedo, floor)
     out = _zeros(color.shape)
     for b, c, y, x in _indices(color.shape):
@@ -134,7 +134,7 @@ def demodulate(color: Tensor, albedo: Tensor, *, floor: float = 1e-2) -> Tensor:
 
 
 def remodulate(image: Tensor, albedo: Tensor, *, floor: float = 1e-2) -> Tensor:
-    """``image * max(albedo, floor)``; unchanged where the albedo is below ``floor`` in every channel."""
+    """``image * max(albedo, floor)``; unchanged where the albedo is below 1e-4 in every channel."""
     source, modulation = image.tolist(), _modulation(albedo, floor)
     out = _zeros(image.shape)
     for b, c, y, x in _indices(image.shape):
@@ -256,7 +256,7 @@ def _taps(kernel: Tensor, y: int, x: int, border: str) -> Iterator[tuple[int, in
 def _modulation(albedo: Tensor, floor: float) -> Image:
     values, out = albedo.tolist(), _zeros(albedo.shape)
     for b, c, y, x in _indices(albedo.shape):
-        textured = any(channel[y][x] >= floor for channel in values[b])
+        textured = any(channel[y][x] >= 1e-4 for channel in values[b])
         out[b][c][y][x] = max(values[b][c][y][x], floor) if textured else 1.0
     return out
 

@@ -8,15 +8,16 @@ from torch import Tensor, nn
 from mcdenoise.ops._check import check_shapes
 
 FLOOR = 1e-2
+# Below this there is no texture: less than half of the darkest 8-bit sRGB step above black.
+NO_ALBEDO = 1e-4
 
 
 def demodulate(color: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor:
     """Divide radiance by albedo, which leaves the (smooth) incident light where the surface is diffuse.
 
-    ``out = color / m`` with the modulation ``m = max(albedo, floor)`` where some channel of the pixel's albedo
-    reaches ``floor``, and ``m = 1`` where none does: emitters, mirrors, glass and background have no texture to
-    divide out and pass unchanged. :func:`remodulate` multiplies with the same ``m`` and is the exact inverse
-    everywhere, up to rounding.
+    ``out = color / m`` with the modulation ``m = max(albedo, floor)``, and ``m = 1`` where no channel of the pixel's
+    albedo reaches 1e-4: emitters, mirrors, glass and background have no texture to divide out and pass unchanged.
+    :func:`remodulate` multiplies with the same ``m`` and is the exact inverse everywhere, up to rounding.
 
     Args:
         color: ``(B, C, H, W)`` radiance, scene-linear, unclamped.
@@ -111,5 +112,5 @@ class Remodulate(nn.Module):
 def _modulation(albedo: Tensor, floor: float) -> Tensor:
     if not floor > 0:
         raise ValueError(f"floor: expected a positive number, found {floor}")
-    textured = (albedo >= floor).any(1, keepdim=True)
+    textured = (albedo >= NO_ALBEDO).any(1, keepdim=True)
     return torch.where(textured, albedo.clamp_min(floor), 1)
