@@ -24,7 +24,7 @@ class BufferSpec:
         low: smallest legal value.
         high: largest legal value.
         meaning: unit and convention, for messages and documentation.
-        infinite: whether positive infinity is legal (a distance where nothing was hit).
+        infinite: whether infinity is legal, within the range (nothing was hit, or there is no previous position).
         slack: how far values may overshoot ``high`` before they are refused; up to there they are clamped.
     """
 
@@ -46,7 +46,9 @@ BUFFERS: dict[str, BufferSpec] = {
         1, 0.0, _UNBOUNDED, "distance along the view axis, scene units; inf where nothing was hit", infinite=True
     ),
     "position": BufferSpec(3, -_UNBOUNDED, _UNBOUNDED, "world-space hit point, scene units"),
-    "motion": BufferSpec(2, -_UNBOUNDED, _UNBOUNDED, "pixels (x right, y down): previous = current + motion"),
+    "motion": BufferSpec(
+        2, -_UNBOUNDED, _UNBOUNDED, "pixels, x right, y down: previous = current + motion", infinite=True
+    ),
     "reference": BufferSpec(3, 0.0, _UNBOUNDED, "converged radiance, scene-linear RGB"),
 }
 
@@ -68,7 +70,8 @@ class Frame:
         normal: ``(B, 3, H, W)`` world-space unit shading normal in [-1, 1]; 0 where nothing was hit.
         depth: ``(B, 1, H, W)`` distance along the view axis in scene units; ``inf`` where nothing was hit.
         position: ``(B, 3, H, W)`` world-space hit point in scene units.
-        motion: ``(B, 2, H, W)`` pixels, x right and y down, ``previous_position = current_position + motion``.
+        motion: ``(B, 2, H, W)`` pixels, x right and y down, ``previous_position = current_position + motion``;
+            infinite where there is no previous position.
         view_projection: ``(B, 4, 4)`` row-vector world-to-clip matrix, ``clip = [x y z 1] @ M``; clip y points down.
         reference: ``(B, 3, H, W)`` converged radiance of the same pixels.
 
@@ -130,6 +133,14 @@ class Frame:
     def to(self, target: torch.device | torch.dtype | str) -> Frame:
         """Every buffer moved to a device or converted to a dtype."""
         return Frame(**{name: value.to(target) for name, value in self.items()})
+
+    def with_depth(self) -> Frame:
+        """The same frame; without a depth but with positions and a camera, its depth is the clip w of the positions."""
+        if self.depth is not None or self.position is None or self.view_projection is None:
+            return self
+        column = self.view_projection[:, :, 3, None, None]
+        depth = (self.position * column[:, :3]).sum(1, keepdim=True) + column[:, 3:]
+        return self.replace(depth=torch.where(depth > 0, depth, torch.inf))
 
     def validate(self) -> tuple[Frame, int]:
         """Look at every value: repair what is a renderer's daily bread, refuse what would spoil the result.
@@ -196,7 +207,7 @@ def _check_values(name: str, value: Tensor) -> Tensor:
     spec = BUFFERS.get(name, _MATRIX)
     bad = ~torch.isfinite(value)
     if spec.infinite:
-        bad &= value != _UNBOUNDED
+        bad = torch.isnan(value) | ((value == -_UNBOUNDED) & (spec.low != -_UNBOUNDED))
     if bad.any():
         where = bad.nonzero()[0].tolist()
         place = f"first at row {where[2]}, column {where[3]}" if len(where) == 4 else f"first at {where[1:]}"

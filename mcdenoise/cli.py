@@ -109,7 +109,7 @@ def _demo() -> Callable[..., int | None]:
                 out,
                 model=model,
                 on_render=lambda done, total: progress.update(rendering, completed=done, total=total),
-                on_frame=lambda number: progress.advance(denoising),
+                on_frame=lambda: progress.advance(denoising),
             )
         _print_scores(asdict(score) for score in result.scores)
         _print_times(result.report.milliseconds)
@@ -172,7 +172,7 @@ def _denoise() -> Callable[..., int | None]:
                 denoiser,
                 str(weights or model),
                 half=not full_float,
-                on_frame=lambda number: progress.advance(task),
+                on_frame=lambda frame, images: progress.advance(task),
             )
         for stage, plan in report.stages.items():
             print(f"  {stage}: {'kept' if plan['kept'] else 'left out'} ({plan['reason']})")

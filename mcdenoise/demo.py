@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.buffers import Frame
+from mcdenoise.data import open_sequence
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
 from mcdenoise.demo_scene import demo_cameras, demo_scene
 from mcdenoise.denoise import SequenceReport, denoise_sequence, make_folder
-from mcdenoise.denoiser import Denoiser
-from mcdenoise.evaluate import Score, score_sequence
+from mcdenoise.denoiser import Denoiser, Images
+from mcdenoise.evaluate import Score, Scorer
 from mcdenoise.metrics import displayed
 from mcdenoise.render import render_sequence
 
@@ -49,7 +50,7 @@ def run_demo(
     model: str = "cascaded",
     variant: str | None = "scalar_rgb",
     on_render: Callable[[int, int], None] = lambda done, total: None,
-    on_frame: Callable[[int], None] = lambda number: None,
+    on_frame: Callable[[], None] = lambda: None,
 ) -> DemoResult:
     """Render 16 frames at one sample a pixel, denoise them, and compare the last ones with references.
 
@@ -60,7 +61,7 @@ def run_demo(
         model: name of a model with shipped weights.
         variant: of Mitsuba; ``"scalar_rgb"`` needs nothing but its package.
         on_render: called with finished and total paths a pixel.
-        on_frame: called with the number of each denoised frame.
+        on_frame: called after each denoised frame.
 
     Raises:
         InputError: Mitsuba is missing, the model is unknown, or the folder cannot be written to.
@@ -78,19 +79,22 @@ def run_demo(
         progress=on_render,
     )
     sequence = open_sequence(out / "sequence")
-    report = denoise_sequence(sequence, out / "denoised", denoiser, model, on_frame=on_frame)
-    scores = score_sequence(sequence, denoiser, sweep=False)
+    scorer = Scorer("demo")
+    last: list[tuple[Frame, Images]] = []
+
+    def show(frame: Frame, images: Images) -> None:
+        scorer.add(frame, images)
+        last[:] = [(frame, images)]
+        on_frame()
+
+    report = denoise_sequence(sequence, out / "denoised", denoiser, model, references=True, on_frame=show)
     picture = out / "demo.png"
-    write_png(picture, _sheet(sequence, denoiser))
-    return DemoResult(scores, report, picture, out / "denoised")
+    write_png(picture, _sheet(*last[0]))
+    return DemoResult(scorer.scores(), report, picture, out / "denoised")
 
 
-def _sheet(sequence: Sequence, denoiser: Denoiser) -> Picture:
-    """The last frame four times side by side, and under each image a close-up."""
-    denoiser.reset()
-    for number in sequence.numbers:
-        frame = sequence.frame(number)
-        images = denoiser.images(frame)
+def _sheet(frame: Frame, images: Images) -> Picture:
+    """A frame four times side by side, and under each image a close-up."""
     shown = {
         "1 sample a pixel": images.noisy,
         "accumulated": images.accumulated,

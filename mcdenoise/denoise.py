@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -12,9 +12,10 @@ from typing import Any
 
 import torch
 
+from mcdenoise.buffers import Frame
 from mcdenoise.data import Sequence, write_exr
 from mcdenoise.data.files import write_text
-from mcdenoise.denoiser import Denoiser, FrameReport
+from mcdenoise.denoiser import Denoiser, FrameReport, Images
 from mcdenoise.errors import InputError
 
 
@@ -55,7 +56,8 @@ def denoise_sequence(
     model: str,
     *,
     half: bool = True,
-    on_frame: Callable[[int], None] = lambda number: None,
+    references: bool = False,
+    on_frame: Callable[[Frame, Images], None] = lambda frame, images: None,
 ) -> SequenceReport:
     """Denoise a sequence and write ``OUT/denoisedN.exr`` and ``OUT/denoise.json``.
 
@@ -65,36 +67,56 @@ def denoise_sequence(
         denoiser: is reset first.
         model: what to call the model in the report.
         half: write half floats, else 32-bit floats.
-        on_frame: called with the number of each finished frame.
+        references: read references too, for ``on_frame``.
+        on_frame: called with each finished frame and its images.
 
     Raises:
         InputError: a file is damaged, a buffer has invalid values, or the folder cannot be written to.
     """
     make_folder(out)
-    denoiser.reset()
+    # A report stands for a complete result: an old one must not survive a run that fails half-way.
+    (out / "denoise.json").unlink(missing_ok=True)
     report = SequenceReport(model, _stages(sequence))
-    for number in sequence.numbers:
+    for number, (frame, images) in zip(
+        sequence.numbers, denoised_frames(sequence, denoiser, reference=references), strict=True
+    ):
         start = time.perf_counter()
-        frame = sequence.frame(number, reference=False)
-        read = time.perf_counter()
-        try:
-            image = denoiser(frame)
-        except InputError as error:
-            raise InputError(f"{sequence.root}, frame {number}: {error}") from error
-        denoised = time.perf_counter()
-        pixels = image[0].permute(1, 2, 0).float().cpu().numpy()
+        pixels = images.denoised[0].permute(1, 2, 0).cpu().numpy()
         write_exr(out / f"denoised{number}.exr", pixels, ["R", "G", "B"], half=half, metadata=sequence.metadata(number))
-        written = time.perf_counter()
-        done = denoiser.report
-        done.milliseconds = {
-            "read": (read - start) * 1e3,
-            **done.milliseconds,
-            "write": (written - denoised) * 1e3,
-        }
-        report.frames[number] = done
-        on_frame(number)
+        report.frames[number] = denoiser.report
+        denoiser.report.milliseconds["write"] = (time.perf_counter() - start) * 1e3
+        on_frame(frame, images)
     write_text(out / "denoise.json", json.dumps(_as_json(sequence, denoiser, report), indent=2) + "\n")
     return report
+
+
+def denoised_frames(
+    sequence: Sequence, denoiser: Denoiser, *, reference: bool = True
+) -> Iterator[tuple[Frame, Images]]:
+    """Read and denoise frame after frame.
+
+    Args:
+        sequence: the frames.
+        denoiser: is reset first.
+        reference: read references too.
+
+    Yields:
+        Each frame with its images; the denoiser's report includes the time to read.
+
+    Raises:
+        InputError: a file is damaged, or a buffer has invalid values; the message names the frame.
+    """
+    denoiser.reset()
+    for number in sequence.numbers:
+        start = time.perf_counter()
+        frame = sequence.frame(number, reference=reference)
+        read = (time.perf_counter() - start) * 1e3
+        try:
+            images = denoiser.images(frame)
+        except InputError as error:
+            raise InputError(f"{sequence.root}, frame {number}: {error}") from error
+        denoiser.report.milliseconds = {"read": read, **denoiser.report.milliseconds}
+        yield frame, images
 
 
 def make_folder(out: Path) -> None:
@@ -115,7 +137,9 @@ def _stages(sequence: Sequence) -> dict[str, dict[str, Any]]:
     else:
         accumulate = (False, "no motion, and no positions with cameras: single frames")
     has_albedo = "albedo" in buffers
+    stored = "with albedo" if sequence.color_has_albedo else "without albedo, which the reader multiplies back"
     stages = {
+        "read": (True, f"color is stored {stored}"),
         "demodulate": (has_albedo, "albedo" if has_albedo else "no albedo"),
         "accumulate": accumulate,
         "network": (True, "always"),

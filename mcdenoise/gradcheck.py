@@ -65,7 +65,7 @@ def select(names: Sequence[str] | None = None) -> list[tuple[Op, Case]]:
 
 def check_case(op: Op, case: Case) -> GradcheckResult:
     """:func:`check` of one case."""
-    start, message = time.perf_counter(), ""
+    start, passed, message = time.perf_counter(), True, ""
     function, arguments = _of_differentiable(op, case)
     try:
         with torch.random.fork_rng(devices=[]):
@@ -73,9 +73,10 @@ def check_case(op: Op, case: Case) -> GradcheckResult:
             torch.autograd.gradcheck(function, arguments, fast_mode=False)
             torch.autograd.gradgradcheck(function, arguments, fast_mode=False)
     except Exception as error:  # whatever an op raises belongs in the report of that op, and the others go on
-        message = next(iter(str(error).splitlines()), type(error).__name__)
+        passed = False
+        message = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
     seconds = time.perf_counter() - start
-    return GradcheckResult(op.name, case.name, case.differentiable, not message, seconds, message)
+    return GradcheckResult(op.name, case.name, case.differentiable, passed, seconds, message)
 
 
 def _of_differentiable(op: Op, case: Case) -> tuple[Callable[..., Any], tuple[Tensor, ...]]:

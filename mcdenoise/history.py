@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.buffers import Frame
-from mcdenoise.ops import Surface, accumulate, demodulate, motion_from_position
+from mcdenoise.ops import Accumulate, Surface, demodulate, motion_from_position
 
 # A cut leaves a few accidental matches; a fast pan keeps far more than this share of the image.
 _CUT_SHARE = 0.05
@@ -36,18 +36,19 @@ class _State(NamedTuple):
 
 
 class History:
-    """Demodulates frames and accumulates them, one after the other, by :func:`mcdenoise.ops.accumulate`.
+    """Demodulates frames and accumulates them, one after the other.
 
     The motion is the frame's own where it has one, else that of its positions seen from the previous camera; with
     neither there is no past. The past is thrown away by :meth:`reset`, when the image size changes, and at a cut (less
     than 5 % of the pixels find their surface in the previous frame).
 
     Args:
-        alpha_min: smallest weight of the current frame, see :func:`mcdenoise.ops.accumulate`.
+        accumulate: the rule and its limits; by default those that scale with depth. The published BMFR rule is
+            ``Accumulate(0.2, "bmfr", position_limit, normal_limit)`` with the scene's squared limits.
     """
 
-    def __init__(self, alpha_min: float = 0.1) -> None:
-        self.alpha_min = alpha_min
+    def __init__(self, accumulate: Accumulate | None = None) -> None:
+        self.accumulate = Accumulate() if accumulate is None else accumulate
         self._state: _State | None = None
 
     def reset(self) -> None:
@@ -60,6 +61,7 @@ class History:
         Args:
             frame: the next frame; its values must be valid (:meth:`mcdenoise.buffers.Frame.validate`).
         """
+        frame = frame.with_depth()
         color = frame.color if frame.albedo is None else demodulate(frame.color, frame.albedo)
         surface = Surface(frame.position, frame.normal, frame.depth)
         result = self._blend(frame, color, surface)
@@ -79,9 +81,7 @@ class History:
             motion = motion_from_position(frame.position, state.view_projection)
         else:
             return first._replace(reset="no motion, and no position with a previous camera")
-        accumulated, length = accumulate(
-            color, state.color, state.length, motion, surface, state.surface, alpha_min=self.alpha_min
-        )
+        accumulated, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
         if float((length > 1).float().mean()) < _CUT_SHARE:
             return first._replace(reset="cut")
         return Accumulated(accumulated, length, "")

@@ -8,6 +8,7 @@ therefore the rays are built here, and Mitsuba traces them. Mitsuba is optional 
 from __future__ import annotations
 
 import functools
+import hashlib
 import importlib
 import json
 import math
@@ -92,6 +93,7 @@ def render_sequence(
     matrices = np.stack([view_projection(camera, width, height, near, far) for camera in cameras])
     settings: dict[str, Any] = {
         "scene": _scene_name(scene),
+        "scene_sha256": _scene_digest(scene),
         "renderer": tracer.name,
         "frames": len(cameras),
         "width": width,
@@ -297,7 +299,19 @@ _CONVENTIONS: dict[str, Any] = {
     },
 }
 # Frames rendered with different values of these do not belong into one folder.
-_IDENTITY = ("scene", "renderer", "width", "height", "near", "far", "noisy_spp", "max_depth", "rr_depth", "seed")
+_IDENTITY = (
+    "scene",
+    "scene_sha256",
+    "renderer",
+    "width",
+    "height",
+    "near",
+    "far",
+    "noisy_spp",
+    "max_depth",
+    "rr_depth",
+    "seed",
+)
 
 
 def _prepare_folder(out: Path, settings: dict[str, Any]) -> Path:
@@ -408,6 +422,24 @@ def _scene_name(scene: Scene) -> str:
         return "in memory"
     path = Path(scene).resolve()
     return path.parent.name if path.stem == "scene" else path.stem
+
+
+def _scene_digest(scene: Scene) -> str:
+    """Tells one description of a scene from another; of the files that an XML names, only the names count."""
+    digest = hashlib.sha256()
+
+    def feed(value: Any) -> None:
+        if isinstance(value, Mapping):
+            for key, item in value.items():
+                digest.update(f"{key}:".encode())
+                feed(item)
+        elif isinstance(value, np.ndarray):
+            digest.update(str(value.shape).encode() + value.tobytes())
+        else:
+            digest.update(f"{value!r};".encode())
+
+    feed(scene if isinstance(scene, Mapping) else Path(scene).read_bytes())
+    return digest.hexdigest()
 
 
 def _image(values: Array, width: int, height: int) -> torch.Tensor:

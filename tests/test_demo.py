@@ -22,7 +22,9 @@ def small_demo(monkeypatch):
 def test_demo_renders_denoises_and_shows(small_demo, tmp_path):
     rendered, denoised = [], []
     result = small_demo.run_demo(
-        tmp_path, on_render=lambda done, total: rendered.append((done, total)), on_frame=denoised.append
+        tmp_path,
+        on_render=lambda done, total: rendered.append((done, total)),
+        on_frame=lambda: denoised.append(len(denoised)),
     )
     assert rendered[-1][0] == rendered[-1][1] == 3 + 2 * 64
     assert denoised == [0, 1, 2]

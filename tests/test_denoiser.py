@@ -207,9 +207,15 @@ def test_a_sequence_is_written_with_its_numbers_and_metadata(small_sequence: Pat
     for number in sequence.numbers:
         color = small_sequence / "inputs" / f"color{number}.exr"
         write_exr(color, read_exr(color)[0], ["R", "G", "B"], metadata={"Owner": f"frame {number}", "camera": 1.5})
-    seen: list[int] = []
-    denoise_sequence(sequence, out, Denoiser(small_model()), "small", on_frame=seen.append)
-    assert seen == [1, 2]
+    seen: list[tuple[bool, bool]] = []
+    denoise_sequence(
+        sequence,
+        out,
+        Denoiser(small_model()),
+        "small",
+        on_frame=lambda frame, images: seen.append((frame.reference is None, images.noisy.equal(frame.color))),
+    )
+    assert seen == [(True, True)] * 2
     assert sorted(path.name for path in out.iterdir()) == ["denoise.json", "denoised1.exr", "denoised2.exr"]
     denoiser = Denoiser(small_model())
     for number in sequence.numbers:
@@ -241,6 +247,7 @@ def test_the_report_of_a_sequence(small_sequence: Path, tmp_path: Path) -> None:
     assert written["threads"] == torch.get_num_threads()
     assert written["sequence"] == {"name": "plane", "layout": "bmfr", "size": [20, 24]}
     assert written["plan"] == {
+        "read": {"kept": True, "reason": "color is stored with albedo"},
         "demodulate": {"kept": True, "reason": "albedo"},
         "accumulate": {"kept": True, "reason": "positions and cameras"},
         "network": {"kept": True, "reason": "always"},
@@ -262,6 +269,7 @@ def test_the_plan_of_color_alone(small_sequence: Path, tmp_path: Path) -> None:
             path.unlink()
     report = denoise_sequence(open_sequence(small_sequence), tmp_path / "out", Denoiser(small_model()), "small")
     assert {name: stage["kept"] for name, stage in report.stages.items()} == {
+        "read": True,
         "demodulate": False,
         "accumulate": False,
         "network": True,
@@ -287,3 +295,28 @@ def test_an_output_folder_that_cannot_be(small_sequence: Path, tmp_path: Path) -
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         message = refused(lambda out=out: denoise_sequence(sequence, out, denoiser, "small"))
         assert f"{out}: expected a folder that can be written to" in message
+
+
+def test_an_old_report_does_not_survive_a_run_that_fails(small_sequence: Path, tmp_path: Path) -> None:
+    sequence, out = open_sequence(small_sequence), tmp_path / "out"
+    denoise_sequence(sequence, out, Denoiser(small_model()), "small")
+    path = small_sequence / "inputs" / "albedo2.exr"
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(InputError):
+        denoise_sequence(sequence, out, Denoiser(small_model()), "small")
+    assert not (out / "denoise.json").exists()
+
+
+def test_depth_comes_from_positions_and_camera(small_sequence: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    with_depth, without = Denoiser(small_model()), Denoiser(small_model())
+    for number in sequence.numbers:
+        frame = sequence.frame(number)
+        expected = with_depth(frame.with_depth())
+        image = without(frame.replace(depth=None))
+        assert without.report.missing == []
+        hit = frame.normal.abs().sum(1, keepdim=True) > 0
+        derived = frame.replace(depth=None).with_depth().depth
+        torch.testing.assert_close(derived[hit], frame.depth[hit], rtol=1e-3, atol=0)
+        assert image.isfinite().all()
+        assert expected.shape == image.shape

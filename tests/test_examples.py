@@ -89,10 +89,9 @@ def test_denoise_sequence_writes_every_frame(small_sequence: Path, weights: Path
 
 
 def test_gradcheck_passes() -> None:
-    # The whole table takes the best part of a minute on a slow machine, and has tests of its own.
-    lines = run("gradcheck_ops.py", "kernel_conv", "demodulate").splitlines()
+    lines = run("gradcheck_ops.py").splitlines()
     assert lines[0].startswith("passed  my_filter")
-    assert len(lines) > 10
+    assert len(lines) > 30
     assert all(line.startswith("passed") for line in lines)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from mcdenoise.buffers import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.history import History
-from mcdenoise.ops import demodulate, remodulate
+from mcdenoise.ops import Accumulate, demodulate, remodulate
 
 HEIGHT, WIDTH = 5, 6
 
@@ -35,7 +35,7 @@ def test_the_first_frame_is_itself() -> None:
 
 
 def test_a_still_shot_is_averaged() -> None:
-    history, colors = History(alpha_min=0.1), torch.rand(10, 1, 3, HEIGHT, WIDTH)
+    history, colors = History(Accumulate(0.1)), torch.rand(10, 1, 3, HEIGHT, WIDTH)
     for i, color in enumerate(colors, start=1):
         past = history.update(still(color))
         torch.testing.assert_close(past.color, colors[:i].mean(0))
@@ -134,7 +134,7 @@ def test_motion_goes_before_positions() -> None:
 
 @pytest.mark.parametrize("alpha_min", [0.1, 0.25])
 def test_accumulation_reduces_the_error_of_a_moving_camera(small_sequence: Path, alpha_min: float) -> None:
-    sequence, history = open_sequence(small_sequence), History(alpha_min)
+    sequence, history = open_sequence(small_sequence), History(Accumulate(alpha_min))
     for number in sequence.numbers:
         frame = sequence.frame(number)
         past = history.update(frame)
@@ -161,3 +161,31 @@ def test_the_background_has_a_past(small_sequence: Path) -> None:
     assert (past.length[sky] > 1).float().mean() > 0.8
     # It has no noise and one color, which blending must not change.
     torch.testing.assert_close(past.color * sky, frame.color * sky)
+
+
+def test_another_surface_at_the_same_pixel_is_no_past_even_without_depth() -> None:
+    """Positions with a camera are enough: depth is what the camera sees of them."""
+    matrix = torch.eye(4)[None]
+    matrix[:, 2, 3], matrix[:, 3, 3] = 1, 0  # clip w = z
+
+    def wall(z: float) -> Frame:
+        y, x = torch.meshgrid(torch.linspace(-0.9, 0.9, 10), torch.linspace(-0.9, 0.9, 10), indexing="ij")
+        position = torch.stack([x * z, y * z, torch.full_like(x, z)])[None]
+        return Frame(color=torch.ones(1, 3, 10, 10), position=position, view_projection=matrix)
+
+    history = History()
+    history.update(wall(2.0))
+    assert history.update(wall(2.0)).reset == ""
+    assert history.update(wall(9.0)).reset == "cut"
+
+
+def test_the_published_rule_can_be_asked_for(small_sequence: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    history = History(Accumulate(0.2, "bmfr", position_limit=1.0, normal_limit=0.25))
+    for number in sequence.numbers:
+        past = history.update(sequence.frame(number))
+    assert past.length.max() == len(sequence)
+    nothing_alike = History(Accumulate(0.2, "bmfr", position_limit=0.0, normal_limit=0.25))
+    for number in sequence.numbers:
+        past = nothing_alike.update(sequence.frame(number))
+    assert past.reset == "cut"

@@ -39,7 +39,7 @@ ALLOWED: dict[str, set[str]] = {
     "denoiser": SIGNAL | {"models", "history", "plan"},
     "denoise": LIBRARY,
     "run_folder": SIGNAL | {"data"},
-    "evaluate": LIBRARY,
+    "evaluate": LIBRARY | {"denoise"},
     "report": LIBRARY,
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS),
     "cli": LIBRARY | TOOLS,

@@ -147,6 +147,15 @@ def test_a_stopped_run_is_resumed(tmp_path: Path) -> None:
         render(None, seed=1)
 
 
+def test_another_scene_of_the_same_name_is_refused(tmp_path: Path) -> None:
+    scene = demo_scene()
+    settings = {**SCALAR, "reference_frames": []}
+    render_sequence(scene, demo_cameras(1), tmp_path, **settings)
+    scene["window"] = {**scene["window"], "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [1, 2, 3]}}}
+    with pytest.raises(InputError, match="rendered with scene_sha256"):
+        render_sequence(scene, demo_cameras(1), tmp_path, **settings)
+
+
 def _furnace(albedo: float = 0.5) -> dict[str, Any]:
     """A sphere inside a glowing one: the radiance of every pixel is known."""
     grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}

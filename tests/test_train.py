@@ -17,6 +17,7 @@ from mcdenoise.data.clips import Clip, ClipSampler, accumulated_shots
 from mcdenoise.errors import InputError
 from mcdenoise.history import History
 from mcdenoise.models import describe_weights, load_weights
+from mcdenoise.ops import Accumulate
 
 pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
 pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
@@ -56,7 +57,8 @@ def state(run: Path) -> list[Tensor]:
             return [tensor for item in value for tensor in tensors(item)]
         return [torch.as_tensor(value)] if isinstance(value, Tensor | int | float) else []
 
-    return tensors(torch.load(run / "checkpoint.pt", weights_only=True))
+    saved = torch.load(run / "checkpoint.pt", weights_only=True)
+    return tensors([saved["step"], saved["parts"]])
 
 
 # Runs
@@ -129,8 +131,11 @@ def test_what_a_run_leaves(small_sequence: Path, tmp_path: Path) -> None:
         assert frame.reference is not None
         digest.update(frame.color.numpy().tobytes() + frame.reference.numpy().tobytes())
     data = json.loads((run / "data.json").read_text())
-    assert data == [{"name": "plane", "frames": 4, "size": "24x20", "sha256": digest.hexdigest()}]
-    log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    entry = {"name": "plane", "frames": 4, "size": "24x20", "validation": [3], "sha256": digest.hexdigest()}
+    assert data == {"credits": "A. Painter, CC0", "sequences": [entry]}
+    start, *log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    assert start["first_step"] == 0
+    assert set(start) == {"first_step", "commit", "threads"}
     assert [entry["step"] for entry in log] == [2, 4, 6]
     assert all(set(entry) == {"step", "loss", "seconds", "validation"} for entry in log)
 
@@ -138,7 +143,8 @@ def test_what_a_run_leaves(small_sequence: Path, tmp_path: Path) -> None:
     assert (about["architecture"], about["settings"], about["steps"]) == ("cascaded", {"width": 4}, "6")
     assert (about["licence"], about["credits"]) == ("Apache-2.0", "A. Painter, CC0")
     assert json.loads(about["config"]) == config
-    assert json.loads(about["data"]) == data
+    assert json.loads(about["data"]) == data["sequences"]
+    assert json.loads(about["commits"]) == [{"first_step": 0, "commit": start["commit"]}]
     saved = torch.load(run / "checkpoint.pt", weights_only=True)["parts"][0]
     for key, tensor in load_weights(weights, "cascaded").state_dict().items():
         assert torch.equal(tensor, saved[key].half().float())
@@ -336,7 +342,7 @@ def test_shots_start_anew_and_are_accumulated(small_sequence: Path) -> None:
     shots = accumulated_shots(sequence, 0.1, start_every=2)
     assert [tuple(shot.shape) for shot in shots] == [(4, 13, 20, 24), (2, 13, 20, 24)]
     for first, shot in zip((0, 2), shots, strict=True):
-        clip, history = Clip.from_stack(shot[None]), History(0.1)
+        clip, history = Clip.from_stack(shot[None]), History(Accumulate(0.1))
         for i, number in enumerate(sequence.numbers[first:]):
             frame = sequence.frame(number)
             assert torch.equal(clip.color[0, i], history.update(frame).color[0])

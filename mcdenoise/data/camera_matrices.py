@@ -45,7 +45,10 @@ class CameraMatrices:
         return len(self.matrices)
 
     def view_projection(self, index: int, size: tuple[int, int]) -> Array:
-        r"""One frame's matrix with its pixel offset folded in, so that ``u W - 0.5, v H - 0.5`` is the pixel index.
+        r"""One frame's matrix with a pixel offset folded in, so that ``u W - 0.5, v H - 0.5`` is the pixel index.
+
+        The matrix serves to look up the frame after it, as in the published code, which takes this frame's matrix and
+        the next frame's offset.
 
         .. math:: M'_{:,0} = M_{:,0} + \frac{1 - 2 o_x}{W} M_{:,3}, \quad
                   M'_{:,1} = M_{:,1} + \frac{2 o_y - 1}{H} M_{:,3}
@@ -58,7 +61,7 @@ class CameraMatrices:
             float64 ``(4, 4)``.
         """
         height, width = size
-        offset_x, offset_y = self.pixel_offsets[index]
+        offset_x, offset_y = self.pixel_offsets[min(index + 1, len(self) - 1)]
         matrix: Array = self.matrices[index].copy()
         matrix[:, 0] += (1 - 2 * offset_x) / width * matrix[:, 3]
         matrix[:, 1] += (2 * offset_y - 1) / height * matrix[:, 3]

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.history import History
+from mcdenoise.ops import Accumulate
 
 # name, channels: what a training clip holds, in the order in which it is stacked for augmentation
 _PARTS = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
@@ -52,7 +53,7 @@ def accumulated_shots(sequence: Sequence, alpha_min: float, start_every: int) ->
 
     Args:
         sequence: frames with references and all features.
-        alpha_min: see :class:`mcdenoise.history.History`.
+        alpha_min: see :func:`mcdenoise.ops.accumulate`.
         start_every: distance between the first frames.
 
     Returns:
@@ -73,7 +74,7 @@ def accumulated_shots(sequence: Sequence, alpha_min: float, start_every: int) ->
     frames = [sequence.frame(number).validate()[0] for number in sequence.numbers]
     shots = []
     for first in range(0, len(frames), start_every):
-        history = History(alpha_min)
+        history = History(Accumulate(alpha_min))
         stacks = []
         for frame in frames[first:]:
             color = history.update(frame).color

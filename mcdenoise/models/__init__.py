@@ -1,6 +1,5 @@
 """The zoo: denoisers assembled from the operators, by name."""
 
-from mcdenoise.models import cascaded as _cascaded  # entering itself in the register
 from mcdenoise.models._overview import ModelOverview, overview
 from mcdenoise.models._registry import list_models, register_model
 from mcdenoise.models._weights import create_model, describe_weights, load_weights, pretrained_models, save_weights
@@ -34,5 +33,3 @@ __all__ = [
     "register_model",
     "save_weights",
 ]
-
-del _cascaded

@@ -69,7 +69,9 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> nn.Mod
     settings = {**description["settings"], **settings}
     try:
         model = build_model(found, **settings)
-    except (TypeError, RuntimeError) as error:
+    except InputError:
+        raise
+    except (TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"{path}: expected settings of model '{found}', found {settings}") from error
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - a safetensors handle is no dict
@@ -79,6 +81,8 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> nn.Mod
         actual = tuple(tensors[key].shape) if key in tensors else "no such layer"
         if expected != actual:
             raise InputError(f"{path}: layer '{key}': model '{found}' expects {expected}, found {actual}")
+    if description.get("sha256") != _digest(tensors):
+        raise InputError(f"{path}: expected tensors that match the header's sha256, found others; the file is damaged")
     model.load_state_dict({key: tensor.float() for key, tensor in tensors.items()})
     return model.eval()
 
@@ -118,10 +122,20 @@ def save_weights(model: nn.Module, architecture: str, settings: dict[str, Any], 
 
     Returns:
         The file's bytes; the header also has the ``sha256`` of the tensors' bytes.
+
+    Raises:
+        InputError: a weight is not finite in half precision.
     """
     tensors = {key: value.detach().cpu().to(torch.float16).contiguous() for key, value in model.state_dict().items()}
+    for key, tensor in tensors.items():
+        if not tensor.isfinite().all():
+            raise InputError(f"layer '{key}': expected weights that fit half precision, found NaN or infinite ones")
+    header = {"architecture": architecture, "settings": json.dumps(settings), **about, "sha256": _digest(tensors)}
+    return save(tensors, header)
+
+
+def _digest(tensors: dict[str, torch.Tensor]) -> str:
     digest = hashlib.sha256()
     for key in sorted(tensors):
-        digest.update(key.encode() + tensors[key].numpy().tobytes())
-    header = {"architecture": architecture, "settings": json.dumps(settings), **about, "sha256": digest.hexdigest()}
-    return save(tensors, header)
+        digest.update(key.encode() + tensors[key].contiguous().numpy().tobytes())
+    return digest.hexdigest()

@@ -213,7 +213,7 @@ class _Correlate(Function):
         result = source.new_empty(image.shape[0], kernel_size * kernel_size, height, width)
         for tap, dy, dx in offsets(kernel_size):
             result[:, tap] = (source * shifted(other, radius, dy, dx, height, width)).sum(1)
-        return result.to(image.dtype)
+        return result
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:

@@ -96,10 +96,10 @@ def reproject(
 
     - ``rule="relative"``: limits scale with depth. ``|dot(P_k - P, N)| <= position_limit * depth``, the distance off
       the tangent plane (``|P_k - P|`` without normals; default 0.02); with depths only,
-      ``|d_k - d| <= position_limit * d`` (default 0.1); ``|N_k - N|^2 <= normal_limit`` (default 0.5). Depth comes
-      from ``depth``; without it the plane test is left out. A pixel that hit nothing matches only such pixels.
+      ``|d_k - d| <= position_limit * d`` (default 0.1); ``|N_k - N|^2 <= normal_limit`` (default 0.5). Positions
+      need depths beside them. A pixel that hit nothing matches only such pixels.
     - ``rule="bmfr"``: ``|P_k - P|^2 < position_limit`` and ``|N_k - N|^2 < normal_limit``, squared limits in scene
-      units, which the scene must supply.
+      units, which the scene must supply; positions and normals are needed.
 
     Args:
         previous: ``(B, C, H, W)`` anything of the previous frame.
@@ -108,15 +108,15 @@ def reproject(
         surface: the current frame's surface; ``None`` tests only for the image border.
         previous_surface: the previous frame's surface.
         rule: ``"relative"`` or ``"bmfr"``.
-        position_limit: see above; required by ``"bmfr"`` where positions are given.
-        normal_limit: see above; required by ``"bmfr"`` where normals are given.
+        position_limit: see above; required by ``"bmfr"``.
+        normal_limit: see above; required by ``"bmfr"``.
 
     Returns:
         ``(B, C, H, W)`` value in the dtype of ``previous``, and ``(B, 1, H, W)`` kept weight in [0, 1].
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, the rule is unknown, or ``"bmfr"`` lacks a limit.
+        ValueError: shapes disagree, the rule is unknown, or it lacks a buffer or a limit that it needs.
 
     Differentiable in ``previous`` (to any order) and, between the pixel centres, in ``motion``; the test is a
     decision and has no derivative. Without a test it is ``kornia.geometry.transform.remap`` inside the image.
@@ -134,7 +134,8 @@ def reproject(
     if rule not in ("relative", "bmfr"):
         raise ValueError(f"rule: expected 'relative' or 'bmfr', found {rule!r}")
     here, there = _comparable(surface, previous_surface, previous)
-    _check_limits(rule, here, position_limit, normal_limit)
+    if surface is not None and previous_surface is not None:
+        _check_rule(rule, here, position_limit, normal_limit)
     height, width = sizes["H"], sizes["W"]
     dtype = torch.promote_types(previous.dtype, torch.float32)
 
@@ -327,12 +328,17 @@ def _comparable(surface: Surface | None, previous: Surface | None, like: Tensor)
     return Surface(*(a for a, _ in pairs)), Surface(*(b for _, b in pairs))
 
 
-def _check_limits(rule: Rule, surface: Surface, position_limit: float | None, normal_limit: float | None) -> None:
+def _check_rule(rule: Rule, surface: Surface, position_limit: float | None, normal_limit: float | None) -> None:
+    """What a rule cannot do without must not be left out in silence: it would accept everything."""
     if rule == "bmfr":
-        if surface.position is not None and position_limit is None:
-            raise ValueError("position_limit: the rule 'bmfr' needs its squared limit in scene units, found None")
-        if surface.normal is not None and normal_limit is None:
-            raise ValueError("normal_limit: the rule 'bmfr' needs its squared limit, found None")
+        for name, buffer in (("position", surface.position), ("normal", surface.normal)):
+            if buffer is None:
+                raise ValueError(f"surface.{name}: the rule 'bmfr' needs it in both frames, found None")
+        for name, limit in (("position_limit", position_limit), ("normal_limit", normal_limit)):
+            if limit is None:
+                raise ValueError(f"{name}: the rule 'bmfr' needs the scene's squared limit, found None")
+    elif surface.position is not None and surface.depth is None:
+        raise ValueError("surface.depth: the rule 'relative' needs it beside position in both frames, found None")
 
 
 def _bmfr_test(here: Surface, tap: Surface, position_limit: float | None, normal_limit: float | None) -> Tensor | bool:

@@ -358,12 +358,30 @@ def test_a_model_without_shipped_weights_says_so() -> None:
     assert "expected one of" in refused(lambda: create_model("oidn", pretrained=True))
 
 
-@pytest.mark.skipif(not (SHIPPED / "cascaded.safetensors").is_file(), reason="no cascaded.safetensors is shipped yet")
+def test_a_damaged_tensor_and_an_infinite_weight_are_refused(tmp_path: Path) -> None:
+    model, path = create_model("cascaded", width=4), tmp_path / "cascaded.safetensors"
+    content = bytearray(save_weights(model, "cascaded", {"width": 4}, {}))
+    path.write_bytes(content)
+    load_weights(path)
+    content[-1] ^= 1
+    path.write_bytes(content)
+    assert "sha256" in refused(lambda: load_weights(path))
+    with torch.no_grad():
+        next(model.parameters()).flatten()[0] = 1e6  # more than half precision holds
+    assert "NaN or infinite" in refused(lambda: save_weights(model, "cascaded", {"width": 4}, {}))
+
+
 def test_the_shipped_weights() -> None:
     assert "cascaded" in pretrained_models()
     model = create_model("cascaded", pretrained=True)
     about = describe_weights(SHIPPED / "cascaded.safetensors")
-    assert {"config", "data", "steps", "commit", "licence", "credits", "sha256"} <= set(about)
+    assert about["licence"] == "Apache-2.0"
+    for author in ("Mareck", "NovaZeeke", "Jay-Artist", "Wig42"):
+        assert author in about["credits"]
+    assert int(about["steps"]) == json.loads(about["config"])["steps"]
+    assert all(len(part["commit"]) == 40 for part in json.loads(about["commits"]))
+    trained_on = {entry["name"].removesuffix("-flythrough") for entry in json.loads(about["data"])}
+    assert trained_on == {"bathroom", "classroom", "living-room-2", "staircase"}
     with torch.no_grad():
         assert torch.isfinite(model(*inputs(33, 20)).final).all()
 

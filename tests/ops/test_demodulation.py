@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mcdenoise.ops import demodulate, remodulate
+from mcdenoise.ops import demodulate, kernel_conv, remodulate
 from mcdenoise.ops.demodulation import FLOOR
 
 
@@ -31,7 +31,7 @@ def test_remodulate_is_the_inverse_everywhere(dtype: torch.dtype) -> None:
 
 def test_no_albedo_passes_unchanged() -> None:
     color = pixel(0.0, 0.3, 1e4)
-    for albedo in (pixel(0, 0, 0), pixel(1e-8, 0, FLOOR / 2)):
+    for albedo in (pixel(0, 0, 0), pixel(1e-8, 0, 9e-5)):
         assert torch.equal(demodulate(color, albedo), color)
         assert torch.equal(remodulate(color, albedo), color)
 
@@ -53,7 +53,17 @@ def test_albedo_above_one_is_divided_by() -> None:
 
 def test_floor_can_be_set() -> None:
     assert torch.equal(demodulate(pixel(1.0, 1.0), pixel(0.75, 0.25), floor=0.5), pixel(1 / 0.75, 2.0))
-    assert torch.equal(demodulate(pixel(1.0, 1.0), pixel(0.25, 0.25), floor=0.5), pixel(1.0, 1.0))
+    assert torch.equal(demodulate(pixel(1.0, 1.0), pixel(0.25, 0.25), floor=0.5), pixel(2.0, 2.0))
+
+
+def test_a_dark_texture_is_filtered_without_steps() -> None:
+    """Uniform light on a texture that crosses the floor: what filtering leaves is still a multiple of the texture."""
+    albedo = torch.tensor([0.0003, 0.0099, 0.0101, 0.02], dtype=torch.float64).reshape(1, 1, 1, 4)
+    light = demodulate(2 * albedo, albedo)
+    assert light[..., 1:].amax() / light[..., 1:].amin() < 1.02
+    box = torch.full((1, 9, 1, 4), 1 / 9, dtype=torch.float64)
+    filtered = remodulate(kernel_conv(light, box), albedo)
+    assert (filtered <= 2 * albedo.clamp_min(FLOOR) * (1 + 1e-12)).all()
 
 
 def test_gradients_are_finite_everywhere() -> None:

@@ -152,3 +152,18 @@ def test_memory_of_the_gradient_is_that_of_a_kernel(op: Callable[..., Tensor], b
         op(image, kernel, border=border).sum().backward()
     # A stack of 49 shifted images would hold 3 * 49 * 32 * 32.
     assert largest.numel == 49 * 32 * 32
+
+
+@pytest.mark.parametrize("op", [kernel_conv, kernel_splat])
+def test_a_float32_kernel_of_a_half_image_keeps_its_gradient(op: Callable[..., Tensor]) -> None:
+    """Autocast gives half images and float32 weights; a product beyond 65504 must not end as infinity."""
+    g = torch.Generator().manual_seed(0)
+    image = (torch.rand(1, 3, 3, 5, generator=g) * 2e4).half()
+    kernel = torch.rand(1, 9, 3, 5, generator=g) / 9
+    upstream = torch.rand(1, 3, 3, 5, generator=g).half() * 10
+    results = []
+    for dtype in (torch.float16, torch.float64):
+        weights = kernel.to(torch.promote_types(dtype, torch.float32)).requires_grad_()
+        (gradient,) = torch.autograd.grad(op(image.to(dtype), weights), weights, upstream.to(dtype))
+        results.append(gradient.double())
+    torch.testing.assert_close(*results, rtol=1e-6, atol=0)
