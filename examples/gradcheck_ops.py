@@ -20,7 +20,6 @@ from torch.autograd import gradcheck, gradgradcheck
 from mcdenoise.gradcheck import check
 from mcdenoise.ops import cross_bilateral_weights, demodulate, kernel_conv, remodulate
 
-
 PARTS = ["demodulate", "cross_bilateral_weights", "kernel_conv", "remodulate"]
 
 

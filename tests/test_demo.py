@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from mcdenoise.data import open_sequence, read_exr
-from mcdenoise.models import pretrained_models
 
 pytest.importorskip("mitsuba", reason="the demo renders with Mitsuba, which is not installed")
 
@@ -18,7 +17,6 @@ def small_demo(monkeypatch):
     return demo
 
 
-@pytest.mark.skipif("cascaded" not in pretrained_models(), reason="the weights of 'cascaded' are not there yet")
 def test_demo_renders_denoises_and_shows(small_demo, tmp_path):
     rendered, denoised = [], []
     result = small_demo.run_demo(
