@@ -244,6 +244,7 @@ def _train() -> Callable[..., int | None]:
         sequences: tyro.conf.Positional[list[Path]],
         out: Out,
         config: tyro.conf.OmitArgPrefixes[TrainConfig],
+        initial_weights: Path | None = None,
         accelerator: str = "cpu",
         checkpoint_every: int = 500,
         credits: str = "",
@@ -254,6 +255,7 @@ def _train() -> Callable[..., int | None]:
             sequences: folders of sequences with references, albedo, normal and depth.
             out: folder of the run: checkpoint, log, TensorBoard events, and at the end the weights.
             config: what to train.
+            initial_weights: safetensors file of weights to start from.
             accelerator: cpu or cuda.
             checkpoint_every: steps between checkpoints.
             credits: authors and licences of the training scenes, stored with the weights.
@@ -269,6 +271,7 @@ def _train() -> Callable[..., int | None]:
                 config,
                 sequences,
                 out,
+                initial_weights=initial_weights,
                 accelerator=accelerator,
                 checkpoint_every=checkpoint_every,
                 credits=credits,

@@ -22,7 +22,7 @@ from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.losses import cascade_loss
 from mcdenoise.metrics import displayed, psnr_srgb, smape_linear
-from mcdenoise.models import create_model, save_weights
+from mcdenoise.models import create_model, describe_weights, save_weights
 from mcdenoise.ops import remodulate
 from mcdenoise.run_folder import RunFolder, source_commit
 
@@ -55,6 +55,7 @@ class TrainConfig:
         start_every: a shot also starts at every n-th frame, to train on short histories.
         validation_frames: the last frames of each sequence, kept for validation (the paper's 4); none of a sequence
             that would be left with less than one clip.
+        lamps: chance that a clip gets lamps, see :class:`mcdenoise.data.clips.ClipSampler`.
         precision: ``"bf16-mixed"`` runs convolutions in bfloat16.
         seed: of weights and clips.
     """
@@ -72,6 +73,7 @@ class TrainConfig:
     alpha_min: float = 0.1
     start_every: int = 4
     validation_frames: int = 4
+    lamps: float = 0.0
     precision: Precision = "32-true"
     seed: int = 0
 
@@ -102,6 +104,7 @@ def train(
     sequences: list[Path],
     out: Path,
     *,
+    initial_weights: Path | None = None,
     accelerator: str = "cpu",
     checkpoint_every: int = 500,
     credits: str = "",
@@ -117,6 +120,7 @@ def train(
         sequences: folders of sequences with references and features.
         out: folder of the run: ``config.json``, ``data.json``, ``log.jsonl``, TensorBoard events, ``checkpoint.pt``,
             and at the end ``MODEL.safetensors``.
+        initial_weights: weights to start from instead of random ones, such as those of an earlier run.
         accelerator: ``"cpu"`` or ``"cuda"``.
         checkpoint_every: steps between checkpoints and validations.
         credits: authors and licences of the training scenes, stored with the weights.
@@ -138,7 +142,7 @@ def train(
 
     torch.manual_seed(config.seed)
     settings: dict[str, Any] = {"width": config.width} if config.width else {}
-    network = create_model(config.model, **settings).train()
+    network = create_model(config.model, weights=initial_weights, **settings).train()
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(config, step))
@@ -146,7 +150,12 @@ def train(
     validation = [clip.to(fabric.device) for clip in validation]
     # Only now, so that input that cannot be trained on leaves no trace of a run.
     run = RunFolder(out)
-    data = {"credits": credits, "sequences": [_describe(config, sequence) for sequence in opened]}
+    initial = describe_weights(initial_weights)["sha256"] if initial_weights else "none"
+    data = {
+        "credits": credits,
+        "initial_weights": initial,
+        "sequences": [_describe(config, sequence) for sequence in opened],
+    }
     run.claim(config=dataclasses.asdict(config), data=data)
     first, provenance = run.load(network, optimizer, scheduler)
     weights = out / f"{config.model}.safetensors"
@@ -191,6 +200,7 @@ def train(
         "config": json.dumps(dataclasses.asdict(config)),
         "data": json.dumps(data["sequences"]),
         "credits": credits,
+        "initial_weights": initial,
         "steps": str(config.steps),
         "commits": json.dumps(provenance),
         "licence": "Apache-2.0",
@@ -235,6 +245,8 @@ def _check(config: TrainConfig, checkpoint_every: int) -> None:
         raise InputError(f"seed: expected 0 to 2^32 - 1, found {config.seed}")
     if not config.learning_rate > 0:
         raise InputError(f"learning_rate: expected a positive number, found {config.learning_rate}")
+    if not 0 <= config.lamps <= 1:
+        raise InputError(f"lamps: expected in [0, 1], found {config.lamps}")
     if not 0 < config.alpha_min <= 1:
         raise InputError(f"alpha_min: expected in (0, 1], found {config.alpha_min}")
 
@@ -263,7 +275,7 @@ def _data(config: TrainConfig, sequences: list[Sequence]) -> tuple[ClipSampler, 
             shots.append(shot[: max(0, len(shot) - held)])
             if i == 0 and held:
                 validation.append(Clip.from_stack(shot[None, -held:]))
-    return ClipSampler(shots, config.frames, config.crop), validation
+    return ClipSampler(shots, config.frames, config.crop, config.lamps), validation
 
 
 def _describe(config: TrainConfig, sequence: Sequence) -> dict[str, Any]:

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import torch
 from kornia.augmentation import RandomHorizontalFlip, RandomRotation90, RandomVerticalFlip
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.history import History
-from mcdenoise.ops import Accumulate
+from mcdenoise.ops import Accumulate, demodulate
 
 # name, channels: what a training clip holds, in the order in which it is stacked for augmentation
 _PARTS = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
@@ -96,14 +97,16 @@ class ClipSampler:
         shots: tensors ``(T, 13, H, W)`` of :func:`accumulated_shots`; those shorter than ``frames`` are left out.
         frames: T of a clip.
         crop: side of the square crop in pixels.
+        lamps: chance that a clip gets rectangles of constant radiance, without noise, up to 30 times as bright as its
+            mean: emitters seen directly, of which few training scenes have any.
 
     Raises:
         InputError: no shot is long enough, or one is smaller than the crop.
     """
 
-    def __init__(self, shots: Iterable[Tensor], frames: int, crop: int) -> None:
+    def __init__(self, shots: Iterable[Tensor], frames: int, crop: int, lamps: float = 0.0) -> None:
         self.shots = [shot for shot in shots if len(shot) >= frames]
-        self.frames, self.crop = frames, crop
+        self.frames, self.crop, self.lamps = frames, crop, lamps
         if not self.shots:
             raise InputError(f"training clips: expected a sequence of at least {frames} frames, found none")
         for shot in self.shots:
@@ -134,7 +137,28 @@ class ClipSampler:
         order = torch.randperm(3)
         signs = (torch.randint(2, (3,)) * 2 - 1).float().reshape(3, 1, 1)
         normal = normal[:, torch.randperm(3)] * signs
-        return torch.cat([color[:, order], albedo[:, order], normal, depth, reference[:, order]], 1)
+        stack = torch.cat([color[:, order], albedo[:, order], normal, depth, reference[:, order]], 1)
+        if self.lamps and float(torch.rand(())) < self.lamps:
+            for _ in range(1 + _randint(3)):
+                self._hang_lamp(stack, reference.mean())
+        return stack
+
+    def _hang_lamp(self, stack: Tensor, mean: Tensor) -> None:
+        """Paint a rectangle that shines in all frames of ``(T, 13, H, W)``, with or without an albedo of its own."""
+        height, width = 2 + _randint(self.crop // 3), 2 + _randint(self.crop // 3)
+        top, left = _randint(self.crop - height), _randint(self.crop - width)
+        tint = 0.7 + 0.6 * torch.rand(1, 3, 1, 1)
+        radiance = mean * 30 ** torch.rand(()) * tint
+        albedo = torch.rand(1, 1, 1, 1).expand(1, 3, 1, 1) * _randint(2)
+        normal = normalize(torch.randn(1, 3, 1, 1), dim=1)
+        lamp = stack[:, :, top : top + height, left : left + width]
+        for part, value in zip(
+            lamp.split(list(_PARTS.values()), 1),
+            (demodulate(radiance, albedo), albedo, normal, None, radiance),
+            strict=True,
+        ):
+            if value is not None:  # depth stays: lamps hang on whatever is there
+                part.copy_(value.expand_as(part))
 
 
 def _randint(high: int) -> int:
