@@ -17,7 +17,7 @@ from mcdenoise.data.clips import Clip, ClipSampler, accumulated_shots
 from mcdenoise.errors import InputError
 from mcdenoise.history import History
 from mcdenoise.models import describe_weights, load_weights
-from mcdenoise.ops import Accumulate
+from mcdenoise.ops import Accumulate, remodulate
 
 pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
 pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
@@ -132,7 +132,7 @@ def test_what_a_run_leaves(small_sequence: Path, tmp_path: Path) -> None:
         digest.update(frame.color.numpy().tobytes() + frame.reference.numpy().tobytes())
     data = json.loads((run / "data.json").read_text())
     entry = {"name": "plane", "frames": 4, "size": "24x20", "validation": [3], "sha256": digest.hexdigest()}
-    assert data == {"credits": "A. Painter, CC0", "sequences": [entry]}
+    assert data == {"credits": "A. Painter, CC0", "initial_weights": "none", "sequences": [entry]}
     start, *log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     assert start["first_step"] == 0
     assert set(start) == {"first_step", "commit", "threads"}
@@ -163,9 +163,9 @@ def test_frames_held_back_are_not_trained_on(
     shots: list[Tensor] = []
 
     class Spy(ClipSampler):
-        def __init__(self, given: list[Tensor], frames: int, crop: int) -> None:
+        def __init__(self, given: list[Tensor], frames: int, crop: int, lamps: float) -> None:
             shots.extend(given)
-            super().__init__(given, frames, crop)
+            super().__init__(given, frames, crop, lamps)
 
     monkeypatch.setattr("mcdenoise.train.ClipSampler", Spy)
     config = TrainConfig(**{**SMALL, "steps": 1, "validation_frames": 2, "start_every": 1})
@@ -348,3 +348,33 @@ def test_shots_start_anew_and_are_accumulated(small_sequence: Path) -> None:
             assert torch.equal(clip.color[0, i], history.update(frame).color[0])
             for name in ("albedo", "normal", "depth", "reference"):
                 assert torch.equal(getattr(clip, name)[0, i], getattr(frame, name)[0]), name
+
+
+def test_lamps_shine_alike_in_color_and_reference() -> None:
+    """A clip of nothing: whatever is in it is a lamp, noise-free, in all frames, and brighter than nothing."""
+    torch.manual_seed(0)
+    shot = torch.zeros(4, 13, 20, 24)
+    shot[:, 0:3], shot[:, 10:13] = 0.1, 0.5
+    clip = ClipSampler([shot], frames=4, crop=16, lamps=1.0).draw(20)
+    radiance = remodulate(clip.color.flatten(0, 1), clip.albedo.flatten(0, 1)).unflatten(0, (20, 4))
+    lit = torch.isclose(radiance, clip.reference).all(2, keepdim=True)
+    assert lit.flatten(1).any(1).all()
+    assert (lit == lit[:, :1]).all()
+    assert 0.02 < lit.float().mean() < 0.5
+    assert (radiance[~lit.expand_as(radiance)] == torch.tensor(0.1)).all()
+    assert clip.reference.max() > 3
+    torch.manual_seed(0)
+    dark = ClipSampler([shot], frames=4, crop=16).draw(20)
+    assert dark.reference.unique().tolist() == [0.5]
+
+
+def test_a_run_can_start_from_weights(small_sequence: Path, tmp_path: Path) -> None:
+    first = train(TrainConfig(**SMALL), [small_sequence], tmp_path / "first")
+    config = TrainConfig(**{**SMALL, "steps": 1}, learning_rate=1e-12)
+    second = train(config, [small_sequence], tmp_path / "second", initial_weights=first)
+    before, after = (load_weights(path).state_dict() for path in (first, second))
+    for key, tensor in before.items():
+        torch.testing.assert_close(after[key], tensor, rtol=1e-3, atol=1e-6)
+    assert describe_weights(second)["initial_weights"] == describe_weights(first)["sha256"]
+    message = refused(lambda: train(config, [small_sequence], tmp_path / "second"))
+    assert "data.json" in message
