@@ -42,7 +42,8 @@ def test_demo_renders_denoises_and_shows(small_demo, tmp_path):
 
     # What is there is used again: the noise, and with it every clean frame, stays the same to the last bit.
     before = read_exr(result.denoised / "denoised2.exr")[0]
-    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "sequence" / "inputs").iterdir()}
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "sequence" / "inputs").glob("*.exr")}
+    assert len(files) == 3 * 5 + 2
     again = small_demo.run_demo(tmp_path)
     assert {path: path.stat().st_mtime_ns for path in files} == files
     np.testing.assert_array_equal(read_exr(again.denoised / "denoised2.exr")[0], before)

@@ -121,7 +121,7 @@ def test_unseen_scenes_compares_every_image(small_sequence: Path, weights: Path,
     file = tmp_path / "scores.json"
     arguments = (small_sequence, small_sequence, "--weights", weights, "--json", file, "--markdown")
     lines = run("unseen_scenes.py", *arguments).splitlines()
-    assert lines[0] == "| scene | frames | image | SMAPE | PSNR |"
+    assert lines[0] == "| scene | frames | image | SMAPE | relMSE | PSNR |"
     scores = json.loads(file.read_text())
     methods = ["noisy", "accumulated", "joint bilateral, best", "initial", "denoised"]
     assert [score["method"] for score in scores] == methods * 3
@@ -139,4 +139,4 @@ def test_unseen_scenes_compares_every_image(small_sequence: Path, weights: Path,
 def test_unseen_scenes_prints_plain_columns_too(small_sequence: Path, weights: Path) -> None:
     lines = run("unseen_scenes.py", small_sequence, "--weights", weights).splitlines()
     assert len(lines) == 6
-    assert lines[0].split() == ["scene", "frames", "image", "SMAPE", "PSNR"]
+    assert lines[0].split() == ["scene", "frames", "image", "SMAPE", "relMSE", "PSNR"]
