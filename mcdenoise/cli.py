@@ -111,11 +111,11 @@ def _demo() -> Callable[..., int | None]:
                 on_render=lambda done, total: progress.update(rendering, completed=done, total=total),
                 on_frame=lambda: progress.advance(denoising),
             )
-        _print_scores(asdict(score) for score in result.scores)
+        scores = [asdict(score) for score in result.scores]
+        _print_scores(scores)
         _print_times(result.report.milliseconds)
         print(f"clean frames: {result.denoised}\npicture: {result.picture}")
-        figures = {"scores": [asdict(s) for s in result.scores], "milliseconds": result.report.milliseconds}
-        _write_json(json, figures)
+        _write_json(json, {"scores": scores, "milliseconds": result.report.milliseconds})
 
     return demo
 
@@ -390,8 +390,7 @@ def _show(table: Table) -> None:
     Console(width=None if console.is_terminal else 200).print(table)
 
 
-def _print_scores(scores: Any) -> None:
-    rows = list(scores)
+def _print_scores(rows: list[dict[str, Any]]) -> None:
     table = Table("image", *rows[0]["values"], "frames")
     for row in rows:
         table.add_row(row["method"], *(f"{value:.4g}" for value in row["values"].values()), str(row["frames"]))

@@ -42,7 +42,7 @@ class TrainConfig:
 
     Args:
         model: name of the model in the zoo.
-        width: feature channels; 0 takes the model's own.
+        width: feature channels; 0 takes the model's own, or that of the weights it starts from.
         steps: optimiser steps.
         batch: clips in a step.
         frames: frames in a clip.
@@ -141,7 +141,8 @@ def train(
     sampler, validation = _data(config, opened)
 
     torch.manual_seed(config.seed)
-    settings: dict[str, Any] = {"width": config.width} if config.width else {}
+    start: dict[str, Any] = describe_weights(initial_weights) if initial_weights else {"settings": {}, "sha256": "none"}
+    settings: dict[str, Any] = {**start["settings"], **({"width": config.width} if config.width else {})}
     network = create_model(config.model, weights=initial_weights, **settings).train()
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
@@ -150,10 +151,9 @@ def train(
     validation = [clip.to(fabric.device) for clip in validation]
     # Only now, so that input that cannot be trained on leaves no trace of a run.
     run = RunFolder(out)
-    initial = describe_weights(initial_weights)["sha256"] if initial_weights else "none"
     data = {
         "credits": credits,
-        "initial_weights": initial,
+        "initial_weights": start["sha256"],
         "sequences": [_describe(config, sequence) for sequence in opened],
     }
     run.claim(config=dataclasses.asdict(config), data=data)
@@ -200,7 +200,7 @@ def train(
         "config": json.dumps(dataclasses.asdict(config)),
         "data": json.dumps(data["sequences"]),
         "credits": credits,
-        "initial_weights": initial,
+        "initial_weights": start["sha256"],
         "steps": str(config.steps),
         "commits": json.dumps(provenance),
         "licence": "Apache-2.0",

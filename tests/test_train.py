@@ -378,3 +378,12 @@ def test_a_run_can_start_from_weights(small_sequence: Path, tmp_path: Path) -> N
     assert describe_weights(second)["initial_weights"] == describe_weights(first)["sha256"]
     message = refused(lambda: train(config, [small_sequence], tmp_path / "second"))
     assert "data.json" in message
+
+
+def test_weights_of_another_width_are_gone_on_with(small_sequence: Path, tmp_path: Path) -> None:
+    """The run does not say a width; its result must, or nobody could load it."""
+    first = train(TrainConfig(**{**SMALL, "steps": 1}), [small_sequence], tmp_path / "first")
+    config = TrainConfig(**{**SMALL, "steps": 1, "width": 0})
+    second = train(config, [small_sequence], tmp_path / "second", initial_weights=first)
+    assert describe_weights(second)["settings"] == {"width": SMALL["width"]}
+    load_weights(second, "cascaded")
