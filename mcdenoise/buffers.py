@@ -49,6 +49,9 @@ BUFFERS: dict[str, BufferSpec] = {
     "motion": BufferSpec(
         2, -_UNBOUNDED, _UNBOUNDED, "pixels, x right, y down: previous = current + motion", infinite=True
     ),
+    "previous_position": BufferSpec(
+        3, -_UNBOUNDED, _UNBOUNDED, "where the surface point seen now was in the previous frame, world space"
+    ),
     "reference": BufferSpec(3, 0.0, _UNBOUNDED, "converged radiance, scene-linear RGB"),
 }
 
@@ -72,6 +75,9 @@ class Frame:
         position: ``(B, 3, H, W)`` world-space hit point in scene units.
         motion: ``(B, 2, H, W)`` pixels, x right and y down, ``previous_position = current_position + motion``;
             infinite where there is no previous position.
+        previous_position: ``(B, 3, H, W)`` world-space position, in the previous frame, of the surface point that is
+            seen now; equal to ``position`` where nothing moves. The normal that this point had then is not kept: what
+            compares normals across frames compares the current one, as if objects only moved and did not turn.
         view_projection: ``(B, 4, 4)`` row-vector world-to-clip matrix, ``clip = [x y z 1] @ M``; clip y points down.
         reference: ``(B, 3, H, W)`` converged radiance of the same pixels.
 
@@ -94,6 +100,7 @@ class Frame:
     depth: Tensor | None = None
     position: Tensor | None = None
     motion: Tensor | None = None
+    previous_position: Tensor | None = None
     view_projection: Tensor | None = None
     reference: Tensor | None = None
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import itertools
 import json
+import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +15,19 @@ import pytest
 import torch
 
 from mcdenoise.buffers import Frame
+from mcdenoise.cli import main
 from mcdenoise.data.exr import read_exr
 from mcdenoise.data.sequences import open_sequence
 from mcdenoise.demo_scene import demo_cameras, demo_scene
 from mcdenoise.errors import InputError
-from mcdenoise.render import Camera, load_camera_path, render_sequence, view_projection
+from mcdenoise.history import History
+from mcdenoise.metrics import smape_linear
+from mcdenoise.render import Camera, load_shot, render_sequence, view_projection
+from mcdenoise.render import frames as render_frames
+from mcdenoise.render.processes import render_in_processes
+from mcdenoise.render.tracer import first_working
 
+SHARED_SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 WIDTH, HEIGHT = 32, 18
 SCALAR: dict[str, Any] = {"size": (WIDTH, HEIGHT), "variant": "scalar_rgb"}
 
@@ -209,9 +218,7 @@ def test_noisy_frames_are_independent_and_their_mean_is_the_reference(tmp_path: 
 
 
 def test_variants_agree(tmp_path: Path) -> None:
-    from mcdenoise.render import _llvm_works
-
-    if not _llvm_works():
+    if first_working(("llvm_ad_rgb",)) is None:
         pytest.skip("no usable LLVM library: Mitsuba's llvm_ad_rgb does not run here")
     folders = [
         render_sequence(
@@ -225,6 +232,15 @@ def test_variants_agree(tmp_path: Path) -> None:
         assert (np.abs(scalar - vector).max(axis=-1) > tolerance).mean() < 0.01, name
     scalar, vector = (np.minimum(read(folder, "reference0"), 4).mean() for folder in folders)
     np.testing.assert_allclose(scalar, vector, rtol=0.03)
+
+
+def test_variants_agree_on_what_moves(moving: Path, tmp_path: Path) -> None:
+    if first_working(("llvm_ad_rgb",)) is None:
+        pytest.skip("no usable LLVM library: Mitsuba's llvm_ad_rgb does not run here")
+    folder = _render_moving(tmp_path, variant="llvm_ad_rgb", reference_frames=[])
+    for name in ("world_position2", "previous_position2", "albedo2"):
+        different = np.abs(read(folder, name) - read(moving, name)).max(axis=-1) > 2e-3
+        assert different.mean() < 0.01, name
 
 
 def test_view_projection_of_a_point_to_the_right_and_above() -> None:
@@ -253,14 +269,14 @@ def test_bad_camera_paths(tmp_path: Path, content: str, message: str) -> None:
     path = tmp_path / "camera_path.json"
     path.write_text(content)
     with pytest.raises(InputError, match=message) as caught:
-        load_camera_path(path)
+        load_shot(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_camera_paths_of_both_layouts(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="No such file"):
-        load_camera_path(tmp_path / "nothing.json")
+        load_shot(tmp_path / "nothing.json")
     camera = Camera.look_at((1, 2, 3), (0, 1, 0), fov_x=65)
     matrices, looks = tmp_path / "matrices.json", tmp_path / "looks.json"
     matrices.write_text(json.dumps({"fov": 65, "to_world": [camera.to_world.tolist()]}))
@@ -268,16 +284,86 @@ def test_camera_paths_of_both_layouts(tmp_path: Path) -> None:
         json.dumps({"fov": 65, "frames": [{"position": [1, 2, 3], "look_at": [0, 1, 0], "up": [0, 1, 0]}]})
     )
     for path in (matrices, looks):
-        (found,) = load_camera_path(path)
+        (found,) = load_shot(path).cameras
         assert found.fov_x == 65
         np.testing.assert_allclose(found.to_world, camera.to_world)
     matrices.write_text(json.dumps({"fov": 90, "fov_axis": "y", "aspect": "2:1", "to_world": [np.eye(4).tolist()]}))
-    np.testing.assert_allclose(load_camera_path(matrices)[0].fov_x, 126.8698976)
+    np.testing.assert_allclose(load_shot(matrices).cameras[0].fov_x, 126.8698976)
+
+
+MOVED = {"fov": 60, "to_world": [np.eye(4).tolist()] * 2}
+
+
+@pytest.mark.parametrize(
+    ("objects", "message"),
+    [
+        ([], "expected 'objects' to map ids to lists of matrices, found list"),
+        ({"ball": [np.eye(4).tolist()]}, r"'ball': expected 2 matrices .* found shape \(1, 4, 4\)"),
+        ({"ball": [[1, 2], [3]]}, "'ball': expected matrices"),
+        ({"ball": [np.eye(3).tolist()] * 2}, "'ball': expected 2 matrices of 4x4 or 3x4"),
+        ({"ball": [np.eye(4).tolist(), np.zeros((4, 4)).tolist()]}, "found something else in frame 1"),
+    ],
+)
+def test_bad_paths_of_objects(tmp_path: Path, objects: Any, message: str) -> None:
+    path = tmp_path / "shot.json"
+    path.write_text(json.dumps({**MOVED, "objects": objects}))
+    with pytest.raises(InputError, match=message) as caught:
+        load_shot(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_paths_of_objects(tmp_path: Path) -> None:
+    path = tmp_path / "shot.json"
+    moved = np.eye(4)
+    moved[:3, 3] = 1, 2, 3
+    path.write_text(json.dumps({**MOVED, "objects": {"ball": [np.eye(4)[:3].tolist(), moved[:3].tolist()]}}))
+    shot = load_shot(path)
+    assert list(shot.moves) == ["ball"]
+    np.testing.assert_array_equal(shot.moves["ball"], [np.eye(4), moved])
+    path.write_text(json.dumps(MOVED))
+    assert load_shot(path).moves == {}
+
+
+TUNGSTEN = """{"bsdfs": [{"name": "odd, ]"},], "camera": {"resolution": [1280, 720], "transform":
+{"position": [%d, 2, 3,], "look_at": [0, 1, 0], "up": [0, 1, 0]}, "type": "pinhole", "fov": 65.0,},}"""
+
+
+def test_camera_paths_of_tungsten_scenes(tmp_path: Path) -> None:
+    """As published: a scene file per frame, with commas that JSON does not allow."""
+    expected = [Camera.look_at((x, 2, 3), (0, 1, 0), fov_x=65).to_world for x in (1, 2, 10)]
+    scenes = tmp_path / "scenes"
+    scenes.mkdir()
+    for name, x in (("0", 1), ("2", 2), ("10", 10)):
+        (scenes / f"spp_4096_scene_{name}.json").write_text(TUNGSTEN % x)
+    together = tmp_path / "together.json"
+    together.write_text("[" + ",".join(TUNGSTEN % x for x in (1, 2, 10)) + ",]")
+    for path in (scenes, together):
+        cameras = load_shot(path).cameras
+        assert [camera.fov_x for camera in cameras] == [65, 65, 65]
+        np.testing.assert_allclose([camera.to_world for camera in cameras], expected)
+    (one,) = load_shot(scenes / "spp_4096_scene_2.json").cameras
+    np.testing.assert_allclose(one.to_world, expected[1])
+
+
+@pytest.mark.skipif(not SHARED_SCENES.is_dir(), reason=f"needs the scenes in {SHARED_SCENES}")
+def test_published_flythroughs() -> None:
+    paths = sorted(SHARED_SCENES.glob("*/tungsten_flythrough.json"))
+    assert paths
+    for path in paths:
+        assert len(load_shot(path).cameras) > 10
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"realisations": 0}, "realisations: expected at least 1"),
+        ({"workers": 0}, "workers: expected at least 1"),
+        ({"noise_level": 0.0}, "noise_level: expected more than 0 and less than 1, found 0"),
+        ({"moves": {"rug": np.eye(4)}}, "object 'rug': expected 1 matrices"),
+        (
+            {"moves": {"nothing": np.eye(4)[None]}},
+            r"object 'nothing': expected the id of .*\(bench, .* and [0-9]+ more\)",
+        ),
         ({"size": (0, 9)}, "size: expected"),
         ({"size": (16, 100000)}, "size: expected"),
         ({"frames": -1}, "at least one camera"),
@@ -324,3 +410,349 @@ def test_passes_of_one_frame_do_not_reuse_the_noise_of_another(tmp_path: Path) -
     neighbours = np.mean([np.abs(a - b).mean() for a, b in itertools.pairwise(colors)])
     # Frames that share one of two passes would differ by a factor of 0.7 less.
     np.testing.assert_allclose(neighbours, np.abs(colors[0] - colors[3]).mean(), rtol=0.15)
+
+
+TINY: dict[str, Any] = {"size": (16, 9), "variant": "scalar_rgb"}
+
+
+def test_realisations_are_independent_and_have_one_expectation(tmp_path: Path) -> None:
+    camera, count = demo_cameras(1)[0], 48
+    settings = {**TINY, "reference_spp": 512}
+    alone = render_sequence(demo_scene(), [camera], tmp_path / "alone", **{**settings, "reference_frames": []})
+    folder = render_sequence(demo_scene(), [camera], tmp_path / "many", realisations=count, **settings)
+    assert np.array_equal(read(folder, "color0"), read(alone, "color0"))
+    sequence = open_sequence(folder)
+    assert sequence.realisations == describe(folder)["realisations"] == count
+    frames = [sequence.frame(0, realisation=k) for k in range(count)]
+    reference = frames[0].reference
+    assert reference is not None
+    colors = torch.cat([frame.color for frame in frames]).double().flatten(1)
+    # Single pixels are too skewed for it, whole images are not.
+    whole = colors.mean(1)
+    assert (whole.mean() - reference.double().mean()).abs() < 4 * whole.std() * (1 / count + 1 / 512) ** 0.5
+    residual = torch.log1p(colors) - torch.log1p(colors).mean(0)
+    assert ((residual[1:] * residual[:-1]).sum() / residual.square().sum()).abs() < 0.1
+
+
+def test_realisations_are_added_to_what_is_there(tmp_path: Path) -> None:
+    settings = {**TINY, "reference_frames": []}
+    folder = render_sequence(demo_scene(), demo_cameras(2), tmp_path, **settings)
+    before = images(folder)
+    render_sequence(demo_scene(), demo_cameras(2), tmp_path, realisations=3, **settings)
+    assert images(folder) == before
+    assert open_sequence(folder).realisations == 3
+    (folder / "realisation2" / "color1.exr").unlink()
+    assert open_sequence(folder).realisations == 2
+    render_sequence(demo_scene(), demo_cameras(1), tmp_path, **settings)
+    assert describe(folder)["realisations"] == 3
+
+
+def test_a_reference_is_resumed_in_the_middle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {**TINY, "reference_spp": 70}
+    whole = render_sequence(demo_scene(), demo_cameras(1), tmp_path / "whole", **settings)
+    monkeypatch.setattr(render_frames, "_SECONDS_BETWEEN_SAVES", -1)
+
+    def interrupt(done: int, total: int) -> None:
+        if done >= 48:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_sequence(demo_scene(), demo_cameras(1), tmp_path / "cut", progress=interrupt, **settings)
+    folder = tmp_path / "cut" / "inputs"
+    assert (folder / "reference0.partial.npz").is_file()
+    assert not (folder / "reference0.exr").exists()
+    assert describe(folder)["reference_spp"] == {}
+    calls: list[tuple[int, int]] = []
+    render_sequence(demo_scene(), demo_cameras(1), folder.parent, progress=lambda *call: calls.append(call), **settings)
+    assert images(folder) == images(whole)
+    assert describe(folder) == describe(whole)
+    assert {path.name for path in folder.iterdir()} == {path.name for path in whole.iterdir()}
+    assert calls[-1] == (71, 71)
+    (folder / "reference0.exr").unlink()
+    (folder / "reference0.partial.npz").write_text("hello")
+    with pytest.raises(InputError, match=r"reference0\.partial\.npz: expected a reference in the making"):
+        render_sequence(demo_scene(), demo_cameras(1), folder.parent, **settings)
+
+
+def test_refining_a_reference_continues_where_it_was(tmp_path: Path) -> None:
+    def render_with(reference_spp: int, out: Path) -> Path:
+        return render_sequence(demo_scene(), demo_cameras(1), out, reference_spp=reference_spp, **TINY)
+
+    folder, at_once = render_with(32, tmp_path / "refined"), render_with(96, tmp_path / "at_once")
+    color = (folder / "color0.exr").stat().st_mtime_ns
+    render_with(96, folder.parent)
+    assert (folder / "color0.exr").stat().st_mtime_ns == color
+    # Half floats, twice.
+    np.testing.assert_allclose(read(folder, "reference0"), read(at_once, "reference0"), rtol=2**-10)
+    assert describe(folder)["reference_spp"] == {"0": 96}
+    noise = [describe(place)["reference_noise"]["0"] for place in (folder, at_once)]
+    np.testing.assert_allclose(*noise, rtol=0.3)
+    # Less is no reason to begin anew.
+    before = images(folder)
+    render_with(16, folder.parent)
+    assert images(folder) == before
+    assert describe(folder)["reference_spp"] == {"0": 96}
+
+
+def test_the_estimated_noise_is_the_error_against_a_better_reference(tmp_path: Path) -> None:
+    rough, good = (
+        render_sequence(demo_scene(), demo_cameras(1), tmp_path / str(spp), reference_spp=spp, **TINY)
+        for spp in (128, 2048)
+    )
+    reference, truth = (torch.from_numpy(read(folder, "reference0")).permute(2, 0, 1) for folder in (rough, good))
+    estimated = describe(rough)["reference_noise"]["0"]
+    # Measured over six seeds: 6 % too little, because of the few bright paths that none of the halves has met.
+    np.testing.assert_allclose(smape_linear(reference, truth).item(), estimated, rtol=0.2)
+    # 16 times the paths: a quarter of the noise.
+    assert describe(good)["reference_noise"]["0"] < estimated / 3
+
+
+def test_references_end_at_a_noise_level(tmp_path: Path) -> None:
+    calls: list[tuple[int, int]] = []
+
+    def render_to(noise_level: float, **settings: Any) -> tuple[Path, int, float]:
+        calls.clear()
+        folder = render_sequence(
+            demo_scene(),
+            demo_cameras(1),
+            tmp_path,
+            noise_level=noise_level,
+            progress=lambda *call: calls.append(call),
+            **{**TINY, "reference_spp": 1024, **settings},
+        )
+        said = describe(folder)
+        return folder, said["reference_spp"]["0"], said["reference_noise"]["0"]
+
+    folder, spp, noise = render_to(0.1)
+    assert 32 <= spp < 256
+    assert noise <= 0.1
+    assert calls[-1] == (1025, 1025)
+    before = images(folder)
+    assert render_to(0.11) == (folder, spp, noise)
+    assert images(folder) == before
+    _, more, less = render_to(0.06)
+    assert spp < more < 1024
+    assert less <= 0.06
+    # The level is out of reach: all the paths there are.
+    assert render_to(0.001, reference_spp=more + 24)[1] == more + 24
+
+
+FLIGHT = 3
+
+
+def _moving_scene() -> dict[str, Any]:
+    """A ball and a box fly above a floor; a lamp moves too, and something stands still."""
+    colors = np.random.default_rng(1).uniform(0.2, 0.9, (8, 8, 3))
+
+    def paint(nested: Any) -> dict[str, Any]:
+        return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": nested}}
+
+    spots = {"type": "bitmap", "bitmap": colors, "raw": True, "filter_type": "nearest"}
+    grey = {"type": "rgb", "value": 0.5}
+    lying = np.eye(4)
+    lying[:3, :3] = [[9, 0, 0], [0, 0, 9], [0, -9, 0]]
+    place = np.eye(4)
+    place[:3] = [[0.5, 0, 0, 1.3], [0, 0.5, 0, 0.6], [0, 0, 0.5, 0.2]]
+    post = np.eye(4)
+    post[:3] = [[0.2, 0, 0, 2.6], [0, 1.0, 0, 1.0], [0, 0, 0.2, -1.0]]
+    return {
+        "type": "scene",
+        "floor": {"type": "rectangle", "to_world": lying, "bsdf": paint(grey)},
+        "ball": {"type": "sphere", "center": [-1.2, 0.8, 0.0], "radius": 0.8, "bsdf": paint(spots)},
+        "box": {"type": "cube", "to_world": place, "bsdf": paint(spots)},
+        "post": {"type": "cube", "to_world": post, "bsdf": paint(spots)},
+        "lamp": {"type": "point", "position": [0.0, 5.0, 3.0], "intensity": {"type": "rgb", "value": 60.0}},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
+    }
+
+
+def _moves() -> dict[str, np.ndarray[Any, Any]]:
+    moves = {name: np.tile(np.eye(4), (FLIGHT, 1, 1)) for name in ("ball", "box", "lamp")}
+    for frame in range(FLIGHT):
+        angle = 0.1 * frame
+        turn = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        moves["ball"][frame, :3, 3] = 0.25 * frame, 0.1 * frame, 0.3 * frame
+        moves["box"][frame, :3, :3] = turn
+        moves["box"][frame, :3, 3] = -0.2 * frame, 0, 0
+        moves["lamp"][frame, :3, 3] = frame, 0, 0
+    return moves
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("mitsuba")
+    return _render_moving(tmp_path_factory.mktemp("moving"))
+
+
+def _render_moving(out: Path, **settings: Any) -> Path:
+    cameras = [Camera.look_at((0.1 * n, 2, 6), (0.05 * n, 0.8, 0), fov_x=50) for n in range(FLIGHT)]
+    size = {"size": (36, 24), "variant": "scalar_rgb", "reference_spp": 4}
+    return render_sequence(_moving_scene(), cameras, out, moves=_moves(), **{**size, **settings})
+
+
+def test_what_stands_still_was_where_it_is(moving: Path) -> None:
+    for frame in range(FLIGHT):
+        now, before = read(moving, f"world_position{frame}"), read(moving, f"previous_position{frame}")
+        still = (now == before).all(axis=-1)
+        if frame == 0:
+            assert still.all()
+        else:
+            assert 0.1 < 1 - still.mean() < 0.4
+    assert describe(moving)["moves"]["box"] == _moves()["box"].tolist()
+
+
+def test_what_moves_stays_on_its_surface(moving: Path) -> None:
+    moves = _moves()["ball"]
+    for frame in range(1, FLIGHT):
+        now, before = (
+            read(moving, f"{name}{frame}").astype(np.float64) for name in ("world_position", "previous_position")
+        )
+        center = np.array([-1.2, 0.8, 0.0])
+        on_ball = np.abs(np.linalg.norm(now - center - moves[frame, :3, 3], axis=-1) - 0.8) < 1e-3
+        assert on_ball.sum() > 20
+        radius = np.linalg.norm(before - center - moves[frame - 1, :3, 3], axis=-1)
+        np.testing.assert_allclose(radius[on_ball], 0.8, atol=1e-4)
+
+
+def test_the_previous_frame_shows_the_same_point_where_the_previous_position_projects_to(moving: Path) -> None:
+    for frame in range(1, FLIGHT):
+        now, before = (
+            read(moving, f"{name}{frame}").astype(np.float64) for name in ("world_position", "previous_position")
+        )
+        moved = (now != before).any(axis=-1)
+        shown, seen, found = read(moving, f"world_position{frame - 1}"), read(moving, f"albedo{frame - 1}"), {}
+        matrix = np.array(describe(moving)["camera_matrices"][frame - 1])
+        for name, point in (("previous", before), ("position", now)):
+            clip = np.concatenate([point[moved], np.ones((moved.sum(), 1))], axis=1) @ matrix
+            column, row = ((clip[:, axis] / clip[:, 3] + 1) / 2 * (36, 24)[axis] for axis in (0, 1))
+            column, row = np.clip(column.astype(int), 0, 35), np.clip(row.astype(int), 0, 23)
+            near = np.linalg.norm(shown[row, column] - point[moved], axis=-1) < 0.2
+            alike = np.abs(seen[row, column] - read(moving, f"albedo{frame}")[moved]).max(axis=-1) < 1e-3
+            found[name] = near.mean(), alike.mean()
+        # Half a pixel aside there may be another texel, or the edge of the object.
+        assert found["previous"][0] > 0.85
+        assert found["previous"][1] > 0.4
+        assert found["position"][0] < 0.4
+        assert found["position"][1] < 0.5 * found["previous"][1]
+
+
+def test_history_follows_what_moves(moving: Path) -> None:
+    sequence = open_sequence(moving)
+    assert "previous_position" in sequence.buffers
+    kept = {}
+    for known in (True, False):
+        history = History()
+        for number in sequence.numbers:
+            frame, _ = sequence.frame(number).validate()
+            assert frame.previous_position is not None
+            moved = (frame.previous_position != frame.position).any(1, keepdim=True)
+            past = history.update(frame if known else frame.replace(previous_position=None))
+        assert past.reset == ""
+        kept[known] = (past.length[moved] > 1).float().mean().item()
+    assert kept[True] > 0.9
+    assert kept[False] < kept[True] - 0.3
+
+
+def test_several_workers_write_the_same_files(moving: Path, tmp_path: Path) -> None:
+    calls: list[tuple[int, int]] = []
+    folder = _render_moving(tmp_path, workers=2, progress=lambda *call: calls.append(call))
+    assert images(folder) == images(moving)
+    assert describe(folder) == describe(moving)
+    assert calls[-1] == (15, 15)
+    assert calls == sorted(calls)
+
+
+def test_the_path_of_an_object_cannot_change(moving: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "inputs"
+    shutil.copytree(moving, folder)
+    moves = _moves()
+    moves["ball"][1, 0, 3] += 1
+    cameras = [Camera.look_at((0.1 * n, 2, 6), (0.05 * n, 0.8, 0), fov_x=50) for n in range(FLIGHT)]
+    settings = {"size": (36, 24), "variant": "scalar_rgb", "reference_spp": 4}
+    with pytest.raises(InputError, match="object 'ball' was elsewhere when frame 1 was rendered"):
+        render_sequence(_moving_scene(), cameras, tmp_path, moves=moves, **settings)
+    with pytest.raises(InputError, match="rendered with ball, box, lamp moving, now nothing"):
+        render_sequence(_moving_scene(), cameras, tmp_path, **settings)
+
+
+def test_objects_move_like_a_scene_that_is_built_there(tmp_path: Path) -> None:
+    """Analytic shapes, meshes, lights and the shadows of all."""
+    moves = {name: path[2:] for name, path in _moves().items()}
+    camera = Camera.look_at((0.2, 2, 6), (0.1, 0.8, 0), fov_x=50)
+    settings: dict[str, Any] = {"size": (18, 12), "variant": "scalar_rgb", "reference_frames": [], "spp": 4}
+    moved = render_sequence(_moving_scene(), [camera], tmp_path / "moved", moves=moves, **settings)
+    scene = _moving_scene()
+    scene["ball"]["center"] = (np.array(scene["ball"]["center"]) + moves["ball"][0, :3, 3]).tolist()
+    scene["box"]["to_world"] = moves["box"][0] @ scene["box"]["to_world"]
+    scene["lamp"]["position"] = (np.array(scene["lamp"]["position"]) + moves["lamp"][0, :3, 3]).tolist()
+    built = render_sequence(scene, [camera], tmp_path / "built", **settings)
+    for name, tolerance in (("albedo0", 1e-3), ("shading_normal0", 1e-3), ("world_position0", 1e-3), ("color0", 1e-2)):
+        different = np.abs(read(moved, name) - read(built, name)).max(axis=-1) > tolerance
+        assert different.mean() < 0.02, name
+
+
+class _Ends:
+    """Ends the process that unpickles it."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os._exit, (3,)
+
+
+def test_a_worker_that_dies_gives_one_line() -> None:
+    with pytest.raises(InputError, match="a worker process ended without a word") as caught:
+        render_in_processes(
+            _Ends(),  # type: ignore[arg-type]
+            None,  # type: ignore[arg-type]
+            [0, 1],
+            2,
+            lambda paths: None,
+            lambda number, state: None,
+        )
+    assert "\n" not in str(caught.value)
+
+
+def test_what_cannot_be_sent_to_workers_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected plain Python and numpy for more than one worker"):
+        render_sequence({**demo_scene(), "x": lambda: 0}, demo_cameras(1), tmp_path, workers=2, **TINY)
+
+
+XML = """<scene version="3.0.0">
+<bsdf type="diffuse" id="grey"/>
+<shape type="cube" id="still"><transform name="to_world"><translate x="-2"/></transform><ref id="grey"/></shape>
+<shape type="cube" id="moving"><ref id="grey"/></shape>
+<shape type="rectangle" id="lamp"><transform name="to_world"><translate z="9"/></transform>
+<emitter type="area"><rgb name="radiance" value="5"/></emitter></shape>
+</scene>"""
+
+
+def test_the_command_line_moves_objects_of_a_scene_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, path, out = (tmp_path / name for name in ("scene.xml", "shot.json", "out"))
+    scene.write_text(XML)
+    camera = Camera.look_at((0, 1, 8), (-1, 0, 0), fov_x=60).to_world.tolist()
+    moved = np.eye(4)
+    moved[0, 3] = 0.5
+    objects = {"moving": [np.eye(4).tolist(), moved.tolist()], "lamp": [np.eye(4).tolist(), moved.tolist()]}
+    content: dict[str, Any] = {"fov": 60, "to_world": [camera] * 2, "objects": objects}
+    path.write_text(json.dumps(content))
+    command = ["render", str(scene), "--camera-path", str(path), "-o", str(out), "--size", "16x12"]
+    command += ["--variant", "scalar_rgb", "--reference-spp", "32", "--realisations", "2", "--noise-level", "0.5"]
+    with pytest.raises(SystemExit) as ended:
+        main(command)
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.strip() == str(out / "inputs")
+    sequence = open_sequence(out)
+    assert (len(sequence), sequence.realisations) == (2, 2)
+    frame = sequence.frame(1)
+    assert frame.position is not None
+    assert frame.previous_position is not None
+    step = frame.position - frame.previous_position
+    step = step[:, :, (step != 0).any(1)[0]]
+    assert step.shape[2] > 5
+    torch.testing.assert_close(step.mean(2), torch.tensor([[0.5, 0, 0]]))
+    path.write_text(json.dumps({**content, "objects": {"teapot": objects["moving"]}}))
+    with pytest.raises(SystemExit) as ended:
+        main([*command[:5], str(tmp_path / "new"), *command[6:]])
+    assert ended.value.code == 2
+    message = capsys.readouterr().err
+    assert "object 'teapot': expected the id of a shape or a light that can move (lamp, moving, still)" in message
+    assert message.count("\n") == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,17 +26,21 @@ _STEMS = {
     "position": "world_position",
     "depth": "depth",
     "motion": "motion",
+    "previous_position": "previous_position",
     "reference": "reference",
     "color": "color",
 }
 _CHANNELS = {1: ["Y"], 2: ["X", "Y"], 3: ["R", "G", "B"]}
 _MATRICES = "camera_matrices.h"
 _DESCRIPTION = "camera.json"
+_FULL_FLOAT = {"position", "previous_position"}
 
 
 @dataclass(frozen=True)
 class BmfrFolder:
     """A folder in this layout: ``{color,albedo,shading_normal,world_position,...}N.exr`` and ``camera_matrices.h``.
+
+    Further noisy colors of the same frames, with noise of their own, are ``realisation{1,2,...}/colorN.exr``.
 
     Args:
         path: the folder that holds the files.
@@ -46,6 +50,7 @@ class BmfrFolder:
         cameras: what ``camera_matrices.h`` says, or ``None`` without it.
         color_has_albedo: whether the color files hold radiance (``camera.json`` says so) or radiance divided by
             albedo (the published data, which has no ``camera.json``). Without albedo files it is always radiance.
+        more_colors: for each realisation of the noise from 1 on, the color file of each frame number.
     """
 
     path: Path
@@ -54,6 +59,12 @@ class BmfrFolder:
     size: tuple[int, int]
     cameras: CameraMatrices | None
     color_has_albedo: bool
+    more_colors: Sequence[Mapping[int, Path]] = ()
+
+    @property
+    def realisations(self) -> int:
+        """How many noisy colors every frame in use has."""
+        return 1 + len(self.more_colors)
 
     @property
     def buffers(self) -> frozenset[str]:
@@ -72,11 +83,14 @@ class BmfrFolder:
         """Attributes of the color file of one frame."""
         return read_exr_header(self.files["color"][number]).metadata
 
-    def frame(self, number: int, *, reference: bool = True) -> Frame:
+    def frame(self, number: int, *, reference: bool = True, realisation: int = 0) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
+        sources: dict[str, Mapping[int, Path]] = dict(self.files)
+        if realisation:
+            sources["color"] = self.more_colors[realisation - 1]
         buffers = {
             name: self._read(name, files[number])
-            for name, files in self.files.items()
+            for name, files in sources.items()
             if number in files and (reference or name != "reference")
         }
         if not self.color_has_albedo:
@@ -103,8 +117,18 @@ def find_frames(path: Path) -> dict[str, dict[int, Path]] | None:
     Raises:
         InputError: the folder cannot be listed, or two files are the same frame of a buffer.
     """
-    found: dict[str, dict[int, Path]] = {name: {} for name in _STEMS}
-    patterns = {name: re.compile(rf"{stem}([0-9]{{1,9}})\.exr") for name, stem in _STEMS.items()}
+    found = _list_files(path, _STEMS)
+    return found if found["color"] else None
+
+
+def realisation_folder(folder: Path, realisation: int) -> Path:
+    """Where the colors of one realisation of the noise are: 0 in the folder itself, k in ``realisation{k}``."""
+    return folder / f"realisation{realisation}" if realisation else folder
+
+
+def _list_files(path: Path, stems: Mapping[str, str]) -> dict[str, dict[int, Path]]:
+    found: dict[str, dict[int, Path]] = {name: {} for name in stems}
+    patterns = {name: re.compile(rf"{stem}([0-9]{{1,9}})\.exr") for name, stem in stems.items()}
     try:
         entries = sorted(os.listdir(path))
     except OSError as error:
@@ -115,7 +139,7 @@ def find_frames(path: Path) -> dict[str, dict[int, Path]] | None:
                 other = found[name].setdefault(int(match[1]), path / entry)
                 if other.name != entry:
                     raise InputError(f"{path}: expected one file a frame, found {other.name} and {entry}; remove one")
-    return found if found["color"] else None
+    return found
 
 
 def open_bmfr(path: Path, files: Mapping[str, Mapping[int, Path]], numbers: list[int]) -> BmfrFolder:
@@ -149,7 +173,22 @@ def open_bmfr(path: Path, files: Mapping[str, Mapping[int, Path]], numbers: list
             f"{len(cameras) - 1}); write all matrices, or choose fewer frames"
         )
     has_albedo = _color_has_albedo(path, "albedo" in used)
-    return BmfrFolder(path, {name: files[name] for name in used}, numbers, size, cameras, has_albedo)
+    more_colors = _find_realisations(path, numbers, size)
+    return BmfrFolder(path, {name: files[name] for name in used}, numbers, size, cameras, has_albedo, more_colors)
+
+
+def _find_realisations(path: Path, numbers: list[int], size: tuple[int, int]) -> list[dict[int, Path]]:
+    """Color files of the realisations 1, 2, ... up to the first that some frame lacks: it is still being rendered."""
+    found: list[dict[int, Path]] = []
+    while os.path.isdir(folder := realisation_folder(path, 1 + len(found))):
+        colors = _list_files(folder, {"color": "color"})["color"]
+        if not all(number in colors for number in numbers):
+            break
+        for number in numbers:
+            header = read_exr_header(colors[number])
+            _check_file("color", colors[number], header.size, header.channels, size)
+        found.append(colors)
+    return found
 
 
 def write_bmfr_frame(
@@ -180,14 +219,32 @@ def write_bmfr_frame(
     if not (folder / _DESCRIPTION).exists():
         write_text(folder / _DESCRIPTION, json.dumps({"color_includes_albedo": True}) + "\n")
     buffers = dict(frame.items())
-    for name, stem in _STEMS.items():
-        if name not in buffers:
-            continue
-        image = buffers[name][0].detach().float().permute(1, 2, 0).cpu().numpy()
-        if name == "depth":
-            image = np.where(np.isinf(image), 0, image)
-        half = name != "position" and not (name == "depth" and image.max() > LARGEST_HALF)
-        write_exr(folder / f"{stem}{number}.exr", image, _CHANNELS[image.shape[2]], half=half, metadata=metadata)
+    for name in _STEMS:
+        if name in buffers:
+            write_buffer(folder, number, name, buffers[name], metadata=metadata)
+
+
+def write_buffer(
+    folder: Path, number: int, name: str, buffer: Tensor, *, metadata: Mapping[str, MetadataValue] | None = None
+) -> None:
+    """Write one buffer of a frame, whole or not at all, as :func:`write_bmfr_frame` does.
+
+    Args:
+        folder: where to write. It must exist.
+        number: frame number.
+        name: which buffer, such as ``"reference"``.
+        buffer: ``(1, C, H, W)``.
+        metadata: attributes for the file.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    image = buffer[0].detach().float().permute(1, 2, 0).cpu().numpy()
+    if name == "depth":
+        image = np.where(np.isinf(image), 0, image)
+    half = name not in _FULL_FLOAT and not (name == "depth" and image.max() > LARGEST_HALF)
+    path = folder / f"{_STEMS[name]}{number}.exr"
+    write_exr(path, image, _CHANNELS[image.shape[2]], half=half, metadata=metadata)
 
 
 def _check_file(

@@ -1,11 +1,12 @@
-"""Cameras and camera paths: where each frame of a sequence is seen from."""
+"""Cameras, and shots: where each frame of a sequence is seen from, and where its objects are."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -15,6 +16,10 @@ from numpy.typing import NDArray
 from mcdenoise.errors import InputError
 
 Array: TypeAlias = NDArray[np.float64]
+
+# A text, which is kept as it is, or a comma that nothing follows.
+_LAST_COMMA = re.compile(r'("(?:[^"\\]|\\.)*")|,(?=\s*[}\]])')
+_SMALLEST_VOLUME = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,48 +60,116 @@ class Camera:
         return cls(to_world + 0.0, float(fov_x))  # + 0.0 turns -0 into 0
 
 
-def load_camera_path(path: Path) -> list[Camera]:
-    """Read a camera path, one camera per frame.
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """What changes from frame to frame.
 
-    Two JSON layouts are known: ``{"fov": ..., "to_world": [4x4, ...]}``, with matrices as in :class:`Camera`, and
-    ``{"fov": ..., "frames": [{"position": ..., "look_at": ..., "up": ...}, ...]}``. ``fov`` is in degrees and across
-    the image width; with ``"fov_axis": "y"`` it is across the height, and ``"aspect": "16:9"`` converts it.
+    Args:
+        cameras: one camera per frame.
+        moves: for each object of the scene that moves, by its id, ``(T, 4, 4)`` float64: for each of the T frames the
+            world-space transform (column vectors) that is applied to the object where the scene places it.
+    """
+
+    cameras: list[Camera]
+    moves: dict[str, Array] = field(default_factory=dict)
+
+
+def load_shot(path: Path) -> Shot:
+    """Read a camera path, and with it the paths of objects.
+
+    These JSON layouts are known; a comma after the last element is forgiven:
+
+    - ``{"fov": ..., "to_world": [4x4, ...]}``, with matrices as in :class:`Camera`;
+    - ``{"fov": ..., "frames": [{"position": ..., "look_at": ..., "up": ...}, ...]}``; a frame may have its own
+      ``fov``;
+    - scenes of the Tungsten renderer, which hold ``"camera": {"transform": {"position": ..., "look_at": ..., "up":
+      ...}, "fov": ...}``: one, a list of them, ``frames`` as above, or a folder with one file per frame.
+
+    ``fov`` is in degrees and across the image width; with ``"fov_axis": "y"`` it is across the height, and
+    ``"aspect": "16:9"`` converts it. Beside the cameras, ``"objects": {"ID": [4x4 or 3x4, ...], ...}`` moves objects:
+    one matrix per frame, as in :class:`Shot`.
+
+    Args:
+        path: the file; or a folder of ``*.json`` files, which are taken in the order of the last number in their names.
 
     Raises:
-        InputError: the file is missing, no JSON, or a camera in it is unusable.
+        InputError: the file is missing, no JSON, or a camera or an object in it is unusable.
     """
     path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"{path}: expected a camera path, found nothing readable ({error.strerror}); check the path"
-        ) from error
-    except ValueError as error:
-        raise InputError(
-            f"{path}: expected JSON, found something else ({error}); check that it is a camera path"
-        ) from error
+    content: Any
+    if path.is_dir():
+        files = sorted(path.glob("*.json"), key=_last_number)
+        content = {"frames": [_read_json(file) for file in files]}
+    else:
+        content = _read_json(path)
+    if isinstance(content, list) and content:
+        content = {"frames": content}
+    elif isinstance(content, dict) and isinstance(content.get("camera"), dict):
+        content = {"frames": [content]}
     if not isinstance(content, dict) or not any(isinstance(content.get(key), list) for key in ("to_world", "frames")):
         raise InputError(f"{path}: expected a list 'to_world' (matrices) or 'frames' (look_at), found neither")
     where = "'fov'"
     try:
-        fov = _fov_x(content)
         cameras = []
         if isinstance(content.get("to_world"), list):
+            fov = _fov_x(content, content)
             for number, matrix in enumerate(content["to_world"]):
                 where = f"'to_world' of frame {number}"
                 cameras.append(Camera(_check_pose(np.array(matrix, dtype=np.float64)), fov))
         else:
             for number, entry in enumerate(content["frames"]):
                 where = f"camera of frame {number}"
-                camera = Camera.look_at(entry["position"], entry["look_at"], fov, entry.get("up", (0, 1, 0)))
+                entry = entry.get("camera", entry)
+                pose = entry.get("transform", entry)
+                fov = _fov_x(entry if "fov" in entry else content, content)
+                camera = Camera.look_at(pose["position"], pose["look_at"], fov, pose.get("up", (0, 1, 0)))
                 cameras.append(Camera(_check_pose(camera.to_world), fov))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         missing = f"nothing under {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(f"{path}: {where} is unusable: {missing}") from error
     if not cameras:
         raise InputError(f"{path}: expected at least one camera, found none")
-    return cameras
+    objects = content.get("objects", {})
+    if not isinstance(objects, dict):
+        raise InputError(f"{path}: expected 'objects' to map ids to lists of matrices, found {type(objects).__name__}")
+    try:
+        return Shot(cameras, check_moves(objects, len(cameras)))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def check_moves(moves: Mapping[str, Any], frames: int) -> dict[str, Array]:
+    """Transforms of objects as :class:`Shot` holds them.
+
+    Args:
+        moves: for each id, ``frames`` matrices of shape ``(4, 4)`` or ``(3, 4)``.
+        frames: how many there have to be.
+
+    Raises:
+        InputError: a matrix is missing, not finite, not affine or cannot be inverted.
+    """
+    checked: dict[str, Array] = {}
+    for identity, matrices in moves.items():
+        try:
+            given = np.array(matrices, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"object '{identity}': expected matrices, found something else ({error})") from error
+        if given.ndim != 3 or given.shape[1:] not in ((4, 4), (3, 4)) or len(given) != frames:
+            raise InputError(
+                f"object '{identity}': expected {frames} matrices of 4x4 or 3x4, one per camera, found shape "
+                f"{given.shape}"
+            )
+        whole = np.tile(np.eye(4), (frames, 1, 1))
+        whole[:, : given.shape[1]] = given
+        for number, matrix in enumerate(whole):
+            usable = np.isfinite(matrix).all() and np.allclose(matrix[3], (0, 0, 0, 1))
+            if not usable or abs(np.linalg.det(matrix[:3, :3])) < _SMALLEST_VOLUME:
+                raise InputError(
+                    f"object '{identity}': expected a finite affine transform that can be inverted, found something "
+                    f"else in frame {number}"
+                )
+        checked[str(identity)] = whole
+    return checked
 
 
 def view_projection(camera: Camera, width: int, height: int, near: float, far: float) -> Array:
@@ -164,13 +237,35 @@ def _check_pose(matrix: Array) -> Array:
     return matrix
 
 
-def _fov_x(content: dict[str, Any]) -> float:
-    fov = float(content["fov"])
+def _fov_x(holder: dict[str, Any], conventions: dict[str, Any]) -> float:
+    fov = float(holder["fov"])
     if not 0 < fov < 180:
         raise ValueError(f"expected an angle between 0 and 180 degrees, found {fov:g}")
-    if content.get("fov_axis", "x") == "x":
+    if conventions.get("fov_axis", "x") == "x":
         return fov
-    if content["fov_axis"] != "y":
-        raise ValueError(f"expected fov_axis 'x' or 'y', found '{content['fov_axis']}'")
-    across, down = (float(part) for part in content["aspect"].split(":"))
+    if conventions["fov_axis"] != "y":
+        raise ValueError(f"expected fov_axis 'x' or 'y', found '{conventions['fov_axis']}'")
+    across, down = (float(part) for part in conventions["aspect"].split(":"))
     return math.degrees(2 * math.atan(math.tan(math.radians(fov) / 2) * across / down))
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            f"{path}: expected a camera path, found nothing readable ({error.strerror}); check the path"
+        ) from error
+    except ValueError as error:
+        raise InputError(f"{path}: expected JSON, found no UTF-8 text; check that it is a camera path") from error
+    try:
+        return json.loads(_LAST_COMMA.sub(lambda match: match[1] or "", text))
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"{path}: expected JSON, found something else ({error}); check that it is a camera path"
+        ) from error
+
+
+def _last_number(path: Path) -> tuple[int, str]:
+    numbers = re.findall(r"[0-9]+", path.stem)
+    return (int(numbers[-1]) if numbers else -1), path.name

@@ -46,7 +46,12 @@ class Layout(Protocol):
         """Whether color is stored with the albedo in it."""
         ...
 
-    def frame(self, number: int, *, reference: bool = True) -> Frame:
+    @property
+    def realisations(self) -> int:
+        """How many noisy colors every frame in use has."""
+        ...
+
+    def frame(self, number: int, *, reference: bool = True, realisation: int = 0) -> Frame:
         """Read one frame."""
         ...
 
@@ -68,6 +73,7 @@ class Sequence:
         buffers: names of the buffers that every frame of the sequence has.
         reference_numbers: frames that have a reference; possibly only some.
         color_has_albedo: whether the files hold color with the albedo in it. Frames always do.
+        realisations: how many noisy colors every frame has: of the same pixels, with independent noise. Mostly 1.
     """
 
     root: Path
@@ -78,12 +84,13 @@ class Sequence:
     buffers: frozenset[str]
     reference_numbers: list[int]
     color_has_albedo: bool
+    realisations: int
     _source: Layout = field(repr=False)
 
     def __len__(self) -> int:
         return len(self.numbers)
 
-    def frame(self, number: int, reference: bool = True) -> Frame:
+    def frame(self, number: int, reference: bool = True, realisation: int = 0) -> Frame:
         """Read one frame: a batch of 1, float32, on the CPU; values are not validated.
 
         ``color`` is radiance with the albedo in it, whatever the files hold. ``depth`` is that of the depth file or
@@ -93,12 +100,18 @@ class Sequence:
         Args:
             number: one of ``numbers``.
             reference: whether to read the reference too, where there is one.
+            realisation: which noisy color, from 0 to ``realisations - 1``; the other buffers are the same for all.
 
         Raises:
-            InputError: there is no such frame, or a file is damaged.
+            InputError: there is no such frame or realisation, or a file is damaged.
         """
         self._check(number)
-        return self._source.frame(number, reference=reference)
+        if not 0 <= realisation < self.realisations:
+            raise InputError(
+                f"{self.root}: expected a realisation of the noise from 0 to {self.realisations - 1}, "
+                f"found {realisation}; render more of them"
+            )
+        return self._source.frame(number, reference=reference, realisation=realisation)
 
     def metadata(self, number: int) -> Metadata:
         """Attributes of the color file of one frame: texts, numbers and tuples of numbers.
@@ -202,5 +215,6 @@ def _wrap(root: Path, layout: str, source: Layout) -> Sequence:
         buffers=source.buffers,
         reference_numbers=source.reference_numbers,
         color_has_albedo=source.color_has_albedo,
+        realisations=source.realisations,
         _source=source,
     )

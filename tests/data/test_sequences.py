@@ -12,7 +12,7 @@ import torch
 
 from mcdenoise.buffers import Frame
 from mcdenoise.data import open_sequence, read_exr, write_exr
-from mcdenoise.data.bmfr import write_bmfr_frame
+from mcdenoise.data.bmfr import realisation_folder, write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, read_camera_matrices, write_camera_matrices
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.errors import InputError
@@ -167,6 +167,49 @@ def test_references_of_some_frames(small_sequence: Path) -> None:
     assert sequence.frame(2).reference is None
     assert sequence.frame(3).reference is not None
     assert "reference" in open_sequence(small_sequence, "0-1").buffers
+
+
+def _add_realisation(inputs: Path, realisation: int, numbers: range) -> None:
+    for number in numbers:
+        color = np.full((20, 24, 3), 10.0 * realisation + number)
+        folder = realisation_folder(inputs, realisation)
+        folder.mkdir(exist_ok=True)
+        write_exr(folder / f"color{number}.exr", color, RGB)
+
+
+def test_realisations_of_the_noise(small_sequence: Path) -> None:
+    inputs = small_sequence / "inputs"
+    assert open_sequence(small_sequence).realisations == 1
+    _add_realisation(inputs, 1, range(4))
+    _add_realisation(inputs, 2, range(2))
+    _add_realisation(inputs, 4, range(4))
+    sequence = open_sequence(small_sequence)
+    # The second one is not complete, and what comes after a gap does not count.
+    assert sequence.realisations == 2
+    assert open_sequence(small_sequence, "0-1").realisations == 3
+    first, second = sequence.frame(3), sequence.frame(3, realisation=1)
+    assert second.color.unique().tolist() == [13]
+    for name, value in first.items():
+        assert name == "color" or torch.equal(value, getattr(second, name))
+    assert sequence.frame(3, reference=False, realisation=1).reference is None
+    for wrong in (2, -1):
+        message = refused(lambda wrong=wrong: sequence.frame(0, realisation=wrong))
+        assert f"expected a realisation of the noise from 0 to 1, found {wrong}" in message
+
+
+def test_realisations_without_albedo_get_it_back(small_sequence: Path) -> None:
+    inputs = small_sequence / "inputs"
+    _add_realisation(inputs, 1, range(4))
+    (inputs / "camera.json").write_text('{"color_includes_albedo": false}')
+    frame = open_sequence(small_sequence).frame(2, realisation=1)
+    torch.testing.assert_close(frame.color, 12 * frame.albedo)
+
+
+def test_a_realisation_of_another_size_is_refused(small_sequence: Path) -> None:
+    _add_realisation(small_sequence / "inputs", 1, range(4))
+    path = small_sequence / "inputs" / "realisation1" / "color2.exr"
+    write_exr(path, np.ones((20, 23, 3)), RGB)
+    assert f"{path}: expected 24 x 20 pixels" in refused(lambda: open_sequence(small_sequence))
 
 
 def test_chosen_frames(small_sequence: Path) -> None:
@@ -366,6 +409,8 @@ def test_camera_header_round_trip(tmp_path: Path) -> None:
 def test_written_frame_is_read_back(small_sequence: Path, tmp_path: Path) -> None:
     frame = open_sequence(small_sequence).frame(1)
     frame = frame.replace(motion=torch.randn(1, 2, 20, 24, generator=torch.Generator().manual_seed(0)).half().float())
+    # Not rounded to half floats.
+    frame = frame.replace(previous_position=frame.position + 1e-3)
     write_bmfr_frame(tmp_path / "new", 0, frame, metadata={"owner of it": "me"})
     sequence = open_sequence(tmp_path / "new")
     assert sequence.metadata(0)["owner of it"] == "me"

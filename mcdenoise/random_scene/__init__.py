@@ -1,0 +1,128 @@
+"""Training scenes without limit: random rooms, courts and still lifes, each the same again for the same seed.
+
+They are made for variety of what a denoiser meets: light through windows, small and large lamps, sun, gloss, glass,
+fine and coarse textures, thin parts, and cameras and objects that move. The description is plain Python and numpy, in
+the form :func:`mcdenoise.render.render_sequence` takes; Mitsuba is not needed to build it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mcdenoise.data.camera_path import Array, Camera
+from mcdenoise.random_scene.cameras import shoot
+from mcdenoise.random_scene.rooms import build
+from mcdenoise.random_scene.stage import Stage, bounds, rotate
+
+__all__ = ["RandomScene", "random_scene"]
+
+_MOVING_SHARE = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class RandomScene:
+    """A scene with its camera path.
+
+    Args:
+        scene: a Mitsuba dictionary in the form :func:`mcdenoise.render.render_sequence` takes; metres, y is up.
+        cameras: one per frame.
+        moves: id of an object in ``scene`` to ``(T, 4, 4)`` transforms in world space, one per frame, applied to the
+            object where the scene places it. Empty for most seeds.
+    """
+
+    scene: dict[str, Any]
+    cameras: list[Camera]
+    moves: dict[str, Array] = field(default_factory=dict)
+
+
+def random_scene(seed: int, frames: int = 8) -> RandomScene:
+    """A random scene; the same for the same seed, and a longer shot begins like a shorter one.
+
+    Args:
+        seed: which of the scenes, 0 or more.
+        frames: number of cameras.
+
+    Example:
+        >>> made = random_scene(3, frames=2)
+        >>> made.scene["type"], len(made.cameras)
+        ('scene', 2)
+    """
+    place_rng, camera_rng, move_rng, level_rng = (
+        np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(4)
+    )
+    stage = build(place_rng)
+    cameras = shoot(stage, camera_rng, frames)
+    moves = _moves(stage, move_rng, frames, cameras[0]) if move_rng.random() < _MOVING_SHARE else {}
+    scene = _exposed(stage.scene(), 10 ** float(level_rng.uniform(-1.5, 1.5)))
+    return RandomScene(scene, cameras, moves)
+
+
+def _moves(stage: Stage, rng: np.random.Generator, frames: int, camera: Camera) -> dict[str, Array]:
+    """Let one to three small objects slide, swing or spin, or a lamp swing."""
+    moves: dict[str, Array] = {}
+    bulbs = [name for name in stage.lamps if _is_small(stage, [name])]
+    if bulbs and rng.random() < 0.3:
+        moves.update(_motion(stage, rng, frames, [bulbs[int(rng.integers(len(bulbs)))]]))
+    groups = [names for names in stage.groups.values() if _is_small(stage, names)]
+    # Those in front of the camera first.
+    groups.sort(key=lambda names: -_facing(stage, names, camera))
+    for index in rng.permutation(min(len(groups), 5))[: int(rng.integers(1, 4))]:
+        moves.update(_motion(stage, rng, frames, groups[int(index)]))
+    return moves
+
+
+def _motion(stage: Stage, rng: np.random.Generator, frames: int, names: list[str]) -> dict[str, Array]:
+    center = _center(stage, names)
+    direction = rng.normal(0, 1, 3) * (1, 0.2, 1)
+    direction *= math.exp(rng.uniform(math.log(0.005), math.log(0.08))) / np.linalg.norm(direction)
+    spin = float(rng.choice([0.0, rng.uniform(-12, 12)]))
+    swing, phase = rng.uniform(0.05, 0.5), rng.uniform(0, 2 * math.pi)
+    transforms = np.empty((frames, 4, 4))
+    for frame in range(frames):
+        away = direction * (math.sin(swing * frame + phase) - math.sin(phase)) / swing
+        turned = rotate("y", spin * frame)
+        turned[:3, 3] = center - turned[:3, :3] @ center + away
+        transforms[frame] = turned
+    return {name: transforms.copy() for name in names}
+
+
+def _center(stage: Stage, names: list[str]) -> Array:
+    return np.asarray(np.mean([stage.placed(name)[:3, 3] for name in names], axis=0))
+
+
+def _is_small(stage: Stage, names: list[str]) -> bool:
+    corners = [bounds("cube", stage.placed(name)) for name in names]
+    low, high = np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
+    return bool((high - low).max() < 1.5)
+
+
+def _facing(stage: Stage, names: list[str], camera: Camera) -> float:
+    """Cosine of the angle between the viewing direction and the direction to a group."""
+    way = _center(stage, names) - camera.to_world[:3, 3]
+    return float(way @ camera.to_world[:3, 2] / max(float(np.linalg.norm(way)), 1e-9))
+
+
+def _exposed(scene: dict[str, Any], level: float) -> dict[str, Any]:
+    """The same scene with all its lights scaled: a denoiser must not depend on the unit of radiance."""
+    scaled: dict[str, Any] = {}
+    for name, entry in scene.items():
+        if not isinstance(entry, dict):
+            scaled[name] = entry
+        elif entry["type"] == "envmap":
+            scaled[name] = {**entry, "bitmap": entry["bitmap"] * level}
+        elif "intensity" in entry:
+            scaled[name] = {**entry, "intensity": _times(entry["intensity"], level)}
+        elif "emitter" in entry:
+            emitter = {**entry["emitter"], "radiance": _times(entry["emitter"]["radiance"], level)}
+            scaled[name] = {**entry, "emitter": emitter}
+        else:
+            scaled[name] = entry
+    return scaled
+
+
+def _times(color: dict[str, Any], factor: float) -> dict[str, Any]:
+    return {**color, "value": [factor * channel for channel in color["value"]]}

@@ -1,0 +1,134 @@
+"""Cameras: free places to stand, something to look at, and ways to move."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mcdenoise.data.camera_path import Array, Camera
+from mcdenoise.random_scene.stage import Stage
+
+Rng = np.random.Generator
+# A path is checked over so many frames; a longer shot goes back and forth on it.
+HORIZON = 16
+_CLEARANCE = 0.12
+_TRIES = 150
+
+
+@dataclass(frozen=True)
+class _View:
+    origin: Array
+    target: Array
+    fov_x: float
+
+
+def shoot(stage: Stage, rng: Rng, frames: int) -> list[Camera]:
+    """A camera path through free space; the first frames do not depend on how many there are."""
+    moving = rng.random() > 0.2
+    path: Callable[[_View, int], _View] = _stay
+    best: tuple[float, _View, Callable[[_View, int], _View]] | None = None
+    for _ in range(_TRIES):
+        view = _propose(stage, rng)
+        path = _motion(view, rng) if moving else _stay
+        score = min(_score(stage, path(view, frame)) for frame in (0, HORIZON // 2, HORIZON))
+        if best is None or score > best[0]:
+            best = (score, view, path)
+        if score >= 1:
+            break
+    # Never empty: _TRIES is positive.
+    _, view, path = best or (0.0, view, path)
+    seen = [path(view, HORIZON - abs(frame % (2 * HORIZON) - HORIZON)) for frame in range(frames)]
+    return [Camera.look_at(one.origin.tolist(), one.target.tolist(), one.fov_x) for one in seen]
+
+
+def _propose(stage: Stage, rng: Rng) -> _View:
+    low, high = stage.low + 0.25, stage.high - 0.25
+    origin = rng.uniform(low, high)
+    if rng.random() < 0.7 and high[1] > 1.5:
+        # Mostly at the height of eyes.
+        origin[1] = np.clip(rng.normal(1.35, 0.3), low[1], high[1])
+    points = stage.points or [(low + high) / 2]
+    target = points[int(rng.integers(len(points)))] + rng.normal(0, 0.15, 3)
+    fov = float(rng.uniform(45, 75) if rng.random() < 0.6 else rng.uniform(20, 45))
+    return _View(origin, target, fov)
+
+
+def _score(stage: Stage, view: _View) -> float:
+    """1 or more for a camera in free space that sees several things, none of them too close."""
+    lows, highs = stage.boxes()
+    inside = ((view.origin > lows - _CLEARANCE) & (view.origin < highs + _CLEARANCE)).all(axis=1)
+    out = ((view.origin < stage.low) | (view.origin > stage.high)).any()
+    forward = view.target - view.origin
+    distance = float(np.linalg.norm(forward))
+    if inside.any() or out or distance < 0.5 or abs(forward[1]) > 0.9 * distance:
+        return 0.0
+    forward /= distance
+    left = np.cross((0.0, 1.0, 0.0), forward)
+    left /= np.linalg.norm(left)
+    up = np.cross(forward, left)
+    extent = math.tan(math.radians(view.fov_x) / 2)
+    steps = np.linspace(-0.85, 0.85, 7) * extent
+    rays = np.array([forward + a * left + b * up for a in steps for b in steps])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = (lows[None] - view.origin) / rays[:, None]
+        second = (highs[None] - view.origin) / rays[:, None]
+    enter = np.nanmax(np.minimum(first, second), axis=-1)
+    leave = np.nanmin(np.maximum(first, second), axis=-1)
+    hit = np.where((leave > enter) & (enter > 0), enter, np.inf)
+    nearest, which = hit.min(axis=1), hit.argmin(axis=1)
+    seen = np.isfinite(nearest)
+    close = float((nearest < 0.45).mean())
+    kinds = len(set(which[seen].tolist()))
+    median = float(np.median(np.where(seen, nearest, 20)))
+    return min(kinds / 8, 1) * min(median / 1.0, 1) * (1 - close) * min(float(seen.mean()) / 0.5, 1) + (
+        0.1 if close < 0.1 and kinds >= 7 and median > 0.9 and seen.mean() > 0.45 else 0
+    )
+
+
+def _stay(view: _View, frame: int) -> _View:
+    return view
+
+
+def _motion(view: _View, rng: Rng) -> Callable[[_View, int], _View]:
+    """A way to move at 0.3 to 12 pixels a frame in an image 256 pixels wide."""
+    speed = float(np.exp(rng.uniform(math.log(0.3), math.log(12))))
+    angle = math.radians(view.fov_x) / 256 * speed
+    step = angle * float(np.linalg.norm(view.target - view.origin))
+    kind = rng.choice(["dolly", "forward", "orbit", "pan", "free"], p=[0.3, 0.2, 0.15, 0.15, 0.2])
+    sign = float(rng.choice([-1, 1]))
+    drift = rng.normal(0, 1, 3) * (1, 0.3, 1)
+    drift *= step / np.linalg.norm(drift)
+    # Sway of a hand: sums of waves, so that any frame can be had without those before it.
+    sway = rng.choice([0.0, rng.uniform(0.1, 1.5)], p=[0.5, 0.5]) * math.radians(view.fov_x) / 256
+    waves, phases = rng.uniform(0.4, 2.2, (3, 2)), rng.uniform(0, 2 * math.pi, (3, 2))
+
+    def move(start: _View, frame: int) -> _View:
+        origin, target = start.origin, start.target
+        forward = target - origin
+        length = float(np.linalg.norm(forward))
+        left = np.cross((0.0, 1.0, 0.0), forward / length)
+        shift = np.sin(waves * frame + phases).sum(axis=1) * sway * length
+        if kind == "dolly":
+            offset = sign * frame * step * left
+            origin, target = origin + offset, target + 0.7 * offset
+        elif kind == "forward":
+            # Straight ahead the image moves at its edges only, and by less.
+            origin = origin + sign * min(2 * frame * step, 0.6 * length) * forward / length
+            target = target + sign * forward
+        elif kind == "orbit":
+            origin = target + _turned(-forward, sign * frame * angle)
+        elif kind == "pan":
+            target = origin + _turned(forward, sign * frame * angle)
+        else:
+            origin, target = origin + frame * drift, target + 0.3 * frame * np.roll(drift, 1)
+        return _View(origin, target + shift, start.fov_x)
+
+    return move
+
+
+def _turned(vector: Array, angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array((c * vector[0] + s * vector[2], vector[1], c * vector[2] - s * vector[0]))

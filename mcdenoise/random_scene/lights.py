@@ -1,0 +1,253 @@
+"""Skies and lamps. Powers are chosen by what they light, so that small lamps are bright and cause bright outliers."""
+
+from __future__ import annotations
+
+import colorsys
+import math
+
+import numpy as np
+
+from mcdenoise.data.camera_path import Array
+from mcdenoise.random_scene.materials import diffuse, random_metal, random_opaque
+from mcdenoise.random_scene.stage import Part, Stage, ball, box, drum, plate, rgb, rod, rotate, sheet
+from mcdenoise.random_scene.textures import Color
+
+Rng = np.random.Generator
+_SKY_ROWS = 128
+
+
+def sky(rng: Rng, level: float, sun: Array | None, sun_share: float) -> Array:
+    """A lat-long image of a gradient, clouds, a dark ground with a skyline, and a sun.
+
+    Args:
+        rng: the source of randomness.
+        level: mean radiance of the upper half without the sun.
+        sun: unit vector towards the sun, if there is one.
+        sun_share: irradiance of the sun relative to that of the sky.
+    """
+    rows, columns = _SKY_ROWS, 2 * _SKY_ROWS
+    polar = (np.arange(rows) + 0.5)[:, None] / rows * math.pi
+    azimuth = (np.arange(columns) + 0.5)[None] / columns * 2 * math.pi
+    up = np.cos(polar)
+    direction = np.stack(
+        np.broadcast_arrays(np.sin(azimuth) * np.sin(polar), up, -np.cos(azimuth) * np.sin(polar)), axis=-1
+    )
+    zenith = np.array(colorsys.hsv_to_rgb(rng.uniform(0.5, 0.65), rng.uniform(0, 0.75), 1))
+    horizon = np.array(colorsys.hsv_to_rgb(rng.uniform(0.02, 0.15), rng.uniform(0, 0.6), rng.uniform(0.6, 2.2)))
+    height = np.clip(up, 0, 1)[..., None] ** rng.uniform(0.3, 0.8)
+    image = zenith * height + horizon * (1 - height) + 0 * direction
+    if rng.random() < 0.4:
+        image = image * (0.5 + rng.uniform(0.5, 2) * _clouds(rng, direction)[..., None])
+    if sun is not None:
+        glow = np.clip(direction @ sun, 0, 1)[..., None] ** rng.uniform(8, 60)
+        image = image + rng.uniform(0, 3) * glow * np.array((1, 0.85, 0.6))
+    above = (up > 0) * np.sin(polar)
+    image = image * level / max(float((image.mean(axis=-1) * above).sum() / (above.sum() * columns)), 1e-6)
+    ground = level * rng.uniform(0.05, 0.5) * np.array(colorsys.hsv_to_rgb(rng.uniform(0.05, 0.35), 0.4, 1))
+    skyline = np.zeros((1, columns))
+    for _ in range(int(rng.integers(0, 25))):
+        left, width = int(rng.integers(columns)), int(rng.integers(2, 20))
+        skyline[0, left : left + width] = rng.uniform(0, 0.35)
+    image = np.where((up < skyline)[..., None], ground * rng.uniform(0.4, 1), image)
+    image = np.where((up < 0)[..., None], ground, image)
+    if sun is not None:
+        # One or four pixels: they stay small enough for hard shadows.
+        lit = np.argsort(-(direction @ sun), axis=None)[: int(rng.choice([1, 4]))]
+        solid = (math.pi / rows) * (2 * math.pi / columns) * np.sin(polar.ravel()[lit // columns])
+        warmth = np.array(colorsys.hsv_to_rgb(0.09, rng.uniform(0, 0.6) * (1 - sun[1]), 1))
+        image.reshape(-1, 3)[lit] = sun_share * math.pi * level * warmth / float(solid.sum())
+    return np.asarray(image)
+
+
+def _clouds(rng: Rng, direction: Array) -> Array:
+    """Soft patches in [0, 1] from a few waves over the direction."""
+    total = np.zeros(direction.shape[:-1])
+    for octave in range(4):
+        for _ in range(3):
+            wave = rng.normal(0, 2.5 * 2**octave, 3)
+            total += 0.6**octave * np.sin(direction @ wave + rng.uniform(0, 2 * math.pi))
+    return np.asarray(1 / (1 + np.exp(-2 * total)))
+
+
+def sun_direction(rng: Rng, towards: float | None = None) -> Array:
+    """A unit vector to the sun at a random height; ``towards`` is an azimuth, degrees, that it should be close to."""
+    azimuth = math.radians(rng.uniform(0, 360) if towards is None else towards + rng.uniform(-65, 65))
+    elevation = math.radians(rng.uniform(6, 75) if towards is None else rng.uniform(6, 50))
+    level = math.cos(elevation)
+    return np.array((level * math.sin(azimuth), math.sin(elevation), level * math.cos(azimuth)))
+
+
+def studio(rng: Rng, level: float) -> Array:
+    """A dark surrounding with a few bright panels of different colours."""
+    rows, columns = 64, 128
+    image = np.full((rows, columns, 3), level * rng.uniform(0.02, 0.3))
+    for _ in range(int(rng.integers(1, 5))):
+        top, left = int(rng.integers(0, 30)), int(rng.integers(columns - 30))
+        height, width = int(rng.integers(3, 16)), int(rng.integers(3, 30))
+        panel = np.array(light_color(rng)) * level * rng.uniform(2, 20)
+        image[top : top + height, left : left + width] = panel
+    return image
+
+
+def light_color(rng: Rng) -> Color:
+    """From candle to cold daylight; sometimes a party."""
+    if rng.random() < 0.15:
+        color = colorsys.hsv_to_rgb(float(rng.random()), float(rng.uniform(0.4, 0.95)), 1)
+    else:
+        warmth = rng.uniform(-0.35, 0.7)
+        color = (1.0, 1 - 0.45 * max(warmth, 0) - 0.15 * max(-warmth, 0), 1 - max(warmth, 0) - 0.0)
+        if warmth < 0:
+            color = (1 + warmth, 1 + 0.4 * warmth, 1.0)
+    mean = sum(color) / 3
+    return color[0] / mean, max(color[1], 0.02) / mean, max(color[2], 0.02) / mean
+
+
+def add_lamps(stage: Stage, rng: Rng, low: Array, high: Array, count: int, brightness: float) -> None:
+    """Hang, stand and hide lamps in a room; together they light its surfaces to about ``brightness``."""
+    width, height, depth = high - low
+    flux = brightness * math.pi * 2 * (width * height + height * depth + depth * width) * 0.5
+    for share in rng.dirichlet(np.full(count, 1.5)):
+        power = float(flux * share)
+        kind = rng.choice(
+            ["panel", "tube", "bulb", "standing", "cove", "spot", "point", "chandelier"],
+            p=[0.24, 0.1, 0.2, 0.14, 0.1, 0.1, 0.04, 0.08],
+        )
+        x, z = (float(rng.uniform(low[axis] + 0.15 * s, high[axis] - 0.15 * s)) for axis, s in ((0, width), (2, depth)))
+        color = light_color(rng)
+        ceiling = float(high[1])
+        if kind == "panel":
+            half = np.exp(rng.uniform(math.log(0.04), math.log(0.5 * min(width, depth) / 2), 2))
+            _panel(stage, (x, ceiling - 0.02, z), (float(half[0]), float(half[1])), power, color)
+        elif kind == "tube":
+            _panel(stage, (x, ceiling - 0.1, z), (0.03, 0.3 * float(depth) / 2), power, color)
+        elif kind == "bulb":
+            _pendant(stage, rng, (x, ceiling, z), float(height), power, color)
+        elif kind == "standing":
+            _standing(stage, rng, (x, float(low[1]), z), float(height), power, color)
+        elif kind == "cove":
+            _cove(stage, rng, low, high, power, color)
+        elif kind == "chandelier":
+            _chandelier(stage, rng, (x, ceiling, z), power, color)
+        else:
+            point = np.array((x, ceiling - 0.15, z))
+            target = np.array((x, low[1], z)) + rng.uniform(-1, 1, 3) * (0.3 * width, 0, 0.3 * depth)
+            add_spot(stage, rng, point, target, power, color, narrow=kind == "spot")
+
+
+def add_spot(stage: Stage, rng: Rng, origin: Array, target: Array, power: float, color: Color, narrow: bool) -> None:
+    """A spot that shines at a target, or a point light."""
+    if not narrow:
+        intensity = _scaled(color, power / (4 * math.pi))
+        stage.add_light({"type": "point", "position": origin.tolist(), "intensity": rgb(intensity)})
+        return
+    cutoff = float(rng.uniform(15, 55))
+    solid = 2 * math.pi * (1 - math.cos(math.radians(cutoff)))
+    intensity = _scaled(color, power / solid * 0.5)
+    axis = (target - origin) / np.linalg.norm(target - origin)
+    side = np.cross((0.0, 0.0, 1.0), axis)
+    side /= np.linalg.norm(side)
+    pose = np.eye(4)
+    pose[:3] = np.stack((side, np.cross(axis, side), axis, origin), axis=1)
+    stage.add_light({"type": "spot", "to_world": pose, "cutoff_angle": cutoff, "intensity": rgb(intensity)})
+
+
+def softbox(stage: Stage, rng: Rng, origin: Array, target: Array, power: float) -> None:
+    """A rectangle or a ball of light that faces a target."""
+    color, size = light_color(rng), float(np.exp(rng.uniform(math.log(0.03), math.log(0.6))))
+    black = stage.material(diffuse((0.02, 0.02, 0.02)))
+    if rng.random() < 0.4:
+        stage.add([ball(origin, size / 2, black, _scaled(color, power / (math.pi**2 * size**2)))])
+        return
+    axis = (target - origin) / np.linalg.norm(target - origin)
+    side = np.cross((0.0, 1.0, 0.0), axis)
+    side /= max(float(np.linalg.norm(side)), 1e-6)
+    rotation = np.eye(4)
+    rotation[:3, :3] = np.stack((side, np.cross(axis, side), axis), axis=1)
+    half = (size, size * float(rng.uniform(0.3, 1)))
+    radiance = _scaled(color, power / (math.pi * 4 * half[0] * half[1]))
+    stage.add([sheet(origin, half, black, rotation, radiance)])
+
+
+def _panel(
+    stage: Stage, center: tuple[float, float, float], half: tuple[float, float], power: float, color: Color
+) -> None:
+    white = stage.material(diffuse((0.8, 0.8, 0.8)))
+    radiance = _scaled(color, power / (math.pi * 4 * half[0] * half[1]))
+    stage.add([sheet(center, half, white, rotate("x", 90), radiance)])
+    frame = (center[0], center[1] + 0.012, center[2])
+    stage.add([box(frame, (2 * half[0] + 0.06, 0.02, 2 * half[1] + 0.06), white)])
+
+
+def _pendant(
+    stage: Stage, rng: Rng, hook: tuple[float, float, float], height: float, power: float, color: Color
+) -> None:
+    """A bulb on a cord, bare or under a shade that keeps its light from the ceiling."""
+    radius = float(np.exp(rng.uniform(math.log(0.02), math.log(0.2))))
+    y = hook[1] - float(rng.uniform(0.15, 0.45)) * height
+    center = (hook[0], y, hook[2])
+    cord = stage.material(diffuse((0.05, 0.05, 0.05)))
+    stage.add([rod((hook[0], y + radius, hook[2]), hook, 0.006, cord)])
+    stage.add([_bulb(center, radius, cord, power, color)])
+    stage.points.append(np.array(center))
+    if rng.random() < 0.4:
+        shade = stage.material(random_opaque(rng))
+        wide = radius * float(rng.uniform(1.3, 2.5))
+        stage.add(
+            [
+                rod((hook[0], y - radius, hook[2]), (hook[0], y + 1.5 * radius, hook[2]), wide, shade),
+                plate((hook[0], y + 1.5 * radius, hook[2]), wide, shade),
+            ]
+        )
+
+
+def _standing(
+    stage: Stage, rng: Rng, foot: tuple[float, float, float], height: float, power: float, color: Color
+) -> None:
+    metal = stage.material(random_metal(rng))
+    x, y, z = foot
+    top = float(rng.uniform(0.35, 0.7)) * height
+    radius = float(rng.uniform(0.04, 0.15))
+    stage.add([*drum(foot, 0.03, 0.15, metal), rod((x, y, z), (x, y + top - radius, z), 0.015, metal)])
+    stage.add([_bulb((x, y + top, z), radius, metal, power, color)])
+    stage.points.append(np.array((x, y + top, z)))
+    if rng.random() < 0.5:
+        shade = stage.material(random_opaque(rng))
+        stage.add([rod((x, y + top - 1.4 * radius, z), (x, y + top + 1.4 * radius, z), 1.8 * radius, shade)])
+
+
+def _cove(stage: Stage, rng: Rng, low: Array, high: Array, power: float, color: Color) -> None:
+    """A strip of light behind a board under the ceiling: everything below is lit indirectly."""
+    white = stage.material(diffuse((0.8, 0.8, 0.8)))
+    side = int(rng.choice([-1, 1]))
+    x = float(low[0] if side < 0 else high[0]) - side * 0.12
+    y, z = float(high[1]) - 0.35, float(low[2] + high[2]) / 2
+    length = 0.85 * float(high[2] - low[2])
+    half = (0.04, length / 2)
+    radiance = _scaled(color, 1.5 * power / (math.pi * 4 * half[0] * half[1]))
+    stage.add([sheet((x, y + 0.03, z), half, white, rotate("x", -90), radiance)])
+    stage.add(
+        [box((x, y, z), (0.2, 0.03, length), white), box((x - side * 0.1, y + 0.06, z), (0.02, 0.15, length), white)]
+    )
+
+
+def _chandelier(stage: Stage, rng: Rng, hook: tuple[float, float, float], power: float, color: Color) -> None:
+    metal = stage.material(random_metal(rng))
+    bulbs, radius = 3, float(rng.uniform(0.2, 0.5))
+    y = hook[1] - float(rng.uniform(0.4, 0.8))
+    stage.add([rod((hook[0], y, hook[2]), hook, 0.012, metal)])
+    for number in range(bulbs):
+        angle = 2 * math.pi * number / bulbs
+        end = (hook[0] + radius * math.cos(angle), y + 0.08, hook[2] + radius * math.sin(angle))
+        stage.add([rod((hook[0], y, hook[2]), end, 0.01, metal)])
+        stage.add([_bulb((end[0], end[1] + 0.05, end[2]), 0.04, metal, power / bulbs, color)])
+    stage.points.append(np.array((hook[0], y, hook[2])))
+
+
+def _bulb(
+    center: tuple[float, float, float], radius: float, material: dict[str, str], power: float, color: Color
+) -> Part:
+    return ball(center, radius, material, _scaled(color, power / (4 * math.pi**2 * radius**2)))
+
+
+def _scaled(color: Color, factor: float) -> Color:
+    return color[0] * factor, color[1] * factor, color[2] * factor

@@ -1,0 +1,126 @@
+"""Materials of a random scene, drawn from a fixed set of kinds.
+
+A vectorised renderer compiles its program anew for another set of plugins; therefore a plain colour is a small bitmap
+too, every scene has every kind, and :mod:`mcdenoise.random_scene.stage` sees to it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mcdenoise.data.camera_path import Array
+from mcdenoise.random_scene.textures import Color, leaf_mask, random_color, texture
+
+Bsdf = dict[str, Any]
+_METALS = ("Ag", "Al", "Au", "Cu", "Cr", "W")
+
+
+def diffuse(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
+    """A matt surface."""
+    return _two_sided({"type": "diffuse", "reflectance": _bitmap(reflectance, repeat)})
+
+
+def plastic(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
+    """A matt surface under a clear coat."""
+    return _two_sided({"type": "plastic", "diffuse_reflectance": _bitmap(reflectance, repeat)})
+
+
+def rough_plastic(reflectance: Color | Array, alpha: float, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
+    """A matt surface under a rough coat."""
+    return _two_sided({"type": "roughplastic", "diffuse_reflectance": _bitmap(reflectance, repeat), "alpha": alpha})
+
+
+def rough_metal(material: str, alpha: float | Array, tint: Color | Array = (1, 1, 1)) -> Bsdf:
+    """A metal that blurs what it mirrors; ``alpha`` may be a ``(H, W, 1)`` texture."""
+    roughness = np.full((2, 2, 1), alpha) if isinstance(alpha, float) else alpha
+    return _two_sided(
+        {
+            "type": "roughconductor",
+            "material": material,
+            "alpha": _bitmap(roughness),
+            "specular_reflectance": _bitmap(tint),
+        }
+    )
+
+
+def mirror(material: str = "Ag") -> Bsdf:
+    """A perfect mirror."""
+    return _two_sided({"type": "conductor", "material": material})
+
+
+def glass(index: float = 1.5) -> Bsdf:
+    """Solid glass, for closed shapes."""
+    return {"type": "dielectric", "int_ior": index}
+
+
+def pane() -> Bsdf:
+    """Thin glass that does not bend light."""
+    return {"type": "thindielectric", "int_ior": 1.5}
+
+
+def foliage(rng: np.random.Generator, color: Color) -> Bsdf:
+    """A twig of leaves cut out of a rectangle."""
+    shade = np.clip(np.array(color) * rng.uniform(0.6, 1.4, (16, 16, 1)), 0.02, 0.9)
+    return {"type": "mask", "opacity": _bitmap(leaf_mask(rng)), "bsdf": diffuse(shade)}
+
+
+def every_kind() -> list[Bsdf]:
+    """One material of each kind."""
+    gray = (0.5, 0.5, 0.5)
+    rng = np.random.default_rng(0)
+    return [
+        diffuse(gray),
+        plastic(gray),
+        rough_plastic(gray, 0.2),
+        rough_metal("Al", 0.2),
+        mirror(),
+        glass(),
+        pane(),
+        foliage(rng, gray),
+    ]
+
+
+def random_metal(rng: np.random.Generator) -> Bsdf:
+    """A rough metal: plain, tinted or brushed."""
+    material, alpha = str(rng.choice(_METALS)), float(np.exp(rng.uniform(np.log(0.02), np.log(0.4))))
+    if rng.random() < 0.25:
+        pattern = texture(rng).mean(axis=-1, keepdims=True)
+        return rough_metal(material, np.clip(alpha * (0.5 + 2 * pattern), 0.02, 0.5))
+    if rng.random() < 0.2:
+        return rough_metal(material, alpha, tint=texture(rng))
+    return rough_metal(material, alpha)
+
+
+def random_opaque(rng: np.random.Generator, repeat: tuple[float, float] = (1, 1), textured: float = 0.4) -> Bsdf:
+    """Paint, wood, cloth, lacquer: diffuse or with a coat, textured with the given probability."""
+    look = texture(rng) if rng.random() < textured else random_color(rng)
+    kind = rng.random()
+    if kind < 0.55:
+        return diffuse(look, repeat)
+    if kind < 0.7:
+        return plastic(look, repeat)
+    return rough_plastic(look, float(np.exp(rng.uniform(np.log(0.03), np.log(0.4)))), repeat)
+
+
+def random_material(rng: np.random.Generator) -> Bsdf:
+    """Anything a small closed object can be made of."""
+    kind = rng.random()
+    if kind < 0.66:
+        return random_opaque(rng)
+    if kind < 0.82:
+        return random_metal(rng)
+    if kind < 0.88:
+        return mirror(str(rng.choice(_METALS)))
+    return glass(float(rng.uniform(1.3, 1.75)))
+
+
+def _two_sided(bsdf: Bsdf) -> Bsdf:
+    return {"type": "twosided", "bsdf": bsdf}
+
+
+def _bitmap(look: Color | Array, repeat: tuple[float, float] = (1, 1)) -> dict[str, Any]:
+    image = np.tile(np.array(look, dtype=np.float64), (2, 2, 1)) if isinstance(look, tuple) else look
+    # raw: the numbers are reflectances already, and no sRGB values to be decoded.
+    return {"type": "bitmap", "bitmap": image, "raw": True, "to_uv": np.diag((*repeat, 1.0, 1.0))}

@@ -1,0 +1,220 @@
+"""The stage: where the parts of a random scene are put together, and what is known about free space in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from mcdenoise.data.camera_path import Array
+from mcdenoise.random_scene.materials import Bsdf, every_kind
+from mcdenoise.random_scene.textures import Color
+
+Vector: TypeAlias = Sequence[float] | Array
+
+# Lights that never shine fill every scene up to this number, because it is part of a vectorised renderer's program.
+_LIGHTS = 16
+# low and high corner of each shape in its own space
+_BOUNDS = {
+    "cube": ((-1, -1, -1), (1, 1, 1)),
+    "sphere": ((-1, -1, -1), (1, 1, 1)),
+    "cylinder": ((-1, -1, 0), (1, 1, 1)),
+    "disk": ((-1, -1, 0), (1, 1, 0)),
+    "rectangle": ((-1, -1, 0), (1, 1, 0)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A shape with its material, in the space of the group it belongs to.
+
+    Args:
+        kind: a shape plugin of Mitsuba.
+        to_group: ``(4, 4)`` from the shape's own space.
+        material: what :meth:`Stage.material` returned.
+        radiance: what it emits, if it is a light.
+    """
+
+    kind: str
+    to_group: Array
+    material: dict[str, str]
+    radiance: Color | None = None
+
+
+class Stage:
+    """Collects materials, shapes and lights as a Mitsuba dictionary.
+
+    ``low`` and ``high`` bound where people and cameras may be. ``points`` are worth looking at. ``groups`` are small
+    objects that could move, with the ids of their shapes.
+    """
+
+    def __init__(self, low: Vector, high: Vector) -> None:
+        self.low, self.high = np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
+        self.points: list[Array] = []
+        self.groups: dict[str, list[str]] = {}
+        self.lamps: list[str] = []
+        self._materials: dict[str, Any] = {}
+        self._objects: dict[str, Any] = {}
+        self._lights: dict[str, Any] = {}
+        self._sky: dict[str, Any] | None = None
+        self._bounds: list[tuple[Array, Array]] = []
+
+    def material(self, bsdf: Bsdf) -> dict[str, str]:
+        """Register a material that many shapes can share."""
+        name = f"material_{len(self._materials)}"
+        self._materials[name] = bsdf
+        return {"type": "ref", "id": name}
+
+    def add(self, parts: Iterable[Part], to_world: Array | None = None, movable: bool = False) -> list[str]:
+        """Put a group of parts into the world; returns the ids of its shapes."""
+        names = []
+        for part in parts:
+            matrix = part.to_group if to_world is None else to_world @ part.to_group
+            name = f"{'lamp' if part.radiance else part.kind}_{len(self._objects)}"
+            shape: dict[str, Any] = {"type": part.kind, "to_world": matrix, "bsdf": part.material}
+            if part.radiance is not None:
+                shape["emitter"] = {"type": "area", "radiance": rgb(part.radiance), "sampling_weight": 1.0}
+                self.lamps.append(name)
+            self._objects[name] = shape
+            self._bounds.append(bounds(part.kind, matrix))
+            names.append(name)
+        if movable:
+            self.groups[f"group_{len(self.groups)}"] = names
+        return names
+
+    def add_light(self, light: dict[str, Any]) -> None:
+        """Add a light without a surface: a point or a spot."""
+        self._lights[f"light_{len(self._lights)}"] = {**light, "sampling_weight": 1.0}
+
+    def set_sky(self, image: Array) -> None:
+        """Light from everywhere around, as a lat-long image whose top row is the zenith."""
+        self._sky = {"type": "envmap", "bitmap": image, "sampling_weight": 1.0}
+
+    def light_count(self) -> int:
+        """How many lights shine."""
+        return len(self.lamps) + len(self._lights) + (self._sky is not None)
+
+    def placed(self, name: str) -> Array:
+        """Where a shape is: its own space to world."""
+        return np.asarray(self._objects[name]["to_world"])
+
+    def boxes(self, without: Sequence[str] = ()) -> tuple[Array, Array]:
+        """Low and high corners ``(N, 3)`` of all shapes."""
+        kept = [box for name, box in zip(self._objects, self._bounds, strict=True) if name not in without]
+        return np.array([low for low, _ in kept]).reshape(-1, 3), np.array([high for _, high in kept]).reshape(-1, 3)
+
+    def scene(self) -> dict[str, Any]:
+        """The Mitsuba dictionary."""
+        return {"type": "scene", **self._materials, **self._objects, **self._lights, **self._rest()}
+
+    def _rest(self) -> dict[str, Any]:
+        """Tiny shapes below the floor of every kind, and lights that do not shine, so that all scenes are alike."""
+        rest: dict[str, Any] = {}
+        below = float(self.boxes()[0][:, 1].min()) - 0.01
+        x, z = (self.low[[0, 2]] + self.high[[0, 2]]) / 2
+        for number, bsdf in enumerate(every_kind()):
+            material = f"spare_material_{number}"
+            rest[material] = bsdf
+            for kind in _BOUNDS:
+                matrix = place((x + 0.01 * number, below, z), scale=(0.001, 0.001, 0.001))
+                rest[f"spare_{kind}_{number}"] = {
+                    "type": kind,
+                    "to_world": matrix,
+                    "bsdf": {"type": "ref", "id": material},
+                }
+        rest["sky"] = self._sky or {"type": "envmap", "bitmap": np.zeros((4, 8, 3)), "sampling_weight": 0.0}
+        rest["spare_point"] = {"type": "point", "position": [x, below, z], "intensity": rgb((0.0, 0.0, 0.0))}
+        rest["spare_spot"] = {"type": "spot", "to_world": place((x, below, z)), "intensity": rgb((0.0, 0.0, 0.0))}
+        rest["spare_point"]["sampling_weight"] = rest["spare_spot"]["sampling_weight"] = 0.0
+        kinds = ("rectangle", "sphere", "disk", "cube", "cylinder")
+        missing = _LIGHTS - len(self.lamps) - len(self._lights)
+        for number in range(max(missing, len(kinds))):
+            rest[f"spare_lamp_{number}"] = {
+                "type": kinds[number % len(kinds)],
+                "to_world": place((x, below, z + 0.01 * (number + 1)), scale=(0.001, 0.001, 0.001)),
+                "bsdf": {"type": "ref", "id": "spare_material_0"},
+                "emitter": {"type": "area", "radiance": rgb((0.0, 0.0, 0.0)), "sampling_weight": 0.0},
+            }
+        return rest
+
+
+def rgb(color: Color) -> dict[str, Any]:
+    """A colour as Mitsuba wants it."""
+    return {"type": "rgb", "value": [float(channel) for channel in color]}
+
+
+def bounds(kind: str, matrix: Array) -> tuple[Array, Array]:
+    """Low and high corner of a placed shape's axis-aligned box."""
+    ends = np.array(_BOUNDS[kind], dtype=np.float64)
+    corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    world = corners @ matrix[:3, :3].T + matrix[:3, 3]
+    return world.min(axis=0), world.max(axis=0)
+
+
+def place(position: Vector, turn: float = 0, scale: Vector = (1, 1, 1), rotation: Array | None = None) -> Array:
+    """A transform: scale, rotate, turn around the vertical by degrees, move."""
+    matrix = rotate("y", turn)
+    if rotation is not None:
+        matrix = matrix @ rotation
+    matrix = matrix @ np.diag((*scale, 1.0))
+    matrix[:3, 3] = position
+    return np.asarray(matrix)
+
+
+def rotate(axis: str, degrees: float) -> Array:
+    """A rotation around an axis."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    matrix = np.eye(4)
+    matrix[first, first] = matrix[second, second] = c
+    matrix[first, second], matrix[second, first] = -s, s
+    return matrix
+
+
+def box(center: Vector, size: Vector, material: dict[str, str], turn: float = 0, tilt: float = 0) -> Part:
+    """A box of full ``size``, tilted around x, then turned around y, degrees."""
+    half = [0.5 * length for length in size]
+    return Part("cube", place(center, turn, half, rotate("x", tilt)), material)
+
+
+def ball(center: Vector, radius: float, material: dict[str, str], radiance: Color | None = None) -> Part:
+    """A sphere."""
+    return Part("sphere", place(center, scale=(radius, radius, radius)), material, radiance)
+
+
+def rod(start: Vector, end: Vector, radius: float, material: dict[str, str]) -> Part:
+    """An open tube from one point to another."""
+    axis = np.subtract(end, start, dtype=np.float64)
+    length = float(np.linalg.norm(axis))
+    axis /= length
+    aside = np.array((1.0, 0.0, 0.0)) if abs(axis[0]) < 0.9 else np.array((0.0, 1.0, 0.0))
+    first = np.cross(axis, aside)
+    first /= np.linalg.norm(first)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack((first * radius, np.cross(axis, first) * radius, axis * length, np.asarray(start)), axis=1)
+    return Part("cylinder", matrix, material)
+
+
+def drum(foot: Vector, height: float, radius: float, material: dict[str, str]) -> list[Part]:
+    """An upright cylinder that is closed at both ends."""
+    top = (foot[0], foot[1] + height, foot[2])
+    return [rod(foot, top, radius, material), plate(top, radius, material), plate(foot, radius, material, up=False)]
+
+
+def plate(center: Vector, radius: float, material: dict[str, str], up: bool = True) -> Part:
+    """A level disc."""
+    return Part("disk", place(center, 0, (radius, radius, 1), rotate("x", -90 if up else 90)), material)
+
+
+def sheet(
+    center: Vector,
+    half: Vector,
+    material: dict[str, str],
+    rotation: Array,
+    radiance: Color | None = None,
+) -> Part:
+    """A rectangle that faces +z before it is rotated."""
+    return Part("rectangle", place(center, 0, (*half, 1), rotation), material, radiance)

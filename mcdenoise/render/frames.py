@@ -1,0 +1,194 @@
+"""One frame of a rendered sequence: which of its files are missing, and the rendering of those."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mcdenoise.data.bmfr import realisation_folder, write_buffer
+from mcdenoise.data.camera_path import Array, Camera, PixelRays, pixel_rays
+from mcdenoise.render.folder import ReferenceState, read_reference, write_realisation, write_reference
+from mcdenoise.render.halves import ReferenceHalves
+from mcdenoise.render.tracer import STRATIFIED_PATHS, Tracer
+
+# Too few paths have not met the rare bright ones yet, and seem to have less noise than they do.
+_FEWEST_PATHS_IN_A_HALF = 16
+_SMALLEST_HALF = 1 / 8
+_SECONDS_BETWEEN_SAVES = 60.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameJob:
+    """What all frames have in common, and what was there before; see :func:`mcdenoise.render.render_sequence`.
+
+    Args:
+        folder: ``inputs`` of the sequence.
+        cameras: of each frame.
+        moves: of each object that moves.
+        size: width and height in pixels.
+        reach: at which distance the background is put, scene units.
+        spp: paths per pixel of the noisy colours.
+        realisations: how many noisy colours.
+        reference_spp: paths per pixel of a finished reference.
+        noise_level: or its estimated noise.
+        references: frames that get a reference.
+        started: how far the references on disk have come.
+        seed: of the noise.
+    """
+
+    folder: Path
+    cameras: list[Camera]
+    moves: dict[str, Array]
+    size: tuple[int, int]
+    reach: float
+    spp: int
+    realisations: int
+    reference_spp: int
+    noise_level: float | None
+    references: frozenset[int]
+    started: dict[int, ReferenceState] = field(default_factory=dict)
+    seed: int
+
+    def is_finished(self, number: int) -> bool:
+        """Whether a frame has everything."""
+        colors = all(self.has_color(number, realisation) for realisation in range(self.realisations))
+        return colors and self.has_features(number) and (number not in self.references or self.has_reference(number))
+
+    def has_color(self, number: int, realisation: int) -> bool:
+        """Whether a frame has one of its noisy colours."""
+        return (realisation_folder(self.folder, realisation) / f"color{number}.exr").is_file()
+
+    def has_features(self, number: int) -> bool:
+        """Whether a frame has everything but colours and reference."""
+        names = ["albedo", "shading_normal", "world_position", "depth", *(["previous_position"] if self.moves else [])]
+        return all((self.folder / f"{name}{number}.exr").is_file() for name in names)
+
+    def has_reference(self, number: int) -> bool:
+        """Whether a frame has a reference that is good enough."""
+        state = self.started.get(number)
+        return state is not None and self.is_good(state.spp, state.noise)
+
+    def is_good(self, spp: int, noise: float | None) -> bool:
+        """Whether so many paths, or so little noise, are enough for a reference."""
+        quiet = self.noise_level is not None and noise is not None and noise <= self.noise_level
+        return spp >= self.reference_spp or quiet
+
+    def paths_there(self) -> int:
+        """Paths per pixel that need not be traced again, summed over all frames."""
+        frames = range(len(self.cameras))
+        colors = sum(self.has_color(number, k) for number in frames for k in range(self.realisations))
+        states = [(number, self.started[number]) for number in self.references if number in self.started]
+        return colors * self.spp + sum(
+            self.reference_spp if self.has_reference(number) else state.spp for number, state in states
+        )
+
+
+def render_frame(job: FrameJob, tracer: Tracer, number: int, advance: Callable[[int], None]) -> ReferenceState | None:
+    """Write what a frame lacks, the first colour last: a frame that has it is complete.
+
+    Args:
+        job: what all frames have in common.
+        tracer: of the scene.
+        number: which frame.
+        advance: called with the number of paths per pixel after each pass.
+
+    Returns:
+        How far its reference has come; ``None`` if there was nothing to do for it.
+
+    Raises:
+        InputError: a file cannot be written, or what there is of a reference is damaged.
+    """
+    width, height = job.size
+    rays = pixel_rays(job.cameras[number], width, height)
+    tracer.place(number)
+    if not job.has_features(number):
+        for name, values in _features(job, tracer, number, rays).items():
+            write_buffer(job.folder, number, name, _image(values, job.size))
+    state = None
+    if number in job.references and not job.has_reference(number):
+        state = _refine_reference(job, tracer, number, rays, advance)
+    for realisation in reversed(range(job.realisations)):
+        if not job.has_color(number, realisation):
+            # The stream 1 belongs to the reference.
+            stream = 1 + realisation if realisation else 0
+            color = _color(tracer, rays, job.spp, (job.seed, number, stream), advance)
+            write_realisation(job.folder, number, realisation, _image(color, job.size))
+    return state
+
+
+def _features(job: FrameJob, tracer: Tracer, number: int, rays: PixelRays) -> dict[str, Array]:
+    hits = tracer.features(rays)
+    position = rays.origin + np.minimum(hits.distance, job.reach)[:, None] * rays.directions
+    depth = (position - rays.origin) @ job.cameras[number].to_world[:3, 2]
+    features = {"albedo": hits.albedo, "normal": hits.normal, "position": position, "depth": depth}
+    if job.moves:
+        # The first frame has no frame before it; a look back at itself leaves everything where it is.
+        earlier = max(number - 1, 0)
+        before = position.copy()
+        for index, identity in enumerate(tracer.movers):
+            moved = job.moves[identity]
+            if not np.array_equal(moved[earlier], moved[number]):
+                back = moved[earlier] @ np.linalg.inv(moved[number])
+                hit = hits.mover == index
+                before[hit] = position[hit] @ back[:3, :3].T + back[:3, 3]
+        features["previous_position"] = before
+    return features
+
+
+def _color(
+    tracer: Tracer, rays: PixelRays, spp: int, seed: tuple[int, int, int], advance: Callable[[int], None]
+) -> Array:
+    per_pass = min(spp, tracer.paths_per_pass(rays))
+    total = np.zeros_like(rays.directions)
+    for number, start in enumerate(range(0, spp, per_pass)):
+        paths = min(per_pass, spp - start)
+        total += paths * tracer.radiance(rays, paths, (*seed, number))
+        advance(paths)
+    return total / spp
+
+
+def _refine_reference(
+    job: FrameJob, tracer: Tracer, number: int, rays: PixelRays, advance: Callable[[int], None]
+) -> ReferenceState:
+    """Add passes to what there is of a reference until it is good, and write it."""
+    unfinished = job.folder / f"reference{number}.partial.npz"
+    before = job.started.get(number, ReferenceState(0, 0, None))
+    if unfinished.is_file():
+        halves = ReferenceHalves.load(unfinished)
+        advance(halves.spp - before.spp)
+    else:
+        mean = read_reference(job.folder, number) if before.spp else np.zeros_like(rays.directions)
+        halves = ReferenceHalves.start(mean, before.spp, before.passes)
+    saved = time.monotonic()
+    while not job.is_good(halves.spp, _reliable_noise(halves)):
+        missing = job.reference_spp - halves.spp
+        stratified = missing >= (STRATIFIED_PATHS if halves.passes else 2 * STRATIFIED_PATHS)
+        # The noise can only be told from two passes.
+        rest = missing if halves.passes else (missing + 1) // 2
+        paths = STRATIFIED_PATHS if stratified else rest
+        seed = (job.seed, number, 1, halves.passes)
+        halves.add(tracer.radiance(rays, paths, seed, stratified=stratified), paths)
+        advance(paths)
+        if time.monotonic() - saved > _SECONDS_BETWEEN_SAVES:
+            halves.save(unfinished)
+            saved = time.monotonic()
+    advance(max(0, job.reference_spp - halves.spp))
+    state = ReferenceState(halves.spp, halves.passes, halves.noise())
+    write_reference(job.folder, number, _image(halves.mean(), job.size), state)
+    unfinished.unlink(missing_ok=True)
+    return state
+
+
+def _reliable_noise(halves: ReferenceHalves) -> float | None:
+    fewest = max(_FEWEST_PATHS_IN_A_HALF, _SMALLEST_HALF * halves.spp)
+    return halves.noise() if min(halves.paths) >= fewest else None
+
+
+def _image(values: Array, size: tuple[int, int]) -> torch.Tensor:
+    width, height = size
+    return torch.from_numpy(values.reshape(height, width, -1).astype(np.float32)).permute(2, 0, 1)[None]

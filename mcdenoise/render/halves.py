@@ -1,0 +1,96 @@
+"""References in the making: refined pass by pass, with an estimate of the noise that is left."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcdenoise.data.camera_path import Array
+from mcdenoise.data.files import atomic_path
+from mcdenoise.errors import InputError
+
+NOISE_EPSILON = 0.01
+
+
+class ReferenceHalves:
+    r"""The sum of many paths per pixel, in two independent halves.
+
+    The halves A and B are the means of :math:`n_A` and :math:`n_B` paths, so with the variance :math:`\sigma^2` of one
+    path the reference :math:`R = (n_A A + n_B B) / (n_A + n_B)` has the variance :math:`\sigma^2 / (n_A + n_B)`, and
+    :math:`A - B` has :math:`\sigma^2 (1 / n_A + 1 / n_B)`. The difference of the halves, times
+    :math:`\sqrt{n_A n_B} / (n_A + n_B)` (one half for equal halves), is therefore as large as the unknown error of the
+    reference. This gives the estimate of its SMAPE against the truth T, ``mean(|R - T| / (R + T + 0.01))``:
+
+    .. math:: \mathrm{noise} = \mathrm{mean} \frac{\sqrt{n_A n_B}}{n_A + n_B} \frac{|A - B|}{2 R + 0.01}
+
+    It holds as far as the mean absolute error follows the variance: rare bright paths that the halves have not met yet
+    are not in it. In the demonstration's room it is 5 to 8 % too low from 128 paths on, and 15 % too low at 32.
+
+    Args:
+        sums: ``(2, N, 3)`` radiance of all paths of each half.
+        paths: how many paths per pixel each half has.
+        passes: how many passes were made, which is the number of the next one's seed.
+    """
+
+    def __init__(self, sums: Array, paths: tuple[int, int], passes: int) -> None:
+        self._sums = sums
+        self.paths = paths
+        self.passes = passes
+
+    @classmethod
+    def start(cls, mean: Array, spp: int, passes: int) -> ReferenceHalves:
+        """From what there is: ``(N, 3)`` mean radiance of ``spp`` paths (possibly 0), which becomes the first half."""
+        return cls(np.stack([mean * spp, np.zeros_like(mean)]), (spp, 0), passes)
+
+    @classmethod
+    def load(cls, path: Path) -> ReferenceHalves:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        try:
+            # Opened here, because numpy leaves a damaged file open.
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+                first, second, passes = (int(number) for number in stored["counts"])
+                sums: NDArray[np.float64] = stored["sums"]
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise InputError(f"{path}: expected a reference in the making, found something else; remove it") from error
+        return cls(sums, (first, second), passes)
+
+    def save(self, path: Path) -> None:
+        """Write everything, whole or not at all.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        with atomic_path(path) as temporary:
+            np.savez(temporary, sums=self._sums, counts=np.array([*self.paths, self.passes]))
+
+    @property
+    def spp(self) -> int:
+        """Paths per pixel of both halves."""
+        return sum(self.paths)
+
+    def add(self, mean: Array, paths: int) -> None:
+        """Add a pass, ``(N, 3)`` mean radiance of so many paths, to the half that has fewer of them."""
+        half = 0 if self.paths[0] <= self.paths[1] else 1
+        self._sums[half] += mean * paths
+        self.paths = (self.paths[0] + paths, self.paths[1]) if half == 0 else (self.paths[0], self.paths[1] + paths)
+        self.passes += 1
+
+    def mean(self) -> Array:
+        """``(N, 3)`` the reference."""
+        return np.asarray(self._sums.sum(axis=0) / self.spp)
+
+    def noise(self) -> float | None:
+        """The estimated SMAPE of the reference against the truth; ``None`` while a half is empty."""
+        if 0 in self.paths:
+            return None
+        first, second = (total / paths for total, paths in zip(self._sums, self.paths, strict=True))
+        scale = np.sqrt(self.paths[0] * self.paths[1]) / self.spp
+        # In single precision, as it comes back from the header of a file.
+        return float(np.float32(np.mean(scale * np.abs(first - second) / (2 * self.mean() + NOISE_EPSILON))))

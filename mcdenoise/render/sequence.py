@@ -1,0 +1,195 @@
+"""Render a sequence: what is asked for, what is there already, and who renders which frame.
+
+Everything is sampled at the pixel centre: features, noisy colour and reference, so that the expectation of the colour
+is the reference, and dividing by the albedo is consistent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, view_projection
+from mcdenoise.errors import InputError
+from mcdenoise.render.folder import SequenceFolder
+from mcdenoise.render.frames import FrameJob, render_frame
+from mcdenoise.render.processes import TracerSource, render_in_processes
+from mcdenoise.render.tracer import (
+    RR_DEPTH,
+    STRATIFIED_PATHS,
+    Scene,
+    choose_variant,
+    scene_digest,
+    scene_name,
+)
+
+_LARGEST_SIDE = 16384
+
+
+def render_sequence(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    out: Path,
+    *,
+    size: tuple[int, int] = (640, 360),
+    frames: int | None = None,
+    spp: int = 1,
+    realisations: int = 1,
+    reference_spp: int = 512,
+    noise_level: float | None = None,
+    reference_frames: Collection[int] | None = None,
+    moves: Mapping[str, Array] | None = None,
+    seed: int = 0,
+    max_depth: int = 8,
+    workers: int = 1,
+    variant: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Render a sequence in the BMFR layout.
+
+    What is already there is kept, so a stopped run can be resumed, and realisations, frames and better references can
+    be added later: a reference with fewer paths or more noise than asked for is refined by further passes with seeds
+    of their own. It continues from the half floats of its file, whose rounding (0.02 %) is far below its noise. An
+    unfinished reference is saved once a minute, as ``referenceN.partial.npz``.
+
+    Args:
+        scene: a Mitsuba ``scene.xml``, or a Mitsuba dictionary. In a dictionary, numpy arrays may stand for transforms
+            (shape ``(4, 4)``) and for bitmaps (shape ``(H, W, C)``). Its sensors and integrators are not used.
+        cameras: one camera per frame.
+        out: the folder of the sequence; the files go to ``out/inputs``.
+        size: width and height in pixels.
+        frames: render the first so many cameras; all by default.
+        spp: paths per pixel of the noisy colour.
+        realisations: how many noisy colours each frame gets, with independent noise. Those after the first go to
+            ``out/inputs/realisation{1,2,...}``.
+        reference_spp: paths per pixel of the references; with ``noise_level`` the most.
+        noise_level: a reference is finished early when its estimated SMAPE against the truth is this small; see
+            :class:`mcdenoise.render.halves.ReferenceHalves`. ``camera.json`` has what was reached, frame by frame.
+        reference_frames: numbers of the frames that get a reference; all by default.
+        moves: for each object of the scene that moves, by its id, ``(T, 4, 4)``: one world-space transform per camera,
+            applied to the object where the scene places it. Frames of a scene with moves have a ``previous_position``.
+        seed: every (seed, frame, realisation) has its own noise, and always the same.
+        max_depth: longest path, in segments.
+        workers: processes that render frames side by side, each with a scene of its own; the files do not depend on
+            it. It pays with ``scalar_rgb``; the other variants use all processors anyway. A script that asks for more
+            than one must protect its main part by ``if __name__ == "__main__":``.
+        variant: one of ``VARIANTS``; by default the one Mitsuba is already set to, else ``cuda_ad_rgb`` or
+            ``llvm_ad_rgb`` where they work, else ``scalar_rgb``.
+        progress: called with the finished and the total number of paths per pixel, summed over all frames. A reference
+            that reaches the noise level early counts as complete.
+
+    Returns:
+        The folder with the files, ``out/inputs``.
+
+    Raises:
+        InputError: Mitsuba is missing, the scene cannot be loaded, a setting is unusable, an object that is to move
+            is not there, a worker process died, or ``out`` cannot be written or holds a sequence with other settings.
+    """
+    width, height = size
+    cameras = list(cameras)
+    checked_moves = check_moves(moves or {}, len(cameras))
+    count = len(cameras) if frames is None else min(frames, len(cameras))
+    references = frozenset(range(count) if reference_frames is None else reference_frames)
+    _check_settings(size, count, references, noise_level)
+    _check_lowest(
+        spp=(spp, 1),
+        realisations=(realisations, 1),
+        reference_spp=(reference_spp, 1),
+        seed=(seed, 0),
+        max_depth=(max_depth, 1),
+        workers=(workers, 1),
+    )
+    source = TracerSource(scene, choose_variant(variant), max_depth, checked_moves)
+    if workers > 1:
+        source.check_portable()
+    tracer = source.tracer()
+    reach = tracer.reach(cameras)
+    tracer.place(0)
+    distance = tracer.features(pixel_rays(cameras[0], width, height)).distance
+    scale = float(np.median(np.minimum(distance, reach)))
+    near, far = 0.01 * scale, 2 * reach
+    cameras = cameras[:count]
+    matrices = np.stack([view_projection(camera, width, height, near, far) for camera in cameras])
+    settings: dict[str, Any] = {
+        "scene": scene_name(scene),
+        "scene_sha256": scene_digest(scene),
+        "renderer": tracer.name,
+        "frames": count,
+        "width": width,
+        "height": height,
+        "fov_x_degrees": cameras[0].fov_x,
+        "near": near,
+        "far": far,
+        "noisy_spp": spp,
+        "realisations": realisations,
+        "max_depth": max_depth,
+        "rr_depth": RR_DEPTH,
+        "seed": seed,
+        "reference_sampling": f"passes of {STRATIFIED_PATHS} multi-jittered paths, a smaller rest of independent ones",
+        "background": f"no hit: albedo and normal are 0, world_position is {reach:g} units along the ray",
+        "position_limit_squared": (0.02 * scale) ** 2,
+        "normal_limit_squared": 1.0,
+        "pixel_offsets": [[0.5, 0.5]] * count,
+        "camera_matrices": matrices.tolist(),
+        "world_to_clip": matrices.transpose(0, 2, 1).tolist(),
+        "camera_to_world": [camera.to_world.tolist() for camera in cameras],
+    }
+    if checked_moves:
+        settings["moves"] = {name: moved[:count].tolist() for name, moved in checked_moves.items()}
+    folder = SequenceFolder(Path(out), settings)
+    job = FrameJob(
+        folder=folder.path,
+        cameras=cameras,
+        moves=checked_moves,
+        size=size,
+        reach=reach,
+        spp=spp,
+        realisations=realisations,
+        reference_spp=reference_spp,
+        noise_level=noise_level,
+        references=references,
+        started=dict(folder.references),
+        seed=seed,
+    )
+
+    done, total = 0, count * realisations * spp + len(references) * reference_spp
+
+    def advance(paths: int) -> None:
+        nonlocal done
+        done += paths
+        if progress is not None:
+            progress(min(done, total), total)
+
+    advance(job.paths_there())
+    missing = [number for number in range(count) if not job.is_finished(number)]
+    if workers == 1:
+        for number in missing:
+            state = render_frame(job, tracer, number, advance)
+            if state is not None:
+                folder.note_reference(number, state)
+    else:
+        render_in_processes(source, job, missing, workers, advance, folder.note_reference)
+    return folder.path
+
+
+def _check_settings(size: tuple[int, int], count: int, references: frozenset[int], noise_level: float | None) -> None:
+    if count < 1:
+        raise InputError("expected at least one camera and one frame to render, found none")
+    if not all(isinstance(side, int) and 1 <= side <= _LARGEST_SIDE for side in size):
+        raise InputError(
+            f"size: expected width and height between 1 and {_LARGEST_SIDE} pixels, found {size[0]}x{size[1]}"
+        )
+    outside = sorted(number for number in references if not 0 <= number < count)
+    if outside:
+        raise InputError(f"reference frames: expected numbers from 0 to {count - 1}, found {outside[0]}")
+    if noise_level is not None and not 0 < noise_level < 1:
+        raise InputError(f"noise_level: expected more than 0 and less than 1, found {noise_level:g}")
+
+
+def _check_lowest(**settings: tuple[int, int]) -> None:
+    for name, (value, lowest) in settings.items():
+        if value < lowest:
+            raise InputError(f"{name}: expected at least {lowest}, found {value}")

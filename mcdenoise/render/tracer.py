@@ -1,0 +1,413 @@
+"""Mitsuba 3 behind a small interface: given rays in, what they hit and the light that comes back out.
+
+Mitsuba's own renderer always jitters inside the pixel; therefore the rays are built here, and Mitsuba traces them. It
+is optional and imported on first use.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcdenoise.data.camera_path import Array, Camera, PixelRays
+from mcdenoise.errors import InputError
+
+Scene: TypeAlias = str | Path | Mapping[str, Any]
+
+VARIANTS = ("scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb")
+RR_DEPTH = 5
+_SEE_THROUGH_LAYERS = 8
+_WAVEFRONT = 2**20  # paths traced at once: enough to fill the vector units, small enough for a laptop's memory
+_SCALAR_PASS = 8
+STRATIFIED_PATHS = 16
+_MOST_NAMES = 20
+
+
+class Hits(NamedTuple):
+    """What N rays hit.
+
+    Args:
+        distance: ``(N,)`` along the ray, ``inf`` without a hit.
+        normal: ``(N, 3)`` unit shading normal, turned to where the ray comes from; 0 without a hit.
+        albedo: ``(N, 3)`` in [0, 1].
+        mover: ``(N,)`` which of :attr:`Tracer.movers` was hit, -1 for what stands still.
+    """
+
+    distance: Array
+    normal: Array
+    albedo: Array
+    mover: NDArray[np.int64]
+
+
+class Tracer:
+    """Traces given rays through a scene, one by one in the scalar variant, all at once in the others.
+
+    Args:
+        scene: see :func:`mcdenoise.render.render_sequence`.
+        variant: one of ``VARIANTS``.
+        max_depth: longest path, in segments.
+        moves: see :class:`mcdenoise.data.camera_path.Shot`.
+
+    Raises:
+        InputError: Mitsuba is missing, the variant does not run here, the scene cannot be loaded, or an object that
+            is to move is not there.
+    """
+
+    def __init__(self, scene: Scene, variant: str, max_depth: int, moves: Mapping[str, Array] | None = None) -> None:
+        self._mi = mi = _import_mitsuba()
+        try:
+            mi.set_variant(variant)
+        except ImportError as error:
+            raise InputError(f"Mitsuba variant '{variant}' does not run here: {_first_line(error)}") from error
+        self._dr = importlib.import_module("drjit")
+        self._scalar = variant.startswith("scalar")
+        self.name = f"mitsuba {mi.__version__} ({variant}, drjit {self._dr.__version__}), path integrator"
+        # Merged meshes could no longer move each for itself.
+        self._scene = _load_scene(mi, scene, merge=not moves)
+        self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": RR_DEPTH})
+        self._independent = mi.load_dict({"type": "independent"})
+        self._stratified = mi.load_dict({"type": "multijitter", "sample_count": STRATIFIED_PATHS})
+        self._context = mi.BSDFContext()
+        self._last_rays: tuple[PixelRays, list[Any]] | None = None
+        self._moves = dict(moves or {})
+        self._parameters: Any = mi.traverse(self._scene) if moves else {}
+        shapes = {shape.id(): shape for shape in self._scene.shapes()}
+        self._at_rest = {identity: self._placement(identity, shapes) for identity in self._moves}
+        self._moving = {identity: shapes[identity] for identity in self._moves if identity in shapes}
+        self.movers = list(self._moving)
+        self._boxes = {identity: _box(shape) for identity, shape in self._moving.items()}
+
+    def place(self, frame: int) -> None:
+        """Put every object that moves where it is in a frame.
+
+        Raises:
+            InputError: Mitsuba cannot transform an object like this.
+        """
+        for identity, placement in self._at_rest.items():
+            matrix = self._moves[identity][frame]
+            for key, (kind, value) in placement.items():
+                self._parameters[f"{identity}.{key}"] = kind(*_transformed(key, value, matrix))
+        if self._at_rest:
+            try:
+                self._parameters.update()
+            except RuntimeError as error:
+                raise InputError(f"frame {frame}: Mitsuba cannot move the objects: {_first_line(error)}") from error
+
+    def reach(self, cameras: Sequence[Camera]) -> float:
+        """A distance that lies behind everything in the scene, from each camera: where the background is put."""
+        box = self._scene.bbox()
+        if not box.valid():
+            return 1.0
+        corners = [np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)]
+        for identity, moved in self._boxes.items():
+            for matrix in self._moves[identity]:
+                corners.extend(moved @ matrix[:3, :3].T + matrix[:3, 3])
+        low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+        diagonal = float(np.linalg.norm(high - low))
+        away = [float(np.linalg.norm((low + high) / 2 - camera.to_world[:3, 3])) for camera in cameras]
+        # Generous, and the same for any number of frames unless the camera travels far.
+        return max(diagonal + away[0], diagonal / 2 + max(away))
+
+    def features(self, rays: PixelRays) -> Hits:
+        """What the rays hit first, looking through what is see-through."""
+        if self._scalar:
+            found = [self._hit(ray) for ray in self._scalar_rays(rays)]
+            table = np.array([(d, *normal, *albedo, mover) for d, normal, albedo, mover in found], dtype=np.float64)
+        else:
+            distance, normal, albedo, mover = self._hit(self._wavefront(rays, 1))
+            columns = (distance, *normal, *albedo, mover)
+            count = len(rays.directions)  # a constant column has one entry
+            table = np.stack([np.broadcast_to(np.array(c, dtype=np.float64), count) for c in columns], axis=1)
+        # A few BSDFs only approximate their albedo, by a value that can exceed 1.
+        clean = np.clip(np.nan_to_num(table[:, 4:7]), 0, 1)
+        return Hits(table[:, 0], table[:, 1:4], clean, table[:, 7].astype(np.int64))
+
+    def paths_per_pass(self, rays: PixelRays) -> int:
+        """How many independent paths per ray are best traced by one call of :meth:`radiance`."""
+        return _SCALAR_PASS if self._scalar else max(1, _WAVEFRONT // len(rays.directions))
+
+    def radiance(self, rays: PixelRays, paths: int, seed: Sequence[int], *, stratified: bool = False) -> Array:
+        """Mean radiance ``(N, 3)`` of so many paths per ray; another seed gives independent noise.
+
+        Args:
+            rays: N rays.
+            paths: how many per ray; with ``stratified`` it is ``STRATIFIED_PATHS``.
+            seed: of the noise.
+            stratified: spread the paths of each ray evenly over what they choose from (correlated multi-jittered
+                sampling), instead of drawing each for itself. The expectation is the same, the error mostly smaller.
+        """
+        count = len(rays.directions)
+        # Hashed: with sums of seed, frame and pass, two frames could share their noise.
+        state = int(np.random.SeedSequence(seed).generate_state(1)[0])
+        sampler = self._stratified if stratified else self._independent
+        if self._scalar:
+            return self._scalar_radiance(self._scalar_rays(rays), paths, sampler, state, stratified)
+        copies = max(n for n in range(1, paths + 1) if paths % n == 0 and (n == 1 or n * count <= _WAVEFRONT))
+        # A stratified sampler wants the copies of a ray one after the other.
+        wavefront = self._wavefront(rays, copies, interleaved=not stratified)
+        if stratified:
+            sampler.set_samples_per_wavefront(copies)
+        sampler.seed(self._dr.opaque(self._mi.UInt32, state), count * copies)
+        total = np.zeros((count, 3))
+        for _ in range(paths // copies):
+            radiance = self._integrator.sample(self._scene, sampler, wavefront)[0]
+            samples = _finite(np.stack([np.array(channel) for channel in radiance], axis=1))
+            shape = (count, copies, 3) if stratified else (copies, count, 3)
+            total += samples.reshape(shape).sum(axis=1 if stratified else 0, dtype=np.float64)
+            sampler.advance()
+        return total / paths
+
+    def _placement(self, identity: str, shapes: Mapping[str, Any]) -> dict[str, tuple[Any, Array]]:
+        """What has to change when an object moves: for each of its parameters its type and its value at rest."""
+        emitters = {emitter.id() for emitter in self._scene.emitters()}
+        present = [
+            key for key in ("to_world", "vertex_positions", "position") if f"{identity}.{key}" in self._parameters
+        ]
+        if identity not in emitters.union(shapes) or not present:
+            everything = self._parameters.keys()
+            names = sorted(
+                key.rpartition(".")[0]
+                for key in everything
+                if key.endswith((".to_world", ".vertex_positions", ".position"))
+                and key.rpartition(".")[0] in emitters.union(shapes)
+            )
+            more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+            raise InputError(
+                f"object '{identity}': expected the id of a shape or a light that can move "
+                f"({', '.join(names[:_MOST_NAMES])}{more}), found no such thing in the scene"
+            )
+        keys = present[:1]
+        if keys == ["vertex_positions"] and f"{identity}.vertex_normals" in self._parameters:
+            keys.append("vertex_normals")
+        placement = {}
+        for key in keys:
+            value = self._parameters[f"{identity}.{key}"]
+            numbers = np.array(value.matrix if key == "to_world" else value, dtype=np.float64)
+            placement[key] = (type(value), numbers.reshape(4, 4) if key == "to_world" else numbers.reshape(-1, 3))
+        return placement
+
+    def _scalar_rays(self, rays: PixelRays) -> list[Any]:
+        # Kept for the next pass: they cost as much as tracing them once.
+        if self._last_rays is None or self._last_rays[0] is not rays:
+            self._last_rays = (rays, self._make_scalar_rays(rays))
+        return self._last_rays[1]
+
+    def _make_scalar_rays(self, rays: PixelRays) -> list[Any]:
+        origin = self._mi.Point3f(*rays.origin.tolist())
+        return [
+            self._mi.RayDifferential3f(self._mi.Ray3f(origin, self._mi.Vector3f(*direction)))
+            for direction in rays.directions.tolist()
+        ]
+
+    def _scalar_radiance(self, rays: list[Any], paths: int, sampler: Any, state: int, stratified: bool) -> Array:
+        sample, scene = self._integrator.sample, self._scene
+        values: list[float] = []
+        if stratified:
+            for index, ray in enumerate(rays):
+                sampler.seed((state + index) % 2**32, 1)
+                for _ in range(paths):
+                    values.extend(sample(scene, sampler, ray)[0])
+                    sampler.advance()
+            samples = np.array(values, dtype=np.float32).reshape(len(rays), paths, 3).swapaxes(0, 1)
+        else:
+            sampler.seed(state, 1)
+            for _ in range(paths):
+                for ray in rays:
+                    values.extend(sample(scene, sampler, ray)[0])
+            samples = np.array(values, dtype=np.float32).reshape(paths, len(rays), 3)
+        return np.asarray(_finite(samples).sum(axis=0, dtype=np.float64) / paths)
+
+    def _wavefront(self, rays: PixelRays, copies: int, interleaved: bool = True) -> Any:
+        mi = self._mi
+        directions = rays.directions.astype(np.float32)
+        columns = (np.tile(directions, (copies, 1)) if interleaved else np.repeat(directions, copies, axis=0)).T
+        direction = mi.Vector3f(*(mi.Float(np.ascontiguousarray(column)) for column in columns))
+        # Numbers known to the compiler would become part of the kernel: seconds of compilation for each frame.
+        origin = mi.Point3f(*(self._dr.opaque(mi.Float, value) for value in rays.origin.tolist()))
+        return mi.RayDifferential3f(mi.Ray3f(origin, direction))
+
+    def _hit(self, ray: Any) -> tuple[Any, Any, Any, Any]:
+        """Distance, normal, albedo and mover of the first surface that is not see-through, the same in all variants."""
+        mi, dr = self._mi, self._dr
+        hit = self._scene.ray_intersect(ray)
+        for _ in range(_SEE_THROUGH_LAYERS):
+            if not dr.any(hit.is_valid()):
+                break
+            transmission = hit.bsdf(ray).eval_null_transmission(hit, hit.is_valid())
+            through = hit.is_valid() & (sum(transmission) > 1.5)  # opacity below a half, on average over RGB
+            if not dr.any(through):
+                break
+            behind = self._scene.ray_intersect(hit.spawn_ray(ray.d), through)
+            hit = dr.select(through, behind, hit)
+        valid = hit.is_valid()
+        black = mi.Color3f(0)
+        if not dr.any(valid):  # a scalar ray that hit nothing has no BSDF to ask
+            return dr.select(valid, mi.Float(0), mi.Float(dr.inf)), black, black, mi.Float(-1)
+        normal = hit.sh_frame.n
+        normal = dr.select(valid, dr.select(dr.dot(normal, ray.d) > 0, -normal, normal), mi.Normal3f(0))
+        bsdf = hit.bsdf(ray)
+        diffuse = valid & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
+        # select instead of ~diffuse, which is no boolean for a Python bool.
+        glossy = valid & dr.select(diffuse, False, mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyReflection))
+        albedo = dr.select(diffuse, bsdf.eval_diffuse_reflectance(hit, diffuse), black)
+        if dr.any(glossy):
+            albedo = dr.select(glossy, self._directional_albedo(bsdf, hit, glossy), albedo)
+        mover = mi.Float(-1)
+        for index, shape in enumerate(self._moving.values()):
+            found = valid & ((hit.shape == shape) | (hit.instance == shape))
+            mover = dr.select(found, mi.Float(index), mover)
+        return dr.select(valid, dr.dot(hit.p - ray.o, ray.d), dr.inf), normal, albedo, mover
+
+    def _directional_albedo(self, bsdf: Any, hit: Any, active: Any) -> Any:
+        """What a rough metal reflects of a white world towards the viewer: a fixed 4x4 grid of samples, so no noise."""
+        total = self._mi.Color3f(0)
+        grid = [(i + 0.5) / 4 for i in range(4)]
+        for x in grid:
+            for y in grid:
+                total += bsdf.sample(self._context, hit, 0.5, self._mi.Point2f(x, y), active)[1]
+        return total / 16
+
+
+def choose_variant(variant: str | None) -> str:
+    """The variant to use: the given one, else the one Mitsuba is set to, else the fastest that works here.
+
+    Raises:
+        InputError: Mitsuba is missing, or there is no such variant.
+    """
+    if variant is None:
+        current = _import_mitsuba().variant()
+        variant = current if current in VARIANTS else (first_working(("cuda_ad_rgb", "llvm_ad_rgb")) or "scalar_rgb")
+    if variant not in VARIANTS:
+        raise InputError(f"Mitsuba variant: expected one of {', '.join(VARIANTS)}, found '{variant}'")
+    return variant
+
+
+@functools.cache
+def first_working(variants: tuple[str, ...]) -> str | None:
+    """The first of these variants that can render here; ``None`` if none can.
+
+    An LLVM that is too old for the processor aborts the process, so a child tries them.
+    """
+    trial = f"""
+import mitsuba as mi
+for variant in {variants!r}:
+    try:
+        mi.set_variant(variant)
+        mi.render(mi.load_dict(mi.cornell_box()), spp=1).numpy()
+    except Exception:
+        continue
+    print("works:", variant)
+    break
+"""
+    try:
+        child = subprocess.run([sys.executable, "-c", trial], capture_output=True, text=True, timeout=120, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    # With other words around it, such as the warnings of a driver.
+    found = [variant for variant in variants if f"works: {variant}" in child.stdout]
+    return found[0] if found else None
+
+
+def scene_name(scene: Scene) -> str:
+    """What to call a scene: the folder of a ``scene.xml``, the name of any other file."""
+    if isinstance(scene, Mapping):
+        return "in memory"
+    path = Path(scene).resolve()
+    return path.parent.name if path.stem == "scene" else path.stem
+
+
+def scene_digest(scene: Scene) -> str:
+    """Tells one description of a scene from another; of the files that an XML names, only the names count."""
+    digest = hashlib.sha256()
+
+    def feed(value: Any) -> None:
+        if isinstance(value, Mapping):
+            for key, item in value.items():
+                digest.update(f"{key}:".encode())
+                feed(item)
+        elif isinstance(value, np.ndarray):
+            digest.update(str(value.shape).encode() + value.tobytes())
+        else:
+            digest.update(f"{value!r};".encode())
+
+    feed(scene if isinstance(scene, Mapping) else Path(scene).read_bytes())
+    return digest.hexdigest()
+
+
+def _import_mitsuba() -> Any:
+    try:
+        return importlib.import_module("mitsuba")
+    except ImportError as error:
+        raise InputError(
+            "rendering needs Mitsuba 3, which is not installed; pip install 'mcdenoise[render]'"
+        ) from error
+
+
+def _load_scene(mi: Any, scene: Scene, merge: bool) -> Any:
+    if not isinstance(scene, Mapping):
+        scene = Path(scene)
+        if not scene.is_file():
+            raise InputError(f"{scene}: expected a Mitsuba scene, found no such file; check the path")
+    try:
+        if isinstance(scene, Mapping):
+            loaded = mi.load_dict(_to_mitsuba(mi, scene), optimize=merge)
+        else:
+            loaded = mi.load_file(str(scene), optimize=merge)
+    except (RuntimeError, TypeError, ValueError) as error:
+        where = "scene dictionary" if isinstance(scene, Mapping) else scene
+        raise InputError(f"{where}: Mitsuba cannot load it: {_first_line(error)}") from error
+    if not isinstance(loaded, mi.Scene):
+        raise InputError(
+            f"expected a Mitsuba scene, found a {type(loaded).__name__}; its outermost type must be 'scene'"
+        )
+    return loaded
+
+
+def _to_mitsuba(mi: Any, value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _to_mitsuba(mi, item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        if value.shape == (4, 4):
+            return mi.ScalarTransform4f(value)
+        return mi.Bitmap(np.ascontiguousarray(value, dtype=np.float32))
+    return value
+
+
+def _finite(samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A path that ran into 0/0 counts as black: one of them would spoil a whole reference pixel."""
+    return np.where(np.isfinite(samples).all(axis=-1, keepdims=True), samples, np.float32(0))
+
+
+def _box(shape: Any) -> Array:
+    """``(8, 3)`` corners of what bounds a shape."""
+    box = shape.bbox()
+    ends = np.array([box.min, box.max], dtype=np.float64)
+    return np.array([[ends[x, 0], ends[y, 1], ends[z, 2]] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+
+
+def _transformed(key: str, value: Array, matrix: Array) -> tuple[Any, ...]:
+    """Arguments for the type of a parameter: its value at rest with a transform applied."""
+    linear, offset = matrix[:3, :3], matrix[:3, 3]
+    if key == "to_world":
+        return (matrix @ value,)
+    if key == "position":
+        return tuple((linear @ value[0] + offset).tolist())
+    if key == "vertex_normals":
+        normals = value @ np.linalg.inv(linear)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return ((normals / np.where(length > 0, length, 1)).astype(np.float32).ravel(),)
+    return ((value @ linear.T + offset).astype(np.float32).ravel(),)
+
+
+def _first_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0] if lines else type(error).__name__

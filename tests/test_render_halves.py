@@ -1,0 +1,68 @@
+"""References in the making: halves, and the noise that is left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mcdenoise.errors import InputError
+from mcdenoise.metrics import smape_linear
+from mcdenoise.render.halves import ReferenceHalves
+
+PIXELS = 4000
+
+
+def passes(count: int, paths: int, seed: int = 0) -> list[np.ndarray]:
+    """Means of so many paths with a relative standard deviation of 1, around a mean that differs by pixel."""
+    rng = np.random.default_rng(seed)
+    truth = np.linspace(0.1, 4, PIXELS * 3).reshape(PIXELS, 3)
+    return [truth * rng.gamma(paths, 1 / paths, truth.shape) for _ in range(count)]
+
+
+@pytest.mark.parametrize("start", [0, 16, 200])
+def test_noise_is_the_smape_against_the_truth(start: int) -> None:
+    """With equal halves, and where one half is all there was before."""
+    before = passes(1, start, seed=1)[0] if start else np.zeros((PIXELS, 3))
+    halves = ReferenceHalves.start(before, start, start)
+    for mean in passes(6, 16):
+        halves.add(mean, 16)
+    truth = np.linspace(0.1, 4, PIXELS * 3).reshape(PIXELS, 3)
+    images = (torch.from_numpy(image.T.reshape(3, 1, PIXELS)) for image in (halves.mean(), truth))
+    noise = halves.noise()
+    assert noise is not None
+    # Measured: within 1 %.
+    np.testing.assert_allclose(noise, smape_linear(*images).item(), rtol=0.03)
+    assert (halves.spp, halves.passes) == (start + 96, start + 6)
+
+
+def test_passes_go_to_the_smaller_half() -> None:
+    halves = ReferenceHalves.start(np.ones((1, 3)), 20, 20)
+    paths = []
+    for mean in passes(4, 16):
+        halves.add(mean[:1], 16)
+        paths.append(halves.paths)
+    assert paths == [(20, 16), (20, 32), (36, 32), (36, 48)]
+
+
+def test_one_half_alone_tells_nothing() -> None:
+    halves = ReferenceHalves.start(np.ones((1, 3)), 20, 20)
+    assert halves.noise() is None
+    np.testing.assert_array_equal(halves.mean(), 1)
+
+
+def test_saved_and_loaded(tmp_path: Path) -> None:
+    halves = ReferenceHalves.start(np.zeros((PIXELS, 3)), 0, 0)
+    for mean in passes(3, 16):
+        halves.add(mean, 16)
+    path = tmp_path / "reference0.partial.npz"
+    halves.save(path)
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+    found = ReferenceHalves.load(path)
+    assert (found.paths, found.passes, found.noise()) == (halves.paths, halves.passes, halves.noise())
+    np.testing.assert_array_equal(found.mean(), halves.mean())
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(InputError, match="expected a reference in the making"):
+        ReferenceHalves.load(path)
