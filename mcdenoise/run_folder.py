@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import math
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +29,22 @@ class RunFolder:
 
     out: Path
 
+    def check(self, **identity: Any) -> None:
+        """See that no other run has the folder; write nothing.
+
+        Args:
+            identity: for each file its content.
+
+        Raises:
+            InputError: an earlier run wrote something else to one of the files.
+        """
+        for name, content in identity.items():
+            path = self.out / f"{name}.json"
+            if path.exists() and (not path.is_file() or path.read_bytes() != _json(content).encode()):
+                raise InputError(
+                    f"{path}: expected the same as in this run, found another; choose a new folder for a new run"
+                )
+
     def claim(self, **identity: Any) -> None:
         """Write what identifies the run to ``NAME.json``, or check that an earlier run did just that.
 
@@ -40,21 +58,27 @@ class RunFolder:
             self.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{self.out}: expected a folder to write the run to: {error.strerror}") from error
+        self.check(**identity)
         for name, content in identity.items():
             path = self.out / f"{name}.json"
-            text = json.dumps(content, indent=2) + "\n"
             if not path.exists():
-                write_text(path, text)
-            elif not path.is_file() or path.read_bytes() != text.encode():
-                raise InputError(
-                    f"{path}: expected the same as in this run, found another; choose a new folder for a new run"
-                )
+                write_text(path, _json(content))
+        # What a killed process was writing.
+        for left in self.out.glob(f".{self._checkpoint.name}.*"):
+            left.unlink(missing_ok=True)
 
     def save(self, step: int, provenance: Provenance, *parts: Any) -> None:
-        """Replace the checkpoint: the number of steps done, and the states of model, optimizer and scheduler."""
+        """Replace the checkpoint: the number of steps done, and the states of model, optimizer and scheduler.
+
+        Raises:
+            InputError: it cannot be written; the one before is kept.
+        """
         states = [part.state_dict() for part in parts]
+        content = io.BytesIO()
+        torch.save({"step": step, "provenance": provenance, "parts": states}, content)
+        # Not by torch itself, which does not say that a disk is full in a way that could be told from other failures.
         with atomic_path(self._checkpoint) as temporary:
-            torch.save({"step": step, "provenance": provenance, "parts": states}, temporary)
+            temporary.write_bytes(content.getbuffer())
 
     def load(self, *parts: Any) -> tuple[int, Provenance]:
         """Restore what :meth:`save` saved; zero steps without a checkpoint.
@@ -80,9 +104,33 @@ class RunFolder:
         with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
 
+    def rewind(self, step: int) -> None:
+        """Drop from ``log.jsonl`` what will be computed again: steps after ``step``, and a line cut off in writing.
+
+        Raises:
+            InputError: the log cannot be written.
+        """
+        path = self.out / "log.jsonl"
+        if path.exists():
+            lines = path.read_text(encoding="utf-8").splitlines()
+            write_text(path, "".join(f"{line}\n" for line in lines if _last_step(line) <= step))
+
     @property
     def _checkpoint(self) -> Path:
         return self.out / "checkpoint.pt"
+
+
+def _last_step(line: str) -> float:
+    """The step that a line of the log is about, the first that a start is about; infinity where it is torn."""
+    try:
+        entry = json.loads(line)
+        return float(entry.get("step", entry.get("first_step", math.inf)))
+    except (ValueError, AttributeError, TypeError):
+        return math.inf
+
+
+def _json(content: Any) -> str:
+    return json.dumps(content, indent=2) + "\n"
 
 
 def source_commit() -> str:

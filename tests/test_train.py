@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file
 from torch import Tensor
 
 from mcdenoise.data import open_sequence
-from mcdenoise.data.clips import Clip, ClipSampler, accumulated_shots
+from mcdenoise.data.clips import Clip, ClipSampler
+from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.errors import InputError
 from mcdenoise.history import History
+from mcdenoise.metrics import smape_linear
 from mcdenoise.models import describe_weights, load_weights
 from mcdenoise.ops import Accumulate, remodulate
 
@@ -23,6 +34,7 @@ pytest.importorskip("lightning_fabric", reason="training needs the packages of m
 pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
 
 from mcdenoise.train import Progress, TrainConfig, train
+from mcdenoise.train.data import DataFolders
 
 SMALL: dict[str, Any] = {"width": 4, "crop": 16, "frames": 2, "batch": 2, "steps": 6, "validation_frames": 1}
 
@@ -67,8 +79,8 @@ def state(run: Path) -> list[Tensor]:
 def test_one_clip_is_learnt_by_heart(small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     draw, clips, reports = ClipSampler.draw, [], []
 
-    def draw_once(sampler: ClipSampler, batch: int) -> Clip:
-        clips.append(clips[0] if clips else draw(sampler, batch))
+    def draw_once(sampler: ClipSampler, seeds: list[int]) -> Clip:
+        clips.append(clips[0] if clips else draw(sampler, seeds))
         return clips[-1]
 
     monkeypatch.setattr(ClipSampler, "draw", draw_once)
@@ -77,14 +89,14 @@ def test_one_clip_is_learnt_by_heart(small_sequence: Path, tmp_path: Path, monke
     assert [progress.step for progress in reports] == [5, 10, 15, 20, 25, 30]
     # 0.305 to 0.216 was measured.
     assert reports[-1].loss < 0.8 * reports[0].loss
-    assert set(reports[-1].validation) == {"smape", "psnr"}
+    assert set(reports[-1].validation) == {"smape", "psnr", "initial_smape", "initial_psnr"}
 
 
 @pytest.mark.parametrize("schedule", ["constant", "cosine"])
 def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
     small_sequence: Path, tmp_path: Path, schedule: str
 ) -> None:
-    config = TrainConfig(**SMALL, schedule=schedule, gradient_norm=1.0)
+    config = TrainConfig(**SMALL, schedule=schedule, gradient_norm=1.0, ema=0.9)
     steps: list[int] = []
 
     def stop_at_3(progress: Progress) -> None:
@@ -119,7 +131,7 @@ def test_what_a_run_leaves(small_sequence: Path, tmp_path: Path) -> None:
     weights = train(TrainConfig(**SMALL), [small_sequence], run, checkpoint_every=2, credits="A. Painter, CC0")
     assert weights == run / "cascaded.safetensors"
     names = {path.name for path in run.iterdir() if not path.name.startswith("events.")}
-    assert names == {"cascaded.safetensors", "checkpoint.pt", "config.json", "data.json", "log.jsonl"}
+    assert names == {"cache", "cascaded.safetensors", "checkpoint.pt", "config.json", "data.json", "log.jsonl"}
     assert any(path.name.startswith("events.out.tfevents") for path in run.iterdir())
 
     config = json.loads((run / "config.json").read_text())
@@ -131,13 +143,16 @@ def test_what_a_run_leaves(small_sequence: Path, tmp_path: Path) -> None:
         assert frame.reference is not None
         digest.update(frame.color.numpy().tobytes() + frame.reference.numpy().tobytes())
     data = json.loads((run / "data.json").read_text())
-    entry = {"name": "plane", "frames": 4, "size": "24x20", "validation": [3], "sha256": digest.hexdigest()}
+    entry = {"name": "plane", "frames": 4, "size": "24x20", "realisations": 1, "validation": [3]}
+    entry["sha256"] = digest.hexdigest()
     assert data == {"credits": "A. Painter, CC0", "initial_weights": "none", "sequences": [entry]}
     start, *log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     assert start["first_step"] == 0
-    assert set(start) == {"first_step", "commit", "threads"}
+    assert set(start) == {"first_step", "commit", "threads", "processes"}
     assert [entry["step"] for entry in log] == [2, 4, 6]
-    assert all(set(entry) == {"step", "loss", "seconds", "validation"} for entry in log)
+    names = {"step", "loss", "gradient_norm", "learning_rate", "seconds", "validation"}
+    assert all(set(entry) == names for entry in log)
+    assert all(entry["gradient_norm"] > 0 and entry["learning_rate"] == 1e-4 for entry in log)
 
     about = describe_weights(weights)
     assert (about["architecture"], about["settings"], about["steps"]) == ("cascaded", {"width": 4}, "6")
@@ -157,21 +172,184 @@ def test_bfloat16_learns_float32_weights(small_sequence: Path, tmp_path: Path) -
     assert all(torch.isfinite(tensor).all() for tensor in saved.values())
 
 
-def test_frames_held_back_are_not_trained_on(
-    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shots: list[Tensor] = []
+def test_frames_held_back_are_not_trained_on(small_sequence: Path, tmp_path: Path) -> None:
+    def lengths(**changes: Any) -> tuple[list[int], list[int]]:
+        config = TrainConfig(**{**SMALL, **changes})
+        data = DataFolders.open(config, [small_sequence], []).load(tmp_path / "cache")
+        return [len(shot) for shot in data.sampler.shots], [len(shot) for _, shot in data.watched]
 
-    class Spy(ClipSampler):
-        def __init__(self, given: list[Tensor], frames: int, crop: int, lamps: float) -> None:
-            shots.extend(given)
-            super().__init__(given, frames, crop, lamps)
+    # Shots of 4, 3, 2 and 1 frames, each without the last frames; none too short for a clip is kept.
+    assert lengths(start_every=1, validation_frames=1) == ([3, 2], [1])
+    assert lengths(start_every=1, validation_frames=2) == ([2], [2])
+    assert lengths(start_every=2, validation_frames=0) == ([4, 2], [])
+    # Too few frames to hold any back.
+    assert lengths(frames=3, validation_frames=2) == ([4], [])
 
-    monkeypatch.setattr("mcdenoise.train.ClipSampler", Spy)
-    config = TrainConfig(**{**SMALL, "steps": 1, "validation_frames": 2, "start_every": 1})
-    train(config, [small_sequence], tmp_path / "run")
-    # Shots of 4, 3, 2 and 1 frames, each without the last two frames of the sequence.
-    assert [len(shot) for shot in shots] == [2, 1, 0, 0]
+
+def test_every_realisation_of_the_noise_is_trained_on(small_sequence: Path, tmp_path: Path) -> None:
+    inputs = small_sequence / "inputs"
+    (inputs / "realisation1").mkdir()
+    for number in range(4):
+        shutil.copyfile(inputs / f"color{3 - number}.exr", inputs / "realisation1" / f"color{number}.exr")
+    config = TrainConfig(**SMALL)
+    data = DataFolders.open(config, [small_sequence], [small_sequence]).load(tmp_path / "cache")
+    assert [len(shot.colors) for shot in data.sampler.shots] == [2]
+    assert data.description["sequences"][0]["realisations"] == 2
+    # Validation is always on the first.
+    assert "realisations" not in data.description["validation_sequences"][0]
+    assert len(data.watched[1][1].colors) == 1
+
+
+def test_the_log_of_a_stopped_run_has_every_step_once(small_sequence: Path, tmp_path: Path) -> None:
+    config, log = TrainConfig(**SMALL), tmp_path / "run" / "log.jsonl"
+
+    def stop_at_4(progress: Progress) -> None:
+        if progress.step == 4:
+            with log.open("a") as file:
+                file.write('{"step": 5, "lo')
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        train(config, [small_sequence], tmp_path / "run", checkpoint_every=2, report=stop_at_4)
+    # As if the last checkpoint had been that of step 2.
+    saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    saved["step"] = 2
+    torch.save(saved, tmp_path / "run" / "checkpoint.pt")
+    train(config, [small_sequence], tmp_path / "run", checkpoint_every=2)
+    entries = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [entry.get("step", entry.get("first_step")) for entry in entries] == [0, 2, 2, 4, 6]
+
+
+def test_sequences_that_are_only_watched(small_sequence: Path, tmp_path: Path) -> None:
+    """They change what is reported and nothing that is learnt."""
+    other = tmp_path / "other"
+    shutil.copytree(small_sequence, other)
+    config = TrainConfig(**{**SMALL, "steps": 2, "validation_frames": 0})
+    reports: list[Progress] = []
+    plain = train(config, [small_sequence], tmp_path / "plain", report=reports.append)
+    watched = train(config, [small_sequence], tmp_path / "watched", validation=[other], report=reports.append)
+    assert [bool(progress.validation) for progress in reports] == [False, True]
+    assert describe_weights(watched)["sha256"] == describe_weights(plain)["sha256"]
+    data = json.loads((tmp_path / "watched" / "data.json").read_text())
+    assert [entry["name"] for entry in data["sequences"]] == ["plane"]
+    assert [entry["name"] for entry in data["validation_sequences"]] == ["other"]
+    # All frames of the sequence, each denoised on its own.
+    network = load_weights(watched, "cascaded")
+    sequence, history, errors = open_sequence(other), History(Accumulate(0.1)), []
+    for number in sequence.numbers:
+        frame = sequence.frame(number).validate()[0]
+        _, final = network(history.update(frame).color, frame.albedo, frame.normal, frame.depth)
+        errors.append(smape_linear(remodulate(final, frame.albedo), frame.reference).item())
+    # The weights on disk are half precision.
+    assert reports[1].validation["smape"] == pytest.approx(sum(errors) / 4, abs=1e-3)
+
+
+def test_averaged_weights_are_what_is_validated_and_kept(small_sequence: Path, tmp_path: Path) -> None:
+    config = TrainConfig(**{**SMALL, "ema": 0.5, "learning_rate": 1e-2, "steps": 3})
+    trajectory: list[dict[str, Tensor]] = []
+
+    def remember(progress: Progress) -> None:
+        saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["parts"][0]
+        trajectory.append({key: tensor.clone() for key, tensor in saved.items()})
+
+    weights = train(config, [small_sequence], tmp_path / "run", checkpoint_every=1, report=remember)
+    final = load_weights(weights).state_dict()
+    for key, tensor in trajectory[0].items():
+        expected = tensor
+        # The decay of the first steps: 2/11, 3/12, ... up to the limit.
+        for count, later in enumerate(trajectory[1:], 1):
+            expected = expected.lerp(later[key], 1 - min(0.5, (1 + count) / (10 + count)))
+        torch.testing.assert_close(final[key], expected.half().float(), rtol=1e-3, atol=1e-6)
+    assert any(not torch.equal(final[key], trajectory[-1][key].half().float()) for key in final)
+
+
+def mcdenoise(*arguments: object, processes: int = 1) -> list[str]:
+    """The command line, as one or several processes of their own."""
+    launcher = ["torch.distributed.run", "--standalone", "--nproc-per-node", str(processes), "-m"]
+    launch = launcher if processes > 1 else []
+    return [sys.executable, "-m", *launch, "mcdenoise", *map(str, arguments)]
+
+
+def options(config: TrainConfig) -> list[str]:
+    return [
+        text
+        for name, value in dataclasses.asdict(config).items()
+        for text in (f"--{name.replace('_', '-')}", str(value))
+    ]
+
+
+ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+def test_a_killed_run_goes_on_to_the_same_weights(small_sequence: Path, tmp_path: Path) -> None:
+    config = TrainConfig(**{**SMALL, "steps": 60, "ema": 0.9}, schedule="cosine", gradient_norm=1.0, exposure=1.0)
+    run, cache = tmp_path / "killed", tmp_path / "cache"
+    command = mcdenoise("train", small_sequence, "-o", run, "--cache", cache, "--checkpoint-every", 5, *options(config))
+    process = subprocess.Popen(command, env=ONE_THREAD, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (run / "checkpoint.pt").exists():
+        assert process.poll() is None
+        time.sleep(0.005)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert not (run / "cascaded.safetensors").exists()
+    assert 0 < torch.load(run / "checkpoint.pt", weights_only=True)["step"] < 60
+
+    whole = train(config, [small_sequence], tmp_path / "whole", cache=cache, checkpoint_every=60)
+    resumed = train(config, [small_sequence], run, cache=cache, checkpoint_every=5)
+    expected_weights, actual_weights = load_file(whole), load_file(resumed)
+    assert actual_weights.keys() == expected_weights.keys()
+    assert all(torch.equal(tensor, expected_weights[key]) for key, tensor in actual_weights.items())
+    expected, actual = state(tmp_path / "whole"), state(run)
+    assert all(torch.equal(a, b) for a, b in zip(actual, expected, strict=True))
+
+
+def test_a_run_killed_while_it_saves_keeps_the_checkpoint_before(small_sequence: Path, tmp_path: Path) -> None:
+    code = """
+        import os, signal, sys
+        from pathlib import Path
+        from mcdenoise.data import files
+        from mcdenoise.train import TrainConfig, train
+        replace, saved = os.replace, []
+        def killed(source, target):
+            saved.append(Path(target).name)
+            if saved.count("checkpoint.pt") == 2:
+                os.kill(os.getpid(), signal.SIGKILL)
+            replace(source, target)
+        files.os.replace = killed
+        config = TrainConfig(width=4, crop=16, frames=2, batch=2, steps=3, validation_frames=1)
+        train(config, [Path(sys.argv[1])], Path(sys.argv[2]), checkpoint_every=1)
+    """
+    run = tmp_path / "run"
+    command = [sys.executable, "-c", textwrap.dedent(code), str(small_sequence), str(run)]
+    assert subprocess.run(command, env=ONE_THREAD, check=False).returncode == -signal.SIGKILL
+    assert torch.load(run / "checkpoint.pt", weights_only=True)["step"] == 1
+    assert list(run.glob(".checkpoint*"))
+    config = TrainConfig(**{**SMALL, "steps": 3})
+    resumed = train(config, [small_sequence], run, checkpoint_every=1)
+    whole = train(config, [small_sequence], tmp_path / "whole", checkpoint_every=1)
+    assert describe_weights(resumed)["sha256"] == describe_weights(whole)["sha256"]
+    assert not list(run.glob(".*"))
+
+
+def test_two_processes_learn_what_one_does(small_sequence: Path, tmp_path: Path) -> None:
+    config = TrainConfig(**{**SMALL, "batch": 4, "steps": 4, "ema": 0.9}, gradient_norm=0.5, lamps=0.5, exposure=1.0)
+    run = tmp_path / "two"
+    command = mcdenoise("train", small_sequence, "-o", run, *options(config), processes=2)
+    result = subprocess.run(command, env=ONE_THREAD, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split() == [str(run / "cascaded.safetensors")]
+    one = train(config, [small_sequence], tmp_path / "one")
+    two = load_file(run / "cascaded.safetensors")
+    for key, tensor in load_file(one).items():
+        # Half precision; the sums differ by the order of their terms, 2e-7 before rounding.
+        torch.testing.assert_close(two[key], tensor, rtol=1e-3, atol=2e-6)
+    logs = [(tmp_path / name / "log.jsonl").read_text().splitlines() for name in ("one", "two")]
+    (start, *one_log), (two_start, *two_log) = ([json.loads(line) for line in log] for log in logs)
+    assert (start["processes"], two_start["processes"]) == (1, 2)
+    assert len(two_log) == len(one_log) == 1
+    for name in ("loss", "gradient_norm"):
+        assert two_log[0][name] == pytest.approx(one_log[0][name], rel=1e-5)
+    assert len(list(run.glob("events.*"))) == 1
 
 
 # Refusals
@@ -180,10 +358,11 @@ def test_frames_held_back_are_not_trained_on(
 def test_another_config_needs_another_folder(small_sequence: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     train(TrainConfig(**{**SMALL, "steps": 1}), [small_sequence], run)
-    before = {path.name: path.read_bytes() for path in run.iterdir()}
-    message = refused(lambda: train(TrainConfig(**{**SMALL, "steps": 2}), [small_sequence], run))
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    # One with another cache, too, which must not be filled for nothing.
+    message = refused(lambda: train(TrainConfig(**{**SMALL, "steps": 2, "alpha_min": 0.5}), [small_sequence], run))
     assert f"{run / 'config.json'}: expected the same as in this run" in message
-    assert {path.name: path.read_bytes() for path in run.iterdir()} == before
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
 def test_other_data_needs_another_folder(small_sequence: Path, tmp_path: Path) -> None:
@@ -203,6 +382,62 @@ def test_a_damaged_checkpoint_is_refused(small_sequence: Path, tmp_path: Path, c
     assert "remove it" in message
 
 
+def test_a_checkpoint_of_another_architecture_is_refused(small_sequence: Path, tmp_path: Path) -> None:
+    config = TrainConfig(**{**SMALL, "steps": 1})
+    train(config, [small_sequence], tmp_path / "run")
+    train(TrainConfig(**{**SMALL, "steps": 1, "model": "pixel"}), [small_sequence], tmp_path / "pixel")
+    train(TrainConfig(**{**SMALL, "steps": 1, "ema": 0.5}), [small_sequence], tmp_path / "average")
+    for other in ("pixel", "average"):
+        shutil.copyfile(tmp_path / other / "checkpoint.pt", tmp_path / "run" / "checkpoint.pt")
+        message = refused(lambda: train(config, [small_sequence], tmp_path / "run"))
+        assert message.startswith(f"{tmp_path / 'run' / 'checkpoint.pt'}: expected a checkpoint of this run")
+
+
+def test_a_full_disk_keeps_the_checkpoint_before(small_sequence: Path, tmp_path: Path) -> None:
+    code = """
+        import resource, sys
+        from pathlib import Path
+        from mcdenoise.errors import InputError
+        from mcdenoise.train import TrainConfig, train
+        def fill_disk(progress):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (50000, 50000))
+        config = TrainConfig(width=4, crop=16, frames=2, batch=2, steps=6, validation_frames=1)
+        try:
+            train(config, [Path(sys.argv[1])], Path(sys.argv[2]), checkpoint_every=2, report=fill_disk)
+        except InputError as error:
+            print(error)
+    """
+    run = tmp_path / "run"
+    command = [sys.executable, "-c", textwrap.dedent(code), str(small_sequence), str(run)]
+    result = subprocess.run(command, env=ONE_THREAD, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith(f"{run / 'checkpoint.pt'}: cannot be written (File too large)")
+    assert result.stdout.count("\n") == 1
+    assert torch.load(run / "checkpoint.pt", weights_only=True)["step"] == 2
+    assert not list(run.glob(".*"))
+    resumed = train(TrainConfig(**SMALL), [small_sequence], run, checkpoint_every=2)
+    whole = train(TrainConfig(**SMALL), [small_sequence], tmp_path / "whole")
+    assert describe_weights(resumed)["sha256"] == describe_weights(whole)["sha256"]
+
+
+def test_a_gradient_that_is_not_finite_is_not_learnt_from(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.nn.utils.clip_grad_norm_", lambda *args, **kwargs: torch.tensor(torch.inf))
+    message = refused(lambda: train(TrainConfig(**SMALL), [small_sequence], tmp_path / "run"))
+    assert "training, step 0: expected a finite gradient, found inf" in message
+
+
+def test_a_batch_that_cannot_be_shared_out(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    launched = {"TORCHELASTIC_RUN_ID": "none", "WORLD_SIZE": "6", "LOCAL_WORLD_SIZE": "3"}
+    for name, value in launched.items():
+        monkeypatch.setenv(name, value)
+    message = refused(lambda: train(TrainConfig(**SMALL), [small_sequence], tmp_path / "run"))
+    assert "batch: expected a multiple of the 6 processes, found 2" in message
+
+
 def test_no_sequences(tmp_path: Path) -> None:
     assert "expected at least one sequence folder" in refused(lambda: train(TrainConfig(), [], tmp_path / "run"))
     assert not (tmp_path / "run").exists()
@@ -215,15 +450,51 @@ def test_no_sequences(tmp_path: Path) -> None:
         ("reference2", "expected a reference for every frame to train on, found none for frame 2"),
         ("albedo", "expected albedo, normal and depth to train on, found no albedo"),
         ("shading_normal", "expected albedo, normal and depth to train on, found no normal"),
+        ("*2", "expected frame 2 after frame 1, found 3"),
+        ("albedo2", "expected buffer 'albedo' for every frame, found it for some"),
     ],
 )
 def test_data_that_cannot_be_trained_on_leaves_no_run(
     small_sequence: Path, tmp_path: Path, stem: str, expected: str
 ) -> None:
-    for path in (small_sequence / "inputs").glob(f"{stem}*.exr"):
+    broken = tmp_path / "broken"
+    shutil.copytree(small_sequence, broken)
+    for path in (broken / "inputs").glob(f"{stem}*.exr"):
         path.unlink()
-    assert expected in refused(lambda: train(TrainConfig(**SMALL), [small_sequence], tmp_path / "run"))
+    config = TrainConfig(**SMALL)
+    assert expected in refused(lambda: train(config, [small_sequence, broken], tmp_path / "run"))
+    assert expected in refused(lambda: train(config, [small_sequence], tmp_path / "run", validation=[broken]))
     assert not (tmp_path / "run").exists()
+
+
+def test_frames_of_several_sizes_are_refused_and_sequences_of_several_sizes_are_not(
+    small_sequence: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(small_sequence, other)
+    for path in (other / "inputs").glob("*.exr"):
+        image, channels, _ = read_exr(path)
+        if path.stem.endswith("3"):
+            write_exr(path, image[:17, :18], channels)
+    config = TrainConfig(**{**SMALL, "steps": 1})
+    message = refused(lambda: train(config, [small_sequence, other], tmp_path / "run"))
+    assert "expected 24 x 20 pixels like the first color file, found 18 x 17" in message
+    assert not (tmp_path / "run").exists()
+    for path in (other / "inputs").glob("*.exr"):
+        image, channels, _ = read_exr(path)
+        write_exr(path, image[:17, :18], channels, half="position" not in path.stem)
+    assert train(config, [small_sequence, other], tmp_path / "run").exists()
+    message = refused(lambda: train(TrainConfig(**{**SMALL, "crop": 19}), [small_sequence, other], tmp_path / "large"))
+    assert "expected images of at least 19 pixels, found (17, 18)" in message
+
+
+def test_a_frame_that_is_damaged_leaves_no_run(small_sequence: Path, tmp_path: Path) -> None:
+    image, channels, _ = read_exr(small_sequence / "inputs" / "shading_normal1.exr")
+    write_exr(small_sequence / "inputs" / "shading_normal1.exr", image * float("nan"), channels)
+    run = tmp_path / "run"
+    message = refused(lambda: train(TrainConfig(**SMALL), [small_sequence], run))
+    assert f"{small_sequence}, frame 1: buffer 'normal': expected finite values" in message
+    assert [path.name for path in run.iterdir()] == ["cache"]
 
 
 @pytest.mark.parametrize(
@@ -243,6 +514,9 @@ def test_data_that_cannot_be_trained_on_leaves_no_run(
         ("seed", 2**64, "seed: expected 0 to 2^32 - 1, found 18446744073709551616"),
         ("learning_rate", 0.0, "learning_rate: expected a positive number, found 0.0"),
         ("alpha_min", 0.0, "alpha_min: expected in (0, 1], found 0.0"),
+        ("ema", 1.0, "ema: expected in [0, 1), found 1.0"),
+        ("exposure", -1.0, "exposure: expected 0 to 10 stops, found -1.0"),
+        ("tint", float("nan"), "tint: expected 0 to 10 stops, found nan"),
     ],
 )
 def test_settings_that_cannot_be_leave_no_run(
@@ -257,6 +531,8 @@ def test_a_folder_or_an_accelerator_that_cannot_be(small_sequence: Path, tmp_pat
     (tmp_path / "file").write_text("in the way")
     config = TrainConfig(**SMALL)
     message = refused(lambda: train(config, [small_sequence], tmp_path / "file" / "run"))
+    assert f"{tmp_path / 'file' / 'run' / 'cache'}" in message
+    message = refused(lambda: train(config, [small_sequence], tmp_path / "file" / "run", cache=tmp_path / "cache"))
     assert "expected a folder to write the run to" in message
     for accelerator in ("abacus", "tpu"):
         message = refused(lambda a=accelerator: train(config, [small_sequence], tmp_path / "run", accelerator=a))
@@ -264,108 +540,6 @@ def test_a_folder_or_an_accelerator_that_cannot_be(small_sequence: Path, tmp_pat
     message = refused(lambda: train(config, [small_sequence], tmp_path / "run", checkpoint_every=0))
     assert "checkpoint_every: expected at least 1, found 0" in message
     assert not (tmp_path / "run").exists()
-
-
-# Clips
-
-
-def numbered_shot(length: int = 3, height: int = 6, width: int = 7) -> Tensor:
-    """A shot in which every value is another whole number: channel, frame, row and column can be read off."""
-    count = length * 13 * height * width
-    return torch.arange(1.0, count + 1).reshape(length, 13, height, width)
-
-
-def orbit(clip: Tensor) -> list[Tensor]:
-    """An image stack in its eight orientations."""
-    turned = [clip.rot90(k, (-2, -1)) for k in range(4)]
-    return [*turned, *(t.flip(-1) for t in turned)]
-
-
-def test_clips_are_the_shot_turned_and_renamed() -> None:
-    torch.manual_seed(0)
-    crop, frames = 4, 2
-    shot = numbered_shot()
-    # Infinite depths must neither vanish nor spread.
-    shot[:, 9, 2, 3] = torch.inf
-    windows = {
-        (start, top, left): shot[start : start + frames, :, top : top + crop, left : left + crop]
-        for start in range(2)
-        for top in range(3)
-        for left in range(4)
-    }
-    candidates = [
-        (place, orientation, Clip.from_stack(turned[None]))
-        for place, window in windows.items()
-        for orientation, turned in enumerate(orbit(window))
-    ]
-    sampler = ClipSampler([shot], frames, crop)
-    places, orientations, orders = set(), set(), set()
-    for _ in range(96):
-        drawn = sampler.draw(1)
-        found = [(p, o, source) for p, o, source in candidates if torch.equal(source.depth, drawn.depth)]
-        assert len(found) == 1
-        place, orientation, source = found[0]
-        # One order of the colour channels for radiance, albedo and reference.
-        order = [int((source.color[0, 0, :, 0, 0] == value).nonzero()) for value in drawn.color[0, 0, :, 0, 0]]
-        for name in ("color", "albedo", "reference"):
-            assert torch.equal(getattr(drawn, name), getattr(source, name)[:, :, order]), name
-        # Normals: the world's axes renamed and reversed, the same for all pixels and frames.
-        axes = [int((source.normal[0, 0, :, 0, 0] == value.abs()).nonzero()) for value in drawn.normal[0, 0, :, 0, 0]]
-        signs = drawn.normal[0, 0, :, 0, 0].sign().reshape(1, 1, 3, 1, 1)
-        assert sorted(axes) == [0, 1, 2]
-        assert torch.equal(drawn.normal, source.normal[:, :, axes] * signs)
-        places.add(place)
-        orientations.add(orientation)
-        orders.add(tuple(order))
-    assert orientations == set(range(8))
-    assert len(orders) == 6
-    assert {start for start, _, _ in places} == {0, 1}
-    assert {top for _, top, _ in places} == {0, 1, 2}
-    assert {left for _, _, left in places} == {0, 1, 2, 3}
-
-
-def test_the_same_seed_draws_the_same_clips() -> None:
-    sampler = ClipSampler([numbered_shot(), numbered_shot(4)], 2, 4)
-
-    def draw(seed: int) -> Clip:
-        torch.manual_seed(seed)
-        return sampler.draw(3)
-
-    first, again, other = draw(7), draw(7), draw(8)
-    assert first.color.shape == (3, 2, 3, 4, 4)
-    assert all(torch.equal(getattr(first, name), getattr(again, name)) for name in vars(first))
-    assert not torch.equal(first.color, other.color)
-
-
-def test_shots_start_anew_and_are_accumulated(small_sequence: Path) -> None:
-    sequence = open_sequence(small_sequence)
-    shots = accumulated_shots(sequence, 0.1, start_every=2)
-    assert [tuple(shot.shape) for shot in shots] == [(4, 13, 20, 24), (2, 13, 20, 24)]
-    for first, shot in zip((0, 2), shots, strict=True):
-        clip, history = Clip.from_stack(shot[None]), History(Accumulate(0.1))
-        for i, number in enumerate(sequence.numbers[first:]):
-            frame = sequence.frame(number)
-            assert torch.equal(clip.color[0, i], history.update(frame).color[0])
-            for name in ("albedo", "normal", "depth", "reference"):
-                assert torch.equal(getattr(clip, name)[0, i], getattr(frame, name)[0]), name
-
-
-def test_lamps_shine_alike_in_color_and_reference() -> None:
-    """A clip of nothing: whatever is in it is a lamp, noise-free, in all frames, and brighter than nothing."""
-    torch.manual_seed(0)
-    shot = torch.zeros(4, 13, 20, 24)
-    shot[:, 0:3], shot[:, 10:13] = 0.1, 0.5
-    clip = ClipSampler([shot], frames=4, crop=16, lamps=1.0).draw(20)
-    radiance = remodulate(clip.color.flatten(0, 1), clip.albedo.flatten(0, 1)).unflatten(0, (20, 4))
-    lit = torch.isclose(radiance, clip.reference).all(2, keepdim=True)
-    assert lit.flatten(1).any(1).all()
-    assert (lit == lit[:, :1]).all()
-    assert 0.02 < lit.float().mean() < 0.5
-    assert (radiance[~lit.expand_as(radiance)] == torch.tensor(0.1)).all()
-    assert clip.reference.max() > 3
-    torch.manual_seed(0)
-    dark = ClipSampler([shot], frames=4, crop=16).draw(20)
-    assert dark.reference.unique().tolist() == [0.5]
 
 
 def test_a_run_can_start_from_weights(small_sequence: Path, tmp_path: Path) -> None:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from kornia.augmentation import RandomHorizontalFlip, RandomRotation90, RandomVerticalFlip
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from mcdenoise.data.sequences import Sequence
+from mcdenoise.data.cache import PARTS, Array, Shot
 from mcdenoise.errors import InputError
-from mcdenoise.history import History
-from mcdenoise.ops import Accumulate, demodulate
-
-# name, channels: what a training clip holds, in the order in which it is stacked for augmentation
-_PARTS = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
+from mcdenoise.ops import demodulate
 
 
 @dataclass(frozen=True)
@@ -39,109 +37,110 @@ class Clip:
 
     def to(self, device: torch.device) -> Clip:
         """The clip on another device."""
-        return Clip(*(getattr(self, name).to(device) for name in _PARTS))
+        return Clip(*(getattr(self, name).to(device) for name in PARTS))
 
     @staticmethod
     def from_stack(stack: Tensor) -> Clip:
-        """Take apart what :func:`accumulated_shots` stacked: ``(B, T, 13, H, W)``."""
-        return Clip(*stack.split(list(_PARTS.values()), 2))
-
-
-def accumulated_shots(sequence: Sequence, alpha_min: float, start_every: int) -> list[Tensor]:
-    """A sequence as a network sees it, once for each of several first frames.
-
-    A shot that starts later has shorter histories, so that a network also learns how a shot begins.
-
-    Args:
-        sequence: frames with references and all features.
-        alpha_min: see :func:`mcdenoise.ops.accumulate`.
-        start_every: distance between the first frames.
-
-    Returns:
-        For each first frame ``(T, 13, H, W)``, the parts of a :class:`Clip` stacked.
-
-    Raises:
-        InputError: a buffer or a reference is missing.
-    """
-    missing = sorted({"albedo", "normal", "depth"} - sequence.buffers)
-    if missing:
-        raise InputError(f"{sequence.root}: expected albedo, normal and depth to train on, found no {missing[0]}")
-    without = sorted(set(sequence.numbers) - set(sequence.reference_numbers))
-    if without:
-        raise InputError(
-            f"{sequence.root}: expected a reference for every frame to train on, found none for frame {without[0]}; "
-            "render it or choose other frames"
-        )
-    frames = [sequence.frame(number).validate()[0] for number in sequence.numbers]
-    shots = []
-    for first in range(0, len(frames), start_every):
-        history = History(Accumulate(alpha_min))
-        stacks = []
-        for frame in frames[first:]:
-            color = history.update(frame).color
-            parts = [color, *(getattr(frame, name) for name in _PARTS if name != "color")]
-            stacks.append(torch.cat(parts, 1))
-        shots.append(torch.cat(stacks))
-    return shots
+        """Take apart what :meth:`mcdenoise.data.cache.Shot.read` stacked: ``(B, T, 13, H, W)``."""
+        return Clip(*stack.split(list(PARTS.values()), 2))
 
 
 class ClipSampler:
-    """Draws random clips from shots: position, frames, flips, 90-degree turns, and what else leaves physics intact.
+    """Draws random clips from shots: position, frames, noise, flips, 90-degree turns, and what else is exact physics.
 
-    All randomness comes from torch's global generator, so that a seed before each draw makes every draw repeatable.
+    Each clip has a seed of its own, and depends on nothing else: a batch can be drawn in any order, at any time, by any
+    number of processes.
+
     Flips and turns are kornia's, the same for all buffers and frames of a clip. World-space normals stay as they are: a
     mirrored or turned image is one of a mirrored or turned world whose axes are named otherwise, and so the axes
     themselves are shuffled and reversed too. Colour channels are shuffled alike in radiance and albedo.
 
+    Light is linear: all lamps of a scene, brighter by a factor or of another colour, make noisy color and reference
+    brighter by this factor, channel by channel. The networks bring the exposure to a standard before they look; what
+    the exposure changes is the loss, whose epsilon is in units of radiance. Another albedo would change the light that
+    surfaces send to each other, so albedos are left alone.
+
     Args:
-        shots: tensors ``(T, 13, H, W)`` of :func:`accumulated_shots`; those shorter than ``frames`` are left out.
+        shots: those shorter than ``frames`` are left out.
         frames: T of a clip.
         crop: side of the square crop in pixels.
         lamps: chance that a clip gets rectangles of constant radiance, without noise, up to 30 times as bright as its
             mean: emitters seen directly, of which few training scenes have any.
+        exposure: all light of a clip is scaled by up to so many stops, up or down.
+        tint: each colour channel of the light is scaled by up to so many stops, up or down.
 
     Raises:
         InputError: no shot is long enough, or one is smaller than the crop.
     """
 
-    def __init__(self, shots: Iterable[Tensor], frames: int, crop: int, lamps: float = 0.0) -> None:
+    def __init__(
+        self,
+        shots: Iterable[Shot],
+        frames: int,
+        crop: int,
+        *,
+        lamps: float = 0.0,
+        exposure: float = 0.0,
+        tint: float = 0.0,
+    ) -> None:
         self.shots = [shot for shot in shots if len(shot) >= frames]
-        self.frames, self.crop, self.lamps = frames, crop, lamps
-        if not self.shots:
-            raise InputError(f"training clips: expected a sequence of at least {frames} frames, found none")
-        for shot in self.shots:
-            if min(shot.shape[-2:]) < crop:
-                raise InputError(
-                    f"training clips: expected images of at least {crop} pixels, found {tuple(shot.shape[-2:])}"
-                )
+        self.frames, self.crop = frames, crop
+        self.lamps, self.exposure, self.tint = lamps, exposure, tint
+        check_sizes([(len(shot), shot.size) for shot in self.shots], frames, crop)
+        self.chances = torch.tensor([float(len(shot)) for shot in self.shots])
         self.flips_and_turns = nn.Sequential(
             RandomHorizontalFlip(p=0.5),
             RandomVerticalFlip(p=0.5),
-            # "nearest" moves whole pixels; "bilinear" would mix them, and infinity into its neighbours.
+            # "nearest" moves whole numbers; "bilinear" would mix them.
             RandomRotation90((0, 3), p=1.0, resample="nearest"),
         )
 
-    def draw(self, batch: int) -> Clip:
-        """``batch`` clips, each drawn from a shot with a chance in proportion to its number of frames."""
-        chances = torch.tensor([float(len(shot)) for shot in self.shots])
-        chosen = torch.multinomial(chances, batch, replacement=True)
-        return Clip.from_stack(torch.stack([self._draw_one(self.shots[int(i)]) for i in chosen]))
+    def draw(self, seeds: Sequence[int]) -> Clip:
+        """A clip for each seed, from a shot drawn with a chance in proportion to its number of frames."""
+        stacks = []
+        # kornia draws from torch's global generator, which is others' too.
+        with torch.random.fork_rng(devices=[]):
+            for seed in seeds:
+                torch.default_generator.manual_seed(seed)
+                stacks.append(self._draw_one())
+        return Clip.from_stack(torch.stack(stacks))
 
-    def _draw_one(self, shot: Tensor) -> Tensor:
-        length, _, height, width = shot.shape
-        start = _randint(length - self.frames + 1)
+    def _draw_one(self) -> Tensor:
+        shot = self.shots[int(torch.multinomial(self.chances, 1))]
+        height, width = shot.size
+        realisation, start = _randint(len(shot.colors)), _randint(len(shot) - self.frames + 1)
         top, left = _randint(height - self.crop + 1), _randint(width - self.crop + 1)
-        clip = shot[start : start + self.frames, :, top : top + self.crop, left : left + self.crop].float()
-        turned: Tensor = self.flips_and_turns(clip.flatten(0, 1)[None])[0]
-        color, albedo, normal, depth, reference = turned.unflatten(0, clip.shape[:2]).split(list(_PARTS.values()), 1)
-        order = torch.randperm(3)
-        signs = (torch.randint(2, (3,)) * 2 - 1).float().reshape(3, 1, 1)
-        normal = normal[:, torch.randperm(3)] * signs
-        stack = torch.cat([color[:, order], albedo[:, order], normal, depth, reference[:, order]], 1)
+        order, axes = torch.randperm(3).tolist(), torch.randperm(3).tolist()
+        stack = shot.read(
+            slice(start, start + self.frames),
+            slice(top, top + self.crop),
+            slice(left, left + self.crop),
+            realisation=realisation,
+            channels=[*order, *(3 + i for i in order), *(6 + i for i in axes), 9, *(10 + i for i in order)],
+            turn=self._draw_turn(),
+        )
+        color, _, normal, _, reference = stack.split(list(PARTS.values()), 1)
+        normal *= (torch.randint(2, (3, 1, 1)) * 2 - 1).float()
+        stops = self.exposure * (2 * torch.rand(1) - 1) + self.tint * (2 * torch.rand(3) - 1)
+        light = torch.exp2(stops).reshape(3, 1, 1)
+        color *= light
+        reference *= light
         if self.lamps and float(torch.rand(())) < self.lamps:
+            mean = reference.mean()
             for _ in range(1 + _randint(3)):
-                self._hang_lamp(stack, reference.mean())
+                self._hang_lamp(stack, mean)
         return stack
+
+    def _draw_turn(self) -> Callable[[Array], Array]:
+        """Let kornia flip and turn four numbers; what it did to them can be done to any array without copying it."""
+        corners = torch.arange(4.0).reshape(1, 1, 2, 2)
+        moved = self.flips_and_turns(corners)[0, 0].numpy()
+        for turns in range(4):
+            for flip in (False, True):
+                turn = functools.partial(_turn, turns=turns, flip=flip)
+                if np.array_equal(turn(corners[0, 0].numpy()), moved):
+                    return turn
+        raise RuntimeError(f"kornia: expected flips and 90-degree turns, found {moved.tolist()}")
 
     def _hang_lamp(self, stack: Tensor, mean: Tensor) -> None:
         """Paint a rectangle that shines in all frames of ``(T, 13, H, W)``, with or without an albedo of its own."""
@@ -153,12 +152,36 @@ class ClipSampler:
         normal = normalize(torch.randn(1, 3, 1, 1), dim=1)
         lamp = stack[:, :, top : top + height, left : left + width]
         for part, value in zip(
-            lamp.split(list(_PARTS.values()), 1),
+            lamp.split(list(PARTS.values()), 1),
             (demodulate(radiance, albedo), albedo, normal, None, radiance),
             strict=True,
         ):
             if value is not None:  # depth stays: lamps hang on whatever is there
                 part.copy_(value.expand_as(part))
+
+
+def check_sizes(shots: Sequence[tuple[int, tuple[int, int]]], frames: int, crop: int) -> None:
+    """See that clips can be cut from shots.
+
+    Args:
+        shots: number of frames, and height and width in pixels of each.
+        frames: T of a clip.
+        crop: side of the square crop in pixels.
+
+    Raises:
+        InputError: no shot is long enough, or one that is is smaller than the crop.
+    """
+    sizes = [size for length, size in shots if length >= frames]
+    if not sizes:
+        raise InputError(f"training clips: expected a sequence of at least {frames} frames, found none")
+    for size in sizes:
+        if min(size) < crop:
+            raise InputError(f"training clips: expected images of at least {crop} pixels, found {size}")
+
+
+def _turn(image: Array, turns: int, flip: bool) -> Array:
+    turned = np.rot90(image, turns, (-2, -1))
+    return turned[..., ::-1] if flip else turned
 
 
 def _randint(high: int) -> int:

@@ -1,0 +1,7 @@
+"""Train a denoiser of the zoo on rendered sequences."""
+
+from mcdenoise.train.config import Precision, Schedule, TrainConfig
+from mcdenoise.train.devices import is_first_process
+from mcdenoise.train.loop import Progress, train
+
+__all__ = ["Precision", "Progress", "Schedule", "TrainConfig", "is_first_process", "train"]

@@ -1,0 +1,112 @@
+"""What decides what a training run computes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from mcdenoise.errors import InputError
+
+Precision = Literal["32-true", "bf16-mixed"]
+Schedule = Literal["constant", "cosine"]
+
+_WARM_UP = 200
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides what a training run computes.
+
+    The defaults are the paper's setting (Sec. 4.2): clips of 8 frames, 128x128 patches, batches of 8 clips, Adam with
+    a learning rate of 1e-4, a temporal loss weight of 0.1.
+
+    Args:
+        model: name of the model in the zoo.
+        width: feature channels; 0 takes the model's own, or that of the weights it starts from.
+        steps: optimiser steps.
+        batch: clips in a step, of all processes together.
+        frames: frames in a clip.
+        crop: side of the square patches, pixels.
+        learning_rate: of Adam, at its highest.
+        schedule: ``"constant"``, or ``"cosine"`` down to 0 after a warm-up of 200 steps.
+        temporal_weight: of the temporal loss.
+        gradient_norm: largest norm of a step's gradient; 0 does not limit it.
+        ema: decay of an exponential moving average of the weights, such as 0.999, below it in the first steps; the
+            average is what is validated and what the run ends with. 0 takes the weights themselves.
+        alpha_min: of the accumulation, see :func:`mcdenoise.ops.accumulate`.
+        start_every: a shot also starts at every n-th frame, to train on short histories.
+        validation_frames: the last frames of each sequence, kept for validation (the paper's 4); none of a sequence
+            that would be left with less than one clip.
+        lamps: chance that a clip gets lamps, see :class:`mcdenoise.data.clips.ClipSampler`.
+        exposure: the light of a clip is scaled by up to so many stops.
+        tint: each colour channel of the light is scaled by up to so many stops.
+        precision: ``"bf16-mixed"`` runs convolutions in bfloat16.
+        seed: of weights and clips.
+    """
+
+    model: str = "cascaded"
+    width: int = 0
+    steps: int = 10_000
+    batch: int = 8
+    frames: int = 8
+    crop: int = 128
+    learning_rate: float = 1e-4
+    schedule: Schedule = "constant"
+    temporal_weight: float = 0.1
+    gradient_norm: float = 0.0
+    ema: float = 0.0
+    alpha_min: float = 0.1
+    start_every: int = 4
+    validation_frames: int = 4
+    lamps: float = 0.0
+    exposure: float = 0.0
+    tint: float = 0.0
+    precision: Precision = "32-true"
+    seed: int = 0
+
+    def rate(self, step: int) -> float:
+        """The learning rate of a step, in parts of the highest."""
+        if self.schedule == "constant":
+            return 1.0
+        warm_up = min(1.0, (step + 1) / _WARM_UP)
+        return warm_up * 0.5 * (1 + math.cos(math.pi * min(1.0, step / self.steps)))
+
+
+def check_config(config: TrainConfig, checkpoint_every: int) -> None:
+    """See that every setting is one that can be trained with.
+
+    Raises:
+        InputError: one is not; names it.
+    """
+    lowest = {
+        "width": 0,
+        "steps": 1,
+        "batch": 1,
+        "frames": 2 if config.temporal_weight else 1,
+        # A lamp is two pixels wide and has room to hang in more than one place.
+        "crop": 3 if config.lamps else 1,
+        "temporal_weight": 0,
+        "gradient_norm": 0,
+        "start_every": 1,
+        "validation_frames": 0,
+        "checkpoint_every": 1,
+    }
+    settings = {**dataclasses.asdict(config), "checkpoint_every": checkpoint_every}
+    for name, low in lowest.items():
+        if not settings[name] >= low:
+            raise InputError(f"{name}: expected at least {low}, found {settings[name]}")
+    for name in ("exposure", "tint"):
+        if not 0 <= settings[name] <= 10:
+            raise InputError(f"{name}: expected 0 to 10 stops, found {settings[name]}")
+    if not 0 <= config.seed < 2**32:
+        raise InputError(f"seed: expected 0 to 2^32 - 1, found {config.seed}")
+    if not config.learning_rate > 0:
+        raise InputError(f"learning_rate: expected a positive number, found {config.learning_rate}")
+    if not 0 <= config.ema < 1:
+        raise InputError(f"ema: expected in [0, 1), found {config.ema}")
+    if not 0 <= config.lamps <= 1:
+        raise InputError(f"lamps: expected in [0, 1], found {config.lamps}")
+    if not 0 < config.alpha_min <= 1:
+        raise InputError(f"alpha_min: expected in (0, 1], found {config.alpha_min}")

@@ -1,0 +1,276 @@
+"""The training loop: a run that can be stopped at any moment and goes on as if it had not been."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from mcdenoise.data.clips import Clip
+from mcdenoise.data.files import atomic_path
+from mcdenoise.errors import InputError
+from mcdenoise.losses import cascade_loss
+from mcdenoise.models import create_model, describe_weights, save_weights
+from mcdenoise.run_folder import Provenance, RunFolder, source_commit
+from mcdenoise.train.config import TrainConfig, check_config
+from mcdenoise.train.data import DataFolders, TrainingData
+from mcdenoise.train.devices import open_fabric
+from mcdenoise.train.validation import denoise_clip, validate
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
+
+_LOG_EVERY = 50
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a training run reports.
+
+    Args:
+        step: optimiser steps done.
+        loss: mean training loss since the last report.
+        gradient_norm: mean norm of the gradient since the last report, before it was limited.
+        learning_rate: of the last step.
+        seconds: time since the run was started or resumed.
+        validation: errors on the validation frames, by name, where they were measured.
+    """
+
+    step: int
+    loss: float
+    gradient_norm: float
+    learning_rate: float
+    seconds: float
+    validation: dict[str, float]
+
+
+def train(
+    config: TrainConfig,
+    sequences: list[Path],
+    out: Path,
+    *,
+    validation: list[Path] | None = None,
+    cache: Path | None = None,
+    initial_weights: Path | None = None,
+    accelerator: str = "cpu",
+    checkpoint_every: int = 500,
+    credits: str = "",
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> Path:
+    """Train a model, from the start or from where an earlier run of the same config in ``out`` stopped.
+
+    Every clip of every step has its own seed, so that a run that was interrupted and resumed computes the same as one
+    that was not, and several processes (``torchrun``) the same as one, up to the rounding of sums. Processes on several
+    machines need ``sequences``, ``out`` and ``cache`` on a disk that they share.
+
+    Args:
+        config: what to train.
+        sequences: folders of sequences with references and features.
+        out: folder of the run: ``config.json``, ``data.json``, ``log.jsonl``, TensorBoard events, ``checkpoint.pt``,
+            and at the end ``MODEL.safetensors``.
+        validation: folders of sequences that are used for nothing but validation.
+        cache: folder of the decoded sequences, which several runs may share; ``out/cache`` by default. Nothing in it is
+            needed once a run has ended.
+        initial_weights: weights to start from instead of random ones, such as those of an earlier run.
+        accelerator: ``"cpu"`` or ``"cuda"``.
+        checkpoint_every: steps between checkpoints and validations.
+        credits: authors and licences of the training scenes, stored with the weights.
+        report: called with the progress every 50 steps, in the first process only.
+
+    Returns:
+        Path of the weights.
+
+    Raises:
+        InputError: no data, data without references, a run of another config in ``out``, a file that cannot be written,
+            or an optional dependency is missing.
+    """
+    check_config(config, checkpoint_every)
+    fabric = open_fabric(accelerator, config.precision, config.batch)
+    folders = DataFolders.open(config, sequences, validation or [])
+
+    torch.manual_seed(config.seed)
+    start: dict[str, Any] = describe_weights(initial_weights) if initial_weights else {"settings": {}, "sha256": "none"}
+    settings: dict[str, Any] = {**start["settings"], **({"width": config.width} if config.width else {})}
+    network = create_model(config.model, weights=initial_weights, **settings).train()
+
+    run, settled = RunFolder(out), dataclasses.asdict(config)
+    run.check(config=settled)
+    with fabric.rank_zero_first():
+        data = folders.load(cache or out / "cache")
+    identity = {"credits": credits, "initial_weights": start["sha256"], **data.description}
+    # Only now, so that input that cannot be trained on leaves no trace of a run.
+    if fabric.is_global_zero:
+        run.claim(config=settled, data=identity)
+    fabric.barrier()
+
+    trainer = _Trainer(config, network, fabric)
+    first, provenance = run.load(*trainer.parts)
+    weights = out / f"{config.model}.safetensors"
+    if first == config.steps and weights.exists():
+        return weights
+    # The source tree may change while the run goes on, and between its parts.
+    provenance.append({"first_step": first, "commit": source_commit()})
+    with _writing(out):
+        _run(trainer, data, run, first, provenance, checkpoint_every, report)
+        if fabric.is_global_zero:
+            about = {
+                "config": json.dumps(settled),
+                "data": json.dumps(data.description["sequences"]),
+                "credits": credits,
+                "initial_weights": start["sha256"],
+                "steps": str(config.steps),
+                "commits": json.dumps(provenance),
+                "licence": "Apache-2.0",
+            }
+            with atomic_path(weights) as temporary:
+                temporary.write_bytes(save_weights(trainer.result, config.model, settings, about))
+    fabric.barrier()
+    return weights
+
+
+class _Trainer:
+    """A network and what it learns with.
+
+    Args:
+        config: of the run.
+        network: in training mode.
+        fabric: devices.
+    """
+
+    def __init__(self, config: TrainConfig, network: nn.Module, fabric: Fabric) -> None:
+        self.config, self.fabric = config, fabric
+        self.network: nn.Module = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
+        self.scheduler = torch.optim.lr_scheduler.LambdaLR(self.optimizer, config.rate)
+        self.model, self.stepper = fabric.setup(network, self.optimizer)
+        self.average = _moving_average(network, config.ema) if config.ema else None
+
+    @property
+    def parts(self) -> list[Any]:
+        """What a checkpoint holds."""
+        parts = [self.network, self.optimizer, self.scheduler]
+        return [*parts, self.average] if self.average is not None else parts
+
+    @property
+    def result(self) -> nn.Module:
+        """The network that is validated and kept."""
+        return self.network if self.average is None else self.average.module
+
+    def seeds(self, step: int) -> list[int]:
+        """The seed of each clip of this process in a step: together those that one process would draw."""
+        share = self.config.batch // self.fabric.world_size
+        clips = range(self.fabric.global_rank * share, (self.fabric.global_rank + 1) * share)
+        entropies = ([self.config.seed, step, clip] for clip in clips)
+        return [int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0]) for entropy in entropies]
+
+    def step(self, step: int, clip: Clip) -> tuple[float, float]:
+        """Learn from this process's clips; loss and norm of the gradient of the whole batch.
+
+        Raises:
+            InputError: one of them is not finite; nothing has been learnt from it then.
+        """
+        # The clips have seeds of their own; this one is for a network that draws numbers itself.
+        torch.manual_seed(self.config.seed * 1_000_003 + step)
+        clip = clip.to(self.fabric.device)
+        initial, final = denoise_clip(self.model, clip)
+        loss = cascade_loss(initial, final, clip.reference, temporal_weight=self.config.temporal_weight)
+        self.stepper.zero_grad()
+        self.fabric.backward(loss)
+        norm = self.fabric.clip_gradients(
+            self.model, self.stepper, max_norm=self.config.gradient_norm or math.inf, error_if_nonfinite=False
+        )
+        mean = torch.as_tensor(self.fabric.all_reduce(loss.detach(), reduce_op="mean"))
+        found = {"loss": mean.item(), "gradient": torch.as_tensor(norm).item()}
+        for name, value in found.items():
+            if not math.isfinite(value):
+                raise InputError(
+                    f"training, step {step}: expected a finite {name}, found {value}; the last checkpoint is kept: "
+                    "start a new run with a lower learning rate or a limit on the gradient's norm"
+                )
+        self.stepper.step()
+        self.scheduler.step()
+        if self.average is not None:
+            self.average.update_parameters(self.network)
+        return found["loss"], found["gradient"]
+
+
+def _moving_average(network: nn.Module, decay: float) -> AveragedModel:
+    """Averaged weights; at first over the last few steps only, lest they stay close to random ones for long."""
+
+    def blend(averages: Any, current: Any, count: Any) -> None:
+        warm_up = (1 + int(count)) / (10 + int(count))
+        get_ema_multi_avg_fn(min(decay, warm_up))(averages, current, count)
+
+    return AveragedModel(network, multi_avg_fn=blend)
+
+
+def _run(
+    trainer: _Trainer,
+    data: TrainingData,
+    run: RunFolder,
+    first: int,
+    provenance: Provenance,
+    checkpoint_every: int,
+    report: Callable[[Progress], None],
+) -> None:
+    """All steps from the first on; only the first process writes."""
+    config, fabric = trainer.config, trainer.fabric
+    with _board(run.out, first, fabric.is_global_zero) as board:
+        if fabric.is_global_zero:
+            run.rewind(first)
+            run.log({**provenance[-1], "threads": torch.get_num_threads(), "processes": fabric.world_size})
+        started = time.monotonic()
+        history: list[tuple[float, float]] = []
+        for step in range(first, config.steps):
+            rate = config.learning_rate * config.rate(step)
+            history.append(trainer.step(step, data.sampler.draw(trainer.seeds(step))))
+            done = step + 1
+            save = done % checkpoint_every == 0 or done == config.steps
+            if not (save or done % _LOG_EVERY == 0):
+                continue
+            loss, norm = (float(mean) for mean in np.mean(history, axis=0))
+            history.clear()
+            if not fabric.is_global_zero:
+                continue
+            scores: dict[str, float] = {}
+            if save:
+                run.save(done, provenance, *trainer.parts)
+                scores = validate(trainer.result, data.watched, fabric, board, done)
+            progress = Progress(done, loss, norm, rate, time.monotonic() - started, scores)
+            run.log(dataclasses.asdict(progress))
+            for name in ("loss", "gradient_norm", "learning_rate"):
+                board.add_scalar(f"train/{name}", getattr(progress, name), done)
+            report(progress)
+
+
+@contextmanager
+def _board(out: Path, first: int, writes: bool) -> Iterator[Any]:
+    """The TensorBoard writer of the first process; the others have none."""
+    if not writes:
+        yield None
+        return
+    from torch.utils.tensorboard import SummaryWriter  # here because importing it takes a second
+
+    with SummaryWriter(str(out), purge_step=first) as board:
+        yield board
+
+
+@contextmanager
+def _writing(out: Path) -> Iterator[None]:
+    """One line for what the operating system refuses."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise InputError(f"{out}: cannot be written ({reason}); check its permissions and free space") from error

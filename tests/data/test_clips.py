@@ -1,0 +1,172 @@
+"""Clips: what is drawn is the shot, flipped, turned and lit otherwise, and nothing depends on who draws it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from mcdenoise.data.cache import PARTS, Shot
+from mcdenoise.data.clips import Clip, ClipSampler
+from mcdenoise.errors import InputError
+from mcdenoise.ops import remodulate
+
+
+def shot_of(stack: Tensor, *more_colors: Tensor) -> Shot:
+    """A shot that lies in memory, from ``(T, 13, H, W)`` and further colors ``(T, 3, H, W)``."""
+    color, *features = (part.numpy() for part in stack.split(list(PARTS.values()), 1))
+    names = [name for name in PARTS if name != "color"]
+    return Shot((color, *(more.numpy() for more in more_colors)), dict(zip(names, features, strict=True)))
+
+
+def numbered(length: int = 3, height: int = 6, width: int = 7) -> Tensor:
+    """A shot in which every value is another whole number: channel, frame, row and column can be read off."""
+    count = length * 13 * height * width
+    return torch.arange(1.0, count + 1).reshape(length, 13, height, width)
+
+
+def orbit(clip: Tensor) -> list[Tensor]:
+    """An image stack in its eight orientations."""
+    turned = [clip.rot90(k, (-2, -1)) for k in range(4)]
+    return [*turned, *(t.flip(-1) for t in turned)]
+
+
+def refused(action: Callable[[], object]) -> str:
+    with pytest.raises(InputError) as error:
+        action()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_clips_are_the_shot_turned_and_renamed() -> None:
+    crop, frames = 4, 2
+    shot = numbered()
+    # Infinite depths must neither vanish nor spread.
+    shot[:, 9, 2, 3] = torch.inf
+    windows = {
+        (start, top, left): shot[start : start + frames, :, top : top + crop, left : left + crop]
+        for start in range(2)
+        for top in range(3)
+        for left in range(4)
+    }
+    candidates = [
+        (place, orientation, Clip.from_stack(turned[None]))
+        for place, window in windows.items()
+        for orientation, turned in enumerate(orbit(window))
+    ]
+    sampler = ClipSampler([shot_of(shot)], frames, crop)
+    places, orientations, orders = set(), set(), set()
+    for seed in range(96):
+        drawn = sampler.draw([seed])
+        found = [(p, o, source) for p, o, source in candidates if torch.equal(source.depth, drawn.depth)]
+        assert len(found) == 1
+        place, orientation, source = found[0]
+        # One order of the colour channels for radiance, albedo and reference.
+        order = [int((source.color[0, 0, :, 0, 0] == value).nonzero()) for value in drawn.color[0, 0, :, 0, 0]]
+        for name in ("color", "albedo", "reference"):
+            assert torch.equal(getattr(drawn, name), getattr(source, name)[:, :, order]), name
+        # Normals: the world's axes renamed and reversed, the same for all pixels and frames.
+        axes = [int((source.normal[0, 0, :, 0, 0] == value.abs()).nonzero()) for value in drawn.normal[0, 0, :, 0, 0]]
+        signs = drawn.normal[0, 0, :, 0, 0].sign().reshape(1, 1, 3, 1, 1)
+        assert sorted(axes) == [0, 1, 2]
+        assert torch.equal(drawn.normal, source.normal[:, :, axes] * signs)
+        places.add(place)
+        orientations.add(orientation)
+        orders.add(tuple(order))
+    assert orientations == set(range(8))
+    assert len(orders) == 6
+    assert {start for start, _, _ in places} == {0, 1}
+    assert {top for _, top, _ in places} == {0, 1, 2}
+    assert {left for _, _, left in places} == {0, 1, 2, 3}
+
+
+def test_a_clip_depends_on_its_seed_alone() -> None:
+    sampler = ClipSampler([shot_of(numbered()), shot_of(numbered(4))], 2, 4, lamps=0.5, exposure=1.0, tint=1.0)
+    torch.manual_seed(1)
+    before = torch.random.get_rng_state()
+    batch = sampler.draw([7, 8, 9])
+    # Whoever else draws random numbers does not notice.
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert batch.color.shape == (3, 2, 3, 4, 4)
+    torch.manual_seed(2)
+    for i, seed in ((2, 9), (0, 7)):
+        alone = sampler.draw([seed])
+        assert all(torch.equal(getattr(alone, name)[0], getattr(batch, name)[i]) for name in PARTS)
+    assert not torch.equal(batch.color[0], batch.color[1])
+
+
+def test_every_realisation_of_the_noise_is_drawn_with_the_same_features() -> None:
+    stack = numbered()
+    others = [torch.full((3, 3, 6, 7), -1.0), torch.full((3, 3, 6, 7), -2.0)]
+    clip = ClipSampler([shot_of(stack, *others)], 2, 4).draw(list(range(60)))
+    kinds = [-1 if value == -1 else -2 if value == -2 else 0 for value in clip.color[:, 0, 0, 0, 0].tolist()]
+    assert all(10 < kinds.count(kind) < 30 for kind in (0, -1, -2))
+    assert (clip.reference > 0).all()
+
+
+def test_exposure_scales_light_and_nothing_else() -> None:
+    """Light is linear: noisy color and reference of a clip grow by one factor, within the limit."""
+    stack = numbered()
+    seeds = list(range(40))
+    plain = ClipSampler([shot_of(stack)], 2, 4).draw(seeds)
+    lit = ClipSampler([shot_of(stack)], 2, 4, exposure=2.0).draw(seeds)
+    for name in ("albedo", "normal", "depth"):
+        assert torch.equal(getattr(lit, name), getattr(plain, name)), name
+    factors = (lit.color / plain.color)[:, :1, :1, :1, :1]
+    torch.testing.assert_close(lit.color, plain.color * factors)
+    torch.testing.assert_close(lit.reference, plain.reference * factors)
+    stops = factors.log2()
+    assert stops.abs().max() <= 2
+    assert stops.min() < -1
+    assert stops.max() > 1
+
+
+def test_tint_scales_each_channel_alike_in_color_and_reference() -> None:
+    stack, seeds = numbered(), list(range(20))
+    plain = ClipSampler([shot_of(stack)], 2, 4).draw(seeds)
+    lit = ClipSampler([shot_of(stack)], 2, 4, tint=0.5).draw(seeds)
+    factors = (lit.color / plain.color)[:, :1, :, :1, :1]
+    torch.testing.assert_close(lit.color, plain.color * factors)
+    torch.testing.assert_close(lit.reference, plain.reference * factors)
+    assert torch.equal(lit.albedo, plain.albedo)
+    assert factors.log2().abs().max() <= 0.5
+    assert (factors.std(2) > 0.01).all()
+
+
+def test_lamps_shine_alike_in_color_and_reference() -> None:
+    """A clip of nothing: whatever is in it is a lamp, noise-free, in all frames, and brighter than nothing."""
+    stack = torch.zeros(4, 13, 20, 24)
+    stack[:, 0:3], stack[:, 10:13] = 0.1, 0.5
+    seeds = list(range(20))
+    clip = ClipSampler([shot_of(stack)], frames=4, crop=16, lamps=1.0).draw(seeds)
+    radiance = remodulate(clip.color.flatten(0, 1), clip.albedo.flatten(0, 1)).unflatten(0, (20, 4))
+    lit = torch.isclose(radiance, clip.reference).all(2, keepdim=True)
+    assert lit.flatten(1).any(1).all()
+    assert (lit == lit[:, :1]).all()
+    assert 0.02 < lit.float().mean() < 0.5
+    assert (radiance[~lit.expand_as(radiance)] == torch.tensor(0.1)).all()
+    assert clip.reference.max() > 3
+    dark = ClipSampler([shot_of(stack)], frames=4, crop=16).draw(seeds)
+    assert dark.reference.unique().tolist() == [0.5]
+
+
+def test_shots_are_drawn_in_proportion_to_their_frames() -> None:
+    shots = [shot_of(torch.full((length, 13, 4, 4), float(length))) for length in (2, 6)]
+    clip = ClipSampler(shots, 2, 4).draw(list(range(200)))
+    assert 0.65 < (clip.depth[:, 0, 0, 0, 0] == 6).float().mean() < 0.85
+
+
+def test_clips_leave_the_shot_alone() -> None:
+    stack = numbered()
+    ClipSampler([shot_of(stack)], 2, 4, lamps=1.0, exposure=1.0).draw([0, 1, 2, 3])
+    assert torch.equal(stack, numbered())
+
+
+def test_shots_that_cannot_be_cut() -> None:
+    long, short = shot_of(numbered(3)), shot_of(numbered(2, 2, 2))
+    assert "expected a sequence of at least 9 frames, found none" in refused(lambda: ClipSampler([long], 9, 4))
+    assert "at least 5 pixels, found (2, 2)" in refused(lambda: ClipSampler([long, short], 2, 5))
+    # One that is too short to be used may be small.
+    assert len(ClipSampler([long, short], 3, 5).shots) == 1
