@@ -1,64 +1,140 @@
-"""Compare every way to denoise on scenes of your choice: noisy, accumulated, a plain filter, and the network.
+"""Compare every way to denoise on scenes of your choice: noisy, accumulated, a plain filter, OIDN, and the networks.
 
-    python examples/unseen_scenes.py path/to/scene path/to/another --markdown
-    python examples/unseen_scenes.py path/to/scene --weights runs/mine/cascaded.safetensors --json scores.json
+    python examples/unseen_scenes.py path/to/scene path/to/another --peers oidn --markdown
+    python examples/unseen_scenes.py path/to/scene --models cascaded --weights runs/mine/cascaded.safetensors
 
-Prints SMAPE (scene-linear, lower is better) and PSNR (as displayed, in dB, higher is better), each the mean over the
-frames with a reference, for every scene and for the mean over the scenes. The plain filter is kornia's joint bilateral
-filter of the same accumulated input, with the best setting of a sweep chosen by the reference: it is flattered.
+Prints for every scene, and for the mean over the scenes, the mean over the frames with a reference of: SMAPE and relMSE
+(scene-linear, lower is better), PSNR and SSIM (as displayed, higher is better), FLIP (as displayed, lower is better),
+and tSMAPE (scene-linear) and tRMSE (as displayed), the errors of the change from frame to frame, lower is better.
+
+Peers are shown at their best: a row that stands for several settings takes, for each metric by itself, the setting that
+the reference says is best. OIDN is Intel Open Image Denoise in 36 settings: fast, balanced and high; albedo and normal
+taken as noisy, as clean, or denoised first; started from one sample a pixel ("raw"), from the accumulated image, from
+that one divided by albedo, or from one sample a pixel with the results accumulated by the same rule ("accumulated
+after"). Its high quality is the network of balanced unless albedo and normal are clean. The plain filter is kornia's
+joint bilateral filter of the accumulated image, in 20 settings. --json holds every setting by itself.
 """
 
 import argparse
 import json
-from dataclasses import asdict
+import sys
+import time
+from collections import Counter
+from dataclasses import asdict, replace
 from pathlib import Path
 
+import torch
+
 from mcdenoise import Denoiser
-from mcdenoise.data import open_sequence
-from mcdenoise.evaluate import METRICS, Score, score_sequence
-
-
-def mean_over_scenes(scores: list[Score]) -> list[Score]:
-    """Every scene counts the same, however many frames it has."""
-    means = []
-    for method in dict.fromkeys(score.method for score in scores):
-        own = [score for score in scores if score.method == method]
-        values = {name: sum(score.values[name] for score in own) / len(own) for name in METRICS}
-        means.append(Score(f"mean of {len(own)}", method, sum(score.frames for score in own), values))
-    return means
+from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.errors import InputError
+from mcdenoise.evaluate import METRICS, Score, folded, reference_noise, score_sequence, summary, verdicts
+from mcdenoise.peers import Peer, joint_bilateral_peers, oidn_peers
 
 
 def table(scores: list[Score], markdown: bool) -> str:
-    """One row for each scene and method."""
-    header = ["scene", "frames", "image", *METRICS]
+    """One row for each scene and method; a metric that was not computed is a dash."""
+    metrics = [name for name in METRICS if any(name in score.values for score in scores)]
+    header = ["scene", "frames", "image", *metrics]
     rows = [
-        [score.sequence, str(score.frames), score.method, *(f"{value:.4g}" for value in score.values.values())]
+        [score.sequence, str(score.frames), score.method]
+        + [f"{score.values[name]:.4g}" if name in score.values else "-" for name in metrics]
         for score in scores
     ]
     if markdown:
-        rule = ["---", "--:", "---", *("--:" for _ in METRICS)]
+        rule = ["---", "--:", "---", *("--:" for _ in metrics)]
         return "\n".join(f"| {' | '.join(row)} |" for row in [header, rule, *rows])
     widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
     return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in [header, *rows])
 
 
-def main() -> None:
+def open_all(paths: list[Path], frames: str | None) -> list[Sequence]:
+    """Open sequences; the second of a name gets a number, so that the tables keep them apart."""
+    sequences: list[Sequence] = []
+    names: Counter[str] = Counter()
+    for path in paths:
+        sequence = open_sequence(path, frames)
+        names[sequence.name] += 1
+        count = names[sequence.name]
+        sequences.append(sequence if count == 1 else replace(sequence, name=f"{sequence.name} ({count})"))
+    return sequences
+
+
+def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("sequences", type=Path, nargs="+", metavar="SEQUENCE", help="folder of frames with references")
-    parser.add_argument("--model", default="cascaded", help="a name that `mcdenoise models` lists")
-    parser.add_argument("--weights", type=Path, help="weights of your own training; by default the shipped ones")
-    parser.add_argument("--markdown", action="store_true", help="print a Markdown table")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the scores to this file too")
-    options = parser.parse_args()
+    parser.add_argument("--models", default="cascaded", metavar="NAMES", help="names that `mcdenoise models` lists")
+    parser.add_argument("--weights", type=Path, metavar="FILE", help="your own weights of the one model that is named")
+    parser.add_argument(
+        "--peers", choices=["oidn"], action="append", default=[], help="other denoisers; mcdenoise[peers]"
+    )
+    parser.add_argument(
+        "--no-bilateral",
+        action="store_true",
+        help="leave out the plain filter: its sweep takes seconds a frame, and minutes at 1280x720",
+    )
+    parser.add_argument("--flip-every", type=int, default=4, metavar="N", help="FLIP of the first of N frames (4)")
+    parser.add_argument("--no-flip", action="store_true", help="leave out FLIP, which needs mcdenoise[peers]")
+    parser.add_argument("--frames", metavar="NUMBERS", help="which frames to use, such as 0-15")
+    parser.add_argument("--threads", type=int, metavar="N", help="of the networks and of OIDN")
+    parser.add_argument("--markdown", action="store_true", help="print Markdown tables")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every score to this file too")
+    return parser.parse_args()
 
-    denoiser = Denoiser(options.model, weights=options.weights)
-    scores = [score for path in options.sequences for score in score_sequence(open_sequence(path), denoiser)]
-    if len(options.sequences) > 1:
-        scores += mean_over_scenes(scores)
-    print(table(scores, options.markdown))
+
+def main() -> None:
+    options = parse()
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    names = options.models.split(",")
+    if options.weights and len(names) > 1:
+        raise InputError(f"--weights: expected one model to load them into, found --models {options.models}")
+    if options.flip_every < 1:
+        raise InputError(f"--flip-every: expected at least 1, found {options.flip_every}")
+    sequences = open_all(options.sequences, options.frames)
+    denoisers = {name: Denoiser(name, weights=options.weights) for name in names}
+    peers: list[Peer] = [] if options.no_bilateral else joint_bilateral_peers()
+    if "oidn" in options.peers:
+        peers += oidn_peers(threads=options.threads)
+    metrics = [name for name in METRICS if not (options.no_flip and name == "FLIP")]
+
+    scores: list[Score] = []
+    for sequence in sequences:
+        start = time.perf_counter()
+        scores += score_sequence(sequence, denoisers, peers=peers, metrics=metrics, flip_every=options.flip_every)
+        print(f"{sequence.name}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
+
+    print(table(folded(scores), options.markdown))
+    means = summary(scores) if len(sequences) > 1 else []
+    if means:
+        print(f"\n{table(means, options.markdown)}")
+    noise = {sequence.name: reference_noise(sequence) for sequence in sequences}
+    notes = [
+        f"{name}: the references' own SMAPE against the truth is about {value:.4g}."
+        for name, value in noise.items()
+        if value
+    ]
+    if "FLIP" in metrics and options.flip_every > 1:
+        notes.append(f"FLIP: of one in {options.flip_every} frames.")
+    against = [verdict for name in names for verdict in verdicts(scores, name)] if "oidn" in options.peers else []
+    for lines in (notes, [str(verdict) for verdict in against]):
+        if lines:
+            print("\n" + "\n".join(f"- {line}" if options.markdown else line for line in lines))
     if options.json:
-        options.json.write_text(json.dumps([asdict(score) for score in scores], indent=2) + "\n")
+        everything = {
+            "scores": [asdict(score) for score in scores],
+            "folded": [asdict(score) for score in folded(scores)],
+            "summary": [asdict(score) for score in means],
+            "verdicts": [asdict(v) | {"ahead": v.ahead, "won": v.won} for v in against],
+            "reference_noise": noise,
+            "flip_every": options.flip_every,
+            "threads": torch.get_num_threads(),
+        }
+        options.json.write_text(json.dumps(everything, indent=2) + "\n")
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as error:
+        sys.exit(str(error))

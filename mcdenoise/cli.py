@@ -186,7 +186,7 @@ def _denoise() -> Callable[..., int | None]:
 
 def _render() -> Callable[..., int | None]:
     """Render a Mitsuba 3 scene along a camera path to a noisy sequence with references."""
-    from mcdenoise.render import load_camera_path, render_sequence
+    from mcdenoise.render import load_shot, render_sequence
 
     def render(
         scene: tyro.conf.Positional[Path],
@@ -194,38 +194,53 @@ def _render() -> Callable[..., int | None]:
         out: Out,
         frames: int | None = None,
         spp: int = 1,
+        realisations: int = 1,
         reference_spp: int = 512,
+        noise_level: float | None = None,
         size: str = "640x360",
         seed: int = 0,
+        workers: int = 1,
         variant: str | None = None,
     ) -> None:
         """Render a Mitsuba 3 scene along a camera path to a sequence in the BMFR layout.
 
+        The same command again resumes a run that was stopped; with more samples or less noise it refines references.
+
         Args:
             scene: Mitsuba 3 scene.xml.
             camera_path: JSON with 'fov' in degrees, and a list 'to_world' of 4x4 camera-to-world matrices or a list
-                'frames' of cameras with 'position' and 'look_at'.
+                'frames' of cameras with 'position' and 'look_at'; or a folder of Tungsten scenes, one per frame. With
+                'objects', a list of 4x4 matrices per frame for each id, objects of the scene move.
             out: folder of the sequence; finished frames in it are kept.
             frames: render the first so many cameras; all by default.
             spp: samples a pixel of the noisy color.
-            reference_spp: samples a pixel of the references; 0 renders none.
+            realisations: noisy colors of each frame, with independent noise.
+            reference_spp: samples a pixel of the references; 0 renders none. With --noise-level the most.
+            noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
             size: WIDTHxHEIGHT in pixels.
             seed: of the noise.
+            workers: processes that render frames side by side; of use with scalar_rgb.
             variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
         """
-        cameras = load_camera_path(camera_path)
+        if reference_spp < 0:
+            raise InputError(f"--reference-spp: expected at least 0, found {reference_spp}")
+        shot = load_shot(camera_path)
         with _progress() as progress:
             task = progress.add_task("render", total=None)
             written = render_sequence(
                 scene,
-                cameras,
+                shot.cameras,
                 out,
                 size=_size(size),
                 frames=frames,
                 spp=spp,
+                realisations=realisations,
                 reference_spp=max(reference_spp, 1),
+                noise_level=noise_level,
                 reference_frames=None if reference_spp > 0 else [],
+                moves=shot.moves,
                 seed=seed,
+                workers=workers,
                 variant=variant,
                 progress=lambda done, total: progress.update(task, completed=done, total=total),
             )
@@ -237,13 +252,15 @@ def _render() -> Callable[..., int | None]:
 def _train() -> Callable[..., int | None]:
     """Train a model on sequences with references."""
     from mcdenoise.train import Progress as Report
-    from mcdenoise.train import TrainConfig
+    from mcdenoise.train import TrainConfig, is_first_process
     from mcdenoise.train import train as run
 
     def train(
         sequences: tyro.conf.Positional[list[Path]],
         out: Out,
         config: tyro.conf.OmitArgPrefixes[TrainConfig],
+        validation: list[Path] = [],  # noqa: B006 - tyro reads it
+        cache: Path | None = None,
         initial_weights: Path | None = None,
         accelerator: str = "cpu",
         checkpoint_every: int = 500,
@@ -255,8 +272,10 @@ def _train() -> Callable[..., int | None]:
             sequences: folders of sequences with references, albedo, normal and depth.
             out: folder of the run: checkpoint, log, TensorBoard events, and at the end the weights.
             config: what to train.
+            validation: folders of sequences that are used for nothing but validation.
+            cache: folder of the decoded sequences, which several runs may share; OUT/cache by default.
             initial_weights: safetensors file of weights to start from.
-            accelerator: cpu or cuda.
+            accelerator: cpu or cuda; for several devices or machines start the command with torchrun.
             checkpoint_every: steps between checkpoints.
             credits: authors and licences of the training scenes, stored with the weights.
         """
@@ -264,20 +283,23 @@ def _train() -> Callable[..., int | None]:
 
         def report(progress: Report) -> None:
             scores = "".join(f"  validation {name} {value:.4f}" for name, value in progress.validation.items())
-            console.print(f"step {progress.step}  loss {progress.loss:.4f}  {progress.seconds:.0f} s{scores}")
+            line = f"step {progress.step}  loss {progress.loss:.4f}  {progress.seconds:.0f} s{scores}"
+            console.print(line, soft_wrap=True)
 
-        print(
-            run(
-                config,
-                sequences,
-                out,
-                initial_weights=initial_weights,
-                accelerator=accelerator,
-                checkpoint_every=checkpoint_every,
-                credits=credits,
-                report=report,
-            )
+        weights = run(
+            config,
+            sequences,
+            out,
+            validation=validation,
+            cache=cache,
+            initial_weights=initial_weights,
+            accelerator=accelerator,
+            checkpoint_every=checkpoint_every,
+            credits=credits,
+            report=report,
         )
+        if is_first_process():
+            print(weights)
 
     return train
 

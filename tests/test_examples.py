@@ -118,25 +118,54 @@ def test_fitted_filter_is_better_on_a_scene_it_has_not_seen() -> None:
 
 
 def test_unseen_scenes_compares_every_image(small_sequence: Path, weights: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    pytest.importorskip("flip_evaluator", reason="FLIP is in the extra mcdenoise[peers]")
     file = tmp_path / "scores.json"
-    arguments = (small_sequence, small_sequence, "--weights", weights, "--json", file, "--markdown")
-    lines = run("unseen_scenes.py", *arguments).splitlines()
-    assert lines[0] == "| scene | frames | image | SMAPE | relMSE | PSNR |"
-    scores = json.loads(file.read_text())
-    methods = ["noisy", "accumulated", "joint bilateral, best", "initial", "denoised"]
-    assert [score["method"] for score in scores] == methods * 3
-    assert len(lines) == 2 + len(scores)
-    first, second, mean = scores[:5], scores[5:10], scores[10:]
-    assert first == second
-    assert [score["sequence"] for score in mean] == ["mean of 2"] * 5
-    for one, both in zip(first, mean, strict=True):
-        assert both["values"] == pytest.approx(one["values"])
-    noisy, accumulated, filtered = (score["values"] for score in first[:3])
-    assert filtered["SMAPE"] < accumulated["SMAPE"] < noisy["SMAPE"]
-    assert filtered["PSNR"] > accumulated["PSNR"] > noisy["PSNR"]
+    arguments = (small_sequence, small_sequence, "--weights", weights, "--json", file, "--markdown", "--peers", "oidn")
+    first_table, second_table, notes, lines = run("unseen_scenes.py", *arguments).strip().split("\n\n")
+    header = "| scene | frames | image | SMAPE | relMSE | PSNR | SSIM | FLIP | tSMAPE | tRMSE |"
+    assert first_table.startswith(header)
+    assert second_table.startswith(header)
+    assert notes == "- FLIP: of one in 4 frames."
+    metrics = header.split(" | ")[3:]
+    metrics[-1] = metrics[-1].removesuffix(" |")
+    assert [line.partition(":")[0] for line in lines.splitlines()] == [f"- {metric}" for metric in metrics]
+
+    everything = json.loads(file.read_text())
+    scores = everything["scores"]
+    # Two images, 20 settings of the plain filter, 36 of OIDN, two images of the network, of each scene.
+    assert len(scores) == 2 * 60
+    assert [score["sequence"] for score in scores] == [*["plane"] * 60, *["plane (2)"] * 60]
+    assert all(set(score["values"]) == set(metrics) for score in scores)
+    methods = [score["method"] for score in everything["folded"]]
+    plain, best = "joint bilateral, best of 20 settings", "OIDN, best of 36 settings"
+    images = ("raw", "accumulated", "accumulated after")
+    oidn = [f"OIDN {quality}, {image}" for image in images for quality in ("fast", "balanced", "high")]
+    assert methods == ["noisy", "accumulated", plain, *oidn, best, "cascaded, initial", "cascaded"] * 2
+    assert len(first_table.splitlines()) == 2 + len(methods)
+    assert len(second_table.splitlines()) == 2 + len(everything["summary"])
+    first = {score["method"]: score["values"] for score in everything["folded"][:15]}
+    mean = {score["method"]: score["values"] for score in everything["summary"]}
+    for method, values in first.items():
+        assert mean[method] == pytest.approx(values)
+    assert mean["OIDN, best of each scene"] == pytest.approx(first[best])
+    assert first[plain]["SMAPE"] < first["accumulated"]["SMAPE"] < first["noisy"]["SMAPE"]
+    assert first[best]["PSNR"] > first["accumulated"]["PSNR"] > first["noisy"]["PSNR"]
+    assert [verdict["metric"] for verdict in everything["verdicts"]] == metrics
+    assert not everything["verdicts"][0]["ahead"]
 
 
 def test_unseen_scenes_prints_plain_columns_too(small_sequence: Path, weights: Path) -> None:
-    lines = run("unseen_scenes.py", small_sequence, "--weights", weights).splitlines()
-    assert len(lines) == 6
-    assert lines[0].split() == ["scene", "frames", "image", "SMAPE", "relMSE", "PSNR"]
+    arguments = (small_sequence, "--weights", weights, "--no-bilateral", "--no-flip", "--frames", "1-3")
+    lines = run("unseen_scenes.py", *arguments).splitlines()
+    assert len(lines) == 5
+    assert lines[0].split() == ["scene", "frames", "image", "SMAPE", "relMSE", "PSNR", "SSIM", "tSMAPE", "tRMSE"]
+    assert lines[1].split()[:3] == ["plane", "3", "noisy"]
+
+
+def test_unseen_scenes_says_in_one_line_what_is_wrong(small_sequence: Path, weights: Path) -> None:
+    command = [sys.executable, str(EXAMPLES / "unseen_scenes.py"), str(small_sequence), "--weights", str(weights)]
+    command += ["--models", "cascaded,cascaded"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
+    assert done.returncode == 1
+    assert done.stderr == "--weights: expected one model to load them into, found --models cascaded,cascaded\n"

@@ -21,8 +21,19 @@ MODULES = {
 # What each room (a module or folder right below mcdenoise/) may import besides itself. A room that is not in the table
 # fails: place it deliberately.
 SIGNAL = {"errors", "buffers", "ops"}
-LIBRARY = SIGNAL | {"metrics", "losses", "models", "history", "data", "plan", "demo_scene", "render", "denoiser"}
-REPORTS = {"denoise", "evaluate", "report", "run_folder"}
+LIBRARY = SIGNAL | {
+    "metrics",
+    "losses",
+    "models",
+    "history",
+    "data",
+    "plan",
+    "demo_scene",
+    "random_scene",
+    "render",
+    "denoiser",
+}
+REPORTS = {"denoise", "evaluate", "peers", "report", "run_folder"}
 TOOLS = REPORTS | {"benchmark", "demo", "export", "gradcheck", "ops_overview", "stability", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
@@ -35,11 +46,13 @@ ALLOWED: dict[str, set[str]] = {
     "data": SIGNAL | {"history"},
     "plan": SIGNAL | {"data"},
     "demo_scene": SIGNAL | {"data"},
-    "render": SIGNAL | {"data", "demo_scene"},
+    "random_scene": SIGNAL | {"data"},
+    "render": SIGNAL | {"data"},
     "denoiser": SIGNAL | {"models", "history", "plan"},
     "denoise": LIBRARY,
     "run_folder": SIGNAL | {"data"},
-    "evaluate": LIBRARY | {"denoise"},
+    "peers": SIGNAL | {"models", "history", "denoiser"},
+    "evaluate": LIBRARY | {"denoise", "peers"},
     "report": LIBRARY,
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS),
     "cli": LIBRARY | TOOLS,
@@ -50,7 +63,7 @@ ALLOWED: dict[str, set[str]] = {
 OPS_KNOW = {"torch", "kornia"}
 # `import mcdenoise` leaves these alone: optional, slow to load, or of use to the command line only.
 LAZY = {"OpenImageIO", "matplotlib", "tyro"}
-LAZY |= {"drjit", "mitsuba", "pyoidn", "lightning", "lightning_fabric", "tensorboard"}
+LAZY |= {"drjit", "mitsuba", "pyoidn", "flip_evaluator", "lightning", "lightning_fabric", "tensorboard"}
 SECONDS = 0.5
 
 

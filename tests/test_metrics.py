@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 
 import pytest
@@ -11,10 +12,21 @@ from kornia.metrics import psnr
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from mcdenoise.errors import InputError
 from mcdenoise.losses import cascade_loss
-from mcdenoise.metrics import displayed, psnr_srgb, relmse_linear, smape_linear, temporal_smape_linear
+from mcdenoise.metrics import (
+    displayed,
+    flip_srgb,
+    psnr_srgb,
+    relmse_linear,
+    smape_linear,
+    ssim_srgb,
+    temporal_rmse_srgb,
+    temporal_smape_linear,
+)
 
-IMAGE_METRICS = [smape_linear, relmse_linear, psnr_srgb]
+IMAGE_METRICS = [smape_linear, relmse_linear, psnr_srgb, ssim_srgb, flip_srgb]
+CLIP_METRICS = [temporal_smape_linear, temporal_rmse_srgb]
 
 
 def image(*values: float) -> Tensor:
@@ -61,6 +73,101 @@ def test_psnr_is_that_of_kornia() -> None:
     torch.testing.assert_close(psnr_srgb(first, second)[0], expected)
 
 
+def noisy_pair(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """A noisy image with highlights and its smooth reference, ``(1, 3, H, W)``."""
+    torch.manual_seed(0)
+    y, x = torch.meshgrid(torch.linspace(0, 3, height), torch.linspace(0, 5, width), indexing="ij")
+    reference = torch.stack([0.5 + 0.5 * torch.sin(x + y), 0.4 + 0.3 * torch.cos(2 * x), 0.3 * y])[None]
+    return (reference + 0.1 * torch.randn_like(reference)).clamp_min(0), reference
+
+
+def test_ssim_of_flat_images_written_out() -> None:
+    # Without structure only the means count: (2 a b + K1^2) / (a^2 + b^2 + K1^2).
+    first, second = torch.full((1, 3, 11, 12), 0.2), torch.full((1, 3, 11, 12), 0.4)
+    a, b = (float(displayed(x).flatten()[0]) for x in (first, second))
+    assert ssim_srgb(first, second).item() == pytest.approx((2 * a * b + 1e-4) / (a * a + b * b + 1e-4), abs=1e-4)
+    assert ssim_srgb(first, first).tolist() == [1]
+
+
+def test_ssim_is_that_of_scikit_image() -> None:
+    structural_similarity = pytest.importorskip("skimage.metrics").structural_similarity
+    image, reference = noisy_pair(31, 40)
+    expected = structural_similarity(
+        displayed(image)[0].double().numpy(),
+        displayed(reference)[0].double().numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1,
+        channel_axis=0,
+    )
+    assert 0.1 < expected < 0.9
+    # Measured: 1e-8 in double precision, 1e-7 in single.
+    assert ssim_srgb(image.double(), reference.double()).item() == pytest.approx(expected, abs=1e-6)
+    assert ssim_srgb(image, reference).item() == pytest.approx(expected, abs=1e-5)
+
+
+def test_ssim_needs_a_window() -> None:
+    with pytest.raises(ValueError, match="at least 11 x 11 pixels, found 10 x 20"):
+        ssim_srgb(torch.rand(1, 3, 10, 20), torch.rand(1, 3, 10, 20))
+
+
+def test_ssim_has_a_gradient() -> None:
+    image, reference = (x.double() * 0.5 + 0.1 for x in noisy_pair(11, 12))
+    image.requires_grad_()
+    assert gradcheck(lambda x: ssim_srgb(x, reference), (image,), fast_mode=True)
+
+
+def test_flip_is_that_of_its_authors() -> None:
+    flip = pytest.importorskip("flip_evaluator")
+    image, reference = noisy_pair(20, 24)
+    test, truth = (displayed(x)[0].permute(1, 2, 0).contiguous().numpy() for x in (image, reference))
+    # The error map without its colors, averaged here.
+    errors = flip.evaluate(truth, test, "LDR", applyMagma=False)[0]
+    assert 0.05 < errors.mean() < 0.9
+    assert flip_srgb(image, reference).item() == pytest.approx(float(errors.mean()), rel=1e-4)
+
+
+def test_flip_of_flat_images_written_out() -> None:
+    # Black and white are as far apart as colors can be, up to the compression of the largest distances.
+    black, white = torch.zeros(1, 3, 16, 16), torch.ones(1, 3, 16, 16)
+    assert flip_srgb(black, white).item() > 0.9
+    assert flip_srgb(9 * white, white).item() == 0
+
+
+def test_flip_without_its_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    with pytest.raises(InputError, match=r"FLIP needs flip-evaluator.*mcdenoise\[peers\]"):
+        flip_srgb(torch.rand(1, 3, 4, 4), torch.rand(1, 3, 4, 4))
+
+
+def test_temporal_rmse_written_out() -> None:
+    # All of it below the bend of the curve, where a display shows 12.92 times as much. Errors 0, 1, 3 (in 1/1000):
+    # their changes are 1 and 2.
+    error = temporal_rmse_srgb(clip(0, 0.001, 0.003), clip(0, 0, 0))
+    assert error.item() == pytest.approx(12.92e-3 * (1 + 2) / 2, rel=1e-4)
+    # The wrong direction is an error, unlike in temporal_smape_linear.
+    assert temporal_rmse_srgb(clip(0, 0.001), clip(0.001, 0)).item() == pytest.approx(12.92e-3 * 2, rel=1e-4)
+    # The root is taken of the whole frame: one pixel of two changes by 0.002.
+    two = torch.zeros(1, 2, 3, 1, 2)
+    two[:, 1, :, :, 0] = 0.002
+    assert temporal_rmse_srgb(two, torch.zeros_like(two)).item() == pytest.approx(
+        12.92 * 0.002 / math.sqrt(2), rel=1e-4
+    )
+    # Beyond white nothing changes on a display, and a steady error does not flicker.
+    assert temporal_rmse_srgb(clip(2, 7), clip(1, 1)).item() == 0
+
+
+def test_temporal_metrics_batch_and_have_a_gradient() -> None:
+    torch.manual_seed(0)
+    clips, references = torch.rand(2, 3, 3, 4, 5, dtype=torch.float64), torch.rand(2, 3, 3, 4, 5, dtype=torch.float64)
+    for metric in CLIP_METRICS:
+        together = metric(clips, references)
+        assert together.shape == (2,)
+        torch.testing.assert_close(together[1], metric(clips[1], references[1]))
+    assert gradcheck(lambda x: temporal_rmse_srgb(x, references), (clips.requires_grad_(),))
+
+
 def test_a_display_clamps_and_bends() -> None:
     shown = displayed(image(-1.0, 0.0, 0.5, 1.0, 9.0))[0, 0, 0]
     torch.testing.assert_close(shown, torch.tensor([0.0, 0.0, 1.055 * 0.5 ** (1 / 2.4) - 0.055, 1.0, 1.0]))
@@ -69,7 +176,7 @@ def test_a_display_clamps_and_bends() -> None:
 @pytest.mark.parametrize("metric", IMAGE_METRICS)
 def test_whatever_stands_before_the_image_is_a_batch(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
     torch.manual_seed(0)
-    images, references = torch.rand(2, 4, 3, 5, 6), torch.rand(2, 4, 3, 5, 6)
+    images, references = torch.rand(2, 4, 3, 12, 13) * 1.5, torch.rand(2, 4, 3, 12, 13) * 1.5
     together = metric(images, references)
     assert together.shape == (2, 4)
     for b in range(2):
@@ -77,13 +184,13 @@ def test_whatever_stands_before_the_image_is_a_batch(metric: Callable[[Tensor, T
             torch.testing.assert_close(together[b, t], metric(images[b, t], references[b, t]))
 
 
-@pytest.mark.parametrize("metric", [smape_linear, relmse_linear])
+@pytest.mark.parametrize("metric", [smape_linear, relmse_linear, flip_srgb])
 def test_no_error_is_zero(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
     images = torch.rand(2, 3, 4, 5) * 100
     assert metric(images, images).tolist() == [0, 0]
 
 
-@pytest.mark.parametrize("metric", [*IMAGE_METRICS, temporal_smape_linear])
+@pytest.mark.parametrize("metric", [*IMAGE_METRICS, *CLIP_METRICS])
 def test_shapes_must_agree(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
     with pytest.raises(ValueError, match=r"reference: expected the shape of image .* found \(1, 2, 3, 4, 6\)"):
         metric(torch.rand(1, 2, 3, 4, 5), torch.rand(1, 2, 3, 4, 6))
@@ -91,10 +198,11 @@ def test_shapes_must_agree(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
         metric(torch.rand(4, 5), torch.rand(4, 5))
 
 
-def test_one_frame_has_no_temporal_error() -> None:
+@pytest.mark.parametrize("metric", CLIP_METRICS)
+def test_one_frame_has_no_temporal_error(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
     for shape in ((1, 1, 3, 4, 5), (3, 4, 5)):
         with pytest.raises(ValueError, match=r"clip: expected .* at least 2 frames"):
-            temporal_smape_linear(torch.rand(shape), torch.rand(shape))
+            metric(torch.rand(shape), torch.rand(shape))
 
 
 def test_the_loss_is_equation_11() -> None:
