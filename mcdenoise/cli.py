@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from mcdenoise.errors import InputError
@@ -126,7 +126,7 @@ def _denoise() -> Callable[..., int | None]:
 
     from mcdenoise.data import open_sequence
     from mcdenoise.denoise import denoise_sequence
-    from mcdenoise.denoiser import Denoiser
+    from mcdenoise.denoiser import Denoiser, Precision
 
     def denoise(
         sequence: tyro.conf.Positional[Path],
@@ -136,6 +136,7 @@ def _denoise() -> Callable[..., int | None]:
         frames: str | None = None,
         device: str = "cpu",
         threads: int | None = None,
+        precision: Precision = "float32",
         alpha_min: float = 0.1,
         full_float: bool = False,
         json: Json = None,
@@ -150,6 +151,7 @@ def _denoise() -> Callable[..., int | None]:
             frames: which frames, such as 0-59,70; all by default.
             device: cpu or cuda.
             threads: CPU threads; torch's choice by default.
+            precision: of the network's convolutions; bfloat16 is faster on processors that have it.
             alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
             full_float: write 32-bit instead of half floats.
             json: write the run times to this file too.
@@ -161,7 +163,7 @@ def _denoise() -> Callable[..., int | None]:
         if not 0 < alpha_min <= 1:
             raise InputError(f"--alpha-min: expected in (0, 1], found {alpha_min}")
         opened = open_sequence(sequence, frames)
-        denoiser = Denoiser(model, weights=weights, device=device, alpha_min=alpha_min)
+        denoiser = Denoiser(model, weights=weights, device=device, alpha_min=alpha_min, precision=precision)
         height, width = opened.size
         print(f"{opened.name}: {opened.layout} layout, {len(opened)} frames of {width}x{height}")
         with _progress() as progress:
@@ -247,6 +249,73 @@ def _render() -> Callable[..., int | None]:
         print(written)
 
     return render
+
+
+def _generate() -> Callable[..., int | None]:
+    """Render random scenes to train on."""
+    from mcdenoise.data.sequences import parse_frames
+    from mcdenoise.random_scene import random_scene
+    from mcdenoise.render import render_sequence
+
+    def generate(
+        out: Out,
+        seeds: str = "0-15",
+        frames: int = 12,
+        spp: int = 1,
+        realisations: int = 3,
+        reference_spp: int = 64,
+        noise_level: float | None = None,
+        size: str = "160x160",
+        workers: int = 1,
+        variant: str | None = None,
+    ) -> None:
+        """Render random rooms, courts and still lifes to sequences to train on: OUT/random0000, OUT/random0001, ...
+
+        The same seed is the same scene and noise anywhere. The same command again resumes a run that was stopped.
+
+        Args:
+            out: folder of the sequences; finished frames in it are kept.
+            seeds: which scenes, such as 0-99,200.
+            frames: frames of each sequence.
+            spp: samples a pixel of the noisy color.
+            realisations: noisy colors of each frame, with independent noise.
+            reference_spp: samples a pixel of the references. With --noise-level the most.
+            noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
+            size: WIDTHxHEIGHT in pixels.
+            workers: processes that render frames side by side; of use with scalar_rgb.
+            variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
+        """
+        if frames < 1:
+            raise InputError(f"--frames: expected at least 1, found {frames}")
+        chosen = parse_frames(seeds, name="--seeds")
+        with _progress() as progress:
+            whole = progress.add_task("scenes", total=len(chosen))
+            for seed in chosen:
+                made = random_scene(seed, frames)
+                task = progress.add_task(f"random{seed:04d}", total=None)
+
+                def show(done: int, total: int, task: TaskID = task) -> None:
+                    progress.update(task, completed=done, total=total)
+
+                written = render_sequence(
+                    made.scene,
+                    made.cameras,
+                    out / f"random{seed:04d}",
+                    size=_size(size),
+                    spp=spp,
+                    realisations=realisations,
+                    reference_spp=reference_spp,
+                    noise_level=noise_level,
+                    moves=made.moves,
+                    workers=workers,
+                    variant=variant,
+                    progress=show,
+                )
+                progress.remove_task(task)
+                progress.advance(whole)
+                print(written, flush=True)
+
+    return generate
 
 
 def _train() -> Callable[..., int | None]:
@@ -380,6 +449,7 @@ COMMANDS: dict[str, Callable[[], Callable[..., int | None]]] = {
     "demo": _demo,
     "denoise": _denoise,
     "render": _render,
+    "generate": _generate,
     "train": _train,
     "gradcheck": _gradcheck,
     "models": _models,

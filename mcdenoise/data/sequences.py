@@ -154,11 +154,12 @@ def open_sequence(path: Path, frames: str | None = None) -> Sequence:
     )
 
 
-def parse_frames(text: str) -> list[int]:
+def parse_frames(text: str, name: str = "frames") -> list[int]:
     """Read a choice of frames.
 
     Args:
         text: numbers and ranges, such as ``"0-59,70"``.
+        name: what is chosen, for the message.
 
     Returns:
         The frame numbers, ascending, each once.
@@ -175,7 +176,7 @@ def parse_frames(text: str) -> list[int]:
         match = re.fullmatch(r"\s*([0-9]{1,9})(?:\s*-\s*([0-9]{1,9}))?\s*", part)
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
         if not first <= last < first + _LARGEST_FRAME_COUNT - len(numbers):
-            raise InputError(f"frames: expected numbers and ascending ranges such as '0-59,70', found {text[:80]!r}")
+            raise InputError(f"{name}: expected numbers and ascending ranges such as '0-59,70', found {text[:80]!r}")
         numbers.update(range(first, last + 1))
     return sorted(numbers)
 

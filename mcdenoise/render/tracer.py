@@ -125,6 +125,7 @@ class Tracer:
         else:
             distance, normal, albedo, mover = self._hit(self._wavefront(rays, 1))
             columns = (distance, *normal, *albedo, mover)
+            self._dr.eval(*columns)  # all at once: each by itself would trace the rays again
             count = len(rays.directions)  # a constant column has one entry
             table = np.stack([np.broadcast_to(np.array(c, dtype=np.float64), count) for c in columns], axis=1)
         # A few BSDFs only approximate their albedo, by a value that can exceed 1.
@@ -160,6 +161,7 @@ class Tracer:
         total = np.zeros((count, 3))
         for _ in range(paths // copies):
             radiance = self._integrator.sample(self._scene, sampler, wavefront)[0]
+            self._dr.eval(radiance)  # all channels at once: each by itself would trace the paths again
             samples = _finite(np.stack([np.array(channel) for channel in radiance], axis=1))
             shape = (count, copies, 3) if stratified else (copies, count, 3)
             total += samples.reshape(shape).sum(axis=1 if stratified else 0, dtype=np.float64)
@@ -230,7 +232,7 @@ class Tracer:
         mi = self._mi
         directions = rays.directions.astype(np.float32)
         columns = (np.tile(directions, (copies, 1)) if interleaved else np.repeat(directions, copies, axis=0)).T
-        direction = mi.Vector3f(*(mi.Float(np.ascontiguousarray(column)) for column in columns))
+        direction = mi.Vector3f(*(mi.Float(_aligned(column)) for column in columns))
         # Numbers known to the compiler would become part of the kernel: seconds of compilation for each frame.
         origin = mi.Point3f(*(self._dr.opaque(mi.Float, value) for value in rays.origin.tolist()))
         return mi.RayDifferential3f(mi.Ray3f(origin, direction))
@@ -269,11 +271,15 @@ class Tracer:
 
     def _directional_albedo(self, bsdf: Any, hit: Any, active: Any) -> Any:
         """What a rough metal reflects of a white world towards the viewer: a fixed 4x4 grid of samples, so no noise."""
-        total = self._mi.Color3f(0)
+        mi, dr = self._mi, self._dr
+        total = mi.Color3f(0)
         grid = [(i + 0.5) / 4 for i in range(4)]
         for x in grid:
             for y in grid:
-                total += bsdf.sample(self._context, hit, 0.5, self._mi.Point2f(x, y), active)[1]
+                # Evaluated one by one, from numbers unknown to the compiler: one small kernel, used 16 times.
+                point = mi.Point2f(dr.opaque(mi.Float, x), dr.opaque(mi.Float, y))
+                total += bsdf.sample(self._context, hit, 0.5, point, active)[1]
+                dr.eval(total)
         return total / 16
 
 
@@ -380,6 +386,15 @@ def _to_mitsuba(mi: Any, value: Any) -> Any:
             return mi.ScalarTransform4f(value)
         return mi.Bitmap(np.ascontiguousarray(value, dtype=np.float32))
     return value
+
+
+def _aligned(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A copy at a multiple of 64 bytes: drjit makes the alignment of memory it borrows a part of the kernel."""
+    room = np.empty(values.nbytes + 64, np.uint8)
+    start = -room.ctypes.data % 64
+    copy = room[start : start + values.nbytes].view(np.float32)
+    copy[:] = values
+    return copy
 
 
 def _finite(samples: NDArray[np.float32]) -> NDArray[np.float32]:
