@@ -188,6 +188,7 @@ def _denoise() -> Callable[..., int | None]:
 
 def _render() -> Callable[..., int | None]:
     """Render a Mitsuba 3 scene along a camera path to a noisy sequence with references."""
+    from mcdenoise.data.sequences import parse_frames
     from mcdenoise.render import load_shot, render_sequence
 
     def render(
@@ -199,6 +200,7 @@ def _render() -> Callable[..., int | None]:
         realisations: int = 1,
         reference_spp: int = 512,
         noise_level: float | None = None,
+        reference_frames: str | None = None,
         size: str = "640x360",
         seed: int = 0,
         workers: int = 1,
@@ -219,6 +221,7 @@ def _render() -> Callable[..., int | None]:
             realisations: noisy colors of each frame, with independent noise.
             reference_spp: samples a pixel of the references; 0 renders none. With --noise-level the most.
             noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
+            reference_frames: which frames get a reference, such as 8-11; all by default.
             size: WIDTHxHEIGHT in pixels.
             seed: of the noise.
             workers: processes that render frames side by side; of use with scalar_rgb.
@@ -226,6 +229,7 @@ def _render() -> Callable[..., int | None]:
         """
         if reference_spp < 0:
             raise InputError(f"--reference-spp: expected at least 0, found {reference_spp}")
+        referenced = None if reference_frames is None else parse_frames(reference_frames, name="--reference-frames")
         shot = load_shot(camera_path)
         with _progress() as progress:
             task = progress.add_task("render", total=None)
@@ -239,7 +243,7 @@ def _render() -> Callable[..., int | None]:
                 realisations=realisations,
                 reference_spp=max(reference_spp, 1),
                 noise_level=noise_level,
-                reference_frames=None if reference_spp > 0 else [],
+                reference_frames=referenced if reference_spp > 0 else [],
                 moves=shot.moves,
                 seed=seed,
                 workers=workers,

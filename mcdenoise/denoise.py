@@ -152,6 +152,7 @@ def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> 
         "model": report.model,
         "versions": {name: version(name) for name in ("mcdenoise", "torch", "kornia")},
         "device": str(denoiser.device),
+        "precision": denoiser.precision,
         "threads": torch.get_num_threads(),
         "sequence": {"name": sequence.name, "layout": sequence.layout, "size": list(sequence.size)},
         "plan": report.stages,

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +17,9 @@ from mcdenoise.errors import InputError
 from mcdenoise.history import Accumulated, History
 from mcdenoise.models import create_model
 from mcdenoise.ops import Accumulate, remodulate
+
+Precision = Literal["float32", "bfloat16"]
+PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
 
 
 @dataclass
@@ -62,9 +66,11 @@ class Denoiser:
         weights: a safetensors file of other weights for a model given by name.
         device: where to run; frames may come from anywhere and images stay here.
         alpha_min: smallest weight of the current frame in the accumulation, see :func:`mcdenoise.ops.accumulate`.
+        precision: ``"bfloat16"`` runs the network's convolutions in bfloat16, which is about twice as fast on
+            processors that have it; everything else stays in float32.
 
     Raises:
-        InputError: the model is unknown, has no weights, or the device is not there.
+        InputError: the model is unknown, has no weights, the device is not there, or the precision is unknown.
 
     Example:
         >>> denoiser = Denoiser("cascaded")
@@ -82,8 +88,12 @@ class Denoiser:
         weights: Path | str | None = None,
         device: torch.device | str = "cpu",
         alpha_min: float = 0.1,
+        precision: Precision = "float32",
     ) -> None:
         self.device = _device(device)
+        if precision not in PRECISIONS:
+            raise InputError(f"precision: expected one of {', '.join(PRECISIONS)}, found '{precision}'")
+        self.precision = precision
         if isinstance(model, str):
             model = create_model(model, pretrained=weights is None, weights=weights)
         # Channels-last convolutions are about 1.5 times faster on a CPU.
@@ -121,11 +131,13 @@ class Denoiser:
         with self._timed("accumulate"):
             past = self.history.update(frame)
         report.reset = past.reset
-        with self._timed("network"):
+        bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
+        with self._timed("network"), bfloat16:
             initial, final = self.model(*self._inputs(frame, past))
         with self._timed("remodulate"):
+            # A network that ends with a convolution hands out its precision.
             accumulated, initial, final = (
-                image if frame.albedo is None else remodulate(image, frame.albedo)
+                image.float() if frame.albedo is None else remodulate(image.float(), frame.albedo)
                 for image in (past.color, initial, final)
             )
         return Images(frame.color, accumulated, initial, final)

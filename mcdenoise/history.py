@@ -8,10 +8,13 @@ import torch
 from torch import Tensor
 
 from mcdenoise.buffers import Frame
-from mcdenoise.ops import Accumulate, Surface, demodulate, motion_from_position
+from mcdenoise.ops import NO_ALBEDO, Accumulate, ClampFireflies, Surface, demodulate, motion_from_position
 
 # A cut leaves a few accidental matches; a fast pan keeps far more than this share of the image.
 _CUT_SHARE = 0.05
+# What a mirror or glass shows does not move as its surface does: a long history would smear it.
+_SPECULAR_LENGTH = 2
+_STILL = 0.05  # pixels
 
 
 class Accumulated(NamedTuple):
@@ -38,17 +41,41 @@ class _State(NamedTuple):
 class History:
     """Demodulates frames and accumulates them, one after the other.
 
-    The motion is the frame's own where it has one, else that of its positions seen from the previous camera; with
-    neither there is no past. The past is thrown away by :meth:`reset`, when the image size changes, and at a cut (less
-    than 5 % of the pixels find their surface in the previous frame).
+    The motion is the frame's own where it has one, else that of its previous positions (its positions, where it has
+    none) seen from the previous camera; with neither there is no past. The consistency test compares the previous
+    frame's positions with the previous positions too, so that what moves keeps its past. It compares the normals as
+    they are: what turns by more than the normal limit from one frame to the next starts anew.
+
+    Before it is accumulated, a frame loses its fireflies. Where nothing diffuse is seen (no albedo in any channel:
+    mirrors, glass) and the image moves by more than 0.05 pixels, the past counts for no more than 2 frames, since
+    reflections do not move with the surface. Emitters and background have no albedo either and are treated alike; they
+    have little noise to lose. A frame without an albedo buffer says nothing of mirrors, and its past is kept.
+
+    The past is thrown away by :meth:`reset`, when the image size changes, and at a cut (less than 5 % of the pixels
+    find their surface in the previous frame).
 
     Args:
         accumulate: the rule and its limits; by default those that scale with depth. The published BMFR rule is
             ``Accumulate(0.2, "bmfr", position_limit, normal_limit)`` with the scene's squared limits.
+        fireflies: how fireflies are clamped; ``ClampFireflies(math.inf)`` leaves them.
+        specular_length: the longest history of what is seen in mirrors and through glass while the image moves, in
+            frames, at least 0; infinity treats them as everything else.
+
+    Raises:
+        ValueError: ``specular_length`` is negative.
     """
 
-    def __init__(self, accumulate: Accumulate | None = None) -> None:
+    def __init__(
+        self,
+        accumulate: Accumulate | None = None,
+        fireflies: ClampFireflies | None = None,
+        specular_length: float = _SPECULAR_LENGTH,
+    ) -> None:
+        if not specular_length >= 0:
+            raise ValueError(f"specular_length: expected at least 0, found {specular_length}")
         self.accumulate = Accumulate() if accumulate is None else accumulate
+        self.fireflies = ClampFireflies() if fireflies is None else fireflies
+        self.specular_length = specular_length
         self._state: _State | None = None
 
     def reset(self) -> None:
@@ -62,26 +89,51 @@ class History:
             frame: the next frame; its values must be valid (:meth:`mcdenoise.buffers.Frame.validate`).
         """
         frame = frame.with_depth()
-        color = frame.color if frame.albedo is None else demodulate(frame.color, frame.albedo)
+        color = self.fireflies(frame.color if frame.albedo is None else demodulate(frame.color, frame.albedo))
+        result = self._blend(frame, color)
         surface = Surface(frame.position, frame.normal, frame.depth)
-        result = self._blend(frame, color, surface)
         self._state = _State(result.color, result.length, surface, frame.view_projection)
         return result
 
-    def _blend(self, frame: Frame, color: Tensor, surface: Surface) -> Accumulated:
+    def _blend(self, frame: Frame, color: Tensor) -> Accumulated:
         state = self._state
         first = Accumulated(color, torch.ones_like(color[:, :1]), "first frame")
         if state is None:
             return first
         if state.color.shape != color.shape or state.color.device != color.device:
             return first._replace(reset="size change")
+        before = frame.position if frame.previous_position is None else frame.previous_position
         if frame.motion is not None:
             motion = frame.motion
-        elif frame.position is not None and state.view_projection is not None:
-            motion = motion_from_position(frame.position, state.view_projection)
+        elif before is not None and state.view_projection is not None:
+            motion = motion_from_position(before, state.view_projection)
         else:
             return first._replace(reset="no motion, and no position with a previous camera")
+        surface = Surface(before, frame.normal, frame.depth)
         accumulated, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
         if float((length > 1).float().mean()) < _CUT_SHARE:
             return first._replace(reset="cut")
+        if frame.albedo is not None:
+            accumulated, length = self._shortened(color, accumulated, length, frame.albedo, motion)
         return Accumulated(accumulated, length, "")
+
+    def _shortened(
+        self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What accumulating gives if the past of mirrors and glass that move is no longer than ``specular_length``.
+
+        Which pixels those are is known in this frame, the past's length in the previous one. So the past is shortened
+        after it was blended in: ``lerp(color, past, p)`` with a smaller ``p`` lies on the way back to ``color``.
+        """
+        longest = self.specular_length + 1
+        # A reduction over the channels takes a hundred times as long.
+        moves = torch.hypot(motion[:, :1], motion[:, 1:]) > _STILL
+        specular = albedo.amax(1, keepdim=True) < NO_ALBEDO
+        too_long = moves & specular & (length > longest)
+        share = self._share_of_past(length.clamp_max(longest)) / self._share_of_past(length).clamp_min(1e-6)
+        shortened = torch.lerp(color, accumulated, share.to(color.dtype))
+        return torch.where(too_long, shortened, accumulated), torch.where(too_long, longest, length)
+
+    def _share_of_past(self, length: Tensor) -> Tensor:
+        """The weight of the past in a result of history length ``length``, see :func:`mcdenoise.ops.accumulate`."""
+        return 1 - (1 / length).clamp_min(self.accumulate.alpha_min)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from mcdenoise.buffers import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.history import History
-from mcdenoise.ops import Accumulate, demodulate, remodulate
+from mcdenoise.ops import Accumulate, ClampFireflies, accumulate, demodulate, remodulate
 
 HEIGHT, WIDTH = 5, 6
 
@@ -163,6 +164,40 @@ def test_the_background_has_a_past(small_sequence: Path) -> None:
     torch.testing.assert_close(past.color * sky, frame.color * sky)
 
 
+def test_what_moves_keeps_its_past() -> None:
+    """A wall comes closer, by more than the limit for positions; the camera stands still."""
+    matrix = torch.eye(4)[None]
+    matrix[:, 2, 3], matrix[:, 3, 3] = 1, 0  # clip w = z
+
+    def wall(z: float, before: float | None) -> Frame:
+        y, x = torch.meshgrid((torch.arange(10) + 0.5) / 5 - 1, (torch.arange(10) + 0.5) / 5 - 1, indexing="ij")
+        position = torch.stack([x * z, y * z, torch.full_like(x, z)])[None]
+        previous = position.clone()
+        previous[:, 2] = z if before is None else before
+        return Frame(
+            color=torch.ones(1, 3, 10, 10),
+            normal=torch.tensor([0.0, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, 10, 10),
+            position=position,
+            previous_position=None if before is None else previous,
+            view_projection=matrix,
+        )
+
+    for moves in (True, False):
+        history = History()
+        history.update(wall(2.0, 2.0))
+        past = history.update(wall(1.8, 2.0 if moves else None))
+        assert past.reset == ("" if moves else "cut")
+        if moves:
+            assert past.length.unique().tolist() == [2]
+
+
+def test_motion_goes_before_previous_positions() -> None:
+    history = History()
+    buffers = {"previous_position": constant(3, 100.0), "view_projection": torch.eye(4)[None]}
+    history.update(still(constant(3), **buffers))
+    assert history.update(still(constant(3), **buffers)).length.unique().tolist() == [2]
+
+
 def test_another_surface_at_the_same_pixel_is_no_past_even_without_depth() -> None:
     """Positions with a camera are enough: depth is what the camera sees of them."""
     matrix = torch.eye(4)[None]
@@ -189,3 +224,139 @@ def test_the_published_rule_can_be_asked_for(small_sequence: Path) -> None:
     for number in sequence.numbers:
         past = nothing_alike.update(sequence.frame(number))
     assert past.reset == "cut"
+
+
+# Fireflies
+
+
+def with_firefly(albedo: float) -> list[Tensor]:
+    """Four frames of light 1 on a surface; the first has a firefly in one pixel."""
+    colors = [constant(3, albedo, (9, 9)) for _ in range(4)]
+    colors[0][..., 4, 4] *= 1e4
+    return colors
+
+
+@pytest.mark.parametrize("with_albedo", [True, False])
+def test_a_firefly_does_not_survive(with_albedo: bool) -> None:
+    history, albedo = History(Accumulate(0.1)), 0.5 if with_albedo else 1.0
+    buffers = {"albedo": constant(3, albedo, (9, 9))} if with_albedo else {}
+    for number, color in enumerate(with_firefly(albedo)):
+        past = history.update(still(color, **buffers))
+        assert past.color[..., 4, 4].unique().item() == pytest.approx(1 + 29 / (number + 1), rel=1e-5)
+    # Nothing else differs.
+    past.color[..., 4, 4] = 1
+    torch.testing.assert_close(past.color, constant(3, 1.0, (9, 9)))
+
+
+def test_a_dark_texture_beside_a_bright_one_is_no_firefly() -> None:
+    """What is clamped is the light: a white pixel among black ones, both lit alike, is as bright as its neighbours."""
+    albedo = constant(3, 0.01, (9, 9))
+    albedo[..., 4, 4] = 0.9
+    past = History().update(still(2 * albedo, albedo=albedo))
+    torch.testing.assert_close(past.color, constant(3, 2.0, (9, 9)))
+
+
+def test_an_infinite_limit_leaves_fireflies() -> None:
+    history, colors = History(Accumulate(0.1), ClampFireflies(math.inf)), with_firefly(0.5)
+    albedo = constant(3, 0.5, (9, 9))
+    for color in colors:
+        past = history.update(still(color, albedo=albedo))
+    torch.testing.assert_close(past.color, demodulate(sum(colors) / 4, albedo))
+
+
+# Mirrors and glass
+
+LONG = 12
+
+
+def mirror_in_a_pan(pixels: int) -> list[Frame]:
+    """A mirror two pixels wide on a diffuse wall, both noisy, that move left by ``pixels`` a frame."""
+    frames, generator = [], torch.Generator().manual_seed(0)
+    motion = torch.tensor([float(pixels), 0.0]).reshape(1, 2, 1, 1).expand(1, 2, 3, 24)
+    for number in range(6):
+        albedo = constant(3, 0.5, (3, 24))
+        left = 16 - pixels * number
+        albedo[..., left : left + 2] = 0
+        color = torch.rand(1, 3, 3, 24, generator=generator)
+        frames.append(Frame(color=color, albedo=albedo, motion=motion))
+    return frames
+
+
+def test_the_past_of_a_mirror_that_moves_is_short() -> None:
+    history, last = History(), None
+    for number, frame in enumerate(mirror_in_a_pan(2)):
+        past = history.update(frame)
+        assert frame.albedo is not None
+        mirror = (frame.albedo == 0).all(1, keepdim=True)
+        assert past.length[mirror].unique().tolist() == [min(number + 1, 3)]
+        if number > 2 and last is not None:
+            expected = torch.lerp(frame.color, last.color.roll(-2, -1), 2 / 3)
+            torch.testing.assert_close(past.color * mirror, expected * mirror)
+        last = past
+
+
+def test_what_is_diffuse_keeps_its_past_beside_a_mirror() -> None:
+    """The mirror moves by its width: where it is now, the past was diffuse, and where it was, the present is."""
+    history, everything_alike = History(), History(specular_length=math.inf)
+    for number, frame in enumerate(mirror_in_a_pan(2)):
+        past, alike = history.update(frame), everything_alike.update(frame)
+        assert frame.albedo is not None
+        diffuse = (frame.albedo > 0).all(1, keepdim=True)
+        assert torch.equal(past.length[diffuse], alike.length[diffuse])
+        assert torch.equal(past.color * diffuse, alike.color * diffuse)
+        assert alike.length.max() == number + 1
+
+
+def test_the_past_of_a_mirror_that_stands_still_grows() -> None:
+    history, everything_alike = History(), History(specular_length=math.inf)
+    for number, frame in enumerate(mirror_in_a_pan(0), start=1):
+        # Less than what counts as motion.
+        frame = frame.replace(motion=torch.full_like(frame.color[:, :2], 0.03))
+        past, alike = history.update(frame), everything_alike.update(frame)
+        assert past.length.max().item() == pytest.approx(number)
+        assert torch.equal(past.length, alike.length)
+        assert torch.equal(past.color, alike.color)
+
+
+@pytest.mark.parametrize("alpha_min", [0.1, 0.4, 1.0])
+@pytest.mark.parametrize("longest", [0, 1, 2.5, 20])
+def test_a_shortened_past_is_that_of_a_shorter_history(alpha_min: float, longest: float) -> None:
+    history, albedo = History(Accumulate(alpha_min), specular_length=longest), constant(3, 0.0)
+    for _ in range(LONG):
+        before = history.update(still(torch.rand(1, 3, HEIGHT, WIDTH), albedo=albedo))
+    assert before.length.unique().tolist() == [LONG]
+    color, motion = torch.rand(1, 3, HEIGHT, WIDTH), torch.full((1, 2, HEIGHT, WIDTH), 0.25)
+    past = history.update(Frame(color=color, albedo=albedo, motion=motion))
+    length = before.length.clamp_max(longest)
+    expected = accumulate(color, before.color, length, motion, alpha_min=alpha_min)
+    torch.testing.assert_close(past.color, expected[0])
+    torch.testing.assert_close(past.length, expected[1])
+    # No past at all is not a cut: nothing says that the scene has changed.
+    assert past.reset == ""
+
+
+def test_without_albedo_nothing_is_known_of_mirrors() -> None:
+    history = History()
+    motion = torch.full((1, 2, HEIGHT, WIDTH), 0.25)
+    for number in range(1, 6):
+        past = history.update(Frame(color=torch.rand(1, 3, HEIGHT, WIDTH), motion=motion))
+        assert past.length.max().item() == pytest.approx(number)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_mirror_of_unknown_motion_starts_anew(value: float) -> None:
+    history, motion = History(), torch.zeros(1, 2, HEIGHT, WIDTH)
+    motion[:, 0, 1, 1] = value
+    for number in range(1, 6):
+        color = torch.rand(1, 3, HEIGHT, WIDTH)
+        past = history.update(Frame(color=color, albedo=constant(3, 0.0), motion=motion))
+        assert torch.equal(past.color[..., 1, 1], color[..., 1, 1])
+        assert past.color.isfinite().all()
+        assert past.length[0, 0, 1, 1] == 1
+        assert past.length.max() == number
+
+
+@pytest.mark.parametrize("length", [-1.0, math.nan])
+def test_a_past_of_negative_length_is_refused(length: float) -> None:
+    with pytest.raises(ValueError, match=f"specular_length: expected at least 0, found {length}"):
+        History(specular_length=length)

@@ -30,7 +30,7 @@ from mcdenoise.data import bmfr, camera_matrices, exr
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.history import History
-from mcdenoise.ops import Accumulate, demodulation, temporal
+from mcdenoise.ops import Accumulate, demodulation, fireflies, temporal
 
 # name, channels: what a training clip holds, in the order in which :meth:`Shot.read` stacks it
 PARTS = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
@@ -224,7 +224,7 @@ def _key(plan: _Plan) -> str:
 @functools.cache
 def _code() -> bytes:
     """Checksum of the code that decodes and accumulates: a mended reader must not find what its predecessor read."""
-    modules = (buffers, history, bmfr, camera_matrices, exr, demodulation, temporal)
+    modules = (buffers, history, bmfr, camera_matrices, exr, demodulation, fireflies, temporal)
     sources = [Path(__file__), *(Path(str(module.__file__)) for module in modules)]
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).digest()
 

@@ -1,13 +1,16 @@
 """Differentiable image operators: tensor in, tensor out; no weights, no files."""
 
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
-from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
+from mcdenoise.ops.demodulation import NO_ALBEDO, Demodulate, Remodulate, demodulate, remodulate
+from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
 
 __all__ = [
+    "NO_ALBEDO",
     "Accumulate",
+    "ClampFireflies",
     "CrossBilateralWeights",
     "Demodulate",
     "KernelConv",
@@ -16,6 +19,7 @@ __all__ = [
     "Remodulate",
     "Surface",
     "accumulate",
+    "clamp_fireflies",
     "cross_bilateral_weights",
     "demodulate",
     "downsample",

@@ -4,9 +4,9 @@ To add an op, add an ``Op`` to ``OPS``. Sizes are tiny, because gradients are ch
 because that is where borders go wrong.
 
 Inputs stay away from points without a derivative, where a difference quotient proves nothing: albedo from ``floor``,
-motion from whole pixels, history length from the one where ``alpha`` reaches ``alpha_min``, surfaces from the limits
-of the consistency test, kernel sums from zero. Where a case sits on such a point on purpose, the inputs concerned are
-not among its ``differentiable`` ones.
+motion from whole pixels, brightness from the limit of fireflies, history length from the one where ``alpha`` reaches
+``alpha_min``, surfaces from the limits of the consistency test, kernel sums from zero. Where a case sits on such a
+point on purpose, the inputs concerned are not among its ``differentiable`` ones.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from torch import Generator, Tensor, nn
 from mcdenoise.ops import _reference
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
+from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
@@ -308,6 +309,64 @@ def _demodulation_cases(image: str) -> tuple[Case, ...]:
     )
 
 
+def _firefly_cases() -> tuple[Case, ...]:
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        *fireflies: tuple[int, int],
+        draw: Callable[..., Tensor] = _uniform,
+        value: float = 1e4,
+        differentiable: bool = True,
+        **settings: float,
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            image = draw(g, *size)
+            for row, column in fireflies:
+                image[..., row, column] = value
+            return {"image": image}
+
+        return Case(name, kind, tensors, ("image",) if differentiable else (), settings)
+
+    def constant(g: Generator, *shape: int) -> Tensor:
+        return torch.full(shape, 0.3, dtype=torch.float64)
+
+    def black(g: Generator, *shape: int) -> Tensor:
+        return torch.zeros(shape, dtype=torch.float64)
+
+    def dark(g: Generator, *shape: int) -> Tensor:
+        return torch.full(shape, 1e-4, dtype=torch.float64)
+
+    def half_precision_range(g: Generator, *shape: int) -> Tensor:
+        """Bright enough that a sum of three channels overflows, and next to it the smallest normal number."""
+        image = _uniform(g, *shape, low=5e4, high=6.5e4)
+        image[..., ::2] = torch.finfo(torch.float16).tiny
+        return image
+
+    # The limits are low where a window is so small that the mean of the others says little.
+    return (
+        case("5x7, one firefly", "ordinary", (1, 1, 5, 7), (2, 3)),
+        case("batch of 2, RGB, window of 3", "ordinary", (2, 3, 3, 4), limit=1.5, kernel_size=3),
+        case("window of 5", "ordinary", (1, 3, 4, 3), limit=1.5, kernel_size=5),
+        case("one row, 5 channels", "ordinary", (1, 5, 1, 6), limit=1.2),
+        case("one column", "ordinary", (1, 3, 5, 1), limit=1.2, kernel_size=3),
+        case("smaller than the window", "ordinary", (1, 3, 2, 3), limit=1.2),
+        case("one pixel", "ordinary", (1, 3, 1, 1)),
+        case("64 channels", "ordinary", (1, 64, 1, 2), limit=0.8),
+        case("constant", "ordinary", (1, 3, 3, 4), draw=constant),
+        case("firefly in the corner", "stiff", (1, 3, 4, 5), (0, 0)),
+        case("firefly at the border", "stiff", (1, 3, 4, 5), (3, 2)),
+        case("fireflies side by side", "stiff", (1, 3, 4, 5), (1, 1), (1, 2), (2, 1), limit=2.0),
+        case("six decades", "stiff", (1, 3, 3, 4), draw=_radiance, limit=2.0),
+        # Every pixel is at its limit, which is zero.
+        case("black", "extreme", (1, 3, 3, 3), draw=black, differentiable=False),
+        case("one bright pixel on black", "extreme", (1, 3, 3, 4), (1, 1), draw=black),
+        # A difference quotient of 1e30 says nothing.
+        case("1e30 beside 1e-4", "extreme", (1, 3, 3, 5), (1, 4), draw=dark, value=1e30, differentiable=False),
+        case("range of half precision", "extreme", (1, 3, 3, 5), draw=half_precision_range, limit=1.1),
+    )
+
+
 def _camera(batch: int, eye_z: float, unit: float) -> Tensor:
     """Row-vector world-to-clip matrices that look along +z, with a little of everything in every entry."""
     matrix = torch.tensor(
@@ -465,6 +524,7 @@ OPS: tuple[Op, ...] = (
     Op(laplacian_fusion, _reference.laplacian_fusion, _fusion_cases(), LaplacianFusion),
     Op(demodulate, _reference.demodulate, _demodulation_cases("color"), Demodulate),
     Op(remodulate, _reference.remodulate, _demodulation_cases("image"), Remodulate),
+    Op(clamp_fireflies, _reference.clamp_fireflies, _firefly_cases(), ClampFireflies),
     Op(motion_from_position, _reference.motion_from_position, _motion_cases(), least_dtype=torch.float32),
     Op(reproject, _reference.reproject, _history_cases(accumulating=False)),
     Op(accumulate, _reference.accumulate, _history_cases(accumulating=True), Accumulate),

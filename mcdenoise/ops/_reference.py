@@ -142,6 +142,26 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = 1e-2) -> Tensor:
     return _tensor(out, image.shape)
 
 
+def clamp_fireflies(image: Tensor, *, limit: float = 30.0, kernel_size: int = 7) -> Tensor:
+    """``image[p] * min(1, limit n[p] / y[p])``, with the channels' mean ``y`` and its mean ``n`` over the others."""
+    source, out = image.tolist(), _zeros(image.shape)
+    batch, channels, height, width = image.shape
+    radius = kernel_size // 2
+    for b, y, x in itertools.product(range(batch), range(height), range(width)):
+        brightness = sum(source[b][c][y][x] for c in range(channels)) / channels
+        others = [
+            sum(source[b][c][row][column] for c in range(channels)) / channels
+            for row in range(max(y - radius, 0), min(y + radius + 1, height))
+            for column in range(max(x - radius, 0), min(x + radius + 1, width))
+            if (row, column) != (y, x)
+        ]
+        highest = limit * sum(others) / len(others) if others else math.inf
+        factor = highest / brightness if brightness > highest else 1.0
+        for c in range(channels):
+            out[b][c][y][x] = source[b][c][y][x] * factor
+    return _tensor(out, image.shape)
+
+
 def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
     """``clip = [x y z 1] @ M``; ``motion = ((clip.xy / clip.w + 1) / 2) (W, H) - centre``; infinite for ``w <= 0``."""
     batch, _, height, width = position.shape

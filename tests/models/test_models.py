@@ -75,6 +75,8 @@ CASCADES = {
     "kernel_kernel_plain": ("K+K", False),
     "cascaded": ("P+K", True),
     "cascaded_plain": ("P+K", False),
+    "cascaded_small": ("P+K", True),
+    "cascaded_tiny": ("P+K", True),
 }
 
 
@@ -220,6 +222,29 @@ def test_the_kernel_heads_are_those_of_the_paper() -> None:
     assert [head.out_channels for head in create_model("kernel_plain", kernel_size=3).first.heads] == [9, 9, 9]
 
 
+@pytest.mark.parametrize(
+    ("name", "widths", "taps"),
+    [("cascaded", (40, 40), 25), ("cascaded_small", (16, 32), 25), ("cascaded_tiny", (16, 16), 9)],
+)
+def test_the_sizes_of_the_cascade(name: str, widths: tuple[int, int], taps: int) -> None:
+    model = create_model(name)
+    assert tuple(part.heads[0].in_channels for part in (model.first, model.second)) == widths
+    assert [head.out_channels for head in model.second.heads] == [taps + 3] * 3
+
+
+def test_the_width_of_the_kernel_network_can_be_set() -> None:
+    def widths(**settings: Any) -> tuple[int, int]:
+        model = create_model(**settings)
+        return model.first.heads[0].in_channels, model.second.heads[0].in_channels
+
+    assert widths(name="cascaded", width=8) == (8, 8)
+    assert widths(name="cascaded", width=8, kernel_width=12) == (8, 12)
+    # In K+P the kernel network comes first.
+    assert widths(name="kernel_pixel", width=8, kernel_width=12) == (12, 8)
+    assert widths(name="cascaded_small", width=8) == (8, 32)
+    assert widths(name="cascaded_small", width=8, kernel_width=None) == (8, 8)
+
+
 @pytest.mark.parametrize("levels", [4, 5])
 def test_unet_gives_three_scales_of_any_size(levels: int) -> None:
     unet = UNet(5, 4, levels)
@@ -288,6 +313,27 @@ def test_saved_and_loaded_in_half_precision(weights: Path) -> None:
         before, after = (model(*inputs(17, 20)).final for model in (saved, loaded))
     # 6e-4 of values up to 2 was measured.
     torch.testing.assert_close(after, before, rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("cascaded_small", {}),
+        ("cascaded_small", {"width": WIDTH, "kernel_width": 12}),
+        ("cascaded_tiny", {}),
+        ("cascaded_tiny", {"width": WIDTH, "kernel_size": 5}),
+    ],
+)
+def test_settings_are_saved_and_loaded(name: str, settings: dict[str, int], tmp_path: Path) -> None:
+    path = tmp_path / "weights.safetensors"
+    torch.manual_seed(0)
+    model = create_model(name, **settings)
+    path.write_bytes(save_weights(model, name, settings, {}))
+    assert describe_weights(path)["settings"] == settings
+    for loaded in (load_weights(path), create_model(name, weights=path)):
+        state = loaded.state_dict()
+        assert list(state) == list(model.state_dict())
+        assert all(torch.equal(state[key], value.half().float()) for key, value in model.state_dict().items())
 
 
 def test_the_header_describes_the_weights(weights: Path) -> None:
@@ -395,6 +441,9 @@ def test_overview() -> None:
         assert entry.description
         assert "\n" not in entry.description
         assert entry.pretrained is (name in pretrained_models())
+    cost = {name: entry.kmacs_per_pixel / entries["cascaded"].kmacs_per_pixel for name, entry in entries.items()}
+    assert cost["cascaded_small"] == pytest.approx(0.44, abs=0.005)
+    assert cost["cascaded_tiny"] == pytest.approx(0.17, abs=0.005)
 
 
 def test_the_cost_of_the_pixel_network_written_out() -> None:
