@@ -196,6 +196,7 @@ def _render() -> Callable[..., int | None]:
         camera_path: Path,
         out: Out,
         frames: int | None = None,
+        every: int = 1,
         spp: int = 1,
         realisations: int = 1,
         reference_spp: int = 512,
@@ -217,6 +218,7 @@ def _render() -> Callable[..., int | None]:
                 'objects', a list of 4x4 matrices per frame for each id, objects of the scene move.
             out: folder of the sequence; finished frames in it are kept.
             frames: render the first so many cameras; all by default.
+            every: take only every n-th camera of the path.
             spp: samples a pixel of the noisy color.
             realisations: noisy colors of each frame, with independent noise.
             reference_spp: samples a pixel of the references; 0 renders none. With --noise-level the most.
@@ -230,12 +232,14 @@ def _render() -> Callable[..., int | None]:
         if reference_spp < 0:
             raise InputError(f"--reference-spp: expected at least 0, found {reference_spp}")
         referenced = None if reference_frames is None else parse_frames(reference_frames, name="--reference-frames")
+        if every < 1:
+            raise InputError(f"--every: expected at least 1, found {every}")
         shot = load_shot(camera_path)
         with _progress() as progress:
             task = progress.add_task("render", total=None)
             written = render_sequence(
                 scene,
-                shot.cameras,
+                shot.cameras[::every],
                 out,
                 size=_size(size),
                 frames=frames,
@@ -244,7 +248,7 @@ def _render() -> Callable[..., int | None]:
                 reference_spp=max(reference_spp, 1),
                 noise_level=noise_level,
                 reference_frames=referenced if reference_spp > 0 else [],
-                moves=shot.moves,
+                moves={name: path[::every] for name, path in shot.moves.items()},
                 seed=seed,
                 workers=workers,
                 variant=variant,
