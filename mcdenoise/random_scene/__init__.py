@@ -56,12 +56,12 @@ def random_scene(seed: int, frames: int = 8) -> RandomScene:
     )
     stage = build(place_rng)
     cameras = shoot(stage, camera_rng, frames)
-    moves = _moves(stage, move_rng, frames, cameras[0]) if move_rng.random() < _MOVING_SHARE else {}
+    moves = _movements(stage, move_rng, frames, cameras[0]) if move_rng.random() < _MOVING_SHARE else {}
     scene = _exposed(stage.scene(), 10 ** float(level_rng.uniform(-1.5, 1.5)))
     return RandomScene(scene, cameras, moves)
 
 
-def _moves(stage: Stage, rng: np.random.Generator, frames: int, camera: Camera) -> dict[str, Array]:
+def _movements(stage: Stage, rng: np.random.Generator, frames: int, camera: Camera) -> dict[str, Array]:
     """Let one to three small objects slide, swing or spin, or a lamp swing."""
     moves: dict[str, Array] = {}
     bulbs = [name for name in stage.lamps if _is_small(stage, [name])]
@@ -76,6 +76,7 @@ def _moves(stage: Stage, rng: np.random.Generator, frames: int, camera: Camera) 
 
 
 def _motion(stage: Stage, rng: np.random.Generator, frames: int, names: list[str]) -> dict[str, Array]:
+    """One movement for all shapes of a group; at frame 0 they are where the scene places them."""
     center = _center(stage, names)
     direction = rng.normal(0, 1, 3) * (1, 0.2, 1)
     direction *= math.exp(rng.uniform(math.log(0.005), math.log(0.08))) / np.linalg.norm(direction)
@@ -95,6 +96,7 @@ def _center(stage: Stage, names: list[str]) -> Array:
 
 
 def _is_small(stage: Stage, names: list[str]) -> bool:
+    """Whether a group is less than 1.5 metres long, wide and high."""
     corners = [bounds("cube", stage.placed(name)) for name in names]
     low, high = np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
     return bool((high - low).max() < 1.5)

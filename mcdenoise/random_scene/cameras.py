@@ -12,8 +12,9 @@ from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.random_scene.stage import Stage
 
 Rng = np.random.Generator
-# A path is checked over so many frames; a longer shot goes back and forth on it.
-HORIZON = 16
+# The last frame of a path; a longer shot goes back and forth on it.
+_HORIZON = 16
+# Metres to the box around anything.
 _CLEARANCE = 0.12
 _TRIES = 150
 
@@ -27,20 +28,21 @@ class _View:
 
 def shoot(stage: Stage, rng: Rng, frames: int) -> list[Camera]:
     """A camera path through free space; the first frames do not depend on how many there are."""
+    boxes = stage.boxes()
     moving = rng.random() > 0.2
-    path: Callable[[_View, int], _View] = _stay
-    best: tuple[float, _View, Callable[[_View, int], _View]] | None = None
+    best: tuple[float, list[_View]] = (-1.0, [])
     for _ in range(_TRIES):
-        view = _propose(stage, rng)
-        path = _motion(view, rng) if moving else _stay
-        score = min(_score(stage, path(view, frame)) for frame in (0, HORIZON // 2, HORIZON))
-        if best is None or score > best[0]:
-            best = (score, view, path)
+        start = _propose(stage, rng)
+        path = _way_to_move(start, rng) if moving else _stay
+        views = [path(start, frame) for frame in range(_HORIZON + 1)]
+        score = 0.0
+        if _is_free(stage, boxes, views):
+            score = min(_score(boxes, views[frame]) for frame in (0, _HORIZON // 2, _HORIZON))
+        if score > best[0]:
+            best = (score, views)
         if score >= 1:
             break
-    # Never empty: _TRIES is positive.
-    _, view, path = best or (0.0, view, path)
-    seen = [path(view, HORIZON - abs(frame % (2 * HORIZON) - HORIZON)) for frame in range(frames)]
+    seen = [best[1][_HORIZON - abs(frame % (2 * _HORIZON) - _HORIZON)] for frame in range(frames)]
     return [Camera.look_at(one.origin.tolist(), one.target.tolist(), one.fov_x) for one in seen]
 
 
@@ -56,14 +58,21 @@ def _propose(stage: Stage, rng: Rng) -> _View:
     return _View(origin, target, fov)
 
 
-def _score(stage: Stage, view: _View) -> float:
-    """1 or more for a camera in free space that sees several things, none of them too close."""
-    lows, highs = stage.boxes()
-    inside = ((view.origin > lows - _CLEARANCE) & (view.origin < highs + _CLEARANCE)).all(axis=1)
-    out = ((view.origin < stage.low) | (view.origin > stage.high)).any()
+def _is_free(stage: Stage, boxes: tuple[Array, Array], views: list[_View]) -> bool:
+    """Whether every camera of a path is inside the stage and outside everything on it."""
+    origins = np.array([view.origin for view in views])[:, None]
+    lows, highs = boxes
+    inside = ((origins > lows - _CLEARANCE) & (origins < highs + _CLEARANCE)).all(axis=-1)
+    out = (origins < stage.low) | (origins > stage.high)
+    return not (inside.any() or out.any())
+
+
+def _score(boxes: tuple[Array, Array], view: _View) -> float:
+    """1 or more for a camera that sees several things, none of them too close; boxes stand for the things."""
+    lows, highs = boxes
     forward = view.target - view.origin
     distance = float(np.linalg.norm(forward))
-    if inside.any() or out or distance < 0.5 or abs(forward[1]) > 0.9 * distance:
+    if distance < 0.5 or abs(forward[1]) > 0.9 * distance:
         return 0.0
     forward /= distance
     left = np.cross((0.0, 1.0, 0.0), forward)
@@ -92,7 +101,7 @@ def _stay(view: _View, frame: int) -> _View:
     return view
 
 
-def _motion(view: _View, rng: Rng) -> Callable[[_View, int], _View]:
+def _way_to_move(view: _View, rng: Rng) -> Callable[[_View, int], _View]:
     """A way to move at 0.3 to 12 pixels a frame in an image 256 pixels wide."""
     speed = float(np.exp(rng.uniform(math.log(0.3), math.log(12))))
     angle = math.radians(view.fov_x) / 256 * speed

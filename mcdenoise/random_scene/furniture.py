@@ -91,6 +91,30 @@ def curtain(stage: Stage, rng: Rng, width: float, height: float) -> list[Part]:
     ]
 
 
+def decorate(stage: Stage, rng: Rng, center: tuple[float, float, float], radius: float, count: int) -> None:
+    """Put ornaments onto a surface, apart from each other."""
+    taken: list[tuple[float, float, float]] = []
+    for _ in range(3 * count):
+        size = float(rng.uniform(0.15, 0.5)) * min(radius, 1.0)
+        angle, away = rng.uniform(0, 2 * math.pi), (radius - size / 2) * math.sqrt(rng.random()) * 0.85
+        x, z = center[0] + away * math.cos(angle), center[2] + away * math.sin(angle)
+        if any(math.hypot(x - a, z - b) < 0.5 * (size + c) for a, b, c in taken):
+            continue
+        taken.append((x, z, size))
+        stage.add(ornament(stage, rng, size), place((x, center[1], z), rng.uniform(0, 360)), movable=True)
+        stage.points.append(np.array((x, center[1] + 0.5 * size, z)))
+        if len(taken) == count:
+            return
+
+
+def glass_block(stage: Stage, rng: Rng, size: float) -> list[Part]:
+    """A solid piece of glass that throws caustics."""
+    material = stage.material(glass(float(rng.uniform(1.4, 1.7))))
+    if rng.random() < 0.6:
+        return [ball((0, size / 2, 0), size / 2, material)]
+    return [box((0, size / 2, 0), (size * 0.6, size, size * 0.6), material, rng.uniform(0, 90))]
+
+
 def _ball(stage: Stage, rng: Rng, size: float) -> list[Part]:
     return [ball((0, size / 2, 0), size / 2, stage.material(random_material(rng)))]
 
@@ -269,7 +293,7 @@ def _sofa(stage: Stage, rng: Rng, _: float) -> tuple[list[Part], float, float]:
         box((-width / 2, 0.32, 0), (0.16, 0.55, 0.8), cloth),
         box((width / 2, 0.32, 0), (0.16, 0.55, 0.8), cloth),
     ]
-    for _n in range(int(rng.integers(0, 4))):
+    for _cushion in range(int(rng.integers(0, 4))):
         cushion = stage.material(random_opaque(rng, textured=0.7))
         x = rng.uniform(-0.35, 0.35) * width
         parts.append(box((x, 0.55, -0.1), (0.4, 0.4, 0.12), cushion, rng.uniform(-30, 30), -20))
@@ -307,9 +331,9 @@ def _screen(stage: Stage, rng: Rng, height: float) -> tuple[list[Part], float, f
     return parts, 0.25 * panels + 0.1, 0.0
 
 
-def _crates(stage: Stage, rng: Rng, height: float) -> tuple[list[Part], float, float]:
+def _crates(stage: Stage, rng: Rng, _: float) -> tuple[list[Part], float, float]:
     parts: list[Part] = []
-    for _n in range(int(rng.integers(1, 5))):
+    for _crate in range(int(rng.integers(1, 5))):
         edge = rng.uniform(0.2, 0.6)
         x, z = rng.uniform(-0.3, 0.3, 2)
         parts.append(box((x, edge / 2, z), (edge, edge, edge), _any_opaque(stage, rng), rng.uniform(0, 90)))
@@ -344,27 +368,3 @@ def _any(stage: Stage, rng: Rng) -> Ref:
 
 def _any_opaque(stage: Stage, rng: Rng) -> Ref:
     return stage.material(random_opaque(rng, textured=0.25))
-
-
-def decorate(stage: Stage, rng: Rng, center: tuple[float, float, float], radius: float, count: int) -> None:
-    """Put ornaments onto a surface, apart from each other."""
-    taken: list[tuple[float, float, float]] = []
-    for _ in range(3 * count):
-        size = float(rng.uniform(0.15, 0.5)) * min(radius, 1.0)
-        angle, away = rng.uniform(0, 2 * math.pi), (radius - size / 2) * math.sqrt(rng.random()) * 0.85
-        x, z = center[0] + away * math.cos(angle), center[2] + away * math.sin(angle)
-        if any(math.hypot(x - a, z - b) < 0.5 * (size + c) for a, b, c in taken):
-            continue
-        taken.append((x, z, size))
-        stage.add(ornament(stage, rng, size), place((x, center[1], z), rng.uniform(0, 360)), movable=True)
-        stage.points.append(np.array((x, center[1] + 0.5 * size, z)))
-        if len(taken) == count:
-            return
-
-
-def glass_block(stage: Stage, rng: Rng, size: float) -> list[Part]:
-    """A solid piece of glass that throws caustics."""
-    material = stage.material(glass(float(rng.uniform(1.4, 1.7))))
-    if rng.random() < 0.6:
-        return [ball((0, size / 2, 0), size / 2, material)]
-    return [box((0, size / 2, 0), (size * 0.6, size, size * 0.6), material, rng.uniform(0, 90))]

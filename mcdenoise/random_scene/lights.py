@@ -95,7 +95,7 @@ def light_color(rng: Rng) -> Color:
         color = colorsys.hsv_to_rgb(float(rng.random()), float(rng.uniform(0.4, 0.95)), 1)
     else:
         warmth = rng.uniform(-0.35, 0.7)
-        color = (1.0, 1 - 0.45 * max(warmth, 0) - 0.15 * max(-warmth, 0), 1 - max(warmth, 0) - 0.0)
+        color = (1.0, 1 - 0.45 * max(warmth, 0) - 0.15 * max(-warmth, 0), 1 - max(warmth, 0))
         if warmth < 0:
             color = (1 + warmth, 1 + 0.4 * warmth, 1.0)
     mean = sum(color) / 3

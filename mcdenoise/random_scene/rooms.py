@@ -19,11 +19,12 @@ from mcdenoise.random_scene.materials import (
     rough_metal,
     rough_plastic,
 )
-from mcdenoise.random_scene.stage import Part, Stage, ball, box, place, rod
+from mcdenoise.random_scene.stage import Stage, ball, box, place, rod, sheet
 from mcdenoise.random_scene.textures import texture, wall_color
 
 Rng = np.random.Generator
-_MOST_SHAPES = 380
+# A room with more shapes than this gets no further furniture.
+_ENOUGH_SHAPES = 290
 _WALL = 0.25
 
 
@@ -139,7 +140,7 @@ def _colonnade(rng: Rng) -> Stage:
             cloth = place((float(rng.choice([-1, 1])) * (width / 2 - radius), height - 0.2, z), 90)
             stage.add(curtain(stage, rng, 1.0, rng.uniform(0.8, 1.8)), cloth)
     for _ in range(int(rng.integers(2, 7))):
-        _put_on_floor(stage, rng, stage.low, stage.high, [])
+        _put_on_floor(stage, rng, [])
     for _ in range(6):
         stage.points.append(rng.uniform(stage.low * (1, 1, 0.9), stage.high * (1, 0.7, 0.9)))
     sun = sun_direction(rng) if rng.random() < 0.75 else None
@@ -270,11 +271,7 @@ def _wall_with_windows(stage: Stage, rng: Rng, size: Array, wall: int) -> float:
         for n in range(rows):
             parts.append(box((x, sill + tall * (n + 1) / (rows + 1), -0.12), (wide, 0.04, 0.05), bar))
         if glazed:
-            parts.append(
-                Part(
-                    "rectangle", place((x, sill + tall / 2, -0.14), 0, (wide / 2, tall / 2, 1)), stage.material(pane())
-                )
-            )
+            parts.append(sheet((x, sill + tall / 2, -0.14), (wide / 2, tall / 2), stage.material(pane()), np.eye(4)))
         if dressing == "blinds":
             slats = int(np.clip(tall / 0.08, 6, 24))
             tilt = float(rng.uniform(-50, 50))
@@ -293,16 +290,24 @@ def _wall_with_windows(stage: Stage, rng: Rng, size: Array, wall: int) -> float:
 
 
 def _furnish(stage: Stage, rng: Rng, size: Array) -> None:
+    """Fill the floor with furniture, the more the larger it is."""
     taken: list[tuple[float, float, float]] = []
     pieces = int(np.clip(size[0] * size[2] / rng.uniform(2.5, 6), 2, 9))
     for _ in range(pieces):
-        if len(stage.boxes()[0]) > _MOST_SHAPES - 90:
+        if len(stage.boxes()[0]) > _ENOUGH_SHAPES:
             break
-        _put_on_floor(stage, rng, stage.low, stage.high, taken)
+        _put_on_floor(stage, rng, taken)
 
 
-def _put_on_floor(stage: Stage, rng: Rng, low: Array, high: Array, taken: list[tuple[float, float, float]]) -> None:
-    """Find a free place for a piece of furniture, mostly along the walls, and put things on it."""
+def _put_on_floor(stage: Stage, rng: Rng, taken: list[tuple[float, float, float]]) -> None:
+    """Find a free place for a piece of furniture, mostly along the walls, and put things on it.
+
+    Args:
+        stage: where to put it.
+        rng: the source of randomness.
+        taken: x, z and radius of the pieces that it must not stand in; it is added to them.
+    """
+    low, high = stage.low, stage.high
     parts, radius, top = furniture(stage, rng, float(high[1]))
     for _ in range(12):
         x, z = (

@@ -47,8 +47,8 @@ class Part:
 class Stage:
     """Collects materials, shapes and lights as a Mitsuba dictionary.
 
-    ``low`` and ``high`` bound where people and cameras may be. ``points`` are worth looking at. ``groups`` are small
-    objects that could move, with the ids of their shapes.
+    ``low`` and ``high`` bound where people and cameras may be. ``points`` are worth looking at. ``groups`` are objects
+    that could move, with the ids of their shapes. ``lamps`` are the ids of the shapes that shine.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
@@ -93,18 +93,14 @@ class Stage:
         """Light from everywhere around, as a lat-long image whose top row is the zenith."""
         self._sky = {"type": "envmap", "bitmap": image, "sampling_weight": 1.0}
 
-    def light_count(self) -> int:
-        """How many lights shine."""
-        return len(self.lamps) + len(self._lights) + (self._sky is not None)
-
     def placed(self, name: str) -> Array:
         """Where a shape is: its own space to world."""
         return np.asarray(self._objects[name]["to_world"])
 
-    def boxes(self, without: Sequence[str] = ()) -> tuple[Array, Array]:
-        """Low and high corners ``(N, 3)`` of all shapes."""
-        kept = [box for name, box in zip(self._objects, self._bounds, strict=True) if name not in without]
-        return np.array([low for low, _ in kept]).reshape(-1, 3), np.array([high for _, high in kept]).reshape(-1, 3)
+    def boxes(self) -> tuple[Array, Array]:
+        """Low and high corners ``(N, 3)`` of the boxes around all shapes, in the order they were added."""
+        lows, highs = ([box[end] for box in self._bounds] for end in (0, 1))
+        return np.array(lows).reshape(-1, 3), np.array(highs).reshape(-1, 3)
 
     def scene(self) -> dict[str, Any]:
         """The Mitsuba dictionary."""

@@ -161,7 +161,10 @@ class Tracer:
         total = np.zeros((count, 3))
         for _ in range(paths // copies):
             radiance = self._integrator.sample(self._scene, sampler, wavefront)[0]
-            self._dr.eval(radiance)  # all channels at once: each by itself would trace the paths again
+            # All channels at once: each by itself would trace the paths again. With them where the sampler has come to:
+            # the next pass would otherwise trace these paths again to find out.
+            sampler.schedule_state()
+            self._dr.eval(radiance)
             samples = _finite(np.stack([np.array(channel) for channel in radiance], axis=1))
             shape = (count, copies, 3) if stratified else (copies, count, 3)
             total += samples.reshape(shape).sum(axis=1 if stratified else 0, dtype=np.float64)
@@ -272,6 +275,8 @@ class Tracer:
     def _directional_albedo(self, bsdf: Any, hit: Any, active: Any) -> Any:
         """What a rough metal reflects of a white world towards the viewer: a fixed 4x4 grid of samples, so no noise."""
         mi, dr = self._mi, self._dr
+        # Known from here on: each of the samples would otherwise trace the rays again.
+        dr.eval(hit, active)
         total = mi.Color3f(0)
         grid = [(i + 0.5) / 4 for i in range(4)]
         for x in grid:

@@ -1,0 +1,225 @@
+"""Random scenes: the same again for the same seed, fit to be rendered, and seen from free space."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mcdenoise.data.camera_path import Camera, check_moves, pixel_rays
+from mcdenoise.random_scene import RandomScene, cameras, random_scene
+from mcdenoise.random_scene.materials import diffuse
+from mcdenoise.random_scene.stage import Stage, bounds, box
+from mcdenoise.render.tracer import Tracer, scene_digest
+
+SEEDS = range(150)
+FRAMES = 12
+# Cameras keep further away from the box around anything.
+CLOSE = 0.05
+
+
+@functools.cache
+def survey() -> list[RandomScene]:
+    """Of every seed its scene, with the smallest and the largest number of each image in place of the image."""
+    found = (random_scene(seed, FRAMES) for seed in SEEDS)
+    return [RandomScene(without_images(made.scene), made.cameras, made.moves) for made in found]
+
+
+def without_images(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: without_images(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray) and value.ndim == 3:
+        return np.array([value.min(), value.max()])
+    return value
+
+
+def digest(seed: int, frames: int = FRAMES) -> str:
+    """Of everything that a scene consists of."""
+    made = random_scene(seed, frames)
+    numbers = np.array([[*camera.to_world.ravel(), camera.fov_x] for camera in made.cameras])
+    parts = (scene_digest(made.scene), scene_digest({"cameras": numbers}), scene_digest(made.moves))
+    return hashlib.sha256("".join(parts).encode()).hexdigest()
+
+
+def poses(shot: list[Camera]) -> list[list[Any]]:
+    return [[camera.to_world.tolist(), camera.fov_x] for camera in shot]
+
+
+def entries(value: Any) -> Iterator[dict[str, Any]]:
+    """Every dictionary in a scene, nested ones too."""
+    if isinstance(value, dict):
+        yield value
+        for item in value.values():
+            yield from entries(item)
+
+
+def moving_seed() -> int:
+    return next(seed for seed, made in zip(SEEDS, survey(), strict=True) if made.moves)
+
+
+# The same again
+
+
+def test_the_same_seed_is_the_same_scene_in_any_process() -> None:
+    seeds = [0, 1, 2, moving_seed()]
+    here = [digest(seed) for seed in seeds]
+    assert here == [digest(seed) for seed in seeds]
+    assert len(set(here)) == len(seeds)
+    code = f"from test_random_scene import digest\nprint(*(digest(seed) for seed in {seeds}))"
+    child = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert child.stdout.split() == here, child.stderr
+
+
+def test_a_longer_shot_begins_like_a_shorter_one() -> None:
+    for seed in (0, 1, moving_seed()):
+        short, long = random_scene(seed, 5), random_scene(seed, 40)
+        assert (len(short.cameras), len(long.cameras)) == (5, 40)
+        assert scene_digest(short.scene) == scene_digest(long.scene)
+        assert poses(short.cameras) == poses(long.cameras[:5])
+        # Back and forth on a path of 17 frames.
+        assert poses(long.cameras[:16]) == poses(long.cameras[32:16:-1])
+        assert short.moves.keys() == long.moves.keys()
+        for name, moved in short.moves.items():
+            np.testing.assert_array_equal(moved, long.moves[name][:5])
+
+
+def test_making_a_scene_needs_no_mitsuba() -> None:
+    code = (
+        "import sys\nfrom mcdenoise.random_scene import random_scene\nrandom_scene(0)\n"
+        "print(*{'mitsuba', 'drjit'} & set(sys.modules))"
+    )
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120)
+    assert (child.returncode, child.stdout.strip()) == (0, ""), child.stderr
+
+
+# What is in it
+
+
+def test_shares_of_static_cameras_and_of_moving_objects() -> None:
+    """A fifth and 0.15 are meant; of 150 seeds, the bounds are four standard deviations away."""
+    static = sum(len({camera.to_world.tobytes() for camera in made.cameras}) == 1 for made in survey())
+    moving = sum(bool(made.moves) for made in survey())
+    assert 0.07 < static / len(SEEDS) < 0.33
+    # Now and then there is nothing that could move.
+    assert 0.03 < moving / len(SEEDS) < 0.27
+
+
+def test_moves_are_rigid_and_of_objects_in_the_scene() -> None:
+    turned = False
+    for made in survey():
+        assert set(made.moves) <= set(made.scene)
+        check_moves(made.moves, FRAMES)
+        for moved in made.moves.values():
+            assert moved.shape == (FRAMES, 4, 4)
+            np.testing.assert_allclose(moved[0], np.eye(4), atol=1e-12)
+            np.testing.assert_array_equal(moved[:, 3], np.tile((0, 0, 0, 1), (FRAMES, 1)))
+            rotation = moved[:, :3, :3]
+            np.testing.assert_allclose(
+                rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (FRAMES, 1, 1)), atol=1e-12
+            )
+            np.testing.assert_allclose(np.linalg.det(rotation), 1)
+            turned |= not np.allclose(rotation, np.eye(3))
+            assert (moved[1:] != moved[:-1]).any(axis=(1, 2)).all()
+    assert turned
+
+
+def test_textures_are_reflectances_opacities_or_roughnesses() -> None:
+    count = 0
+    for made in survey():
+        for entry in entries(made.scene):
+            if entry.get("type") == "bitmap":
+                smallest, largest = entry["bitmap"]
+                assert 0 <= smallest <= largest <= 1
+                count += 1
+    assert count > 10 * len(SEEDS)
+
+
+def test_every_light_that_may_be_chosen_shines() -> None:
+    """What only keeps scenes alike is black and never chosen."""
+    for made in survey():
+        chosen = 0
+        for entry in entries(made.scene):
+            if "sampling_weight" not in entry:
+                assert entry["type"] not in ("area", "envmap", "point", "spot")
+                continue
+            values = entry.get("bitmap", entry.get("radiance", entry.get("intensity")))
+            values = np.array(values["value"] if isinstance(values, dict) else values)
+            assert np.isfinite(values).all()
+            if entry["sampling_weight"] > 0:
+                # A sky may have black pixels.
+                assert values.min() >= 0 if entry["type"] == "envmap" else values.min() > 0
+                assert values.max() > 0
+                chosen += 1
+            else:
+                assert not values.any()
+        assert chosen > 0
+
+
+# Where it is seen from
+
+
+def test_cameras_are_outside_the_boxes_of_all_shapes() -> None:
+    for seed, made in zip(SEEDS, survey(), strict=True):
+        shapes = {name: shape for name, shape in made.scene.items() if "to_world" in shape and "bsdf" in shape}
+        boxes = np.array(
+            [bounds(shape["type"], shape["to_world"]) for name, shape in shapes.items() if "spare" not in name]
+        )
+        for camera in made.cameras:
+            eye = camera.to_world[:3, 3]
+            assert not ((eye > boxes[:, 0] - CLOSE) & (eye < boxes[:, 1] + CLOSE)).all(axis=-1).any(), seed
+
+
+def test_every_frame_of_a_path_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Among pillars, on a way that leads aside and jumps back to where it started every eight frames."""
+
+    def way(start: cameras._View, rng: np.random.Generator) -> Callable[[cameras._View, int], cameras._View]:
+        aside = np.array((0.3, 0, 0.2))
+        return lambda view, frame: replace(view, origin=view.origin + frame % 8 * aside)
+
+    monkeypatch.setattr(cameras, "_way_to_move", way)
+    stage = Stage((-6, 0, -6), (6, 3, 6))
+    gray = stage.material(diffuse((0.5, 0.5, 0.5)))
+    stage.add(box((x, 1.5, z), (0.3, 3, 0.3), gray) for x in range(-6, 7, 2) for z in range(-6, 7, 2))
+    stage.points.append(np.array((0, 1, 0)))
+    lows, highs = stage.boxes()
+    moving = 0
+    for seed in range(10):
+        shot = cameras.shoot(stage, np.random.default_rng(seed), 17)
+        eyes = np.array([camera.to_world[:3, 3] for camera in shot])[:, None]
+        assert not ((eyes > lows - CLOSE) & (eyes < highs + CLOSE)).all(axis=-1).any(), seed
+        moving += bool((eyes[0] != eyes[1]).any())
+    assert moving > 3
+
+
+# As Mitsuba sees it
+
+
+def test_scenes_can_be_traced_from_free_space_and_are_not_black() -> None:
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    for seed in range(40):
+        made = random_scene(seed, FRAMES)
+        tracer = Tracer(made.scene, "scalar_rgb", max_depth=8, moves=made.moves)
+        tracer.place(FRAMES - 1)
+        rays = pixel_rays(made.cameras[-1], 8, 8)
+        distance = tracer.features(rays).distance
+        assert (distance < CLOSE).mean() < 0.1, seed
+        assert np.isfinite(distance).mean() > 0.1, seed
+        if seed < 10:
+            radiance = tracer.radiance(rays, 4, (seed, 0))
+            assert np.isfinite(radiance).all(), seed
+            assert radiance.mean() > 0, seed
