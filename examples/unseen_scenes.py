@@ -27,8 +27,18 @@ import torch
 
 from mcdenoise import Denoiser
 from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
-from mcdenoise.evaluate import METRICS, Score, folded, reference_noise, score_sequence, summary, verdicts
+from mcdenoise.evaluate import (
+    METRICS,
+    Score,
+    check_references,
+    folded,
+    reference_noise,
+    score_sequence,
+    summary,
+    verdicts,
+)
 from mcdenoise.peers import Peer, joint_bilateral_peers, oidn_peers
 
 
@@ -54,6 +64,7 @@ def open_all(paths: list[Path], frames: str | None) -> list[Sequence]:
     names: Counter[str] = Counter()
     for path in paths:
         sequence = open_sequence(path, frames)
+        check_references(sequence)
         names[sequence.name] += 1
         count = names[sequence.name]
         sequences.append(sequence if count == 1 else replace(sequence, name=f"{sequence.name} ({count})"))
@@ -84,7 +95,9 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     options = parse()
-    if options.threads:
+    if options.threads is not None:
+        if options.threads < 1:
+            raise InputError(f"--threads: expected at least 1, found {options.threads}")
         torch.set_num_threads(options.threads)
     names = options.models.split(",")
     if options.weights and len(names) > 1:
@@ -130,11 +143,12 @@ def main() -> None:
             "flip_every": options.flip_every,
             "threads": torch.get_num_threads(),
         }
-        options.json.write_text(json.dumps(everything, indent=2) + "\n")
+        write_text(options.json, json.dumps(everything, indent=2) + "\n")
 
 
 if __name__ == "__main__":
     try:
         main()
     except InputError as error:
-        sys.exit(str(error))
+        print(error, file=sys.stderr)
+        sys.exit(2)

@@ -214,8 +214,8 @@ def _render() -> Callable[..., int | None]:
         Args:
             scene: Mitsuba 3 scene.xml.
             camera_path: JSON with 'fov' in degrees, and a list 'to_world' of 4x4 camera-to-world matrices or a list
-                'frames' of cameras with 'position' and 'look_at'; or a folder of Tungsten scenes, one per frame. With
-                'objects', a list of 4x4 matrices per frame for each id, objects of the scene move.
+                'frames' of cameras with 'position' and 'look_at'; or a folder of Tungsten scenes, one per frame.
+                Objects of the scene move with 'objects': for each id a list of 4x4 matrices, one per frame.
             out: folder of the sequence; finished frames in it are kept.
             frames: render the first so many cameras; all by default.
             every: take only every n-th camera of the path.
@@ -273,6 +273,8 @@ def _generate() -> Callable[..., int | None]:
         realisations: int = 3,
         reference_spp: int = 64,
         noise_level: float | None = None,
+        reference_frames: str | None = None,
+        noise_seed: int | None = None,
         size: str = "160x160",
         workers: int = 1,
         variant: str | None = None,
@@ -289,6 +291,8 @@ def _generate() -> Callable[..., int | None]:
             realisations: noisy colors of each frame, with independent noise.
             reference_spp: samples a pixel of the references. With --noise-level the most.
             noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
+            reference_frames: which frames get a reference, such as 8-11; all by default.
+            noise_seed: of the noise of all scenes; by default each has the noise of its own seed.
             size: WIDTHxHEIGHT in pixels.
             workers: processes that render frames side by side; of use with scalar_rgb.
             variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
@@ -296,6 +300,7 @@ def _generate() -> Callable[..., int | None]:
         if frames < 1:
             raise InputError(f"--frames: expected at least 1, found {frames}")
         chosen = parse_frames(seeds, name="--seeds")
+        referenced = None if reference_frames is None else parse_frames(reference_frames, name="--reference-frames")
         with _progress() as progress:
             whole = progress.add_task("scenes", total=len(chosen))
             for seed in chosen:
@@ -314,6 +319,8 @@ def _generate() -> Callable[..., int | None]:
                     realisations=realisations,
                     reference_spp=reference_spp,
                     noise_level=noise_level,
+                    reference_frames=referenced,
+                    seed=seed if noise_seed is None else noise_seed,
                     moves=made.moves,
                     workers=workers,
                     variant=variant,

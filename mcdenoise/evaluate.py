@@ -158,6 +158,16 @@ class Scorer:
         ]
 
 
+def check_references(sequence: Sequence) -> None:
+    """See that there is something to compare with.
+
+    Raises:
+        InputError: the sequence has no references.
+    """
+    if not sequence.reference_numbers:
+        raise InputError(f"{sequence.root}: expected references to compare with, found none; render them")
+
+
 def score_sequence(
     sequence: Sequence,
     denoisers: Mapping[str, Denoiser],
@@ -189,8 +199,7 @@ def score_sequence(
             not installed.
         ValueError: no denoiser is given.
     """
-    if not sequence.reference_numbers:
-        raise InputError(f"{sequence.root}: expected references to compare with, found none; render them")
+    check_references(sequence)
     if not denoisers:
         raise ValueError("denoisers: expected one at least, found none")
     peers = list(peers)

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from mcdenoise.cli import COMMANDS, main
-from mcdenoise.data import read_exr, write_exr
+from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.models import create_model, list_models, pretrained_models, save_weights
 from mcdenoise.train import TrainConfig
 
@@ -398,6 +398,51 @@ def test_render_with_bad_paths(refused: Callable[..., str], camera_path: Path, t
     assert f"{scene}: Mitsuba cannot load it" in refused("render", scene, "--camera-path", camera_path, *scalar)
     assert "nowhere.json" in refused("render", scene, "--camera-path", tmp_path / "nowhere.json", *scalar)
     assert "0x8" in refused("render", scene, "--camera-path", camera_path, *scalar[:2], "--size", "0x8", *scalar[4:])
+    assert not out.exists()
+
+
+def test_generate(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    # The first seed has objects that move, the second has none.
+    command = ["generate", "-o", out, "--seeds", "3,7", "--frames", "2", "--size", "8x8", "--variant", "scalar_rgb"]
+    command += ["--realisations", "2", "--reference-spp", "2"]
+    status, text, errors = run(*command)
+    assert (status, errors) == (0, "")
+    folders = [out / "random0003", out / "random0007"]
+    assert text.split() == [str(folder / "inputs") for folder in folders]
+    for folder, moves in zip(folders, (True, False), strict=True):
+        found = open_sequence(folder)
+        assert (len(found), found.size, found.realisations) == (2, (8, 8), 2)
+        for number in range(2):
+            frame, again = (found.frame(number, realisation=k) for k in range(2))
+            frame.validate()
+            assert frame.reference is not None
+            assert (frame.previous_position is not None) is moves
+            assert not torch.equal(frame.color, again.color)
+    times = {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")}
+    assert len(times) == 2 * 2 * 7 + 2
+    assert run(*command)[:2] == (0, text)
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")} == times
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("--seeds", "3-1", "--seeds: expected numbers and ascending ranges"),
+        ("--seeds", "-1", "--seeds"),
+        ("--seeds", "all", "--seeds: expected numbers and ascending ranges"),
+        ("--frames", "0", "--frames: expected at least 1, found 0"),
+        ("--size", "160", "--size: expected WIDTHxHEIGHT such as 1280x720, found '160'"),
+        ("--size", "0x8", "expected width and height between 1 and 16384 pixels, found 0x8"),
+        ("--realisations", "0", "realisations: expected at least 1, found 0"),
+    ],
+)
+def test_generate_with_bad_options(
+    refused: Callable[..., str], out: Path, option: str, value: str, expected: str
+) -> None:
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    message = refused("generate", "-o", out, "--variant", "scalar_rgb", option, value)
+    assert expected in message
     assert not out.exists()
 
 

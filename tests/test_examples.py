@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -167,5 +168,28 @@ def test_unseen_scenes_says_in_one_line_what_is_wrong(small_sequence: Path, weig
     command = [sys.executable, str(EXAMPLES / "unseen_scenes.py"), str(small_sequence), "--weights", str(weights)]
     command += ["--models", "cascaded,cascaded"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert done.stderr == "--weights: expected one model to load them into, found --models cascaded,cascaded\n"
+
+
+def test_unseen_scenes_looks_for_references_before_it_starts(small_sequence: Path, weights: Path) -> None:
+    other = small_sequence.parent / "other"
+    shutil.copytree(small_sequence, other)
+    for path in (other / "inputs").glob("reference*.exr"):
+        path.unlink()
+    command = [sys.executable, str(EXAMPLES / "unseen_scenes.py"), str(small_sequence), str(other)]
+    command += ["--weights", str(weights)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
+    assert done.returncode == 2
+    assert done.stderr == f"{other}: expected references to compare with, found none; render them\n"
+
+
+def test_run_time_prints_a_line_for_each_network(tmp_path: Path) -> None:
+    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    file = tmp_path / "times.json"
+    arguments = ("--models", "cascaded_tiny", "--size", "64x36", "--threads", "1", "--rounds", "2", "--json", file)
+    lines = run("run_time.py", *arguments).splitlines()
+    names = ["OIDN fast", "OIDN balanced", "OIDN high, clean aux", "cascaded_tiny", "cascaded_tiny, bfloat16"]
+    assert [line[:28].strip() for line in lines[2:]] == names
+    assert lines[2].endswith(" 1.00")
+    assert {name: len(times) for name, times in json.loads(file.read_text()).items()} == dict.fromkeys(names, 2)

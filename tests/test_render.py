@@ -7,6 +7,9 @@ import itertools
 import json
 import os
 import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +166,16 @@ def test_another_scene_of_the_same_name_is_refused(tmp_path: Path) -> None:
     scene["window"] = {**scene["window"], "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [1, 2, 3]}}}
     with pytest.raises(InputError, match="rendered with scene_sha256"):
         render_sequence(scene, demo_cameras(1), tmp_path, **settings)
+
+
+@pytest.mark.parametrize("missing", [None, "frames", "camera_matrices", "reference_spp"])
+def test_a_damaged_description_is_refused(sequence: Path, tmp_path: Path, missing: str | None) -> None:
+    folder, cameras = tmp_path / "inputs", demo_cameras(9)
+    shutil.copytree(sequence, folder)
+    about = {key: value for key, value in describe(folder).items() if key != missing}
+    (folder / "camera.json").write_text(json.dumps(about) if missing else "{")
+    with pytest.raises(InputError, match=r"camera\.json: cannot be read, so the run cannot be resumed"):
+        render_sequence(demo_scene(), [cameras[0]], tmp_path, **{**SCALAR, "reference_frames": []})
 
 
 def _furnace(albedo: float = 0.5) -> dict[str, Any]:
@@ -537,6 +550,14 @@ def test_references_end_at_a_noise_level(tmp_path: Path) -> None:
     assert render_to(0.001, reference_spp=more + 24)[1] == more + 24
 
 
+def test_a_noise_told_from_few_paths_ends_no_reference(tmp_path: Path) -> None:
+    settings = {**TINY, "noise_level": 0.9}
+    few = render_sequence(demo_scene(), demo_cameras(1), tmp_path, **{**settings, "reference_spp": 4})
+    assert describe(few)["reference_spp"] == {"0": 4}
+    render_sequence(demo_scene(), demo_cameras(1), tmp_path, **settings)
+    assert 32 <= describe(few)["reference_spp"]["0"] < 64
+
+
 FLIGHT = 3
 
 
@@ -711,6 +732,28 @@ def test_a_worker_that_dies_gives_one_line() -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_workers_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import time\n"
+        "from mcdenoise.render.processes import render_in_processes\n"
+        "class Source:\n"
+        "    def tracer(self):\n"
+        "        print('tracing', flush=True)\n"
+        "        time.sleep(60)\n"
+        "if __name__ == '__main__':\n"
+        "    render_in_processes(Source(), None, [0], 1, print, print)\n"
+    )
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "tracing\n"
+        parent.kill()
+        killed = time.monotonic()
+        # Its end comes when the last process that could write to it is gone.
+        assert parent.stdout.read() == ""
+    assert time.monotonic() - killed < 30
+
+
 def test_what_cannot_be_sent_to_workers_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected plain Python and numpy for more than one worker"):
         render_sequence({**demo_scene(), "x": lambda: 0}, demo_cameras(1), tmp_path, workers=2, **TINY)
@@ -749,6 +792,11 @@ def test_the_command_line_moves_objects_of_a_scene_file(tmp_path: Path, capsys: 
     step = step[:, :, (step != 0).any(1)[0]]
     assert step.shape[2] > 5
     torch.testing.assert_close(step.mean(2), torch.tensor([[0.5, 0, 0]]))
+    with pytest.raises(SystemExit) as ended:
+        main([*command[:5], str(tmp_path / "every"), *command[6:], "--every", "2"])
+    assert ended.value.code == 0
+    assert len(open_sequence(tmp_path / "every")) == 1
+    capsys.readouterr()
     path.write_text(json.dumps({**content, "objects": {"teapot": objects["moving"]}}))
     with pytest.raises(SystemExit) as ended:
         main([*command[:5], str(tmp_path / "new"), *command[6:]])

@@ -63,6 +63,7 @@ def test_saved_and_loaded(tmp_path: Path) -> None:
     found = ReferenceHalves.load(path)
     assert (found.paths, found.passes, found.noise()) == (halves.paths, halves.passes, halves.noise())
     np.testing.assert_array_equal(found.mean(), halves.mean())
-    path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(InputError, match="expected a reference in the making"):
-        ReferenceHalves.load(path)
+    for content in (path.read_bytes()[:-9], b""):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match="expected a reference in the making"):
+            ReferenceHalves.load(path)

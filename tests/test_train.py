@@ -514,6 +514,8 @@ def test_a_frame_that_is_damaged_leaves_no_run(small_sequence: Path, tmp_path: P
         ("seed", 2**64, "seed: expected 0 to 2^32 - 1, found 18446744073709551616"),
         ("learning_rate", 0.0, "learning_rate: expected a positive number, found 0.0"),
         ("alpha_min", 0.0, "alpha_min: expected in (0, 1], found 0.0"),
+        ("schedule", "linear", "schedule: expected one of constant, cosine, found 'linear'"),
+        ("precision", "fp8", "precision: expected one of 32-true, bf16-mixed, found 'fp8'"),
         ("ema", 1.0, "ema: expected in [0, 1), found 1.0"),
         ("exposure", -1.0, "exposure: expected 0 to 10 stops, found -1.0"),
         ("tint", float("nan"), "tint: expected 0 to 10 stops, found nan"),

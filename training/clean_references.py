@@ -11,17 +11,19 @@ For training only: what is measured is measured against references as they were 
 import argparse
 import json
 import shutil
+import sys
 from pathlib import Path
 
 from mcdenoise.data import open_sequence, write_exr
 from mcdenoise.data.files import write_text
+from mcdenoise.errors import InputError
 from mcdenoise.peers import Oidn
 
 
-def clean(source: Path, out: Path, oidn: Oidn) -> None:
-    """Copy a sequence to ``out``; its references are denoised at high quality."""
+def clean(source: Path, out: Path, oidn: Oidn) -> Path:
+    """Copy a sequence to ``out``, its references denoised at high quality; returns the folder of the copy."""
     sequence = open_sequence(source)
-    inputs = source if source.name == "inputs" else source / "inputs"
+    inputs = source / "inputs" if (source / "inputs").is_dir() else source
     copied = out / sequence.name / "inputs"
     shutil.copytree(inputs, copied, ignore=shutil.ignore_patterns("reference*.exr", ".*"), dirs_exist_ok=True)
     for number in sequence.reference_numbers:
@@ -34,7 +36,10 @@ def clean(source: Path, out: Path, oidn: Oidn) -> None:
         write_exr(copied / f"reference{number}.exr", pixels, ["R", "G", "B"], half=True)
     description = copied / "camera.json"
     about = json.loads(description.read_text()) if description.exists() else {}
+    # What was said of the references no longer holds, and without it no renderer takes them for means of so many paths.
+    about = {key: value for key, value in about.items() if key not in ("reference_spp", "reference_noise")}
     write_text(description, json.dumps({**about, "reference_filter": "Open Image Denoise, high, clean aux"}) + "\n")
+    return copied.parent
 
 
 def main() -> None:
@@ -45,9 +50,12 @@ def main() -> None:
     options = parser.parse_args()
     oidn = Oidn()
     for source in options.sequences:
-        clean(source, options.out, oidn)
-        print(options.out / source.name)
+        print(clean(source, options.out, oidn))
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)

@@ -9,12 +9,14 @@ with other seeds (101, 102, ...). Its ``camera.json`` must have the cameras, as 
 import argparse
 import json
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from mcdenoise.data import open_sequence
+from mcdenoise.errors import InputError
 from mcdenoise.render import Camera, render_sequence
 
 _FIRST_SEED = 100
@@ -23,11 +25,16 @@ _FIRST_SEED = 100
 def add_realisations(source: Path, scene: Path, out: Path, realisations: int) -> Path:
     """Copy a sequence and add noisy colours; returns the folder of the copy."""
     sequence = open_sequence(source)
-    inputs = source if source.name == "inputs" else source / "inputs"
+    inputs = source / "inputs" if (source / "inputs").is_dir() else source
+    try:
+        about = json.loads((inputs / "camera.json").read_text())
+        cameras = [Camera(np.array(pose), about["fov_x_degrees"]) for pose in about["camera_to_world"]]
+        max_depth, spp = about["max_depth"], about.get("noisy_spp", 1)
+        moves = {name: np.array(path) for name, path in about.get("moves", {}).items()}
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{inputs / 'camera.json'}: expected cameras and max_depth, found none ({error})") from error
     copied = out / sequence.name / "inputs"
-    shutil.copytree(inputs, copied, dirs_exist_ok=True)
-    about = json.loads((inputs / "camera.json").read_text())
-    cameras = [Camera(np.array(pose), about["fov_x_degrees"]) for pose in about["camera_to_world"]]
+    shutil.copytree(inputs, copied, ignore=shutil.ignore_patterns(".*"), dirs_exist_ok=True)
     height, width = sequence.size
     for realisation in range(1, realisations):
         with tempfile.TemporaryDirectory(dir=out) as folder:
@@ -36,9 +43,11 @@ def add_realisations(source: Path, scene: Path, out: Path, realisations: int) ->
                 cameras,
                 Path(folder),
                 size=(width, height),
+                spp=spp,
                 reference_frames=[],
+                moves=moves,
                 seed=_FIRST_SEED + realisation,
-                max_depth=about["max_depth"],
+                max_depth=max_depth,
             )
             place = copied / f"realisation{realisation}"
             place.mkdir(exist_ok=True)
@@ -59,4 +68,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)

@@ -126,6 +126,7 @@ class SequenceFolder:
             before: dict[str, Any] = json.loads(described.read_text(encoding="utf-8"))
             before["reference_spp"] = {int(number): int(spp) for number, spp in before["reference_spp"].items()}
             poses = list(zip(*(before[key] for key in _POSES), strict=True))
+            before["frames"] = int(before["frames"])
             moves = {identity: list(matrices) for identity, matrices in before.get("moves", {}).items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"{described}: cannot be read, so the run cannot be resumed; {_ADVICE}") from error

@@ -71,7 +71,10 @@ class FrameJob:
     def has_reference(self, number: int) -> bool:
         """Whether a frame has a reference that is good enough."""
         state = self.started.get(number)
-        return state is not None and self.is_good(state.spp, state.noise)
+        if state is None:
+            return False
+        reliable = state.spp >= 2 * _FEWEST_PATHS_IN_A_HALF
+        return self.is_good(state.spp, state.noise if reliable else None)
 
     def is_good(self, spp: int, noise: float | None) -> bool:
         """Whether so many paths, or so little noise, are enough for a reference."""

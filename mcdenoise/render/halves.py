@@ -57,7 +57,7 @@ class ReferenceHalves:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 first, second, passes = (int(number) for number in stored["counts"])
                 sums: NDArray[np.float64] = stored["sums"]
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise InputError(f"{path}: expected a reference in the making, found something else; remove it") from error
         return cls(sums, (first, second), passes)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -70,7 +72,16 @@ def _start_process(source: TracerSource, job: FrameJob, paths: Synchronized[int]
     global _process
     # Ctrl+C reaches every process of a terminal; the first one tells the others what to do.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _process = _Process(source, job, paths, stop)
+
+
+def _end_with_parent() -> None:
+    # A pool whose owner was killed would wait for its next frame for ever, with all the memory it has.
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _render_frame_in_process(number: int) -> ReferenceState | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from mcdenoise.errors import InputError
 
@@ -30,19 +30,19 @@ class TrainConfig:
         frames: frames in a clip.
         crop: side of the square patches, pixels.
         learning_rate: of Adam, at its highest.
-        schedule: ``"constant"``, or ``"cosine"`` down to 0 after a warm-up of 200 steps.
+        schedule: constant, or cosine down to 0 after a warm-up of 200 steps.
         temporal_weight: of the temporal loss.
         gradient_norm: largest norm of a step's gradient; 0 does not limit it.
         ema: decay of an exponential moving average of the weights, such as 0.999, below it in the first steps; the
             average is what is validated and what the run ends with. 0 takes the weights themselves.
-        alpha_min: of the accumulation, see :func:`mcdenoise.ops.accumulate`.
+        alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
         start_every: a shot also starts at every n-th frame, to train on short histories.
         validation_frames: the last frames of each sequence, kept for validation (the paper's 4); none of a sequence
             that would be left with less than one clip.
-        lamps: chance that a clip gets lamps, see :class:`mcdenoise.data.clips.ClipSampler`.
+        lamps: chance that a clip gets lamps: rectangles of constant radiance, without noise, brighter than the rest.
         exposure: the light of a clip is scaled by up to so many stops.
         tint: each colour channel of the light is scaled by up to so many stops.
-        precision: ``"bf16-mixed"`` runs convolutions in bfloat16.
+        precision: bf16-mixed runs convolutions in bfloat16.
         seed: of weights and clips.
     """
 
@@ -97,6 +97,9 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
     for name, low in lowest.items():
         if not settings[name] >= low:
             raise InputError(f"{name}: expected at least {low}, found {settings[name]}")
+    for name, known in (("schedule", get_args(Schedule)), ("precision", get_args(Precision))):
+        if settings[name] not in known:
+            raise InputError(f"{name}: expected one of {', '.join(known)}, found '{settings[name]}'")
     for name in ("exposure", "tint"):
         if not 0 <= settings[name] <= 10:
             raise InputError(f"{name}: expected 0 to 10 stops, found {settings[name]}")

@@ -48,7 +48,10 @@ def open_fabric(accelerator: str, precision: Precision, batch: int) -> Fabric:
         )
         fabric.launch()
     except (RuntimeError, ValueError, ImportError) as error:
-        raise InputError(f"accelerator '{accelerator}': expected one that works here, such as cpu or cuda") from error
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise InputError(
+            f"accelerator '{accelerator}': expected one that works here, such as cpu or cuda, found: {reason}"
+        ) from error
     return fabric
 
 

@@ -1,0 +1,78 @@
+"""The scripts in `training/` that made the training set."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+
+from mcdenoise.data import open_sequence, read_exr
+from mcdenoise.errors import InputError
+
+SCRIPTS = Path(__file__).parents[1] / "training"
+
+
+def script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("place", [".", "inputs"])
+def test_cleaned_references(small_sequence: Path, tmp_path: Path, place: str) -> None:
+    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    from mcdenoise.peers import Oidn
+
+    description = small_sequence / "inputs" / "camera.json"
+    about = json.loads(description.read_text())
+    description.write_text(json.dumps({**about, "reference_spp": {"0": 64}, "reference_noise": {"0": 0.1}}))
+    copied = script("clean_references").clean(small_sequence / place, tmp_path / "out", Oidn(threads=1))
+    assert copied == tmp_path / "out" / "plane"
+    source, cleaned = open_sequence(small_sequence), open_sequence(copied)
+    assert cleaned.reference_numbers == source.reference_numbers
+    before, after = (dict(sequence.frame(1).items()) for sequence in (source, cleaned))
+    assert {name for name in before if not torch.equal(before[name], after[name])} == {"reference"}
+    # What was known of the references is not said of what the filter made of them.
+    said = json.loads((copied / "inputs" / "camera.json").read_text())
+    assert said == {**about, "reference_filter": "Open Image Denoise, high, clean aux"}
+
+
+def test_more_noise_of_a_scene_that_moves(tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    from mcdenoise.render import Camera, render_sequence
+
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        '<scene version="3.0.0"><shape type="sphere" id="lamp">'
+        '<emitter type="area"><rgb name="radiance" value="5"/></emitter></shape></scene>'
+    )
+    moves = np.tile(np.eye(4), (2, 1, 1))
+    moves[1, 0, 3] = 1.5
+    camera = Camera.look_at((0, 0, 6), (0, 0, 0), fov_x=60)
+    settings = {"size": (16, 12), "variant": "scalar_rgb", "reference_frames": []}
+    render_sequence(scene, [camera] * 2, tmp_path / "source", moves={"lamp": moves}, **settings)
+    copied = script("more_noise").add_realisations(tmp_path / "source", scene, tmp_path / "out", 2)
+    assert open_sequence(copied).realisations == 2
+    for number in range(2):
+        # Light seen directly has no noise: the further realisation shows the lamp where the first one does.
+        first, second = (
+            read_exr(copied / "inputs" / place / f"color{number}.exr")[0] for place in ("", "realisation1")
+        )
+        assert first.max() == 5
+        np.testing.assert_array_equal(second, first)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["source"]
+
+
+def test_more_noise_needs_the_cameras(small_sequence: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    with pytest.raises(InputError, match=r"camera\.json: expected cameras and max_depth"):
+        script("more_noise").add_realisations(small_sequence, tmp_path / "scene.xml", tmp_path / "out", 2)
+    assert not (tmp_path / "out").exists()
