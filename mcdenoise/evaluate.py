@@ -212,6 +212,12 @@ def score_sequence(
     before: int | None = None
     for number, (frame, images) in zip(sequence.numbers, denoised_frames(sequence, first), strict=True):
         known = [images, *(other.images(frame) for other in others)]
+        if frame.reference is None:
+            # Nothing to compare with, but what remembers must see every frame.
+            valid, _ = frame.with_depth().validate()
+            for peer in peers:
+                if peer.remembers:
+                    peer(valid, images)
         methods = _images(frame, dict(zip(denoisers, known, strict=True)), peers)
         scorer._add(frame.reference, methods, follows=before is not None and number == before + 1)
         before = number

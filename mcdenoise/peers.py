@@ -50,11 +50,17 @@ class Peer(Protocol):
         name: of the setting, unique.
         group: the settings that share a row of a short table.
         family: the denoiser whose setting it is.
+        remembers: whether its image also depends on the frames before.
     """
 
     @property
     def name(self) -> str:
         """Of the setting."""
+        ...
+
+    @property
+    def remembers(self) -> bool:
+        """Whether its image also depends on the frames before, so that none may be left out."""
         ...
 
     @property
@@ -224,6 +230,11 @@ class OidnPeer:
         """Quality, and whether and when the image is accumulated; with or without albedo is one of its settings."""
         return f"OIDN {self.quality}, {'accumulated' if self.source == 'demodulated' else self.source}"
 
+    @property
+    def remembers(self) -> bool:
+        """Only where its own results are accumulated."""
+        return self.source == "accumulated after"
+
     def reset(self) -> None:
         """See :class:`Peer`."""
         self.history.reset()
@@ -279,6 +290,7 @@ class JointBilateral:
 
     family = "joint bilateral"
     group = family
+    remembers = False
 
     @property
     def name(self) -> str:

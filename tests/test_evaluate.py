@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
@@ -50,6 +50,7 @@ class Scaled:
     factor: float
     group: str = "dull"
     family: str = "Scaled"
+    remembers: bool = False
 
     @property
     def name(self) -> str:
@@ -138,6 +139,26 @@ def test_frames_that_are_not_neighbours_are_no_pair(small_sequence: Path) -> Non
     sequence = open_sequence(small_sequence, "0,2-3")
     (score, *_) = score_sequence(sequence, {"half": Denoiser(Half())}, metrics=("SMAPE", "tRMSE"))
     assert score.counts == {"SMAPE": 3, "tRMSE": 1}
+
+
+@dataclass(frozen=True)
+class Counting(Scaled):
+    """A peer that notes how many frames it has seen."""
+
+    seen: list[Frame] = field(default_factory=list)
+
+    def __call__(self, frame: Frame, images: Images) -> Tensor:
+        self.seen.append(frame)
+        return super().__call__(frame, images)
+
+
+@pytest.mark.parametrize("remembers", [False, True])
+def test_a_peer_that_remembers_sees_frames_without_a_reference_too(small_sequence: Path, remembers: bool) -> None:
+    (small_sequence / "inputs" / "reference1.exr").unlink()
+    peer = Counting(1.0, remembers=remembers)
+    scores = score_sequence(open_sequence(small_sequence), {"half": Denoiser(Half())}, peers=[peer], metrics=("SMAPE",))
+    assert len(peer.seen) == (4 if remembers else 3)
+    assert by_method(scores)[peer.name].counts == {"SMAPE": 3}
 
 
 def test_the_plain_filter_is_the_best_of_its_sweep(small_sequence: Path) -> None:
