@@ -215,9 +215,10 @@ def score_sequence(
         if frame.reference is None:
             # Nothing to compare with, but what remembers must see every frame.
             valid, _ = frame.with_depth().validate()
-            for peer in peers:
-                if peer.remembers:
-                    peer(valid, images)
+            with torch.inference_mode():
+                for peer in peers:
+                    if peer.remembers:
+                        peer(valid, images)
         methods = _images(frame, dict(zip(denoisers, known, strict=True)), peers)
         scorer._add(frame.reference, methods, follows=before is not None and number == before + 1)
         before = number
