@@ -53,8 +53,9 @@ ALLOWED: dict[str, set[str]] = {
     "run_folder": SIGNAL | {"data"},
     "peers": SIGNAL | {"models", "history", "denoiser"},
     "evaluate": LIBRARY | {"denoise", "peers"},
-    "report": LIBRARY,
-    **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS),
+    "results": SIGNAL | {"data"},
+    "report": LIBRARY | {"results"},
+    **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"results"}),
     "cli": LIBRARY | TOOLS,
     "__main__": {"cli"},
     # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.

@@ -1,0 +1,268 @@
+"""What a benchmark found out, as it is stored in ``results.json`` and shown by the report."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mcdenoise.data.files import write_text
+from mcdenoise.errors import InputError
+
+FILE = "results.json"
+IMAGES = "images"
+VERSION = 1
+STAGES = ("read", "accumulate", "network", "filter", "write")
+Kind = Literal["model", "peer", "baseline"]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median and quartiles of repeated measurements.
+
+    Args:
+        median: half of them are below.
+        lower: first quartile.
+        upper: third quartile.
+        count: how many there were.
+    """
+
+    median: float
+    lower: float
+    upper: float
+    count: int
+
+    @classmethod
+    def of(cls, values: list[float]) -> Spread:
+        """Of at least one value.
+
+        Example:
+            >>> Spread.of([1.0, 2.0, 3.0, 4.0, 100.0])
+            Spread(median=3.0, lower=2.0, upper=4.0, count=5)
+        """
+        lower, median, upper = np.quantile(values, [0.25, 0.5, 0.75]).tolist()
+        return cls(median, lower, upper, len(values))
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where it was measured.
+
+    Args:
+        processor: model of the CPU.
+        cores: logical cores that the process may use.
+        memory: gibibytes.
+        device: ``cpu``, or the name of the GPU.
+        threads: of torch and of every peer.
+        system: operating system and its version.
+        packages: versions by name, those that were measured.
+    """
+
+    processor: str
+    cores: int
+    memory: float
+    device: str
+    threads: int
+    system: str
+    packages: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One sequence that was denoised.
+
+    Args:
+        name: unique among the scenes.
+        width: pixels.
+        height: pixels.
+        frames: numbers of the frames that were denoised and timed.
+        scored: numbers of those that have a reference.
+        pictures: numbers of those whose images are kept, as ``images/SCENE/METHOD/N.exr`` and, for the reference,
+            ``images/SCENE/reference/N.exr``; methods are ordered as in :attr:`Results.methods`.
+        reference_noise: the references' own SMAPE against the truth, where the renderer has stored it.
+    """
+
+    name: str
+    width: int
+    height: int
+    frames: list[int]
+    scored: list[int]
+    pictures: list[int] = field(default_factory=list)
+    reference_noise: float | None = None
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to get an image.
+
+    Args:
+        name: unique, such as ``cascaded`` or ``OIDN fast, clean aux, raw``.
+        kind: a model of the package, a peer, or a baseline (``noisy`` does nothing, ``accumulated`` only accumulates).
+        folder: name of its folder in ``images/SCENE``.
+        family: what to colour alike, such as ``OIDN``.
+        parameters: number of weights of a network, where that is known.
+        missing: why it could not be run at all, such as a package that is not installed; else ``""``.
+    """
+
+    name: str
+    kind: Kind
+    folder: str
+    family: str
+    parameters: int | None = None
+    missing: str = ""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method on one scene.
+
+    Args:
+        scene: name.
+        method: name.
+        errors: mean over the scored frames, by name in :data:`mcdenoise.evaluate.METRICS`.
+        errors_spread: median and quartiles over the scored frames, by the same names.
+        whole: milliseconds a frame, from reading to writing.
+        stages: milliseconds a frame of each stage, by name in :data:`STAGES`; what a method does not do is left out.
+        memory: peak memory in mebibytes that denoising added, where it could be measured.
+        failure: why the method failed on this scene; nothing else is known then.
+    """
+
+    scene: str
+    method: str
+    errors: dict[str, float] = field(default_factory=dict)
+    errors_spread: dict[str, Spread] = field(default_factory=dict)
+    whole: Spread | None = None
+    stages: dict[str, Spread] = field(default_factory=dict)
+    memory: float | None = None
+    failure: str = ""
+
+    @property
+    def denoising(self) -> float | None:
+        """Median milliseconds of what happens in memory, without reading and writing files."""
+        own = [spread.median for stage, spread in self.stages.items() if stage not in ("read", "write")]
+        return sum(own) if self.stages else None
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one method costs at one size of image.
+
+    Args:
+        method: name.
+        width: pixels.
+        height: pixels.
+        milliseconds: a frame, without files; ``None`` where it failed.
+        failure: why, such as too little memory.
+    """
+
+    method: str
+    width: int
+    height: int
+    milliseconds: Spread | None = None
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How cost grows with the number of pixels: ``milliseconds = fixed + per_megapixel * megapixels``.
+
+    Args:
+        method: name.
+        fixed: milliseconds.
+        per_megapixel: milliseconds.
+        deviation: largest relative deviation of a measured median from the line.
+    """
+
+    method: str
+    fixed: float
+    per_megapixel: float
+    deviation: float
+
+
+@dataclass(frozen=True)
+class Results:
+    """Everything one run of the benchmark found out.
+
+    Args:
+        command: the command line that measured it.
+        created: UTC time in ISO format.
+        machine: where.
+        rounds: how often each frame was denoised by each method, without the warm-up.
+        scenes: in the order in which they were named.
+        methods: in the order in which they are shown.
+        cells: of each scene and each method that is not missing.
+        costs: by method and size.
+        fits: by method.
+        version: of this format.
+    """
+
+    command: str
+    created: str
+    machine: Machine
+    rounds: int
+    scenes: list[Scene]
+    methods: list[Method]
+    cells: list[Cell]
+    costs: list[Cost] = field(default_factory=list)
+    fits: list[Fit] = field(default_factory=list)
+    version: int = VERSION
+
+    def cell(self, scene: str, method: str) -> Cell | None:
+        """What is known of a method on a scene."""
+        return next((one for one in self.cells if (one.scene, one.method) == (scene, method)), None)
+
+    def write(self, folder: Path) -> None:
+        """Write ``results.json``."""
+        write_text(folder / FILE, json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def read(cls, folder: Path) -> Results:
+        """Read ``results.json`` of a folder.
+
+        Raises:
+            InputError: the file is missing, damaged, or of another version.
+        """
+        path = folder / FILE
+        try:
+            data = json.loads(path.read_text())
+            if data.get("version") != VERSION:
+                raise InputError(f"{path}: expected version {VERSION} of the format, found {data.get('version')}")
+            return _results(data)
+        except FileNotFoundError as error:
+            raise InputError(f"{path}: expected the results of `mcdenoise benchmark`, found no such file") from error
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{path}: expected the results of `mcdenoise benchmark`, found damage: {error}") from error
+
+
+def _results(data: dict[str, Any]) -> Results:
+    def spread(value: dict[str, Any] | None) -> Spread | None:
+        return None if value is None else Spread(**value)
+
+    def spreads(values: dict[str, Any]) -> dict[str, Spread]:
+        return {name: Spread(**value) for name, value in values.items()}
+
+    cells = [
+        Cell(
+            **one
+            | {
+                "errors_spread": spreads(one["errors_spread"]),
+                "whole": spread(one["whole"]),
+                "stages": spreads(one["stages"]),
+            }
+        )
+        for one in data["cells"]
+    ]
+    parsed = {
+        "machine": Machine(**data["machine"]),
+        "scenes": [Scene(**one) for one in data["scenes"]],
+        "methods": [Method(**one) for one in data["methods"]],
+        "cells": cells,
+        "costs": [Cost(**one | {"milliseconds": spread(one["milliseconds"])}) for one in data["costs"]],
+        "fits": [Fit(**one) for one in data["fits"]],
+    }
+    return Results(**data | parsed)
