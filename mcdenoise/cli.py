@@ -7,6 +7,7 @@ import functools
 import io
 import itertools
 import json as jsonlib
+import math
 import sys
 from collections.abc import Callable
 from dataclasses import asdict
@@ -276,6 +277,7 @@ def _generate() -> Callable[..., int | None]:
         reference_frames: str | None = None,
         noise_seed: int | None = None,
         size: str = "160x160",
+        zoom: float = 1.0,
         workers: int = 1,
         variant: str | None = None,
     ) -> None:
@@ -294,17 +296,20 @@ def _generate() -> Callable[..., int | None]:
             reference_frames: which frames get a reference, such as 8-11; all by default.
             noise_seed: of the noise of all scenes; by default each has the noise of its own seed.
             size: WIDTHxHEIGHT in pixels.
+            zoom: render the middle of an image that is so many times as wide and high.
             workers: processes that render frames side by side; of use with scalar_rgb.
             variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
         """
         if frames < 1:
             raise InputError(f"--frames: expected at least 1, found {frames}")
+        if not 0 < zoom < math.inf:
+            raise InputError(f"--zoom: expected a positive number, found {zoom:g}")
         chosen = parse_frames(seeds, name="--seeds")
         referenced = None if reference_frames is None else parse_frames(reference_frames, name="--reference-frames")
         with _progress() as progress:
             whole = progress.add_task("scenes", total=len(chosen))
             for seed in chosen:
-                made = random_scene(seed, frames)
+                made = random_scene(seed, frames, zoom)
                 task = progress.add_task(f"random{seed:04d}", total=None)
 
                 def show(done: int, total: int, task: TaskID = task) -> None:

@@ -98,6 +98,14 @@ def test_a_longer_shot_begins_like_a_shorter_one() -> None:
             np.testing.assert_array_equal(moved, long.moves[name][:5])
 
 
+def test_a_zoomed_camera_sees_the_middle_of_the_image() -> None:
+    plain, zoomed = random_scene(1, 2), random_scene(1, 2, zoom=3)
+    assert scene_digest(plain.scene) == scene_digest(zoomed.scene)
+    for wide, narrow in zip(plain.cameras, zoomed.cameras, strict=True):
+        rays, middle = pixel_rays(wide, 12, 9).directions, pixel_rays(narrow, 4, 3).directions
+        np.testing.assert_allclose(middle.reshape(3, 4, 3), rays.reshape(9, 12, 3)[3:6, 4:8], atol=1e-12)
+
+
 def test_making_a_scene_needs_no_mitsuba() -> None:
     code = (
         "import sys\nfrom mcdenoise.random_scene import random_scene\nrandom_scene(0)\n"

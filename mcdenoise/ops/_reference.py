@@ -124,7 +124,7 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     return _tensor(out, fine.shape)
 
 
-def demodulate(color: Tensor, albedo: Tensor, *, floor: float = 1e-2) -> Tensor:
+def demodulate(color: Tensor, albedo: Tensor, *, floor: float = 4e-2) -> Tensor:
     """``color / max(albedo, floor)``; unchanged where the albedo is below 1e-4 in every channel."""
     source, modulation = color.tolist(), _modulation(albedo, floor)
     out = _zeros(color.shape)
@@ -133,7 +133,7 @@ def demodulate(color: Tensor, albedo: Tensor, *, floor: float = 1e-2) -> Tensor:
     return _tensor(out, color.shape)
 
 
-def remodulate(image: Tensor, albedo: Tensor, *, floor: float = 1e-2) -> Tensor:
+def remodulate(image: Tensor, albedo: Tensor, *, floor: float = 4e-2) -> Tensor:
     """``image * max(albedo, floor)``; unchanged where the albedo is below 1e-4 in every channel."""
     source, modulation = image.tolist(), _modulation(albedo, floor)
     out = _zeros(image.shape)

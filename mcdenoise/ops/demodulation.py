@@ -7,7 +7,9 @@ from torch import Tensor, nn
 
 from mcdenoise.ops._check import check_shapes
 
-FLOOR = 1e-2
+# What a smooth dielectric reflects at normal incidence: on a darker surface most of the light is gloss, which the albedo
+# does not tint. Dividing it by a smaller albedo gives sparse, coloured, huge values.
+FLOOR = 4e-2
 # Below this there is no texture: less than half of the darkest 8-bit sRGB step above black.
 NO_ALBEDO = 1e-4
 

@@ -8,7 +8,7 @@ the form :func:`mcdenoise.render.render_sequence` takes; Mitsuba is not needed t
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -39,12 +39,14 @@ class RandomScene:
     moves: dict[str, Array] = field(default_factory=dict)
 
 
-def random_scene(seed: int, frames: int = 8) -> RandomScene:
+def random_scene(seed: int, frames: int = 8, zoom: float = 1.0) -> RandomScene:
     """A random scene; the same for the same seed, and a longer shot begins like a shorter one.
 
     Args:
         seed: which of the scenes, 0 or more.
         frames: number of cameras.
+        zoom: the cameras see the middle of the image only, this many times as large: what a crop of a larger image
+            shows, with its wide even surfaces and fast motion, for the price of a small one.
 
     Example:
         >>> made = random_scene(3, frames=2)
@@ -57,8 +59,14 @@ def random_scene(seed: int, frames: int = 8) -> RandomScene:
     stage = build(place_rng)
     cameras = shoot(stage, camera_rng, frames)
     moves = _movements(stage, move_rng, frames, cameras[0]) if move_rng.random() < _MOVING_SHARE else {}
+    if zoom != 1:
+        cameras = [replace(camera, fov_x=_narrowed(camera.fov_x, zoom)) for camera in cameras]
     scene = _exposed(stage.scene(), 10 ** float(level_rng.uniform(-1.5, 1.5)))
     return RandomScene(scene, cameras, moves)
+
+
+def _narrowed(fov: float, zoom: float) -> float:
+    return math.degrees(2 * math.atan(math.tan(math.radians(fov) / 2) / zoom))
 
 
 def _movements(stage: Stage, rng: np.random.Generator, frames: int, camera: Camera) -> dict[str, Array]:
