@@ -58,7 +58,7 @@ def test_floor_can_be_set() -> None:
 
 def test_a_dark_texture_is_filtered_without_steps() -> None:
     """Uniform light on a texture that crosses the floor: what filtering leaves is still a multiple of the texture."""
-    albedo = torch.tensor([0.0003, 0.0099, 0.0101, 0.02], dtype=torch.float64).reshape(1, 1, 1, 4)
+    albedo = FLOOR * torch.tensor([0.03, 0.99, 1.01, 2.0], dtype=torch.float64).reshape(1, 1, 1, 4)
     light = demodulate(2 * albedo, albedo)
     assert light[..., 1:].amax() / light[..., 1:].amin() < 1.02
     box = torch.full((1, 9, 1, 4), 1 / 9, dtype=torch.float64)
