@@ -61,8 +61,9 @@ class Denoiser:
 
     Args:
         model: a model's name in the zoo (its shipped weights are loaded), or a module that takes demodulated color,
-            albedo, normal and depth and returns :class:`mcdenoise.models.Denoised`. A module of yours is moved to the
-            device, made channels-last and put into evaluation mode.
+            albedo, normal and depth and returns :class:`mcdenoise.models.Denoised`; with an attribute ``takes_history``
+            that is true, it also gets ``current`` and ``length`` of :class:`mcdenoise.history.Accumulated`. A module of
+            yours is moved to the device, made channels-last and put into evaluation mode.
         weights: a safetensors file of other weights for a model given by name.
         device: where to run; frames may come from anywhere and images stay here.
         alpha_min: smallest weight of the current frame in the accumulation, see :func:`mcdenoise.ops.accumulate`.
@@ -99,6 +100,7 @@ class Denoiser:
         # Channels-last convolutions are about 1.5 times faster on a CPU.
         model.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.model = model.eval()
+        self._takes_history = bool(getattr(model, "takes_history", False))
         self.history = History(Accumulate(alpha_min))
         self.report = FrameReport()
 
@@ -131,9 +133,11 @@ class Denoiser:
         with self._timed("accumulate"):
             past = self.history.update(frame)
         report.reset = past.reset
+        # A module of your own may do with the paper's four.
+        history = {"current": past.current, "length": past.length} if self._takes_history else {}
         bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
         with self._timed("network"), bfloat16:
-            initial, final = self.model(*self._inputs(frame, past))
+            initial, final = self.model(*self._inputs(frame, past), **history)
         with self._timed("remodulate"):
             # A network that ends with a convolution hands out its precision.
             accumulated, initial, final = (

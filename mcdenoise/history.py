@@ -22,11 +22,13 @@ class Accumulated(NamedTuple):
 
     Args:
         color: ``(B, 3, H, W)`` accumulated demodulated radiance.
+        current: ``(B, 3, H, W)`` demodulated radiance of this frame alone, without fireflies.
         length: ``(B, 1, H, W)`` history length in frames, 1 where there is none.
         reset: why the past was thrown away, or ``""`` where it was used.
     """
 
     color: Tensor
+    current: Tensor
     length: Tensor
     reset: str
 
@@ -97,7 +99,7 @@ class History:
 
     def _blend(self, frame: Frame, color: Tensor) -> Accumulated:
         state = self._state
-        first = Accumulated(color, torch.ones_like(color[:, :1]), "first frame")
+        first = Accumulated(color, color, torch.ones_like(color[:, :1]), "first frame")
         if state is None:
             return first
         if state.color.shape != color.shape or state.color.device != color.device:
@@ -115,7 +117,7 @@ class History:
             return first._replace(reset="cut")
         if frame.albedo is not None:
             accumulated, length = self._shortened(color, accumulated, length, frame.albedo, motion)
-        return Accumulated(accumulated, length, "")
+        return Accumulated(accumulated, color, length, "")
 
     def _shortened(
         self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor

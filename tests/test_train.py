@@ -238,7 +238,8 @@ def test_sequences_that_are_only_watched(small_sequence: Path, tmp_path: Path) -
     sequence, history, errors = open_sequence(other), History(Accumulate(0.1)), []
     for number in sequence.numbers:
         frame = sequence.frame(number).validate()[0]
-        _, final = network(history.update(frame).color, frame.albedo, frame.normal, frame.depth)
+        past = history.update(frame)
+        _, final = network(past.color, frame.albedo, frame.normal, frame.depth, past.current, past.length)
         errors.append(smape_linear(remodulate(final, frame.albedo), frame.reference).item())
     # The weights on disk are half precision.
     assert reports[1].validation["smape"] == pytest.approx(sum(errors) / 4, abs=1e-3)

@@ -33,13 +33,14 @@ from mcdenoise.history import History
 from mcdenoise.ops import Accumulate, demodulation, fireflies, temporal
 
 # name, channels: what a training clip holds, in the order in which :meth:`Shot.read` stacks it
-PARTS = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
-# name, channels: what all realisations of the noise and all first frames have in common
-_FEATURES = {name: channels for name, channels in PARTS.items() if name != "color"}
+PARTS = {"color": 3, "current": 3, "length": 1, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
+# Each realisation of the noise and each first frame has its own of these, in one array; all have the others in common.
+_NOISY = ("color", "current", "length")
+_FEATURES = {name: channels for name, channels in PARTS.items() if name not in _NOISY}
 # The files that a reader of sequences looks at, and where they are in a sequence's folder.
 _SUFFIXES = {".exr", ".h", ".json"}
 _PLACES = ("*", "realisation*/*", "inputs/*", "inputs/realisation*/*")
-_FORMAT = 1
+_FORMAT = 2
 
 Array: TypeAlias = NDArray[Any]
 # First frame (an index) and realisation of the noise: each has a color of its own.
@@ -51,7 +52,8 @@ class Shot:
     """Successive frames as a network sees them, with one or more realisations of their noise.
 
     Args:
-        colors: for each realisation ``(T, 3, H, W)`` accumulated demodulated radiance.
+        colors: for each realisation ``(T, 7, H, W)``: accumulated demodulated radiance, that of each frame alone, and
+            the history length.
         features: ``(T, C, H, W)`` of ``albedo``, ``normal``, ``depth`` and ``reference``.
     """
 
@@ -85,14 +87,14 @@ class Shot:
         channels: Iterable[int] = range(sum(PARTS.values())),
         turn: Callable[[Array], Array] = lambda channel: channel,
     ) -> Tensor:
-        """Copy a part of the shot from disk: ``(T, 13, H, W)`` float32, stacked in the order of ``PARTS``.
+        """Copy a part of the shot from disk: ``(T, 17, H, W)`` float32, stacked in the order of ``PARTS``.
 
         Args:
             frames: which frames.
             rows: which rows.
             columns: which columns.
             realisation: of the noise.
-            channels: which of the 13, in which order.
+            channels: which of the 17, in which order.
             turn: gives another view of ``(T, H, W)``, flipped or turned.
         """
         sources = (self.colors[realisation], *(self.features[name] for name in _FEATURES))
@@ -138,7 +140,7 @@ class _Plan:
         return [(first, realisation) for first in self.firsts for realisation in range(self.realisations)]
 
     def color_shape(self, first: int) -> tuple[int, ...]:
-        return (len(self.sequence) - first, PARTS["color"], *self.sequence.size)
+        return (len(self.sequence) - first, sum(PARTS[name] for name in _NOISY), *self.sequence.size)
 
 
 def check_trainable(sequence: Sequence) -> None:
@@ -268,8 +270,9 @@ def _build(folder: Path, plan: _Plan) -> None:
                 frame = _read(sequence, number, realisation, digest)
                 for first in plan.firsts:
                     if first <= i:
-                        color = histories[first, realisation].update(frame).color
-                        files[first, realisation].write(color.numpy().tobytes())
+                        past = histories[first, realisation].update(frame)
+                        noisy = torch.cat([getattr(past, name) for name in _NOISY], 1)
+                        files[first, realisation].write(noisy.numpy().tobytes())
                 if realisation == 0:
                     for name, values in features.items():
                         values.append(_smallest(getattr(frame, name).numpy()))

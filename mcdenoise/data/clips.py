@@ -23,6 +23,8 @@ class Clip:
 
     Args:
         color: accumulated demodulated radiance, 3 channels.
+        current: demodulated radiance of each frame alone, 3 channels.
+        length: history length in frames, 1 channel.
         albedo: diffuse reflectance, 3 channels.
         normal: world-space normals, 3 channels.
         depth: distance along the view axis, 1 channel.
@@ -30,6 +32,8 @@ class Clip:
     """
 
     color: Tensor
+    current: Tensor
+    length: Tensor
     albedo: Tensor
     normal: Tensor
     depth: Tensor
@@ -41,7 +45,7 @@ class Clip:
 
     @staticmethod
     def from_stack(stack: Tensor) -> Clip:
-        """Take apart what :meth:`mcdenoise.data.cache.Shot.read` stacked: ``(B, T, 13, H, W)``."""
+        """Take apart what :meth:`mcdenoise.data.cache.Shot.read` stacked: ``(B, T, 17, H, W)``."""
         return Clip(*stack.split(list(PARTS.values()), 2))
 
 
@@ -116,15 +120,23 @@ class ClipSampler:
             slice(top, top + self.crop),
             slice(left, left + self.crop),
             realisation=realisation,
-            channels=[*order, *(3 + i for i in order), *(6 + i for i in axes), 9, *(10 + i for i in order)],
+            channels=[
+                *order,
+                *(3 + i for i in order),
+                6,
+                *(7 + i for i in order),
+                *(10 + i for i in axes),
+                13,
+                *(14 + i for i in order),
+            ],
             turn=self._draw_turn(),
         )
-        color, _, normal, _, reference = stack.split(list(PARTS.values()), 1)
+        color, current, _, _, normal, _, reference = stack.split(list(PARTS.values()), 1)
         normal *= (torch.randint(2, (3, 1, 1)) * 2 - 1).float()
         stops = self.exposure * (2 * torch.rand(1) - 1) + self.tint * (2 * torch.rand(3) - 1)
         light = torch.exp2(stops).reshape(3, 1, 1)
-        color *= light
-        reference *= light
+        for image in (color, current, reference):
+            image *= light
         if self.lamps and float(torch.rand(())) < self.lamps:
             mean = reference.mean()
             for _ in range(1 + _randint(3)):
@@ -143,7 +155,7 @@ class ClipSampler:
         raise RuntimeError(f"kornia: expected flips and 90-degree turns, found {moved.tolist()}")
 
     def _hang_lamp(self, stack: Tensor, mean: Tensor) -> None:
-        """Paint a rectangle that shines in all frames of ``(T, 13, H, W)``, with or without an albedo of its own."""
+        """Paint a rectangle that shines in all frames of ``(T, 17, H, W)``, with or without an albedo of its own."""
         height, width = 2 + _randint(self.crop // 3), 2 + _randint(self.crop // 3)
         top, left = _randint(self.crop - height), _randint(self.crop - width)
         tint = 0.7 + 0.6 * torch.rand(1, 3, 1, 1)
@@ -151,13 +163,11 @@ class ClipSampler:
         albedo = torch.rand(1, 1, 1, 1).expand(1, 3, 1, 1) * _randint(2)
         normal = normalize(torch.randn(1, 3, 1, 1), dim=1)
         lamp = stack[:, :, top : top + height, left : left + width]
-        for part, value in zip(
-            lamp.split(list(PARTS.values()), 1),
-            (demodulate(radiance, albedo), albedo, normal, None, radiance),
-            strict=True,
-        ):
-            if value is not None:  # depth stays: lamps hang on whatever is there
-                part.copy_(value.expand_as(part))
+        light = demodulate(radiance, albedo)
+        painted = {"color": light, "current": light, "albedo": albedo, "normal": normal, "reference": radiance}
+        for name, part in zip(PARTS, lamp.split(list(PARTS.values()), 1), strict=True):
+            if name in painted:  # depth and history stay: lamps hang on whatever is there
+                part.copy_(painted[name].expand_as(part))
 
 
 def check_sizes(shots: Sequence[tuple[int, tuple[int, int]]], frames: int, crop: int) -> None:

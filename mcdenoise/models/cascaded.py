@@ -16,7 +16,7 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.unet import UNet
 from mcdenoise.ops import cross_bilateral_weights, downsample, kernel_conv, laplacian_fusion, upsample
 
-FEATURES = 7  # albedo 3, normal 3, depth 1
+FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, its share 1
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of f1, f2, f3
 
 
@@ -36,7 +36,7 @@ class Predictor(Protocol):
     """A network that takes an image and guiding features and returns a better image."""
 
     def __call__(self, image: Tensor, features: Tensor) -> Tensor:
-        """``(B, 3, H, W)`` radiance and ``(B, 7, H, W)`` features in [0, 1] to ``(B, 3, H, W)`` radiance."""
+        """``(B, 3, H, W)`` radiance and ``(B, 11, H, W)`` features to ``(B, 3, H, W)`` radiance."""
 
 
 class FusionModule(nn.Module):
@@ -135,17 +135,30 @@ class KernelPredictor(nn.Module):
 class Cascade(nn.Module):
     """One predictor after another: the second sees the first's image and the same features.
 
+    Beside the paper's ten channels the networks see what accumulation did: the current frame alone, and how much of the
+    accumulated image it is. So they can tell long histories from short ones, and lag from light.
+
     Args:
         first: predicts the initial image R'.
         second: predicts the final image R'' from R'; ``None`` makes the initial image the final one.
     """
+
+    takes_history = True
 
     def __init__(self, first: nn.Module, second: nn.Module | None = None) -> None:
         super().__init__()
         self.first = first
         self.second = second
 
-    def forward(self, color: Tensor, albedo: Tensor, normal: Tensor, depth: Tensor) -> Denoised:
+    def forward(
+        self,
+        color: Tensor,
+        albedo: Tensor,
+        normal: Tensor,
+        depth: Tensor,
+        current: Tensor | None = None,
+        length: Tensor | None = None,
+    ) -> Denoised:
         """Denoise one frame of any size.
 
         Args:
@@ -153,12 +166,16 @@ class Cascade(nn.Module):
             albedo: ``(B, 3, H, W)`` in [0, 1].
             normal: ``(B, 3, H, W)`` world-space unit normals in [-1, 1].
             depth: ``(B, 1, H, W)`` distance along the view axis, scene units, ``inf`` where nothing was hit.
+            current: ``(B, 3, H, W)`` demodulated radiance of the current frame alone; ``color`` by default.
+            length: ``(B, 1, H, W)`` history length of ``color`` in frames, at least 1; 1 by default.
 
         Returns:
             The initial and the final image, demodulated as ``color`` is.
         """
         exposure = auto_exposure(color)
-        features = torch.cat([albedo, normal * 0.5 + 0.5, normalize_depth(depth)], 1)
+        alone = torch.log1p((color if current is None else current) * exposure)
+        share = torch.ones_like(depth) if length is None else 1 / length
+        features = torch.cat([albedo, normal * 0.5 + 0.5, normalize_depth(depth), alone, share], 1)
         initial = self.first(color * exposure, features)
         final = initial if self.second is None else self.second(initial, features)
         return Denoised(initial / exposure, final / exposure)

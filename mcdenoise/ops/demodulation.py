@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from mcdenoise.ops._check import check_shapes
 
-# What a smooth dielectric reflects at normal incidence: on a darker surface most of the light is gloss, which the albedo
-# does not tint. Dividing it by a smaller albedo gives sparse, coloured, huge values.
+# What a smooth dielectric reflects at normal incidence: on a darker surface most of the light is gloss, which no albedo
+# tints, and dividing it by a smaller number would give sparse, coloured, huge values.
 FLOOR = 4e-2
 # Below this there is no texture: less than half of the darkest 8-bit sRGB step above black.
 NO_ALBEDO = 1e-4

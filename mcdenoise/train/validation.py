@@ -19,10 +19,8 @@ if TYPE_CHECKING:
 def denoise_clip(model: nn.Module, clip: Clip) -> tuple[Tensor, Tensor]:
     """Initial and final image of every frame, with albedo, ``(B, T, 3, H, W)``."""
     batch = clip.color.shape[:2]
-    inputs = [
-        getattr(clip, name).flatten(0, 1).contiguous(memory_format=torch.channels_last)
-        for name in ("color", "albedo", "normal", "depth")
-    ]
+    names = ("color", "albedo", "normal", "depth", "current", "length")
+    inputs = [getattr(clip, name).flatten(0, 1).contiguous(memory_format=torch.channels_last) for name in names]
     initial, final = model(*inputs)
     albedo = clip.albedo.flatten(0, 1)
     return remodulate(initial, albedo).unflatten(0, batch), remodulate(final, albedo).unflatten(0, batch)

@@ -15,16 +15,16 @@ from mcdenoise.ops import remodulate
 
 
 def shot_of(stack: Tensor, *more_colors: Tensor) -> Shot:
-    """A shot that lies in memory, from ``(T, 13, H, W)`` and further colors ``(T, 3, H, W)``."""
-    color, *features = (part.numpy() for part in stack.split(list(PARTS.values()), 1))
-    names = [name for name in PARTS if name != "color"]
+    """A shot that lies in memory, from ``(T, 17, H, W)`` and further realisations ``(T, 7, H, W)``."""
+    color, *features = (part.numpy() for part in stack.split([7, *list(PARTS.values())[3:]], 1))
+    names = list(PARTS)[3:]
     return Shot((color, *(more.numpy() for more in more_colors)), dict(zip(names, features, strict=True)))
 
 
 def numbered(length: int = 3, height: int = 6, width: int = 7) -> Tensor:
     """A shot in which every value is another whole number: channel, frame, row and column can be read off."""
-    count = length * 13 * height * width
-    return torch.arange(1.0, count + 1).reshape(length, 13, height, width)
+    count = length * 17 * height * width
+    return torch.arange(1.0, count + 1).reshape(length, 17, height, width)
 
 
 def orbit(clip: Tensor) -> list[Tensor]:
@@ -44,7 +44,7 @@ def test_clips_are_the_shot_turned_and_renamed() -> None:
     crop, frames = 4, 2
     shot = numbered()
     # Infinite depths must neither vanish nor spread.
-    shot[:, 9, 2, 3] = torch.inf
+    shot[:, 13, 2, 3] = torch.inf
     windows = {
         (start, top, left): shot[start : start + frames, :, top : top + crop, left : left + crop]
         for start in range(2)
@@ -99,7 +99,7 @@ def test_a_clip_depends_on_its_seed_alone() -> None:
 
 def test_every_realisation_of_the_noise_is_drawn_with_the_same_features() -> None:
     stack = numbered()
-    others = [torch.full((3, 3, 6, 7), -1.0), torch.full((3, 3, 6, 7), -2.0)]
+    others = [torch.full((3, 7, 6, 7), -1.0), torch.full((3, 7, 6, 7), -2.0)]
     clip = ClipSampler([shot_of(stack, *others)], 2, 4).draw(list(range(60)))
     kinds = [-1 if value == -1 else -2 if value == -2 else 0 for value in clip.color[:, 0, 0, 0, 0].tolist()]
     assert all(10 < kinds.count(kind) < 30 for kind in (0, -1, -2))
@@ -112,10 +112,11 @@ def test_exposure_scales_light_and_nothing_else() -> None:
     seeds = list(range(40))
     plain = ClipSampler([shot_of(stack)], 2, 4).draw(seeds)
     lit = ClipSampler([shot_of(stack)], 2, 4, exposure=2.0).draw(seeds)
-    for name in ("albedo", "normal", "depth"):
+    for name in ("length", "albedo", "normal", "depth"):
         assert torch.equal(getattr(lit, name), getattr(plain, name)), name
     factors = (lit.color / plain.color)[:, :1, :1, :1, :1]
     torch.testing.assert_close(lit.color, plain.color * factors)
+    torch.testing.assert_close(lit.current, plain.current * factors)
     torch.testing.assert_close(lit.reference, plain.reference * factors)
     stops = factors.log2()
     assert stops.abs().max() <= 2
@@ -129,6 +130,7 @@ def test_tint_scales_each_channel_alike_in_color_and_reference() -> None:
     lit = ClipSampler([shot_of(stack)], 2, 4, tint=0.5).draw(seeds)
     factors = (lit.color / plain.color)[:, :1, :, :1, :1]
     torch.testing.assert_close(lit.color, plain.color * factors)
+    torch.testing.assert_close(lit.current, plain.current * factors)
     torch.testing.assert_close(lit.reference, plain.reference * factors)
     assert torch.equal(lit.albedo, plain.albedo)
     assert factors.log2().abs().max() <= 0.5
@@ -137,8 +139,8 @@ def test_tint_scales_each_channel_alike_in_color_and_reference() -> None:
 
 def test_lamps_shine_alike_in_color_and_reference() -> None:
     """A clip of nothing: whatever is in it is a lamp, noise-free, in all frames, and brighter than nothing."""
-    stack = torch.zeros(4, 13, 20, 24)
-    stack[:, 0:3], stack[:, 10:13] = 0.1, 0.5
+    stack = torch.zeros(4, 17, 20, 24)
+    stack[:, 0:6], stack[:, 14:17] = 0.1, 0.5
     seeds = list(range(20))
     clip = ClipSampler([shot_of(stack)], frames=4, crop=16, lamps=1.0).draw(seeds)
     radiance = remodulate(clip.color.flatten(0, 1), clip.albedo.flatten(0, 1)).unflatten(0, (20, 4))
@@ -149,11 +151,12 @@ def test_lamps_shine_alike_in_color_and_reference() -> None:
     assert (radiance[~lit.expand_as(radiance)] == torch.tensor(0.1)).all()
     assert clip.reference.max() > 3
     dark = ClipSampler([shot_of(stack)], frames=4, crop=16).draw(seeds)
+    assert torch.equal(clip.current, clip.color)
     assert dark.reference.unique().tolist() == [0.5]
 
 
 def test_shots_are_drawn_in_proportion_to_their_frames() -> None:
-    shots = [shot_of(torch.full((length, 13, 4, 4), float(length))) for length in (2, 6)]
+    shots = [shot_of(torch.full((length, 17, 4, 4), float(length))) for length in (2, 6)]
     clip = ClipSampler(shots, 2, 4).draw(list(range(200)))
     assert 0.65 < (clip.depth[:, 0, 0, 0, 0] == 6).float().mean() < 0.85
 

@@ -1,0 +1,40 @@
+"""Give weights of the paper's ten input channels the four of the history, on which they do not depend yet.
+
+    python training/add_history_inputs.py OLD.safetensors -o NEW.safetensors
+
+The images stay the same: the new channels are multiplied with zeros, from which training starts.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+from safetensors import safe_open
+
+from mcdenoise.data.files import atomic_path
+from mcdenoise.models import create_model, describe_weights, save_weights
+from mcdenoise.models.cascaded import FEATURES
+
+
+def main() -> None:
+    """Parse and convert."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("weights", type=Path, metavar="OLD")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="NEW")
+    options = parser.parse_args()
+    about = describe_weights(options.weights)
+    with safe_open(options.weights, framework="pt") as file:
+        tensors = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118 - a handle is no dict
+    for key, tensor in tensors.items():
+        if key.endswith("unet.encoder.0.0.weight"):
+            missing = 3 + FEATURES - tensor.shape[1]
+            tensors[key] = torch.cat([tensor, tensor.new_zeros(len(tensor), missing, 3, 3)], 1)
+    model = create_model(about["architecture"], **about["settings"])
+    model.load_state_dict(tensors)
+    texts = {key: value for key, value in about.items() if key not in ("architecture", "settings", "sha256")}
+    with atomic_path(options.out) as temporary:
+        temporary.write_bytes(save_weights(model, about["architecture"], about["settings"], texts))
+
+
+if __name__ == "__main__":
+    main()
