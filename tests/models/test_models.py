@@ -464,12 +464,12 @@ def test_overview() -> None:
         assert entry.pretrained is (name in pretrained_models())
     cost = {name: entry.kmacs_per_pixel / entries["cascaded"].kmacs_per_pixel for name, entry in entries.items()}
     assert cost["cascaded_small"] == pytest.approx(0.44, abs=0.005)
-    assert cost["cascaded_tiny"] == pytest.approx(0.17, abs=0.005)
+    assert cost["cascaded_tiny"] == pytest.approx(0.18, abs=0.005)
 
 
 def test_the_cost_of_the_pixel_network_written_out() -> None:
     width = 64
-    full = (10 + width) * width * 9
+    full = (3 + FEATURES + width) * width * 9
     encoder = sum(2 * width * width * 9 / 4**level for level in (1, 2, 3))
     # A 2x2 transposed convolution, two convolutions of which the first sees the encoder too, and a head.
     decoder = sum((width**2 + 3 * width * width * 9 + 3 * width * 9) / 4**level for level in (0, 1, 2))
