@@ -243,14 +243,14 @@ def _run(
             history.clear()
             if not fabric.is_global_zero:
                 continue
-            scores: dict[str, float] = {}
-            if save:
-                run.save(done, provenance, *trainer.parts)
-                scores = validate(trainer.result, data.watched, fabric, board, done)
+            scores = validate(trainer.result, data.watched, fabric, board, done) if save else {}
             progress = Progress(done, loss, norm, rate, time.monotonic() - started, scores)
             run.log(dataclasses.asdict(progress))
             for name in ("loss", "gradient_norm", "learning_rate"):
                 board.add_scalar(f"train/{name}", getattr(progress, name), done)
+            # Last, so that no step that will not be done again is missing in the log.
+            if save:
+                run.save(done, provenance, *trainer.parts)
             report(progress)
 
 
