@@ -10,7 +10,7 @@ import json as jsonlib
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -187,26 +187,62 @@ def _denoise() -> Callable[..., int | None]:
     return denoise
 
 
+@dataclass(frozen=True)
+class RenderOptions:
+    """How a sequence is rendered, whatever the scene.
+
+    Args:
+        spp: samples a pixel of the noisy color.
+        realisations: noisy colors of each frame, with independent noise.
+        reference_spp: samples a pixel of the references; 0 renders none. With --noise-level the most.
+        noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
+        reference_frames: which frames get a reference, such as 8-11; all by default.
+        size: WIDTHxHEIGHT in pixels.
+        workers: processes that render frames side by side; of use with scalar_rgb.
+        variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
+    """
+
+    spp: int = 1
+    realisations: int = 1
+    reference_spp: int = 512
+    noise_level: float | None = None
+    reference_frames: str | None = None
+    size: str = "640x360"
+    workers: int = 1
+    variant: str | None = None
+
+    def arguments(self) -> dict[str, Any]:
+        """Those of :func:`mcdenoise.render.render_sequence`."""
+        from mcdenoise.data.sequences import parse_frames
+
+        if self.reference_spp < 0:
+            raise InputError(f"--reference-spp: expected at least 0, found {self.reference_spp}")
+        frames = self.reference_frames
+        referenced = None if frames is None else parse_frames(frames, name="--reference-frames")
+        return {
+            "spp": self.spp,
+            "realisations": self.realisations,
+            "reference_spp": max(self.reference_spp, 1),
+            "noise_level": self.noise_level,
+            "reference_frames": referenced if self.reference_spp > 0 else [],
+            "size": _size(self.size),
+            "workers": self.workers,
+            "variant": self.variant,
+        }
+
+
 def _render() -> Callable[..., int | None]:
     """Render a Mitsuba 3 scene along a camera path to a noisy sequence with references."""
-    from mcdenoise.data.sequences import parse_frames
     from mcdenoise.render import load_shot, render_sequence
 
     def render(
         scene: tyro.conf.Positional[Path],
         camera_path: Path,
         out: Out,
+        rendering: tyro.conf.OmitArgPrefixes[RenderOptions],
         frames: int | None = None,
         every: int = 1,
-        spp: int = 1,
-        realisations: int = 1,
-        reference_spp: int = 512,
-        noise_level: float | None = None,
-        reference_frames: str | None = None,
-        size: str = "640x360",
         seed: int = 0,
-        workers: int = 1,
-        variant: str | None = None,
     ) -> None:
         """Render a Mitsuba 3 scene along a camera path to a sequence in the BMFR layout.
 
@@ -218,23 +254,14 @@ def _render() -> Callable[..., int | None]:
                 'frames' of cameras with 'position' and 'look_at'; or a folder of Tungsten scenes, one per frame.
                 Objects of the scene move with 'objects': for each id a list of 4x4 matrices, one per frame.
             out: folder of the sequence; finished frames in it are kept.
+            rendering: samples, references, size and processors.
             frames: render the first so many cameras; all by default.
             every: take only every n-th camera of the path.
-            spp: samples a pixel of the noisy color.
-            realisations: noisy colors of each frame, with independent noise.
-            reference_spp: samples a pixel of the references; 0 renders none. With --noise-level the most.
-            noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
-            reference_frames: which frames get a reference, such as 8-11; all by default.
-            size: WIDTHxHEIGHT in pixels.
             seed: of the noise.
-            workers: processes that render frames side by side; of use with scalar_rgb.
-            variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
         """
-        if reference_spp < 0:
-            raise InputError(f"--reference-spp: expected at least 0, found {reference_spp}")
-        referenced = None if reference_frames is None else parse_frames(reference_frames, name="--reference-frames")
         if every < 1:
             raise InputError(f"--every: expected at least 1, found {every}")
+        arguments = rendering.arguments()
         shot = load_shot(camera_path)
         with _progress() as progress:
             task = progress.add_task("render", total=None)
@@ -242,18 +269,11 @@ def _render() -> Callable[..., int | None]:
                 scene,
                 shot.cameras[::every],
                 out,
-                size=_size(size),
                 frames=frames,
-                spp=spp,
-                realisations=realisations,
-                reference_spp=max(reference_spp, 1),
-                noise_level=noise_level,
-                reference_frames=referenced if reference_spp > 0 else [],
                 moves={name: path[::every] for name, path in shot.moves.items()},
                 seed=seed,
-                workers=workers,
-                variant=variant,
                 progress=lambda done, total: progress.update(task, completed=done, total=total),
+                **arguments,
             )
         print(written)
 
@@ -268,18 +288,13 @@ def _generate() -> Callable[..., int | None]:
 
     def generate(
         out: Out,
+        rendering: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions(
+            realisations=3, reference_spp=64, size="160x160"
+        ),
         seeds: str = "0-15",
         frames: int = 12,
-        spp: int = 1,
-        realisations: int = 3,
-        reference_spp: int = 64,
-        noise_level: float | None = None,
-        reference_frames: str | None = None,
-        noise_seed: int | None = None,
-        size: str = "160x160",
         zoom: float = 1.0,
-        workers: int = 1,
-        variant: str | None = None,
+        noise_seed: int | None = None,
     ) -> None:
         """Render random rooms, courts and still lifes to sequences to train on: OUT/random0000, OUT/random0001, ...
 
@@ -287,25 +302,17 @@ def _generate() -> Callable[..., int | None]:
 
         Args:
             out: folder of the sequences; finished frames in it are kept.
+            rendering: samples, references, size and processors.
             seeds: which scenes, such as 0-99,200.
             frames: frames of each sequence.
-            spp: samples a pixel of the noisy color.
-            realisations: noisy colors of each frame, with independent noise.
-            reference_spp: samples a pixel of the references. With --noise-level the most.
-            noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
-            reference_frames: which frames get a reference, such as 8-11; all by default.
-            noise_seed: of the noise of all scenes; by default each has the noise of its own seed.
-            size: WIDTHxHEIGHT in pixels.
             zoom: render the middle of an image that is so many times as wide and high.
-            workers: processes that render frames side by side; of use with scalar_rgb.
-            variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
+            noise_seed: of the noise of all scenes; by default each has the noise of its own seed.
         """
         if frames < 1:
             raise InputError(f"--frames: expected at least 1, found {frames}")
         if not 0 < zoom < math.inf:
             raise InputError(f"--zoom: expected a positive number, found {zoom:g}")
-        chosen = parse_frames(seeds, name="--seeds")
-        referenced = None if reference_frames is None else parse_frames(reference_frames, name="--reference-frames")
+        chosen, arguments = parse_frames(seeds, name="--seeds"), rendering.arguments()
         with _progress() as progress:
             whole = progress.add_task("scenes", total=len(chosen))
             for seed in chosen:
@@ -319,17 +326,10 @@ def _generate() -> Callable[..., int | None]:
                     made.scene,
                     made.cameras,
                     out / f"random{seed:04d}",
-                    size=_size(size),
-                    spp=spp,
-                    realisations=realisations,
-                    reference_spp=reference_spp,
-                    noise_level=noise_level,
-                    reference_frames=referenced,
                     seed=seed if noise_seed is None else noise_seed,
                     moves=made.moves,
-                    workers=workers,
-                    variant=variant,
                     progress=show,
+                    **arguments,
                 )
                 progress.remove_task(task)
                 progress.advance(whole)
