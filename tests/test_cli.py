@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from mcdenoise.cli import COMMANDS, main
+from mcdenoise.cli import COMMANDS, RenderOptions, main
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.models import create_model, list_models, pretrained_models, save_weights
 from mcdenoise.train import TrainConfig
@@ -112,8 +112,9 @@ def test_help_names_every_option(run: Callable[..., tuple[int, str, str]], comma
     assert (status, errors) == (0, "")
     parameters = inspect.signature(COMMANDS[command]()).parameters
     names = set(parameters) - POSITIONAL
-    if "config" in names:
-        names = names - {"config"} | {field.name for field in dataclasses.fields(TrainConfig)}
+    for group, settings in (("config", TrainConfig), ("rendering", RenderOptions)):
+        if group in names:
+            names = names - {group} | {field.name for field in dataclasses.fields(settings)}
     for name in names:
         assert f"--{name.replace('_', '-')}" in text, name
     if "out" in names:
