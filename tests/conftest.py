@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import importlib
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +15,14 @@ from mcdenoise.data.bmfr import write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 
 HEIGHT, WIDTH, FRAMES = 20, 24, 4
+
+
+@pytest.fixture(scope="session")
+def colour() -> Any:
+    """The package colour-science, which warns of packages for plots that it does not find."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return importlib.import_module("colour")
 
 
 @pytest.fixture

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import warnings
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,23 +28,34 @@ def to_rec709(image: Tensor, metadata: Metadata) -> Tensor:
             are Rec. 709's to 0.001, the image is returned as it is.
 
     Returns:
-        The same shape and dtype; the white is adapted by the Bradford transform. Saturated colors may be negative.
+        The same shape and dtype; the white is adapted by the Bradford transform. Saturated colours may be negative.
 
     Raises:
         InputError: the chromaticities are no colour space.
     """
-    stored = metadata.get("chromaticities")
-    if stored is None or np.allclose(np.resize(np.asarray(stored, float), 8), _REC709, atol=_CLOSE):
-        return image
-    # Loading it takes a second, and few files need it.
-    colour = importlib.import_module("colour")
+    stored = metadata.get("chromaticities", _REC709)
+    if isinstance(stored, tuple) and len(stored) == 8 and np.isfinite(stored).all():
+        if np.allclose(stored, _REC709, atol=_CLOSE):
+            return image
+        matrix = _matrix(np.reshape(stored, (4, 2)))
+        if matrix is not None:
+            return torch.einsum("ji,...ihw->...jhw", matrix.to(image), image)
+    raise InputError(
+        f"attribute 'chromaticities': expected x and y of red, green, blue and white, found {stored}; "
+        "correct or remove it"
+    )
+
+
+def _matrix(points: np.ndarray[Any, Any]) -> Tensor | None:
+    """``(3, 3)`` RGB to Rec. 709; ``None`` where the primaries span no colours."""
+    # Loading it takes a second, and few files need it. It warns of packages for plots that it does not find.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        colour = importlib.import_module("colour")
+    target = colour.RGB_COLOURSPACES["ITU-R BT.709"]
     try:
-        points = np.asarray(stored, float).reshape(4, 2)
         space = colour.RGB_Colourspace("file", points[:3], points[3])
-        target = colour.RGB_COLOURSPACES["ITU-R BT.709"]
         matrix = colour.matrix_RGB_to_RGB(space, target, chromatic_adaptation_transform="Bradford")
-    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
-        raise InputError(
-            f"chromaticities: expected x and y of red, green, blue and white, found {stored}; remove the attribute"
-        ) from error
-    return torch.einsum("ji,...ihw->...jhw", torch.from_numpy(matrix).to(image), image)
+    except np.linalg.LinAlgError:
+        return None
+    return torch.from_numpy(matrix) if np.isfinite(matrix).all() else None

@@ -212,7 +212,9 @@ def evaluate_folder(
 
     chosen = PROTOCOLS[protocol]
     strict = Table(PROTOCOLS[STRICT].description)
-    tables: dict[str, Table] = {STRICT: strict} | ({} if protocol == STRICT else {protocol: Table(chosen.description)})
+    tables: dict[str, Table] = {STRICT: strict}
+    if protocol != STRICT:
+        tables[protocol] = Table(chosen.description)
     pairs = _Pairs(strict)
     past: tuple[int, Tensor, Tensor] | None = None
     for number in numbers:
