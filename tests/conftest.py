@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import importlib
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +11,15 @@ from torch import Tensor
 from mcdenoise.buffers import Frame
 from mcdenoise.data.bmfr import write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
+from mcdenoise.data.color_space import import_colour
 
 HEIGHT, WIDTH, FRAMES = 20, 24, 4
 
 
 @pytest.fixture(scope="session")
 def colour() -> Any:
-    """The package colour-science, which warns of packages for plots that it does not find."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return importlib.import_module("colour")
+    """The package colour-science."""
+    return import_colour()
 
 
 @pytest.fixture

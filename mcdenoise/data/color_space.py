@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import sys
 import warnings
 from typing import Any
 
 import numpy as np
+import OpenImageIO as oiio
 import torch
 from torch import Tensor
 
@@ -48,10 +50,7 @@ def to_rec709(image: Tensor, metadata: Metadata) -> Tensor:
 
 def _matrix(points: np.ndarray[Any, Any]) -> Tensor | None:
     """``(3, 3)`` RGB to Rec. 709; ``None`` where the primaries span no colours."""
-    # Loading it takes a second, and few files need it. It warns of packages for plots that it does not find.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        colour = importlib.import_module("colour")
+    colour = import_colour()
     target = colour.RGB_COLOURSPACES["ITU-R BT.709"]
     try:
         space = colour.RGB_Colourspace("file", points[:3], points[3])
@@ -59,3 +58,17 @@ def _matrix(points: np.ndarray[Any, Any]) -> Tensor | None:
     except np.linalg.LinAlgError:
         return None
     return torch.from_numpy(matrix) if np.isfinite(matrix).all() else None
+
+
+def import_colour() -> Any:
+    """The package colour-science; loading it takes a second, and few files need it."""
+    modules: dict[str, Any] = sys.modules
+    with warnings.catch_warnings():
+        # It warns of packages for plots that it does not find.
+        warnings.simplefilter("ignore")
+        # It would keep OpenImageIO alive to the end of the process, which prints pages of leaks then.
+        modules["OpenImageIO"] = None
+        try:
+            return importlib.import_module("colour")
+        finally:
+            modules["OpenImageIO"] = oiio

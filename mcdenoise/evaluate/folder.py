@@ -238,7 +238,7 @@ def evaluate_folder(
                 f"{protocol} leaves out the first {chosen.skipped_frames} frames; this sequence has no reference later"
             )
             tables[protocol].left_out |= dict.fromkeys(chosen.metrics, reason)
-    floor = noise_floor(sequence, metrics=[name for name in METRICS if name != "FLIP"])
+    floor = noise_floor(sequence, metrics=[name for name in METRICS if name not in ("RMSE", "FLIP")])
     return Evaluation(sequence.name, folder, tables, pairs.warping_error, reference_noise(sequence), floor)
 
 

@@ -31,7 +31,9 @@ def noise_floor(sequence: Sequence, *, metrics: Collection[str] = ("SMAPE", "tSM
 
     An estimate: the references are taken for the truth, and copies of them with the noise that the renderer has noted
     for the references. The noise is Gaussian, its standard deviation ``s sqrt(pi / 2) (2 y + 0.01)``, where ``s`` is
-    the noted SMAPE of the frame, independent in each pixel, channel and frame. Real noise is uneven and has outliers.
+    the noted SMAPE of the frame, independent in each pixel, channel and frame. Real noise is uneven and has outliers:
+    in the demonstration's room, with 32 paths a pixel, SMAPE, tSMAPE and tRMSE come out 13 to 21 % too low. RMSE is not
+    to be had in this way: bright emitters, which have no noise, would get the most.
 
     Args:
         sequence: frames with references.

@@ -14,6 +14,8 @@ from mcdenoise.metrics._check import UncomputableError, check_images
 
 _SSIM_WINDOW = 11
 _LARGEST = 65504.0
+# Of a reference darker than this HDR-FLIP finds no exposures, and ends the process.
+_BLACK = 1e-5
 
 
 def displayed(image: Tensor) -> Tensor:
@@ -124,11 +126,13 @@ def flip_hdr(image: Tensor, reference: Tensor) -> Tensor:
 
     Raises:
         ValueError: the shapes differ.
-        UncomputableError: the package ``flip-evaluator`` is not installed.
+        UncomputableError: a reference is black, or the package ``flip-evaluator`` is not installed.
 
     Source: Andersson et al. 2021, Visualizing Errors in Rendered High Dynamic Range Images.
     """
     check_images(image, reference)
+    if bool((reference.amax((-3, -2, -1)) < _BLACK).any()):
+        raise UncomputableError("HDR-FLIP's exposures: expected a reference with light in it, found a black one")
     return flip(image.clamp(0, _LARGEST), reference.clamp(0, _LARGEST), "HDR")
 
 

@@ -165,6 +165,19 @@ def test_hdr_flip_sees_what_a_display_clamps() -> None:
     assert 0 < flip_hdr(torch.full_like(reference, 1e9), reference).item() <= 1
 
 
+def test_hdr_flip_of_darkness() -> None:
+    pytest.importorskip("flip_evaluator")
+    images = torch.rand(2, 3, 16, 16)
+    black = images.clone()
+    black[1] = 0
+    with pytest.raises(UncomputableError, match="found a black one"):
+        flip_hdr(images, black)
+    # A candle in a cellar is enough, and a flat reference has one exposure.
+    black[1, 2, 3, 4] = 2e-5
+    assert flip_hdr(images, black).isfinite().all()
+    assert flip_hdr(images, torch.full_like(images, 0.5)).isfinite().all()
+
+
 def test_flip_without_its_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     with pytest.raises(UncomputableError, match=r"FLIP needs flip-evaluator.*mcdenoise\[peers\]"):
