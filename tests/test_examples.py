@@ -124,7 +124,7 @@ def test_unseen_scenes_compares_every_image(small_sequence: Path, weights: Path,
     file = tmp_path / "scores.json"
     arguments = (small_sequence, small_sequence, "--weights", weights, "--json", file, "--markdown", "--peers", "oidn")
     first_table, second_table, notes, lines = run("unseen_scenes.py", *arguments).strip().split("\n\n")
-    header = "| scene | frames | image | SMAPE | relMSE | PSNR | SSIM | FLIP | tSMAPE | tRMSE |"
+    header = "| scene | frames | image | SMAPE | relMSE | RMSE | PSNR | SSIM | FLIP | tSMAPE | tRMSE |"
     assert first_table.startswith(header)
     assert second_table.startswith(header)
     assert notes == "- FLIP: of one in 4 frames."
@@ -160,7 +160,18 @@ def test_unseen_scenes_prints_plain_columns_too(small_sequence: Path, weights: P
     arguments = (small_sequence, "--weights", weights, "--no-bilateral", "--no-flip", "--frames", "1-3")
     lines = run("unseen_scenes.py", *arguments).splitlines()
     assert len(lines) == 5
-    assert lines[0].split() == ["scene", "frames", "image", "SMAPE", "relMSE", "PSNR", "SSIM", "tSMAPE", "tRMSE"]
+    assert lines[0].split() == [
+        "scene",
+        "frames",
+        "image",
+        "SMAPE",
+        "relMSE",
+        "RMSE",
+        "PSNR",
+        "SSIM",
+        "tSMAPE",
+        "tRMSE",
+    ]
     assert lines[1].split()[:3] == ["plane", "3", "noisy"]
 
 

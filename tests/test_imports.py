@@ -63,7 +63,7 @@ ALLOWED: dict[str, set[str]] = {
 }
 OPS_KNOW = {"torch", "kornia"}
 # `import mcdenoise` leaves these alone: optional, slow to load, or of use to the command line only.
-LAZY = {"OpenImageIO", "matplotlib", "tyro"}
+LAZY = {"OpenImageIO", "colour", "matplotlib", "tyro"}
 LAZY |= {"drjit", "mitsuba", "pyoidn", "flip_evaluator", "lightning", "lightning_fabric", "tensorboard"}
 SECONDS = 0.5
 
