@@ -395,7 +395,7 @@ def _benchmark() -> Callable[..., int | None]:
 
     from mcdenoise.benchmark import Settings, benchmark_ops, choose_candidates, parse_sizes, run_benchmark
     from mcdenoise.benchmark.sizes import SIZES
-    from mcdenoise.benchmark.tables import op_rows, scene_rows
+    from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows
     from mcdenoise.data import open_sequence
 
     def benchmark(
@@ -439,17 +439,22 @@ def _benchmark() -> Callable[..., int | None]:
         if not 1 <= threads <= _MOST_THREADS:
             raise InputError(f"--threads: expected 1 to {_MOST_THREADS}, found {threads}")
         if ops == bool(sequences):
-            raise InputError("expected the folders of sequences, or --ops, and not both; see `mcdenoise benchmark -h`")
+            raise InputError(
+                "expected the folders of sequences, or --ops, and not both; see `mcdenoise benchmark --help`"
+            )
+        rounds = rounds if rounds is not None else 5 if ops else 3
         if ops:
             with _progress() as progress:
                 task = progress.add_task("ops", total=None)
                 costs = benchmark_ops(
                     size=_size(size),
-                    rounds=5 if rounds is None else rounds,
+                    rounds=rounds,
                     threads=threads,
                     device=device,
                     out=out,
-                    command=_command("benchmark", "--ops", out=out, size=size, threads=threads, device=device),
+                    command=_command(
+                        "benchmark", "--ops", out=out, size=size, rounds=rounds, threads=threads, device=device
+                    ),
                     on_step=lambda done, total: progress.update(task, completed=done, total=total),
                 )
             _print_rows(op_rows(costs))
@@ -458,14 +463,26 @@ def _benchmark() -> Callable[..., int | None]:
             return 0
         if out is None:
             raise InputError("--out: expected a folder to write to, found none; give one with -o")
-        options = dict(models=models, peers=peers, precisions=precisions, frames=frames, sizes=sizes)
         settings = Settings(
-            rounds=3 if rounds is None else rounds,
+            rounds=rounds,
             threads=threads,
             device=device,
             sizes=tuple(parse_sizes(sizes)),
             pictures=pictures,
-            command=_command("benchmark", *sequences, out=out, **options, threads=threads, device=device),
+            command=_command(
+                "benchmark",
+                *sequences,
+                out=out,
+                models=models,
+                peers=peers,
+                precisions=precisions,
+                frames=frames,
+                rounds=rounds,
+                threads=threads,
+                device=device,
+                sizes=sizes,
+                pictures=pictures,
+            ),
         )
         opened = [open_sequence(sequence, frames) for sequence in sequences]
         candidates = choose_candidates(models, peers, precisions=precisions, threads=threads, device=device)
@@ -479,7 +496,7 @@ def _benchmark() -> Callable[..., int | None]:
                 on_step=lambda done, total: progress.update(task, completed=done, total=total),
             )
         _print_rows(scene_rows(results))
-        for line in [*results.notes, out]:
+        for line in [*remarks(results), out]:
             print(line)
         _write_json(json, asdict(results))
         return 1 if results.failed else 0
@@ -604,10 +621,11 @@ def _show(table: Table) -> None:
 
 
 def _print_rows(rows: list[dict[str, str]]) -> None:
-    table = Table(*rows[0])
-    for row in rows:
-        table.add_row(*row.values())
-    _show(table)
+    if rows:
+        table = Table(*rows[0])
+        for row in rows:
+            table.add_row(*row.values())
+        _show(table)
 
 
 def _print_scores(rows: list[dict[str, Any]]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -50,13 +51,12 @@ def write_ops_csv(results: OpResults, folder: Path) -> None:
 
 
 def scene_rows(results: Results) -> list[dict[str, str]]:
-    """What to print: error and run time of each method, scene by scene, the best first; then what has failed."""
+    """What to print of each method that did its work: error and run time, scene by scene, the best first."""
     rows = []
     names = [name for name in _SHOWN if any(name in cell.errors for cell in results.cells)]
     for scene in results.scenes:
-        cells = [_cell(results, scene, method) for method in results.methods]
-        for cell in sorted(cells, key=_rank):
-            speed = results.megapixels_per_second(cell)
+        cells = [cell for cell in results.cells if cell.scene == scene.name and not cell.failure]
+        for cell in sorted(cells, key=lambda cell: cell.errors.get("SMAPE", math.inf)):
             rows.append(
                 {
                     "scene": scene.name,
@@ -64,15 +64,24 @@ def scene_rows(results: Results) -> list[dict[str, str]]:
                     **{name: _number(cell.errors.get(name), ".4g") for name in names},
                     "ms": _number(cell.denoising, ".1f"),
                     "quartiles": "" if cell.computing is None else _range(cell.computing),
-                    "ms with files": _number(cell.whole and cell.whole.median, ".1f"),
-                    "megapixels/s": _number(speed, ".2f"),
+                    "ms with files": _number(_median(cell.whole), ".1f"),
+                    "megapixels/s": _number(results.megapixels_per_second(cell), ".2f"),
                     "peak MiB": _number(cell.memory, ".0f"),
-                    "failure": cell.failure,
                 }
             )
-    if not any(row["failure"] for row in rows):
-        rows = [{name: text for name, text in row.items() if name != "failure"} for row in rows]
     return rows
+
+
+def remarks(results: Results) -> list[str]:
+    """What to print below: what failed, what is missing, what is left out, each with its reason."""
+    lines = [f"failed: {cell.scene}, {cell.method}: {cell.failure}" for cell in results.cells if cell.failure]
+    lines += [
+        f"not tried: {one.method}, {one.width}x{one.height}: {one.failure}" for one in results.costs if one.failure
+    ]
+    missing = sorted((method for method in results.methods if method.missing), key=lambda method: method.missing)
+    for reason, methods in groupby(missing, lambda method: method.missing):
+        lines.append(f"missing: {'; '.join(method.name for method in methods)}: {reason}")
+    return lines + results.notes
 
 
 def op_rows(results: OpResults) -> list[dict[str, str]]:
@@ -83,7 +92,7 @@ def op_rows(results: OpResults) -> list[dict[str, str]]:
             "backend": cost.backend,
             "dtype": cost.dtype,
             "relative error": _number(cost.error, ".1e"),
-            "ms": _number(cost.milliseconds and cost.milliseconds.median, ".2f"),
+            "ms": _number(_median(cost.milliseconds), ".2f"),
             "quartiles": "" if cost.milliseconds is None else _range(cost.milliseconds),
             "MiB": _number(cost.mebibytes, ".1f"),
             "copy ms": _number(cost.copy, ".2f"),
@@ -100,10 +109,6 @@ def _cell(results: Results, scene: Scene, method: Method) -> Cell:
     return found or Cell(scene.name, method.name, failure=f"missing: {method.missing}")
 
 
-def _rank(cell: Cell) -> tuple[bool, float]:
-    return bool(cell.failure), cell.errors.get("SMAPE", math.inf)
-
-
 def _number(value: float | None, form: str) -> str:
     return "" if value is None else format(value, form)
 
@@ -118,7 +123,7 @@ def _row(scene: Scene, method: Method, cell: Cell, results: Results) -> dict[str
     for name in metrics:
         spread = cell.errors_spread.get(name)
         errors[name] = cell.errors.get(name)
-        errors |= {f"{name} lower": spread and spread.lower, f"{name} upper": spread and spread.upper}
+        errors |= _quartiles(name, spread)
     return {
         "scene": scene.name,
         "method": method.name,
@@ -132,7 +137,7 @@ def _row(scene: Scene, method: Method, cell: Cell, results: Results) -> dict[str
         **errors,
         **_times("ms", cell.computing),
         **_times("whole ms", cell.whole),
-        **{f"{stage} ms": spread and spread.median for stage in STAGES for spread in [cell.stages.get(stage)]},
+        **{f"{stage} ms": _median(cell.stages.get(stage)) for stage in STAGES},
         "megapixels per second": results.megapixels_per_second(cell),
         "peak MiB": cell.memory,
         "failure": cell.failure,
@@ -140,11 +145,16 @@ def _row(scene: Scene, method: Method, cell: Cell, results: Results) -> dict[str
 
 
 def _times(name: str, spread: Spread | None) -> dict[str, float | None]:
-    return {
-        name: spread and spread.median,
-        f"{name} lower": spread and spread.lower,
-        f"{name} upper": spread and spread.upper,
-    }
+    return {name: _median(spread), **_quartiles(name, spread)}
+
+
+def _median(spread: Spread | None) -> float | None:
+    return None if spread is None else spread.median
+
+
+def _quartiles(name: str, spread: Spread | None) -> dict[str, float | None]:
+    lower, upper = (None, None) if spread is None else (spread.lower, spread.upper)
+    return {f"{name} lower": lower, f"{name} upper": upper}
 
 
 def _write(path: Path, rows: list[dict[str, Any]]) -> None:
