@@ -24,6 +24,7 @@ from mcdenoise.benchmark.memory import peak_memory
 from mcdenoise.benchmark.methods import ModelRunner, PeerRunner
 from mcdenoise.benchmark.operators import backends
 from mcdenoise.benchmark.run import kept_frames
+from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import fit_line, measure_sizes, synthetic_frame
 from mcdenoise.buffers import Frame
 from mcdenoise.cli import main
@@ -224,6 +225,23 @@ def test_nothing_is_left_of_a_run_that_is_interrupted(small_sequence: Path, out:
     assert sorted(out.parent.iterdir()) == before
 
 
+def test_temporal_errors_are_of_neighbours_and_what_is_not_finite_is_left_out() -> None:
+    errors = Errors()
+    reference = torch.full((1, 3, 16, 16), 0.25)
+    for number, level in ((3, 0.25), (4, 0.5), (6, 0.75)):
+        errors.add("ours", number, torch.full_like(reference, level), reference)
+    means, spreads = errors.means("ours"), errors.spreads("ours")
+    # |x - y| / (x + y + 0.01) of 0, 0.25 and 0.5; frame 6 has no neighbour.
+    smape = [0, 0.25 / 0.76, 0.5 / 1.01]
+    assert means["SMAPE"] == pytest.approx(sum(smape) / 3)
+    assert spreads["SMAPE"].median == pytest.approx(smape[1])
+    assert spreads["tSMAPE"].count == spreads["tRMSE"].count == 1
+    # The first image equals its reference.
+    assert "PSNR" not in means
+    assert "PSNR" not in spreads
+    assert errors.means("theirs") == {}
+
+
 # The command
 
 
@@ -264,7 +282,7 @@ def test_missing_peers_are_said_to_be_missing(
     assert [method.name for method in results.methods if method.missing] == missing
     assert "pip install 'mcdenoise[peers]'" in results.methods[4].missing
     assert [cell.method for cell in results.cells] == present
-    assert "FLIP is left out: FLIP needs flip-evaluator" in results.notes[0]
+    assert "FLIP is left out where it cannot be computed: FLIP needs flip-evaluator" in results.notes[0]
     assert all(set(cell.errors) >= METRICS and "FLIP" not in cell.errors for cell in results.cells)
     own = results.methods[-1]
     assert own.parameters == sum(p.numel() for p in create_model("cascaded", width=4).parameters())

@@ -17,7 +17,7 @@ from torch import Tensor
 from mcdenoise.benchmark.machine import Stopwatch, check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.memory import peak_memory
 from mcdenoise.benchmark.methods import Candidate, Runner, one_line
-from mcdenoise.benchmark.scoring import Errors, usable_metrics
+from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import Size, measure_sizes
 from mcdenoise.benchmark.tables import write_csv
 from mcdenoise.buffers import Frame
@@ -106,13 +106,15 @@ def run_benchmark(
         on_step(next(steps), total)
 
     with new_folder(out) as folder:
-        metrics, notes = usable_metrics()
+        left_out: dict[str, str] = {}
         present = [candidate for candidate in candidates if not candidate.method.missing]
         made = _Made(present)
         scenes: list[Scene] = []
         cells: list[Cell] = []
         for name, sequence in zip(_unique_names(sequences), sequences, strict=True):
-            scene, own = _SceneRun(name, sequence, present, made, folder, settings, metrics).measure(step)
+            run = _SceneRun(name, sequence, present, made, folder, settings)
+            scene, own = run.measure(step)
+            left_out |= run.errors.left_out
             scenes.append(scene)
             cells += own
         costs, fits = _costs(present, made, settings, step)
@@ -126,7 +128,7 @@ def run_benchmark(
             cells=cells,
             costs=costs,
             fits=fits,
-            notes=notes,
+            notes=[f"{name} is left out where it cannot be computed: {reason}" for name, reason in left_out.items()],
         )
         results.write(folder)
         write_csv(results, folder)
@@ -163,14 +165,13 @@ class _SceneRun:
         made: _Made,
         folder: Path,
         settings: Settings,
-        metrics: list[str],
     ) -> None:
+        self.errors = Errors()
         self._sequence, self._candidates, self._settings = sequence, candidates, settings
         self._runners = made.runners
         self._failures = dict(made.failures)
         self._folder, self._written = folder, folder / ".written.exr"
         self._watch = Stopwatch(settings.device)
-        self._errors = Errors(metrics)
         self._times: dict[str, dict[str, list[float]]] = {name: {} for name in self._runners}
         height, width = sequence.size
         self._scene = Scene(
@@ -213,7 +214,7 @@ class _SceneRun:
                     if not image.isfinite().all():
                         raise ArithmeticError(f"frame {number} has NaN or infinite values")
                     if frame.reference is not None:
-                        self._errors.add(name, number, image, frame.reference)
+                        self.errors.add(name, number, image, frame.reference)
                 if kept and image is not None and name not in self._failures:
                     self._keep(candidate.method.folder, number, image)
             on_step()
@@ -290,8 +291,8 @@ class _SceneRun:
         return Cell(
             self._scene.name,
             name,
-            self._errors.means(name),
-            self._errors.spreads(name),
+            self.errors.means(name),
+            self.errors.spreads(name),
             whole=times[_WHOLE],
             stages={stage: times[stage] for stage in STAGES if stage in times},
             memory=peak_memory(candidate.make, frames, threads=self._settings.threads, device=self._settings.device),

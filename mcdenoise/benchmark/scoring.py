@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
 from typing import NamedTuple
 
 import torch
@@ -13,9 +12,6 @@ from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
 from mcdenoise.results import Spread
 
-# Larger than the window of any metric.
-_TRIAL_SIZE = 32
-
 
 class _Past(NamedTuple):
     number: int
@@ -23,29 +19,16 @@ class _Past(NamedTuple):
     reference: Tensor
 
 
-def usable_metrics() -> tuple[list[str], list[str]]:
-    """Names in :data:`mcdenoise.evaluate.METRICS`, and a note for each that needs a package which is not installed."""
-    usable, notes = [], []
-    for name, metric in METRICS.items():
-        image = torch.full((1, 3, _TRIAL_SIZE, _TRIAL_SIZE), 0.5)
-        trial = torch.stack([image, image], 1) if metric.temporal else image
-        try:
-            metric.function(trial, trial)
-            usable.append(name)
-        except InputError as error:
-            notes.append(f"{name} is left out: {error}")
-    return usable, notes
-
-
 class Errors:
     """Errors of any number of methods, frame by frame; keeps only the previous image of each.
 
     Args:
-        metrics: names in :data:`mcdenoise.evaluate.METRICS`.
+        left_out: by name of a metric in :data:`mcdenoise.evaluate.METRICS`, why it could not be computed for some image
+            or for any, such as a package that is not installed.
     """
 
-    def __init__(self, metrics: Collection[str]) -> None:
-        self._metrics = metrics
+    def __init__(self) -> None:
+        self.left_out: dict[str, str] = {}
         self._past: dict[str, _Past] = {}
         self._values: dict[str, dict[str, list[float]]] = {}
 
@@ -60,16 +43,20 @@ class Errors:
             reference: of the same shape, on the same device.
         """
         past = self._past.get(method)
-        follows = past is not None and past.number == number - 1
+        if past is not None and past.number != number - 1:
+            past = None
         values = self._values.setdefault(method, {})
-        for name in self._metrics:
-            metric = METRICS[name]
-            if not metric.temporal:
-                value = metric.function(image, reference)
-            elif past is not None and follows:
-                clips = torch.stack([past.image, image], 1), torch.stack([past.reference, reference], 1)
-                value = metric.function(*clips)
-            else:
+        for name, metric in METRICS.items():
+            try:
+                if not metric.temporal:
+                    value = metric.function(image, reference)
+                elif past is not None:
+                    clips = torch.stack([past.image, image], 1), torch.stack([past.reference, reference], 1)
+                    value = metric.function(*clips)
+                else:
+                    continue
+            except InputError as error:
+                self.left_out[name] = str(error)
                 continue
             values.setdefault(name, []).append(float(value))
         self._past[method] = _Past(number, image, reference)
