@@ -127,7 +127,8 @@ class Cell:
         errors_spread: median and quartiles over the scored frames, by the same names.
         whole: milliseconds a frame, from reading to writing.
         stages: milliseconds a frame of each stage, by name in :data:`STAGES`; what a method does not do is left out.
-        memory: peak memory in mebibytes that denoising added, where it could be measured.
+        memory: peak memory in mebibytes that making the method and denoising two frames added, in a process of its own
+            (on a GPU: there), where it could be measured.
         failure: why the method failed on this scene; nothing else is known then.
         computing: milliseconds a frame of what happens in memory, without reading and writing files; measured around
             all of it, so that the stages may add up to a little less.
@@ -174,6 +175,8 @@ class Cost:
 @dataclass(frozen=True)
 class Fit:
     """How cost grows with the number of pixels: ``milliseconds = fixed + per_megapixel * megapixels``.
+
+    The line through the medians with the least squares of relative deviations: each size counts the same.
 
     Args:
         method: name.
