@@ -553,15 +553,16 @@ def test_pictures_are_of_successive_frames(numbers: list[int], most: int, expect
 def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mcdenoise.benchmark.operators, "_COPY_BYTES", 2**20)
     results = benchmark_ops(size=(33, 20), rounds=3, out=out, ops=OPS)
-    assert [cost.op for cost in results.costs[::3]] == [op.name for op in OPS]
-    assert not any(cost.failure for cost in results.costs)
     limits = {"float32": 2e-6, "bfloat16": 2e-2, "float16": 3e-3}
-    for cost in results.costs:
+    by_name = {(cost.op, cost.dtype): cost for cost in results.costs if cost.backend == "torch"}
+    assert list(by_name) == [(op.name, dtype) for op in OPS for dtype in limits]
+    # Another backend may not run here.
+    assert not any(cost.failure for cost in by_name.values())
+    for cost in (cost for cost in results.costs if not cost.failure):
         assert cost.error < limits[cost.dtype]
         assert cost.milliseconds.count == 3
         assert cost.copy == pytest.approx(cost.mebibytes * 2**20 / (results.bandwidth * 1e9) * 1e3)
         assert cost.over_copy == pytest.approx(cost.milliseconds.median / cost.copy)
-    by_name = {(cost.op, cost.dtype): cost for cost in results.costs}
     assert by_name["downsample", "bfloat16"].error > 1e-4
     # A kernel of 25 taps: 25 values and an RGB image in, an RGB image out.
     assert by_name["kernel_conv", "float32"].mebibytes == (25 + 3 + 3) * 33 * 20 * 4 / 2**20
@@ -576,6 +577,9 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
         rows = list(csv.DictReader(text))
     assert len(stored["costs"]) == len(rows) == len(results.costs)
     for row, cost in zip(rows, stored["costs"], strict=True):
+        assert (row["op"], row["backend"], row["dtype"]) == (cost["op"], cost["backend"], cost["dtype"])
+        if cost["failure"]:
+            continue
         assert float(row["relative error"]) == cost["error"]
         assert float(row["ms"]) == cost["milliseconds"]["median"]
 
