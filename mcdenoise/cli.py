@@ -8,6 +8,7 @@ import io
 import itertools
 import json as jsonlib
 import math
+import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -428,6 +429,121 @@ def _evaluate() -> Callable[..., int | None]:
     return evaluate
 
 
+def _benchmark() -> Callable[..., int | None]:
+    """Measure error against run time of models and other denoisers."""
+    import torch
+
+    from mcdenoise.benchmark import Settings, benchmark_ops, choose_candidates, parse_sizes, run_benchmark
+    from mcdenoise.benchmark.sizes import SIZES
+    from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows
+    from mcdenoise.data import open_sequence
+
+    def benchmark(
+        sequences: tyro.conf.Positional[list[Path]] = [],  # noqa: B006 - tyro reads it
+        out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None,
+        models: str | None = None,
+        peers: str = "all",
+        precisions: str = "float32,bfloat16",
+        frames: str | None = None,
+        rounds: int | None = None,
+        threads: int | None = None,
+        device: str = "cpu",
+        sizes: str = SIZES,
+        pictures: int = 4,
+        ops: bool = False,
+        size: str = "1280x720",
+        json: Json = None,
+    ) -> int:
+        """Measure error against run time: models, other denoisers and doing nothing, on the same frames, taking turns.
+
+        Writes OUT/results.json, results.csv and images; OUT must not exist. Exit status 1 if a method failed on a
+        scene. With --ops, measures the operators instead: time, error, and how near they come to a copy.
+
+        Args:
+            sequences: folders of sequences with references.
+            out: folder to make; needed except with --ops.
+            models: names separated by commas, or safetensors files; by default all with shipped weights; or none.
+            peers: oidn, bilateral, or all, or none. Doing nothing and accumulation alone are always there.
+            precisions: of the models' convolutions: float32, bfloat16, or both.
+            frames: which frames of each sequence, such as 0-59,70; all by default.
+            rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.
+            threads: CPU threads of all methods; torch's choice by default.
+            device: cpu or cuda.
+            sizes: of images of which only the cost is measured, such as 1280x720,3840x2160, or none.
+            pictures: of how many frames of each scene images are kept.
+            ops: measure the operators.
+            size: of the images with --ops, WIDTHxHEIGHT.
+            json: write what is in results.json, or ops.json, to this file too.
+        """
+        threads = torch.get_num_threads() if threads is None else threads
+        if not 1 <= threads <= _MOST_THREADS:
+            raise InputError(f"--threads: expected 1 to {_MOST_THREADS}, found {threads}")
+        if ops == bool(sequences):
+            raise InputError(
+                "expected the folders of sequences, or --ops, and not both; see `mcdenoise benchmark --help`"
+            )
+        rounds = rounds if rounds is not None else 5 if ops else 3
+        if ops:
+            with _progress() as progress:
+                task = progress.add_task("ops", total=None)
+                costs = benchmark_ops(
+                    size=_size(size),
+                    rounds=rounds,
+                    threads=threads,
+                    device=device,
+                    out=out,
+                    command=_command(
+                        "benchmark", "--ops", out=out, size=size, rounds=rounds, threads=threads, device=device
+                    ),
+                    on_step=lambda done, total: progress.update(task, completed=done, total=total),
+                )
+            _print_rows(op_rows(costs))
+            print(f"a copy moves {costs.bandwidth:.1f} GB/s, read and written")
+            _write_json(json, asdict(costs))
+            return 0
+        if out is None:
+            raise InputError("--out: expected a folder to write to, found none; give one with -o")
+        settings = Settings(
+            rounds=rounds,
+            threads=threads,
+            device=device,
+            sizes=tuple(parse_sizes(sizes)),
+            pictures=pictures,
+            command=_command(
+                "benchmark",
+                *sequences,
+                out=out,
+                models=models,
+                peers=peers,
+                precisions=precisions,
+                frames=frames,
+                rounds=rounds,
+                threads=threads,
+                device=device,
+                sizes=sizes,
+                pictures=pictures,
+            ),
+        )
+        opened = [open_sequence(sequence, frames) for sequence in sequences]
+        candidates = choose_candidates(models, peers, precisions=precisions, threads=threads, device=device)
+        with _progress() as progress:
+            task = progress.add_task("benchmark", total=None)
+            results = run_benchmark(
+                opened,
+                candidates,
+                out,
+                settings,
+                on_step=lambda done, total: progress.update(task, completed=done, total=total),
+            )
+        _print_rows(scene_rows(results))
+        for line in [*remarks(results), out]:
+            print(line)
+        _write_json(json, asdict(results))
+        return 1 if results.failed else 0
+
+    return benchmark
+
+
 def _gradcheck() -> Callable[..., int | None]:
     """Check first and second derivatives of the operators in float64."""
     from mcdenoise.gradcheck import check_case, select
@@ -507,6 +623,7 @@ COMMANDS: dict[str, Callable[[], Callable[..., int | None]]] = {
     "generate": _generate,
     "train": _train,
     "evaluate": _evaluate,
+    "benchmark": _benchmark,
     "gradcheck": _gradcheck,
     "models": _models,
     "ops": _ops,
@@ -518,6 +635,12 @@ def _size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal()):
         raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{text}'")
     return int(width), int(height)
+
+
+def _command(*arguments: object, **options: object) -> str:
+    """A command line with every choice in it, also those that were made by default."""
+    chosen = [f"--{name}={value}" for name, value in options.items() if value is not None]
+    return shlex.join(["mcdenoise", *map(str, arguments), *chosen])
 
 
 def _progress() -> Progress:
@@ -536,6 +659,14 @@ def _show(table: Table) -> None:
     # A pipe has no width: never fold what a script may read.
     console = Console()
     Console(width=None if console.is_terminal else 200).print(table)
+
+
+def _print_rows(rows: list[dict[str, str]]) -> None:
+    if rows:
+        table = Table(*rows[0])
+        for row in rows:
+            table.add_row(*row.values())
+        _show(table)
 
 
 def _print_scores(rows: list[dict[str, Any]]) -> None:

@@ -33,8 +33,8 @@ LIBRARY = SIGNAL | {
     "render",
     "denoiser",
 }
-REPORTS = {"denoise", "evaluate", "peers", "report", "run_folder"}
-TOOLS = REPORTS | {"benchmark", "demo", "export", "gradcheck", "ops_overview", "stability", "train"}
+REPORTS = {"denoise", "evaluate", "ops_overview", "peers", "report", "run_folder"}
+TOOLS = REPORTS | {"benchmark", "demo", "export", "gradcheck", "stability", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "ops": set(),
@@ -51,6 +51,7 @@ ALLOWED: dict[str, set[str]] = {
     "denoiser": SIGNAL | {"models", "history", "plan"},
     "denoise": LIBRARY,
     "run_folder": SIGNAL | {"data"},
+    "ops_overview": {"ops"},
     "peers": SIGNAL | {"models", "history", "denoiser"},
     "evaluate": LIBRARY | {"denoise", "peers"},
     "results": SIGNAL | {"data"},
