@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
 from mcdenoise.data.files import atomic_path
 from mcdenoise.evaluate import METRICS
 from mcdenoise.report.labels import Box, place_labels
-from mcdenoise.report.views import Range, Row, View, pareto_front, points
+from mcdenoise.report.views import Point, Range, Row, View, pareto_front, points
 from mcdenoise.results import STAGES, Cost, Method, Results
 
 Layout = Literal["wide", "narrow"]
@@ -35,6 +35,10 @@ _VARIABLES |= {color: f"hue-{index}" for index, color in enumerate(_FAMILIES)}
 _VARIABLES |= {_STAGES["read"]: "stage-read", _STAGES["write"]: "stage-write"}
 _MARKERS = {"model": "o", "peer": "s", "baseline": "D"}
 _SIZES = {"wide": (10.4, 5.6), "narrow": (4.9, 4.9)}
+# What the names beside the last points of the cost plot take, in parts of the axis.
+_ROOM = {"wide": 0.3, "narrow": 0.04}
+# A label farther than this from its point, in points, is tied to it by a line.
+_LEADER = 10.0
 _STYLE: dict[str, Any] = {
     "axes.axisbelow": True,
     "axes.edgecolor": _MUTED,
@@ -86,6 +90,11 @@ def css_color(color: str) -> str:
     return f"var(--{_VARIABLES[color]})" if color in _VARIABLES else color
 
 
+def stage_colors() -> dict[str, str]:
+    """The colour of each stage's bars, as :func:`css_color` gives it."""
+    return {stage: css_color(color) for stage, color in _STAGES.items()}
+
+
 def error_over_time(view: View, metric: str, colors: dict[str, str], layout: Layout = "wide") -> Figure:
     """Error of each method over its milliseconds a frame, with quartiles and the Pareto front.
 
@@ -112,16 +121,17 @@ def error_over_time(view: View, metric: str, colors: dict[str, str], layout: Lay
     front = pareto_front([(point.milliseconds.value, point.error.value) for point in shown], higher_is_better=higher)
     _draw_front(axes, [(shown[index].milliseconds.value, shown[index].error.value) for index in front])
     for point in shown:
-        x, y, color = point.milliseconds, point.error, colors[point.row.method.family]
-        axes.plot([x.lower, x.upper], [y.value, y.value], color=color, linewidth=1.1, alpha=0.65, zorder=3)
-        axes.plot([x.value, x.value], [y.lower, y.upper], color=color, linewidth=1.1, alpha=0.65, zorder=3)
-        _mark(axes, point.row.method, x.value, y.value, color)
+        color = colors[point.row.method.family]
+        for start, end in _bars(point):
+            axes.plot(*zip(start, end, strict=True), color=color, linewidth=1.1, alpha=0.65, zorder=3)
+        _mark(axes, point.row.method, point.milliseconds.value, point.error.value, color)
     _draw_idle(axes, idle, metric)
     _label(
         axes,
         [(point.milliseconds.value, point.error.value) for point in shown],
         [_name(point.row, layout) for point in shown],
-        bold={index for index in front},
+        bars=[bar for point in shown for bar in _bars(point)],
+        bold=set(front),
     )
     return figure
 
@@ -144,8 +154,8 @@ def stage_bars(view: View, layout: Layout = "wide") -> Figure:
         for stage, time in row.stages.items():
             axes.barh(-place, time.value, left=left, height=0.36, color=_STAGES[stage], edgecolor=_PAPER, linewidth=0.4)
             left += time.value
-        axes.text(0, -place + 0.24, row.method.name, fontsize=9, va="bottom", gid="label")
-        axes.text(left, -place, f"  {_three_digits(left)}", fontsize=8.5, va="center", color=_MUTED, gid="label")
+        axes.text(0, -place + 0.24, row.method.name, fontsize=9, va="bottom")
+        axes.text(left, -place, f"  {_three_digits(left)}", fontsize=8.5, va="center", color=_MUTED)
     axes.set_ylim(-len(rows) + 0.6, 0.85)
     axes.set_xlim(0, 1.12 * max(sum(time.value for time in row.stages.values()) for row in rows))
     return figure
@@ -160,6 +170,8 @@ def cost_over_pixels(results: Results, colors: dict[str, str], layout: Layout = 
     if not measured:
         return _empty(axes)
     _log_axis(axes, "x", [Range(*[_megapixels(cost)] * 3) for cost in measured])
+    low, high = axes.get_xlim()
+    axes.set_xlim(low, high * (high / low) ** _ROOM[layout])
     spreads = [cost.milliseconds for cost in measured if cost.milliseconds is not None]
     _log_axis(axes, "y", [Range(spread.median, spread.lower, spread.upper) for spread in spreads])
     fits = {fit.method: fit for fit in results.fits}
@@ -184,7 +196,7 @@ def cost_over_pixels(results: Results, colors: dict[str, str], layout: Layout = 
         if own[-1].milliseconds is not None:
             anchors.append((pixels[-1], own[-1].milliseconds.median))
             names.append(method.name if layout == "wide" else str(number))
-    _label(axes, anchors, names)
+    _label(axes, anchors, names, right=True)
     return figure
 
 
@@ -207,11 +219,10 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     figure.savefig(file, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
     svg = file.getvalue()
     svg = svg[svg.index("<svg") :]
-    svg = re.sub(r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*", "", svg, flags=re.S)
+    svg = re.sub(r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*|<style.*?</style>\s*", "", svg, flags=re.S)
     svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")
     for color, variable in _VARIABLES.items():
         svg = svg.replace(color, f"var(--{variable})")
-    svg = svg.replace('<g id="label">', '<g class="label">')
     used = set(re.findall(r'(?:url\(|href=")#([^)"]+)', svg))
     svg = re.sub(r' id="([^"]+)"', lambda found: f' id="{name}-{found[1]}"' if found[1] in used else "", svg)
     svg = re.sub(r'(url\(|href=")#', rf"\1#{name}-", svg)
@@ -266,7 +277,7 @@ def _log_axis(axes: Axes, which: Literal["x", "y"], ranges: Sequence[Range]) -> 
     (axes.set_xlim if which == "x" else axes.set_ylim)(low, high)
     places = ticks(low, high)
     axis.set_major_locator(FixedLocator(places))
-    axis.set_major_formatter(FixedFormatter([f"{place:.3g}" if place < 1e4 else f"{place:g}" for place in places]))
+    axis.set_major_formatter(FixedFormatter([f"{place:g}" for place in places]))
     axis.set_minor_locator(NullLocator())
 
 
@@ -275,6 +286,13 @@ def _linear_axis(axes: Axes, ranges: Sequence[Range]) -> None:
     low, high = min(values, default=0.0), max(values, default=1.0)
     margin = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
     axes.set_ylim(low - margin, high + margin)
+
+
+def _bars(point: Point) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
+    """Both ends of the bar of each spread."""
+    x, y = point.milliseconds, point.error
+    yield (x.lower, y.value), (x.upper, y.value)
+    yield (x.value, y.lower), (x.value, y.upper)
 
 
 def _mark(axes: Axes, method: Method, x: float, y: float, color: str) -> None:
@@ -307,37 +325,54 @@ def _draw_idle(axes: Axes, rows: Sequence[Row], metric: str) -> None:
 
 
 def _label(
-    axes: Axes, anchors: Sequence[tuple[float, float]], names: Sequence[str], bold: set[int] | None = None
+    axes: Axes,
+    anchors: Sequence[tuple[float, float]],
+    names: Sequence[str],
+    *,
+    bars: Sequence[tuple[tuple[float, float], tuple[float, float]]] = (),
+    bold: Collection[int] = (),
+    right: bool = False,
 ) -> None:
+    """Write each name beside its point; ``right`` keeps them to the right of the leftmost point."""
     figure = axes.get_figure()
     assert isinstance(figure, Figure) and isinstance(figure.canvas, FigureCanvasAgg)
     # Only a drawn figure knows where its axes are.
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     renderer = figure.canvas.get_renderer()
-    weights = ["bold" if index in (bold or ()) else "normal" for index in range(len(names))]
+    ground = {"facecolor": _PAPER, "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
     texts = [
-        axes.text(0, 0, name, fontsize=9, fontweight=weight, zorder=5, gid="label")
-        for name, weight in zip(names, weights, strict=True)
+        axes.text(0, 0, name, fontsize=9, fontweight="bold" if index in bold else "normal", bbox=ground, zorder=5)
+        for index, name in enumerate(names)
     ]
     extents = [text.get_window_extent(renderer) for text in texts]
-    places = [tuple(axes.transData.transform(anchor).tolist()) for anchor in anchors]
+    to_pixels, to_data = axes.transData.transform, axes.transData.inverted().transform
+    places = [_pair(to_pixels(anchor)) for anchor in anchors]
     frame = axes.get_window_extent(renderer)
+    left = min((x for x, _ in places), default=frame.x0) + 4 if right else frame.x0
+    obstacles = [Box(x - 4, y - 4, x + 4, y + 4) for x, y in places]
+    for start, end in bars:
+        (x0, y0), (x1, y1) = _pair(to_pixels(start)), _pair(to_pixels(end))
+        obstacles.append(Box(x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5))
     boxes = place_labels(
-        [(x, y) for x, y in places],
+        places,
         [(extent.width + 3, extent.height) for extent in extents],
-        Box(frame.x0, frame.y0, figure.bbox.x1, frame.y1),
-        [Box(x - 4, y - 4, x + 4, y + 4) for x, y in places],
+        Box(left, frame.y0, figure.bbox.x1, frame.y1),
+        obstacles,
     )
-    to_data: Callable[[tuple[float, float]], Any] = axes.transData.inverted().transform
-    for text, box, (x, y) in zip(texts, boxes, places, strict=True):
-        text.set_position(to_data(((box.left + box.right) / 2, (box.bottom + box.top) / 2)))
+    for text, box, place in zip(texts, boxes, places, strict=True):
+        text.set_position(_pair(to_data(((box.left + box.right) / 2, (box.bottom + box.top) / 2))))
         text.set_horizontalalignment("center")
         text.set_verticalalignment("center")
-        end = box.nearest(x, y)
-        if math.dist(end, (x, y)) > 10:
-            (start_x, start_y), (end_x, end_y) = to_data((x, y)), to_data(end)
-            axes.plot([start_x, end_x], [start_y, end_y], color=_MUTED, linewidth=0.5, zorder=2.5, clip_on=False)
+        end = box.nearest(*place)
+        if math.dist(end, place) > _LEADER:
+            line = zip(_pair(to_data(place)), _pair(to_data(end)), strict=True)
+            axes.plot(*line, color=_MUTED, linewidth=0.5, zorder=2.5, clip_on=False)
+
+
+def _pair(values: Any) -> tuple[float, float]:
+    x, y = values
+    return float(x), float(y)
 
 
 def _name(row: Row, layout: Layout) -> str:
