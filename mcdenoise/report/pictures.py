@@ -167,7 +167,7 @@ def crop_errors(image: Image, reference: Image) -> tuple[float, float]:
 
 
 def choose_row(clips: list[list[Codes]]) -> tuple[int, int, int]:
-    """The stretch of a row where the methods change most from frame to frame.
+    """The stretch of a row where the methods change most from frame to frame, away from the border of the frame.
 
     Args:
         clips: of each method the same two or more successive frames, ``(H, W, 3)`` codes.
@@ -182,8 +182,10 @@ def choose_row(clips: list[list[Codes]]) -> tuple[int, int, int]:
         for before, after in zip(clip, clip[1:], strict=False):
             change += np.abs(after.astype(np.float32) - before).mean(-1)
     means = _window_means(change, 1, columns)
-    row, left = np.unravel_index(int(np.argmax(means)), means.shape)
-    return int(row), int(left), columns
+    border = height // 10
+    inner = means[border : height - border]
+    row, left = np.unravel_index(int(np.argmax(inner)), inner.shape)
+    return int(row) + border, int(left), columns
 
 
 def _window_means(values: NDArray[Any], height: int, width: int) -> NDArray[np.float64]:

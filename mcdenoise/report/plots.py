@@ -155,7 +155,9 @@ def stage_bars(view: View, layout: Layout = "wide") -> Figure:
             axes.barh(-place, time.value, left=left, height=0.36, color=_STAGES[stage], edgecolor=_PAPER, linewidth=0.4)
             left += time.value
         axes.text(0, -place + 0.24, row.method.name, fontsize=9, va="bottom")
-        axes.text(left, -place, f"  {_three_digits(left)}", fontsize=8.5, va="center", color=_MUTED)
+        axes.annotate(
+            _three_digits(left), (left, -place), (4, 0), textcoords="offset points", fontsize=8.5, va="center", color=_MUTED
+        )  # fmt: skip
     axes.set_ylim(-len(rows) + 0.6, 0.85)
     axes.set_xlim(0, 1.12 * max(sum(time.value for time in row.stages.values()) for row in rows))
     return figure
@@ -226,7 +228,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     used = set(re.findall(r'(?:url\(|href=")#([^)"]+)', svg))
     svg = re.sub(r' id="([^"]+)"', lambda found: f' id="{name}-{found[1]}"' if found[1] in used else "", svg)
     svg = re.sub(r'(url\(|href=")#', rf"\1#{name}-", svg)
-    svg = re.sub(r"(\d+\.\d\d)\d+", r"\1", svg)
+    svg = re.sub(r' (?:d|x|y|transform)="[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found[0]), svg)
     head, rest = svg.split(">", 1)
     head = re.sub(r' (width|height|version)="[^"]*"', "", head)
     return f'{head} role="img" aria-label="{_attribute(description)}">{rest}'

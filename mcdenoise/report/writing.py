@@ -93,6 +93,8 @@ def _render(content: dict[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    # Methods and frames are in an order of their own.
+    environment.policies["json.dumps_kwargs"] = {"sort_keys": False}
     parts = {name: (page / f"report.{name}").read_text(encoding="utf-8") for name in ("css", "js")}
     return environment.get_template("report.html.jinja").render(**content, **parts)
 
@@ -229,7 +231,7 @@ def _column(shown: list[View], name: str) -> dict[str, Any]:
     higher = METRICS[name].higher_is_better
     values = [[row.errors[name].value for row in view.rows if name in row.errors] for view in shown]
     finite = [abs(value) for own in values for value in own if math.isfinite(value) and value != 0]
-    decimals = min(max(3 - math.floor(math.log10(min(finite))), 0), 4) if finite else 2
+    decimals = min(max(2 - math.floor(math.log10(min(finite))), 2), 4) if finite else 2
     best = [(max if higher else min)(own, default=None) for own in values]
     return {"name": name, "higher": higher, "decimals": decimals, "best": best}
 
@@ -241,7 +243,7 @@ def _number(value: Range | float | None, decimals: int | None = None) -> str:
     figure = value.value if isinstance(value, Range) else value
     if not math.isfinite(figure):
         return "∞" if figure > 0 else "–"
-    if decimals is not None:
+    if decimals is not None and abs(figure) < 100:
         return f"{figure:.{decimals}f}"
     return f"{figure:,.0f}" if abs(figure) >= 100 else f"{figure:.3g}"
 
