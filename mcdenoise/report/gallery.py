@@ -136,9 +136,7 @@ def _files(folder: Path, results: Results, scene: Scene) -> dict[str, dict[int, 
         name: {number: folder / IMAGES / scene.name / place / f"{number}.exr" for number in scene.pictures}
         for name, place in (sources | {REFERENCE: REFERENCE}).items()
     }
-    existing = {
-        name: {number: path for number, path in own.items() if path.exists()} for name, own in found.items()
-    }
+    existing = {name: {number: path for number, path in own.items() if path.exists()} for name, own in found.items()}
     return {name: own for name, own in existing.items() if own}
 
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 _DISTANCES = (0.55, 0.9, 1.4, 2.0, 2.8, 3.8, 5.0, 6.5, 8.5)
 _DIRECTIONS = 16
 _SWEEPS = 6
-# A label that covers something is worse than one far away; one that a leader line crosses is in between.
-_COVERED, _CROSSED, _DISTANT = 100.0, 8.0, 1.0
+# Heights of a label that it had rather be away than cover something, or cross a leader line.
+_COVERED, _CROSSED = 100.0, 8.0
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def place_labels(
     """Place a label beside each point; the same input gives the same places.
 
     Each label in turn takes the candidate that covers least and lies nearest, given where the others are, until
-    nothing moves any more.
+    nothing moves any more, or six times.
 
     Args:
         anchors: the points.
@@ -87,9 +87,7 @@ def place_labels(
                 for other, (anchor, box) in enumerate(zip(anchors, placed, strict=True))
                 if other != index and box is not None
             ]
-            placed[index] = min(
-                candidates[index], key=lambda box: _cost(anchors[index], box, others, obstacles)  # noqa: B023
-            )
+            placed[index] = _cheapest(anchors[index], candidates[index], others, obstacles)
         if placed == before:
             break
     return [box for box in placed if box is not None]
@@ -125,16 +123,36 @@ def _moved_into(box: Box, bounds: Box) -> Box:
     return Box(box.left + across, box.bottom + up, box.right + across, box.top + up)
 
 
+def _cheapest(
+    anchor: tuple[float, float],
+    candidates: Sequence[Box],
+    others: Sequence[tuple[tuple[float, float], Box]],
+    obstacles: Sequence[Box],
+) -> Box:
+    best, least = candidates[0], math.inf
+    for box in candidates:
+        # What it covers or crosses only adds to the distance.
+        if _distance(anchor, box) < least:
+            cost = _cost(anchor, box, others, obstacles)
+            if cost < least:
+                best, least = box, cost
+    return best
+
+
+def _distance(anchor: tuple[float, float], box: Box) -> float:
+    """Between a point and its label, in heights of the label."""
+    return math.dist(anchor, box.nearest(*anchor)) / (box.top - box.bottom)
+
+
 def _cost(
     anchor: tuple[float, float],
     box: Box,
     others: Sequence[tuple[tuple[float, float], Box]],
     obstacles: Sequence[Box],
 ) -> float:
-    height = box.top - box.bottom
-    area = height * (box.right - box.left)
+    area = (box.top - box.bottom) * (box.right - box.left)
     end = box.nearest(*anchor)
-    cost = _DISTANT * math.dist(anchor, end) / height
+    cost = _distance(anchor, box)
     cost += sum(_COVERED * bool(box.overlap(obstacle)) * (1 + box.overlap(obstacle) / area) for obstacle in obstacles)
     for other_anchor, other in others:
         covered = box.overlap(other)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -39,7 +40,7 @@ def encode(radiance: Image) -> Codes:
     """
     x = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=BRIGHTEST), 0.0, BRIGHTEST)
     compressed = x / (1 + x) * ((1 + BRIGHTEST) / BRIGHTEST)
-    return np.rint(255 * compressed ** (1 / _GAMMA)).astype(np.uint8)
+    return np.asarray(np.rint(255 * compressed ** (1 / _GAMMA)), dtype=np.uint8)
 
 
 def decode(codes: NDArray[Any]) -> NDArray[np.float64]:
@@ -56,13 +57,14 @@ def to_srgb(radiance: Image) -> Codes:
     """As a display shows it at exposure 0: clamped to [0, 1], sRGB curve, 8 bit."""
     image = torch.from_numpy(np.nan_to_num(np.ascontiguousarray(radiance, dtype=np.float32)))
     shown = displayed(image.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
-    return np.rint(shown.numpy() * 255).astype(np.uint8)
+    return np.asarray(np.rint(shown.numpy() * 255), dtype=np.uint8)
 
 
 def halved(radiance: Image) -> Image:
     """Mean of 2x2 pixels; an odd last row or column is left out."""
     height, width = (length // 2 * 2 for length in radiance.shape[:2])
-    return radiance[:height, :width].reshape(height // 2, 2, width // 2, 2, -1).mean((1, 3))
+    blocks = radiance[:height, :width].reshape(height // 2, 2, width // 2, 2, -1)
+    return np.asarray(blocks.mean((1, 3)), dtype=np.float32)
 
 
 def data_uri(pixels: Codes, image_format: str = "webp", **options: Any) -> str:
@@ -179,7 +181,7 @@ def choose_row(clips: list[list[Codes]]) -> tuple[int, int, int]:
     columns = max(width // 2, min(width, 64))
     change = np.zeros((height, width))
     for clip in clips:
-        for before, after in zip(clip, clip[1:], strict=False):
+        for before, after in itertools.pairwise(clip):
             change += np.abs(after.astype(np.float32) - before).mean(-1)
     means = _window_means(change, 1, columns)
     border = height // 10

@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import matplotlib
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
 
@@ -37,9 +36,11 @@ _MARKERS = {"model": "o", "peer": "s", "baseline": "D"}
 _SIZES = {"wide": (10.4, 5.6), "narrow": (4.9, 4.9)}
 # What the names beside the last points of the cost plot take, in parts of the axis.
 _ROOM = {"wide": 0.3, "narrow": 0.04}
+# What the labels of the vertical ticks take, in points.
+_TICK_ROOM = 46.0
 # A label farther than this from its point, in points, is tied to it by a line.
 _LEADER = 10.0
-_STYLE: dict[str, Any] = {
+_STYLE: Any = {
     "axes.axisbelow": True,
     "axes.edgecolor": _MUTED,
     "axes.facecolor": "none",
@@ -140,9 +141,7 @@ def stage_bars(view: View, layout: Layout = "wide") -> Figure:
     """How the median time of each method divides into stages, files included."""
     rows = [row for row in view.rows if row.stages]
     width = _SIZES[layout][0]
-    figure = Figure(figsize=(width, 0.75 + 0.44 * max(len(rows), 1)), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
+    axes = _axes(width, 0.75 + 0.44 * max(len(rows), 1), left=6)
     axes.grid(axis="x")
     axes.spines["left"].set_visible(False)
     axes.yaxis.set_major_locator(NullLocator())
@@ -156,11 +155,17 @@ def stage_bars(view: View, layout: Layout = "wide") -> Figure:
             left += time.value
         axes.text(0, -place + 0.24, row.method.name, fontsize=9, va="bottom")
         axes.annotate(
-            _three_digits(left), (left, -place), (4, 0), textcoords="offset points", fontsize=8.5, va="center", color=_MUTED
-        )  # fmt: skip
+            _three_digits(left),
+            (left, -place),
+            (4, 0),
+            textcoords="offset points",
+            fontsize=8.5,
+            va="center",
+            color=_MUTED,
+        )
     axes.set_ylim(-len(rows) + 0.6, 0.85)
     axes.set_xlim(0, 1.12 * max(sum(time.value for time in row.stages.values()) for row in rows))
-    return figure
+    return _figure_of(axes)
 
 
 def cost_over_pixels(results: Results, colors: dict[str, str], layout: Layout = "wide") -> Figure:
@@ -253,19 +258,32 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def _figure(layout: Layout) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=_SIZES[layout], layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
+    axes = _axes(*_SIZES[layout], left=_TICK_ROOM)
     axes.grid(True)
     axes.tick_params(length=3)
-    return figure, axes
+    return _figure_of(axes), axes
+
+
+def _axes(width: float, height: float, *, left: float) -> Axes:
+    """Axes in a new figure, inches; ``left`` is the room for the ticks' labels in points.
+
+    Margins are fixed, because finding them takes longer than everything else, and there are many plots.
+    """
+    figure = Figure(figsize=(width, height))
+    across, up = 1 / (72 * width), 1 / (72 * height)
+    figure.subplots_adjust(left=left * across, right=1 - 6 * across, bottom=36 * up, top=1 - 22 * up)
+    return figure.add_subplot()
+
+
+def _figure_of(axes: Axes) -> Figure:
+    figure = axes.get_figure()
+    assert isinstance(figure, Figure)
+    return figure
 
 
 def _empty(axes: Axes) -> Figure:
     axes.text(0.5, 0.5, "nothing to show", transform=axes.transAxes, ha="center", color=_MUTED)
-    figure = axes.get_figure()
-    assert isinstance(figure, Figure)
-    return figure
+    return _figure_of(axes)
 
 
 def _log_axis(axes: Axes, which: Literal["x", "y"], ranges: Sequence[Range]) -> None:
@@ -321,9 +339,15 @@ def _draw_idle(axes: Axes, rows: Sequence[Row], metric: str) -> None:
         else:
             arrow = "↑" if value > high else "↓"
             axes.text(
-                1.0, 1.015, f"{text} {arrow} (0 ms, off the scale)", transform=axes.transAxes, ha="right",
-                va="bottom", fontsize=8.5, color=_MUTED,
-            )  # fmt: skip
+                1.0,
+                1.015,
+                f"{text} {arrow} (0 ms, off the scale)",
+                transform=axes.transAxes,
+                ha="right",
+                va="bottom",
+                fontsize=8.5,
+                color=_MUTED,
+            )
 
 
 def _label(
@@ -336,21 +360,16 @@ def _label(
     right: bool = False,
 ) -> None:
     """Write each name beside its point; ``right`` keeps them to the right of the leftmost point."""
-    figure = axes.get_figure()
-    assert isinstance(figure, Figure) and isinstance(figure.canvas, FigureCanvasAgg)
-    # Only a drawn figure knows where its axes are.
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")
-    renderer = figure.canvas.get_renderer()
+    figure = _figure_of(axes)
     ground = {"facecolor": _PAPER, "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
     texts = [
         axes.text(0, 0, name, fontsize=9, fontweight="bold" if index in bold else "normal", bbox=ground, zorder=5)
         for index, name in enumerate(names)
     ]
-    extents = [text.get_window_extent(renderer) for text in texts]
+    extents = [text.get_window_extent() for text in texts]
     to_pixels, to_data = axes.transData.transform, axes.transData.inverted().transform
     places = [_pair(to_pixels(anchor)) for anchor in anchors]
-    frame = axes.get_window_extent(renderer)
+    frame = axes.get_window_extent()
     left = min((x for x, _ in places), default=frame.x0) + 4 if right else frame.x0
     obstacles = [Box(x - 4, y - 4, x + 4, y + 4) for x, y in places]
     for start, end in bars:

@@ -185,9 +185,7 @@ def _denoising(cell: Cell) -> Range | None:
 
 def _mean(rows: list[Row], results: Results) -> Row:
     first = rows[0]
-    reasons = [
-        f"{scene.name}: {row.reason}" for scene, row in zip(results.scenes, rows, strict=True) if row.reason
-    ]
+    reasons = [f"{scene.name}: {row.reason}" for scene, row in zip(results.scenes, rows, strict=True) if row.reason]
     if first.method.missing:
         return first
     if reasons:

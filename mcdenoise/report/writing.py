@@ -10,6 +10,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
@@ -26,6 +28,8 @@ _PICTURE_BUDGET = 20_000_000
 _MOST_PIXELS = 60_000_000
 # Where the heat map of SMAPE ends; what is worse looks the same.
 _HEAT_END = 0.5
+# In place of a figure that is not known.
+_UNKNOWN = "\N{EN DASH}"
 
 
 def write_report(folder: Path) -> Path:
@@ -107,7 +111,9 @@ def _write_plots(folder: Path, results: Results, shown: list[View], names: list[
     try:
         target.mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(f"{target}: cannot be made ({error.strerror}); check the folder and its permissions") from error
+        raise InputError(
+            f"{target}: cannot be made ({error.strerror}); check the folder and its permissions"
+        ) from error
     colors = plots.family_colors(results.methods)
     errors: list[dict[str, Any]] = []
     stages: list[dict[str, str]] = []
@@ -129,9 +135,7 @@ def _write_plots(folder: Path, results: Results, shown: list[View], names: list[
                 made = both(f"{metric.lower()}-{suffix}", described, wide, narrow)
                 errors.append({"view": place, "metric": metric, "front": _front(view, metric), **made})
             described = f"Milliseconds of each stage, {view.name}; the table below has the figures"
-            stages.append(
-                both(f"stages-{suffix}", described, plots.stage_bars(view), plots.stage_bars(view, "narrow"))
-            )
+            stages.append(both(f"stages-{suffix}", described, plots.stage_bars(view), plots.stage_bars(view, "narrow")))
         described = "Milliseconds a frame over megapixels; the table below has the figures"
         wide, narrow = (plots.cost_over_pixels(results, colors, layout) for layout in ("wide", "narrow"))
         cost = both("cost", described, wide, narrow) if results.costs else {}
@@ -167,13 +171,9 @@ def _galleries(folder: Path, results: Results) -> list[Gallery]:
     return [read_gallery(folder, results, scene, factor=factor) for scene in results.scenes]
 
 
-def _comparer(
-    results: Results, galleries: list[Gallery], shown: list[View], names: list[str]
-) -> dict[str, Any]:
+def _comparer(results: Results, galleries: list[Gallery], shown: list[View], names: list[str]) -> dict[str, Any]:
     """What the comparer's script needs, in what format the pictures are, and with what it begins."""
-    pictures = [
-        codes for gallery in galleries for own in gallery.codes.values() for codes in own.values()
-    ]
+    pictures = [codes for gallery in galleries for own in gallery.codes.values() for codes in own.values()]
     encoded = data_uris(pictures, _PICTURE_BUDGET)
     if encoded is None:
         raise InputError(
@@ -201,7 +201,7 @@ def _comparer(
         "first": _first_pair(results, shown, names),
         "data": {
             "scenes": scenes,
-            "linear": [float(f"{value:.5g}") for value in decode(list(range(256))).tolist()],
+            "linear": [float(f"{value:.5g}") for value in decode(np.arange(256)).tolist()],
             "heat": _heat_colors(),
             "heatEnd": _HEAT_END,
             "first": _first_pair(results, shown, names),
@@ -239,10 +239,10 @@ def _column(shown: list[View], name: str) -> dict[str, Any]:
 def _number(value: Range | float | None, decimals: int | None = None) -> str:
     """A figure of a table: a fixed number of decimals, or three digits; a dash for what is not known."""
     if value is None:
-        return "–"
+        return _UNKNOWN
     figure = value.value if isinstance(value, Range) else value
     if not math.isfinite(figure):
-        return "∞" if figure > 0 else "–"
+        return "∞" if figure > 0 else _UNKNOWN
     if decimals is not None and abs(figure) < 100:
         return f"{figure:.{decimals}f}"
     return f"{figure:,.0f}" if abs(figure) >= 100 else f"{figure:.3g}"

@@ -140,7 +140,7 @@ def test_zoom_and_pan_keep_both_sides_in_step(tab: Any):
     tab.focus("#stage")
     tab.keyboard.press("ArrowRight")
     panned = pixels(tab)
-    assert (panned[:, : -40] == zoomed[:, 40:]).mean() > 0.97
+    assert (panned[:, :-40] == zoomed[:, 40:]).mean() > 0.97
     tab.keyboard.press("0")
     assert (pixels(tab) == whole).all()
 
@@ -254,9 +254,7 @@ def test_the_pixel_under_the_cursor_is_read_out(tab: Any):
 def test_scene_and_metric_choose_the_plot(tab: Any):
     def visible() -> list[tuple[str, str]]:
         shown = tab.locator("#plots figure:visible")
-        return [
-            (one.get_attribute("data-view"), one.get_attribute("data-metric")) for one in shown.all()
-        ]
+        return [(one.get_attribute("data-view"), one.get_attribute("data-metric")) for one in shown.all()]
 
     assert visible() == [("0", "SMAPE")]
     tab.check("input[value=PSNR]", force=True)
@@ -270,7 +268,9 @@ def test_a_heading_sorts_its_column(tab: Any):
     tab.select_option("#view", label="first")
     table = tab.locator("#figures table:visible")
     heading = table.locator("th").nth(2)
-    column = "[...document.querySelectorAll('#figures [data-view=\"1\"] tbody tr')].map(row => row.cells[2]?.dataset.value)"
+    column = (
+        "[...document.querySelectorAll('#figures [data-view=\"1\"] tbody tr')].map(row => row.cells[2]?.dataset.value)"
+    )
     assert heading.get_attribute("aria-sort") == "none"
     heading.locator("button").focus()
     tab.keyboard.press("Enter")

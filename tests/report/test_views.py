@@ -31,7 +31,8 @@ def test_every_method_off_the_front_is_beaten_by_one_on_it():
     for cost, error in values:
         assert any(values[i][0] <= cost and values[i][1] <= error for i in front)
     errors = [values[i][1] for i in front]
-    assert errors == sorted(errors, reverse=True) and len(set(errors)) == len(errors)
+    assert errors == sorted(errors, reverse=True)
+    assert len(set(errors)) == len(errors)
 
 
 def test_mean_over_scenes(folder: Path):
@@ -51,11 +52,10 @@ def test_a_method_that_failed_once_has_no_mean_but_a_reason(folder: Path):
     mean, first, second = views(Results.read(folder))
     assert mean.rows[3].reason == "second: failed: RuntimeError: out of <memory>"
     assert not mean.rows[3].errors
-    assert first.rows[3].errors and not first.rows[3].reason
+    assert first.rows[3].errors
+    assert not first.rows[3].reason
     assert second.rows[3].reason == "failed: RuntimeError: out of <memory>"
-    assert {view.rows[4].reason for view in (mean, first, second)} == {
-        "missing: the package <absent> is not installed"
-    }
+    assert {view.rows[4].reason for view in (mean, first, second)} == {"missing: the package <absent> is not installed"}
 
 
 def test_a_method_that_was_not_measured_says_so(folder: Path):
