@@ -160,6 +160,21 @@ def test_the_wheel_zooms_where_the_pointer_is(tab: Any):
     assert place == f"{int(0.7 * WIDTH)}, {int(0.3 * HEIGHT)}"
 
 
+def test_a_comparer_that_was_hidden_comes_back_as_it_was(tab: Any):
+    tab.focus("#stage")
+    tab.keyboard.press("+")
+    before, place = pixels(tab), tab.text_content("#pixel")
+    tab.evaluate("document.querySelector('#stage').style.height = '0'")
+    tab.wait_for_function("document.querySelector('#stage').clientHeight === 0")
+    tab.keyboard.press("+")
+    tab.keyboard.press("ArrowUp")
+    tab.evaluate("document.querySelector('#stage').style.height = ''")
+    tab.wait_for_function("document.querySelector('#stage').clientHeight > 0")
+    tab.keyboard.press("Shift+Tab")
+    assert tab.text_content("#pixel") == place
+    assert (pixels(tab) == before).all()
+
+
 def test_two_fingers_pinch(browser: Any, page: Path):
     complaints: list[str] = []
     tab = open_page(browser, page, complaints, viewport={"width": 400, "height": 800}, has_touch=True)

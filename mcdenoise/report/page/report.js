@@ -167,7 +167,8 @@ function startComparer() {
   }
 
   function paint() {
-    if (stage.clientWidth === 0) return;
+    // Hidden, it has no size to paint for.
+    if (fitScale() === 0) return;
     keepInside();
     const ratio = window.devicePixelRatio;
     const [width, height] = [Math.round(stage.clientWidth * ratio), Math.round(stage.clientHeight * ratio)];
@@ -284,6 +285,7 @@ function startComparer() {
   }
 
   function zoomBy(factor, at = { x: stage.clientWidth / 2, y: stage.clientHeight / 2 }) {
+    if (fitScale() === 0) return;
     const fixed = toPicture(at);
     const most = Math.max(LARGEST_PIXEL / fitScale(), 1);
     state.zoom = clamp(state.zoom * factor, 1, most);
@@ -292,6 +294,7 @@ function startComparer() {
   }
 
   function panBy(x, y) {
+    if (fitScale() === 0) return;
     state.center = { x: state.center.x - x, y: state.center.y - y };
     paint();
   }
