@@ -544,6 +544,21 @@ def _benchmark() -> Callable[..., int | None]:
     return benchmark
 
 
+def _report() -> Callable[..., int | None]:
+    """Write the page and the plots of a finished benchmark."""
+    from mcdenoise.report import write_report
+
+    def report(folder: tyro.conf.Positional[Path]) -> None:
+        """Write FOLDER/index.html and FOLDER/plots/ from the results and pictures of a finished benchmark.
+
+        Args:
+            folder: what `mcdenoise benchmark` wrote: results.json and images/.
+        """
+        print(write_report(folder))
+
+    return report
+
+
 def _gradcheck() -> Callable[..., int | None]:
     """Check first and second derivatives of the operators in float64."""
     from mcdenoise.gradcheck import check_case, select
@@ -624,6 +639,7 @@ COMMANDS: dict[str, Callable[[], Callable[..., int | None]]] = {
     "train": _train,
     "evaluate": _evaluate,
     "benchmark": _benchmark,
+    "report": _report,
     "gradcheck": _gradcheck,
     "models": _models,
     "ops": _ops,

@@ -23,7 +23,7 @@ from mcdenoise.models import create_model, list_models, pretrained_models, save_
 from mcdenoise.train import TrainConfig
 
 RGB = ["R", "G", "B"]
-POSITIONAL = {"sequence", "sequences", "scene", "images", "ops"}
+POSITIONAL = {"folder", "sequence", "sequences", "scene", "images", "ops"}
 
 
 @pytest.fixture(autouse=True)

@@ -55,7 +55,7 @@ ALLOWED: dict[str, set[str]] = {
     "peers": SIGNAL | {"models", "history", "denoiser"},
     "evaluate": LIBRARY | {"denoise", "peers"},
     "results": SIGNAL | {"data"},
-    "report": LIBRARY | {"results"},
+    "report": LIBRARY | {"evaluate", "results"},
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"results"}),
     "cli": LIBRARY | TOOLS,
     "__main__": {"cli"},
@@ -64,7 +64,7 @@ ALLOWED: dict[str, set[str]] = {
 }
 OPS_KNOW = {"torch", "kornia"}
 # `import mcdenoise` leaves these alone: optional, slow to load, or of use to the command line only.
-LAZY = {"OpenImageIO", "colour", "matplotlib", "tyro"}
+LAZY = {"OpenImageIO", "PIL", "colour", "jinja2", "matplotlib", "tyro"}
 LAZY |= {"drjit", "mitsuba", "pyoidn", "flip_evaluator", "lightning", "lightning_fabric", "tensorboard"}
 SECONDS = 0.5
 
