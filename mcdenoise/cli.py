@@ -102,6 +102,8 @@ def _demo() -> Callable[..., int | None]:
     def demo(out: Out = Path("demo"), model: str = "cascaded", json: Json = None) -> None:
         """Render 16 frames of a small scene at one sample a pixel, denoise them, print errors and times.
 
+        Ends with a report of error against run time: all models, and what other denoisers are installed.
+
         Args:
             out: folder to write to; what an earlier run rendered there is used again.
             model: name of a model with shipped weights.
@@ -110,16 +112,18 @@ def _demo() -> Callable[..., int | None]:
         with _progress() as progress:
             rendering = progress.add_task("render", total=None)
             denoising = progress.add_task("denoise", total=FRAMES)
+            comparing = progress.add_task("compare", total=None)
             result = run_demo(
                 out,
                 model=model,
                 on_render=lambda done, total: progress.update(rendering, completed=done, total=total),
                 on_frame=lambda: progress.advance(denoising),
+                on_compare=lambda done, total: progress.update(comparing, completed=done, total=total),
             )
         scores = [asdict(score) for score in result.scores]
         _print_scores(scores)
         _print_times(result.report.milliseconds)
-        print(f"clean frames: {result.denoised}\npicture: {result.picture}")
+        print(f"clean frames: {result.denoised}\npicture: {result.picture}\nreport: {result.page}")
         _write_json(json, {"scores": scores, "milliseconds": result.report.milliseconds})
 
     return demo
@@ -437,6 +441,7 @@ def _benchmark() -> Callable[..., int | None]:
     from mcdenoise.benchmark.sizes import SIZES
     from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows
     from mcdenoise.data import open_sequence
+    from mcdenoise.report import check_packages, write_report
 
     def benchmark(
         sequences: tyro.conf.Positional[list[Path]] = [],  # noqa: B006 - tyro reads it
@@ -456,8 +461,9 @@ def _benchmark() -> Callable[..., int | None]:
     ) -> int:
         """Measure error against run time: models, other denoisers and doing nothing, on the same frames, taking turns.
 
-        Writes OUT/results.json, results.csv and images; OUT must not exist. Exit status 1 if a method failed on a
-        scene. With --ops, measures the operators instead: time, error, and how near they come to a copy.
+        Writes OUT/index.html, the report, with its plots, results.json, results.csv and images; OUT must not exist.
+        Exit status 1 if a method failed on a scene. With --ops, measures the operators instead: time, error, and how
+        near they come to a copy.
 
         Args:
             sequences: folders of sequences with references.
@@ -524,6 +530,7 @@ def _benchmark() -> Callable[..., int | None]:
                 pictures=pictures,
             ),
         )
+        check_packages()
         opened = [open_sequence(sequence, frames) for sequence in sequences]
         candidates = choose_candidates(models, peers, precisions=precisions, threads=threads, device=device)
         with _progress() as progress:
@@ -536,7 +543,7 @@ def _benchmark() -> Callable[..., int | None]:
                 on_step=lambda done, total: progress.update(task, completed=done, total=total),
             )
         _print_rows(scene_rows(results))
-        for line in [*remarks(results), out]:
+        for line in [*remarks(results), f"report: {write_report(out)}"]:
             print(line)
         _write_json(json, asdict(results))
         return 1 if results.failed else 0

@@ -144,14 +144,6 @@ class Cell:
     failure: str = ""
     computing: Spread | None = None
 
-    @property
-    def denoising(self) -> float | None:
-        """Median milliseconds of what happens in memory, without reading and writing files."""
-        if self.computing is not None:
-            return self.computing.median
-        own = [spread.median for stage, spread in self.stages.items() if stage not in ("read", "write")]
-        return sum(own) if self.stages else None
-
 
 @dataclass(frozen=True)
 class Cost:
@@ -233,7 +225,7 @@ class Results:
     def megapixels_per_second(self, cell: Cell) -> float | None:
         """How many pixels a method denoises, without reading and writing files."""
         scene = next(one for one in self.scenes if one.name == cell.scene)
-        return scene.width * scene.height / 1e3 / cell.denoising if cell.denoising else None
+        return scene.width * scene.height / 1e3 / cell.computing.median if cell.computing else None
 
     def write(self, folder: Path) -> None:
         """Write ``results.json``.

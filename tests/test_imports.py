@@ -33,8 +33,8 @@ LIBRARY = SIGNAL | {
     "render",
     "denoiser",
 }
-REPORTS = {"denoise", "evaluate", "ops_overview", "peers", "report", "run_folder"}
-TOOLS = REPORTS | {"benchmark", "demo", "export", "gradcheck", "stability", "train"}
+REPORTS = {"benchmark", "denoise", "evaluate", "ops_overview", "peers", "report", "run_folder"}
+TOOLS = REPORTS | {"demo", "export", "gradcheck", "stability", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "ops": set(),
@@ -56,6 +56,7 @@ ALLOWED: dict[str, set[str]] = {
     "evaluate": LIBRARY | {"denoise", "peers"},
     "results": SIGNAL | {"data"},
     "report": LIBRARY | {"evaluate", "results"},
+    "benchmark": LIBRARY | {"evaluate", "ops_overview", "peers", "results"},
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"results"}),
     "cli": LIBRARY | TOOLS,
     "__main__": {"cli"},

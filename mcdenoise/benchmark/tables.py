@@ -62,7 +62,7 @@ def scene_rows(results: Results) -> list[dict[str, str]]:
                     "scene": scene.name,
                     "method": cell.method,
                     **{name: _number(cell.errors.get(name), ".4g") for name in names},
-                    "ms": _number(cell.denoising, ".1f"),
+                    "ms": _number(_median(cell.computing), ".1f"),
                     "quartiles": "" if cell.computing is None else _range(cell.computing),
                     "ms with files": _number(_median(cell.whole), ".1f"),
                     "megapixels/s": _number(results.megapixels_per_second(cell), ".2f"),

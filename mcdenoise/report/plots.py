@@ -207,11 +207,18 @@ def cost_over_pixels(results: Results, colors: dict[str, str], layout: Layout = 
     return figure
 
 
-def write_figure(figure: Figure, folder: Path, name: str) -> None:
-    """Write ``NAME.svg`` and ``NAME.png`` on white, for papers."""
-    for suffix in ("svg", "png"):
-        with atomic_path(folder / f"{name}.{suffix}") as temporary:
-            figure.savefig(temporary, dpi=220, facecolor="white", metadata={"Date": None} if suffix == "svg" else None)
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure on white, for papers, as its ending says.
+
+    Raises:
+        InputError: the ending is unknown, or the file cannot be written.
+    """
+    kind = path.suffix.removeprefix(".")
+    if kind not in figure.canvas.get_supported_filetypes():
+        raise InputError(f"{path}: expected a figure's ending such as .svg, .png or .pdf, found '{path.suffix}'")
+    with atomic_path(path) as temporary:
+        metadata = {"Date": None} if kind == "svg" else None
+        figure.savefig(temporary, format=kind, dpi=220, facecolor="white", metadata=metadata)
 
 
 def inline_svg(figure: Figure, name: str, description: str) -> str:

@@ -153,7 +153,10 @@ def _row(results: Results, number: int, method: Method, scene: str) -> Row:
     if method.missing or cell is None or cell.failure:
         failed = f"failed: {cell.failure}" if cell and cell.failure else "not measured"
         return Row(method, number, reason=f"missing: {method.missing}" if method.missing else failed)
-    milliseconds = _denoising(cell)
+    milliseconds = None if cell.computing is None else _range(cell.computing)
+    # What only hands its input on takes no time worth a place on a logarithmic axis.
+    if milliseconds and not cell.stages.keys() - set(FILE_STAGES):
+        milliseconds = Range(0.0, 0.0, 0.0)
     size = next((one.width * one.height for one in results.scenes if one.name == scene), 0)
     return Row(
         method,
@@ -174,13 +177,6 @@ def _error(cell: Cell, name: str) -> Range:
 
 def _range(spread: Spread) -> Range:
     return Range(spread.median, spread.lower, spread.upper)
-
-
-def _denoising(cell: Cell) -> Range | None:
-    own = [spread for stage, spread in cell.stages.items() if stage not in FILE_STAGES]
-    if cell.denoising is None:
-        return None
-    return Range(cell.denoising, sum(one.lower for one in own), sum(one.upper for one in own))
 
 
 def _mean(rows: list[Row], results: Results) -> Row:

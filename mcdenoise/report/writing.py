@@ -17,7 +17,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
 from mcdenoise.report.gallery import REFERENCE, Gallery, picture_pixels, read_gallery
 from mcdenoise.report.pictures import BRIGHTEST, data_uris, decode
-from mcdenoise.report.views import Range, View, metrics, pareto_front, points, views
+from mcdenoise.report.views import Range, Row, View, metrics, pareto_front, points, views
 from mcdenoise.results import STAGES, Results
 
 FILE = "index.html"
@@ -51,8 +51,7 @@ def write_report(folder: Path) -> Path:
     """
     results = Results.read(folder)
     names = metrics(results)
-    for package in ("jinja2", "matplotlib", "PIL"):
-        _require(package)
+    check_packages()
     galleries = _galleries(folder, results)
     shown = views(results)
     content = {
@@ -77,13 +76,45 @@ def write_report(folder: Path) -> Path:
     return path
 
 
-def _require(package: str) -> None:
-    try:
-        importlib.import_module(package)
-    except ImportError as error:
-        raise InputError(
-            f"a report needs {package}, which is not installed; pip install 'mcdenoise[report]'"
-        ) from error
+def write_error_plot(results: Results, metric: str, path: Path) -> list[Row]:
+    """Draw error over time alone: the mean over the scenes, or the one scene.
+
+    Args:
+        results: of a benchmark.
+        metric: name in :data:`mcdenoise.evaluate.METRICS`.
+        path: of the figure; its ending says which kind, such as ``.svg`` or ``.png``.
+
+    Returns:
+        What is drawn, by method.
+
+    Raises:
+        InputError: the metric was not computed, the ending is unknown, or the file cannot be written.
+    """
+    check_packages()
+    from mcdenoise.report import plots
+
+    if metric not in (known := metrics(results)):
+        raise InputError(f"metric: expected one of {', '.join(known)}, found {metric}")
+    shown = views(results)[0]
+    with plots.plot_style():
+        figure = plots.error_over_time(shown, metric, plots.family_colors(results.methods))
+        plots.write_figure(figure, path)
+    return shown.rows
+
+
+def check_packages() -> None:
+    """See that a report can be written.
+
+    Raises:
+        InputError: a package of ``mcdenoise[report]`` is not installed.
+    """
+    for package in ("jinja2", "matplotlib", "PIL"):
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise InputError(
+                f"a report needs {package}, which is not installed; pip install 'mcdenoise[report]'"
+            ) from error
 
 
 def _render(content: dict[str, Any]) -> str:
@@ -123,7 +154,8 @@ def _write_plots(folder: Path, results: Results, shown: list[View], names: list[
             "wide": plots.inline_svg(wide, f"{name}-wide", description),
             "narrow": plots.inline_svg(narrow, f"{name}-narrow", description),
         }
-        plots.write_figure(wide, target, name)
+        for suffix in ("svg", "png"):
+            plots.write_figure(wide, target / f"{name}.{suffix}")
         return made
 
     with plots.plot_style():

@@ -61,6 +61,7 @@ def write_benchmark(root: Path) -> None:
                     {metric: Spread.of(own) for metric, own in values.items()},
                     Spread(3 + 10.0 * place, 3, 40, 5),
                     stages,
+                    computing=Spread(10.0 * place, 9.0 * place, 12.0 * place, 5),
                 )
             )
     costs = [Cost("ours", 100 * n, 100, Spread(n, 0.9 * n, 1.1 * n, 3)) for n in (1, 2, 4)]
