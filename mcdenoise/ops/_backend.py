@@ -23,7 +23,7 @@ def check_backend(backend: str | None) -> None:
         raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, found {backend!r}")
 
 
-def choose_backend(backend: str | None, *tensors: Tensor | None) -> Backend:
+def choose_backend(backend: str | None, *tensors: Tensor | None, differentiable: bool = True) -> Backend:
     """The backend to run an op on ``tensors`` with.
 
     Args:
@@ -32,6 +32,7 @@ def choose_backend(backend: str | None, *tensors: Tensor | None) -> Backend:
             numba where it is installed and pays, and torch elsewhere, also while a model is exported, so that what is
             exported needs neither.
         tensors: the arguments of the op, the first of them ``(B, C, H, W)``.
+        differentiable: whether the fast form has derivatives.
 
     Raises:
         ValueError: the backend is unknown, or cannot run; the message says why.
@@ -44,18 +45,22 @@ def choose_backend(backend: str | None, *tensors: Tensor | None) -> Backend:
         few = first is None or first.shape[0] * first.shape[-2] * first.shape[-1] < _FEW_PIXELS
         if few or torch.compiler.is_exporting():
             return "torch"
-        return "torch" if _obstacle(tensors) else "numba"
-    obstacle = _obstacle(tensors)
+        return "torch" if _obstacle(tensors, differentiable) else "numba"
+    obstacle = _obstacle(tensors, differentiable)
     if obstacle:
         raise ValueError(f"backend: expected one that can run here, found 'numba', which {obstacle}")
     return "numba"
 
 
-def _obstacle(tensors: tuple[Tensor | None, ...]) -> str:
+def _obstacle(tensors: tuple[Tensor | None, ...], differentiable: bool) -> str:
     """Why numba cannot run on these tensors; empty if it can."""
     for tensor in tensors:
-        if tensor is not None and tensor.device.type != "cpu":
+        if tensor is None:
+            continue
+        if tensor.device.type != "cpu":
             return f"runs on the CPU, not on {tensor.device}"
+        if not differentiable and tensor.requires_grad and torch.is_grad_enabled():
+            return "has no derivatives of this op"
     return _no_numba()
 
 

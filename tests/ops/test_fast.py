@@ -241,7 +241,7 @@ def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPa
     image, kernel = torch.rand(1, 3, 4, 5), torch.rand(1, 9, 4, 5)
     with pytest.raises(ValueError, match="backend: expected one of torch, numba, found 'cuda'"):
         ops.kernel_conv(image, kernel, backend="cuda")  # type: ignore[arg-type]
-    for module in (ops.KernelConv, ops.KernelSplat, ops.CrossBilateralFilter):
+    for module in (ops.KernelConv, ops.KernelSplat, ops.CrossBilateralFilter, ops.Accumulate):
         with pytest.raises(ValueError, match="backend: expected one of torch, numba, found 'c'"):
             module(backend="c")
     with pytest.raises(ValueError, match="found 'numba', which runs on the CPU, not on meta"):
@@ -249,3 +249,68 @@ def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(_backend, "_no_numba", lambda: "cannot be imported (gone); install mcdenoise[fast]")
     with pytest.raises(ValueError, match=r"found 'numba', which cannot be imported \(gone\); install mcdenoise\[fast"):
         ops.cross_bilateral_filter(image, kernel, backend="numba")
+
+
+ACCUMULATE = next(op for op in OPS if op.name == "accumulate")
+
+
+@every_dtype
+@pytest.mark.parametrize("case", ACCUMULATE.cases, ids=lambda case: case.name)
+def test_accumulation_is_that_of_the_plain_form(case: Case, dtype: torch.dtype) -> None:
+    inputs = case.inputs(dtype)
+    actual = ops.accumulate(**inputs, **case.settings, backend="numba")
+    for result, plain in zip(actual, ops.accumulate(**inputs, **case.settings, backend="torch"), strict=True):
+        assert result.dtype == dtype
+        # Both round to half precision once.
+        eps = torch.finfo(dtype).eps
+        torch.testing.assert_close(result, plain, rtol=8 * eps, atol=8 * eps)
+
+
+@pytest.mark.parametrize("rule", ["relative", "bmfr"])
+@pytest.mark.parametrize("layout", [channels_last, slice_of_pixels, every_other_column, transposed])
+def test_accumulation_of_any_layout_and_by_any_number_of_threads(
+    layout: Callable[[Tensor], Tensor], rule: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_filter, "_PIXELS_A_THREAD", 1)
+    case = next(case for case in ACCUMULATE.cases if "all buffers" in case.name)
+    inputs = case.inputs()
+    limits: dict[str, Any] = {"rule": rule, "position_limit": 0.05, "normal_limit": 0.3}
+    plain = ops.accumulate(**inputs, **limits, backend="torch")
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            results = ops.accumulate(**map_tensors(layout, inputs), **limits, backend="numba")
+            for result, expected in zip(results, plain, strict=True):
+                torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-12)
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_accumulation_goes_through_the_compiler() -> None:
+    case = ACCUMULATE.cases[1]
+    torch.compiler.reset()
+    compiled = torch.compile(ops.accumulate, fullgraph=True, backend="aot_eager")
+    results = compiled(**case.inputs(), **case.settings, backend="numba")
+    for result, expected in zip(results, ops.accumulate(**case.inputs(), **case.settings), strict=True):
+        torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_accumulation_with_derivatives_is_plain() -> None:
+    case = ACCUMULATE.cases[0]
+    inputs = case.inputs()
+    leaves_of(inputs, case)
+    with pytest.raises(ValueError, match="found 'numba', which has no derivatives of this op"):
+        ops.accumulate(**inputs, **case.settings, backend="numba")
+    color = torch.rand(1, 3, 96, 96, requires_grad=True)
+    result, _ = ops.accumulate(color, color.detach(), color.detach()[:, :1] + 1, torch.zeros(1, 2, 96, 96))
+    assert torch.autograd.grad(result.sum(), color)[0].shape == color.shape
+
+
+@pytest.mark.parametrize(("settings", "message"), [({"rule": "svgf"}, "rule: expected"), ({"rule": "bmfr"}, "needs")])
+def test_accumulation_refuses_what_the_plain_form_refuses(settings: dict[str, Any], message: str) -> None:
+    inputs = ACCUMULATE.cases[1].inputs()
+    for backend in ("torch", "numba"):
+        with pytest.raises(ValueError, match=message):
+            ops.accumulate(**inputs, **settings, backend=backend)

@@ -9,7 +9,7 @@ sums; kernels are read once, in whatever layout and precision they have. So no a
 ``K*K`` weights exist for ``_CHUNK`` pixels at a time; the derivatives compute them once more. Rows are shared out among
 threads of our own, as many as torch uses: numba's would be a second OpenMP beside torch's.
 
-All kernels are in this file because numba compiles them again when their own file changes, but not when another does.
+All its kernels are in this file: numba compiles them again when their own file changes, but not when another does.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class _Inputs(NamedTuple):
     border: int
 
 
-_compiled = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+compiled = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 
 
 def filtered(
@@ -74,7 +74,7 @@ def filtered(
     out = torch.empty(image.shape, dtype=dtype)
     if out.numel():
         inputs = _inputs(dtype, image, kernel, guides, scales, distance_scale, log_domain, border)
-        _share_rows(image, lambda *rows: _forward(out.numpy(), inputs, *rows))
+        share_rows(image, lambda *rows: _forward(out.numpy(), inputs, *rows))
     return out.to(image.dtype)
 
 
@@ -102,14 +102,14 @@ def derivatives(
     of_kernel = torch.empty_like(kernel, dtype=_readable(kernel, dtype).dtype)
     if scattered.numel():
         inputs = _inputs(dtype, image, kernel, guides, scales, distance_scale, log_domain, border)
-        upstream = _source(gradient.to(dtype))
+        upstream = source(gradient.to(dtype))
         results = (
             scattered.numpy(),
-            _source(of_kernel),
+            source(of_kernel),
             _filled_up([scale.numpy() for scale in of_scales], of_distance.numpy()),
             of_distance.numpy(),
         )
-        _share_rows(image, lambda *rows: _backward(results, upstream, inputs, *rows))
+        share_rows(image, lambda *rows: _backward(results, upstream, inputs, *rows))
     of_planes = torch.split(scattered, [plane.shape[1] for plane in planes], 1)
     # Custom ops hand out tensors of their own, and no views.
     of_image, *guide_gradients = (
@@ -133,7 +133,7 @@ def _readable(tensor: Tensor, dtype: torch.dtype) -> Tensor:
     return tensor if tensor.dtype == torch.bfloat16 and dtype == torch.float32 else tensor.to(dtype)
 
 
-def _source(tensor: Tensor) -> Source:
+def source(tensor: Tensor) -> Source:
     """Any layout is fine: strides go with the memory."""
     strides = tensor.stride()
     extent = 1 + sum((size - 1) * stride for size, stride in zip(tensor.shape, strides, strict=True))
@@ -153,13 +153,13 @@ def _inputs(
     log_domain: bool,
     border: Border,
 ) -> _Inputs:
-    nothing = _source(torch.empty((0, 0, 0, 0), dtype=dtype))
+    nothing = source(torch.empty((0, 0, 0, 0), dtype=dtype))
     return _Inputs(
-        _source(_readable(kernel, dtype)),
-        _source(image.to(dtype)),
-        _filled_up([_source(guide.to(dtype)) for guide in guides], nothing),
-        _filled_up([_source(scale.to(dtype)) for scale in scales], nothing),
-        nothing if distance_scale is None else _source(distance_scale.to(dtype)),
+        source(_readable(kernel, dtype)),
+        source(image.to(dtype)),
+        _filled_up([source(guide.to(dtype)) for guide in guides], nothing),
+        _filled_up([source(scale.to(dtype)) for scale in scales], nothing),
+        nothing if distance_scale is None else source(distance_scale.to(dtype)),
         image.shape[2],
         image.shape[3],
         kernel_size_of(kernel.shape[1], "kernel"),
@@ -172,7 +172,7 @@ def _filled_up(values: list[Any], nothing: Any) -> tuple[Any, ...]:
     return (*values, *[nothing] * (-len(values) % _GUIDES or (0 if values else _GUIDES)))
 
 
-def _share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
+def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
     """``run(b, first, last)`` for all rows of all images of the batch, on as many threads as torch uses."""
     batch, _, height, width = image.shape
     rows = batch * height
@@ -268,7 +268,7 @@ def _exp_overload(value: Any) -> Any:
     return exp
 
 
-@_compiled
+@compiled
 def _copy_row(row: Any, source: Any, start: int, stride: int) -> None:
     memory = source[0]
     if stride == 1:
@@ -280,7 +280,7 @@ def _copy_row(row: Any, source: Any, start: int, stride: int) -> None:
             row[x] = _load(memory[start + x * stride])
 
 
-@_compiled
+@compiled
 def _fetch(rows: Any, source: Any, b: int, y: int, height: int, radius: int, border: int) -> None:
     """Row ``y`` of each channel, which may lie beyond the image, with ``radius`` more pixels at both ends."""
     _, strides, channels = source
@@ -298,7 +298,7 @@ def _fetch(rows: Any, source: Any, b: int, y: int, height: int, radius: int, bor
             row[radius + width :] = inner[width - 1]
 
 
-@_compiled
+@compiled
 def _fetch_all(ring: Any, inputs: Any, b: int, y: int) -> None:
     """The image and behind it the guides."""
     rows, radius, border = ring[y % inputs.kernel_size], inputs.kernel_size // 2, inputs.border
@@ -309,7 +309,7 @@ def _fetch_all(ring: Any, inputs: Any, b: int, y: int) -> None:
         channel += guide[2]
 
 
-@_compiled
+@compiled
 def _read_taps(taps: Any, kernel: Any, b: int, y: int, x0: int, n: int) -> None:
     """The kernels of a run of pixels, one row a tap, from planes or from pixels with their taps side by side."""
     memory, strides, count = kernel
@@ -324,7 +324,7 @@ def _read_taps(taps: Any, kernel: Any, b: int, y: int, x0: int, n: int) -> None:
             _copy_row(taps[t, :n], kernel, start + t * strides[1], strides[3])
 
 
-@_compiled
+@compiled
 def _write_taps(kernel: Any, taps: Any, b: int, y: int, x0: int, n: int) -> None:
     """The opposite of :func:`_read_taps`."""
     memory, strides, count = kernel
@@ -340,7 +340,7 @@ def _write_taps(kernel: Any, taps: Any, b: int, y: int, x0: int, n: int) -> None
                 memory[start + t * strides[1] + x * strides[3]] = _rounded(taps[t, x], memory)
 
 
-@_compiled
+@compiled
 def _subtract_differences(total: Any, factor: Any, neighbours: Any, centres: Any, dx: int, begin: int) -> None:
     """``factor`` times the squared difference of a run of pixels and those ``dx`` to the right, over all channels."""
     n = total.size
@@ -351,7 +351,7 @@ def _subtract_differences(total: Any, factor: Any, neighbours: Any, centres: Any
             total[x] -= factor[x] * difference * difference
 
 
-@_compiled
+@compiled
 def _subtract_multiple(total: Any, values: Any, factor: int) -> None:
     # A whole number would make the products float64.
     scale = total.dtype.type(factor)
@@ -359,7 +359,7 @@ def _subtract_multiple(total: Any, values: Any, factor: int) -> None:
         total[x] -= scale * values[x]
 
 
-@_compiled
+@compiled
 def _weigh(
     weights: Any,
     factors: Any,
@@ -433,7 +433,7 @@ def _weigh(
         inverse[x] = one / inverse[x] if inverse[x] != zero else zero
 
 
-@_compiled
+@compiled
 def _read_scales(falloff: Any, scales: Any, distance: Any, b: int, y: int, x0: int, n: int) -> None:
     for g in range(len(scales)):
         if scales[g][2] > 0:
@@ -445,42 +445,42 @@ def _read_scales(falloff: Any, scales: Any, distance: Any, b: int, y: int, x0: i
         _copy_row(falloff[len(scales), :n], distance, start, strides[3])
 
 
-@_compiled
+@compiled
 def _exponential(values: Any, offset: Any) -> None:
     for x in range(values.size):
         values[x] = _exp(values[x] - offset[x])
 
 
-@_compiled
+@compiled
 def _maximum(total: Any, values: Any) -> None:
     for x in range(total.size):
         total[x] = max(total[x], values[x])
 
 
-@_compiled
+@compiled
 def _add(total: Any, values: Any) -> None:
     for x in range(total.size):
         total[x] += values[x]
 
 
-@_compiled
+@compiled
 def _multiply(values: Any, factors: Any) -> None:
     for x in range(values.size):
         values[x] *= factors[x]
 
 
-@_compiled
+@compiled
 def _add_product(total: Any, a: Any, b: Any) -> None:
     for x in range(total.size):
         total[x] += a[x] * b[x]
 
 
-@_compiled
+@compiled
 def _is_guided(inputs: Any) -> bool:
     return bool(_channels_of(inputs) > inputs.image[2] or inputs.distance[2] > 0)
 
 
-@_compiled
+@compiled
 def _channels_of(inputs: Any) -> int:
     """Of the image and all guides."""
     count: int = inputs.image[2]
@@ -489,7 +489,7 @@ def _channels_of(inputs: Any) -> int:
     return count
 
 
-@_compiled
+@compiled
 def _forward(out: Any, inputs: Any, b: int, first: int, last: int) -> None:
     """Rows ``first`` to ``last`` of the result."""
     width, kernel_size, channels, log_domain = inputs.width, inputs.kernel_size, inputs.image[2], inputs.log_domain
@@ -518,7 +518,7 @@ def _forward(out: Any, inputs: Any, b: int, first: int, last: int) -> None:
                 _multiply(out[b, c, y, x0 : x0 + n], inverse[:n])
 
 
-@_compiled
+@compiled
 def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last: int) -> None:
     """Rows ``first`` to ``last`` of the derivatives.
 
@@ -600,7 +600,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
         _finish(scattered, sums, b, done, radius, border)
 
 
-@_compiled
+@compiled
 def _scale_slopes(
     of_scales: Any,
     of_distance: Any,
@@ -634,7 +634,7 @@ def _scale_slopes(
             _subtract_multiple(result, slopes[t, :n], dy * dy + dx * dx)
 
 
-@_compiled
+@compiled
 def _guide_slopes(
     sums: Any,
     slopes: Any,
@@ -674,7 +674,7 @@ def _guide_slopes(
             channel += guides[g][2]
 
 
-@_compiled
+@compiled
 def _finish(scattered: Any, sums: Any, b: int, y: int, radius: int, border: int) -> None:
     """Hand out a row that no further pixel adds to, and clear its place."""
     width = scattered.shape[3]
