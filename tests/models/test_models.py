@@ -136,6 +136,19 @@ def test_weights_and_filter_in_one_give_the_same_image(
         torch.testing.assert_close(image, model(*inputs(97, 131)).final, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+def test_shortcuts_of_inference_change_no_feature(dtype: torch.dtype) -> None:
+    torch.manual_seed(0)
+    net = UNet(4, WIDTH).to(dtype=dtype, memory_format=torch.channels_last)
+    image = torch.randn(1, 4, 21, 34).to(dtype)
+    trained = net(image)
+    with torch.no_grad():
+        inferred = net(image)
+    for a, b in zip(trained, inferred, strict=True):
+        assert b.isfinite().all()
+        assert torch.equal(a, b)
+
+
 @pytest.mark.parametrize("name", list_models())
 def test_a_gradient_reaches_every_parameter(name: str) -> None:
     model = build(name)
