@@ -64,8 +64,10 @@ ALLOWED: dict[str, set[str]] = {
     "": LIBRARY,
 }
 OPS_KNOW = {"torch", "kornia"}
+# Fast forms are imported when one is chosen; `_backend` looks whether that is possible.
+FAST_OPS_KNOW = OPS_KNOW | {"numba", "numpy"}
 # `import mcdenoise` leaves these alone: optional, slow to load, or of use to the command line only.
-LAZY = {"OpenImageIO", "PIL", "colour", "jinja2", "matplotlib", "tyro"}
+LAZY = {"OpenImageIO", "PIL", "colour", "jinja2", "matplotlib", "numba", "tyro"}
 LAZY |= {"drjit", "mitsuba", "pyoidn", "flip_evaluator", "lightning", "lightning_fabric", "tensorboard"}
 SECONDS = 0.5
 
@@ -98,7 +100,8 @@ def arrows(module: str, source: str) -> Iterator[str]:
     for name in imported(module, source):
         outermost = name.partition(".")[0]
         if outermost != "mcdenoise":
-            if room == "ops" and outermost not in OPS_KNOW | sys.stdlib_module_names:
+            known = FAST_OPS_KNOW if module.startswith(("mcdenoise.ops._fast", "mcdenoise.ops._backend")) else OPS_KNOW
+            if room == "ops" and outermost not in known | sys.stdlib_module_names:
                 yield f"{module} imports {name}: ops know torch, kornia and the standard library only"
         elif room_of(name) not in ALLOWED[room] | {room}:
             yield f"{module} imports {name}: not allowed by the table in {Path(__file__).name}"
@@ -130,6 +133,9 @@ def test_no_import_goes_up(module: str) -> None:
     [
         ("mcdenoise.ops._check", "import numpy", True),
         ("mcdenoise.ops._check", "import OpenImageIO as oiio", True),
+        ("mcdenoise.ops._check", "import numba", True),
+        ("mcdenoise.ops._fast._filter", "import numba", False),
+        ("mcdenoise.ops._fast._filter", "import OpenImageIO", True),
         ("mcdenoise.ops._check", "from mcdenoise.buffers import Frame", True),
         ("mcdenoise.ops._check", "from ..buffers import Frame", True),
         ("mcdenoise.ops._check", "def f():\n    from mcdenoise import buffers", True),

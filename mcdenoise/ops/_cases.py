@@ -12,7 +12,7 @@ point on purpose, the inputs concerned are not among its ``differentiable`` ones
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -20,6 +20,7 @@ from torch import Generator, Tensor, nn
 
 from mcdenoise.ops import _reference
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
+from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
@@ -214,6 +215,25 @@ def _bilateral_cases() -> tuple[Case, ...]:
         case("logits of 50", "extreme", (1, 2, 3), 3, "softmax", logit=50.0, channels=(1,)),
         case("all but the centre vanish", "extreme", (1, 2, 3), 3, "softmax", "zeros", largest_scale=6e4),
     )
+
+
+def _bilateral_filter_cases() -> tuple[Case, ...]:
+    """Those of the weights, with an image to filter."""
+
+    def with_image(case: Case) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            inputs = case.tensors(g)
+            kernel = inputs["kernel"]
+            assert isinstance(kernel, Tensor)
+            if case.settings["normalize"] == "none":
+                # Weights of both signs may have the sum zero.
+                inputs["kernel"] = kernel = kernel.abs() + 0.1
+            batch, _, height, width = kernel.shape
+            return {"image": _normal(g, batch, 2, height, width), **inputs}
+
+        return replace(case, tensors=tensors, differentiable=("image", *case.differentiable))
+
+    return tuple(map(with_image, _bilateral_cases()))
 
 
 def _image_cases(sizes: Callable[[int, int], tuple[int, int]], with_size: bool) -> tuple[Case, ...]:
@@ -519,6 +539,7 @@ OPS: tuple[Op, ...] = (
     Op(kernel_conv, _reference.kernel_conv, _filter_cases(), KernelConv),
     Op(kernel_splat, _reference.kernel_splat, _filter_cases(), KernelSplat),
     Op(cross_bilateral_weights, _reference.cross_bilateral_weights, _bilateral_cases(), CrossBilateralWeights),
+    Op(cross_bilateral_filter, _reference.cross_bilateral_filter, _bilateral_filter_cases(), CrossBilateralFilter),
     Op(downsample, _reference.downsample, _image_cases(lambda height, width: (height, width), with_size=False)),
     Op(upsample, _reference.upsample, _image_cases(_half, with_size=True)),
     Op(laplacian_fusion, _reference.laplacian_fusion, _fusion_cases(), LaplacianFusion),

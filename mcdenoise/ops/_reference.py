@@ -89,6 +89,21 @@ def cross_bilateral_weights(
     return _tensor(out, kernel.shape)
 
 
+def cross_bilateral_filter(
+    image: Tensor,
+    kernel: Tensor,
+    guides: Sequence[Tensor] = (),
+    scales: Sequence[Tensor] = (),
+    distance_scale: Tensor | None = None,
+    *,
+    normalize: str = "softmax",
+    border: str = "replicate",
+) -> Tensor:
+    """Eqs. 4-8, one after the other."""
+    weights = cross_bilateral_weights(kernel, guides, scales, distance_scale, normalize=normalize, border=border)
+    return kernel_conv(image, weights, border=border)
+
+
 def downsample(image: Tensor) -> Tensor:
     """``D`` of Eq. 2: the mean of those pixels of each 2x2 block that exist."""
     batch, channels, height, width = image.shape

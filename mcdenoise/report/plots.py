@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
 
 from mcdenoise.data.files import atomic_path
+from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
 from mcdenoise.report.labels import Box, place_labels
 from mcdenoise.report.views import Point, Range, Row, View, pareto_front, points
