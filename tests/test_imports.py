@@ -56,7 +56,7 @@ ALLOWED: dict[str, set[str]] = {
     "evaluate": LIBRARY | {"denoise", "peers"},
     "results": SIGNAL | {"data"},
     "report": LIBRARY | {"evaluate", "results"},
-    "benchmark": LIBRARY | {"evaluate", "ops_overview", "peers", "results"},
+    "benchmark": LIBRARY | {"evaluate", "ops_overview", "peers", "results", "run_folder"},
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"results"}),
     "cli": LIBRARY | TOOLS,
     "__main__": {"cli"},
