@@ -21,6 +21,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from rich.table import Table
 
 from mcdenoise.errors import InputError
+from mcdenoise.heap import keep_heap
 
 if TYPE_CHECKING:
     from mcdenoise.evaluate import Evaluation
@@ -53,6 +54,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(version("mcdenoise"))
         return
     name, rest = arguments[0], arguments[1:]
+    keep_heap()
     if name not in COMMANDS:
         print(f"mcdenoise: unknown command '{name}'; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(2)
