@@ -10,6 +10,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from decimal import Decimal, localcontext
 from typing import Any
 
 import torch
@@ -70,23 +71,41 @@ def cross_bilateral_weights(
     factor_of_distance = None if distance_scale is None else distance_scale.tolist()
     batch, _, height, width = kernel.shape
     for b, y, x in itertools.product(range(batch), range(height), range(width)):
+        exponents: dict[int, list[float]] = {}
         for t, squared_distance, row, column in _taps(kernel, y, x, border):
-            weight = logits[b][t][y][x] if normalize == "none" else math.exp(logits[b][t][y][x])
             if row is None and border == "renormalize":
-                weight = 0.0
+                continue
+            terms = exponents[t] = []
             for guide, factor in zip(images, factors, strict=True):
                 difference = sum(
                     ((channel[row][column] if row is not None else 0.0) - channel[y][x]) ** 2 for channel in guide[b]
                 )
-                weight *= math.exp(-factor[b][0][y][x] * difference)
+                terms.append(-factor[b][0][y][x] * difference)
             if factor_of_distance is not None:
-                weight *= math.exp(-factor_of_distance[b][0][y][x] * squared_distance)
-            out[b][t][y][x] = weight
+                terms.append(-factor_of_distance[b][0][y][x] * squared_distance)
         if normalize == "softmax":
-            total = sum(taps[y][x] for taps in out[b])
-            for taps in out[b]:
-                taps[y][x] /= total
+            weights = _softmax({t: [logits[b][t][y][x], *terms] for t, terms in exponents.items()})
+        else:
+            weights = {t: logits[b][t][y][x] * math.exp(sum(terms)) for t, terms in exponents.items()}
+        for t, weight in weights.items():
+            out[b][t][y][x] = weight
     return _tensor(out, kernel.shape)
+
+
+def _softmax(exponents: dict[int, list[float]]) -> dict[int, float]:
+    """``exp(sum of the terms)`` of each key over their total: decimal numbers hold what float64 cannot.
+
+    An infinite term is the limit of a large one.
+    """
+    infinite = [any(term == math.inf for term in terms) for terms in exponents.values()]
+    vanishing = [any(term == -math.inf for term in terms) for terms in exponents.values()]
+    if any(infinite) or all(vanishing):
+        chosen = infinite if any(infinite) else vanishing
+        return {t: float(wins) / sum(chosen) for t, wins in zip(exponents, chosen, strict=True)}
+    with localcontext(prec=40):
+        weights = [sum(map(Decimal, terms), Decimal()).exp() for terms in exponents.values()]
+        total = sum(weights, Decimal())
+        return {t: float(weight / total) for t, weight in zip(exponents, weights, strict=True)}
 
 
 def downsample(image: Tensor) -> Tensor:

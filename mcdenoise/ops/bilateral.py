@@ -76,10 +76,14 @@ def cross_bilateral_weights(
     log_domain = normalize == "softmax"
     start = kernel if log_domain else torch.zeros_like(kernel)
     exponent = _exponent(start, guides, scales, distance_scale, radius, border)
-    if border == "renormalize":
-        mask = inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
-        exponent = torch.where(mask, exponent, -torch.inf)
-    weights = torch.softmax(exponent, 1) if log_domain else kernel * torch.exp(exponent)
+    if log_domain:
+        if border == "renormalize":
+            exponent = torch.where(_inside(kernel, kernel_size), exponent, -torch.inf)
+        weights = torch.softmax(exponent, 1)
+    else:
+        weights = kernel * torch.exp(exponent)
+        if border == "renormalize":
+            weights = torch.where(_inside(kernel, kernel_size), weights, 0)
     return weights.to(kernel.dtype)
 
 
@@ -109,6 +113,10 @@ class CrossBilateralWeights(nn.Module):
         return cross_bilateral_weights(
             kernel, guides, scales, distance_scale, normalize=self.normalize, border=self.border
         )
+
+
+def _inside(kernel: Tensor, kernel_size: int) -> Tensor:
+    return inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
 
 
 def _check_normalize(normalize: str) -> None:
@@ -169,9 +177,11 @@ class _Exponent(Function):
         radius: int,
     ) -> Tensor:
         height, width = start.shape[-2:]
-        # One plane after the other, whatever the layout of the kernel: every tap is updated on its own.
+        # One plane after the other, whatever the layout of the kernel: every tap is updated on its own. The copy it takes
+        # makes infinite logits finite, so that of two of them none is NaN, but half.
         dtype = accumulator_dtype(start.dtype)
-        result = start.to(dtype, copy=True, memory_format=torch.contiguous_format)
+        largest = torch.finfo(dtype).max
+        result = start.to(dtype, memory_format=torch.contiguous_format).clamp(-largest, largest)
         for tap, dy, dx in offsets(2 * radius + 1):
             out = result[:, tap : tap + 1]
             if dy == 0 and dx == 0:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._window import accumulator_dtype
 
 # What a smooth dielectric reflects at normal incidence: on a darker surface most of the light is gloss, which no albedo
 # tints, and dividing it by a smaller number would give sparse, coloured, huge values.
@@ -46,7 +47,7 @@ def demodulate(color: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         True
     """
     check_shapes(color=(color, "B C H W"), albedo=(albedo, "B C H W"))
-    return color / _modulation(albedo, floor)
+    return (color.to(accumulator_dtype(color.dtype)) / _modulation(albedo, floor)).to(color.dtype)
 
 
 def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor:
@@ -76,7 +77,7 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         True
     """
     check_shapes(image=(image, "B C H W"), albedo=(albedo, "B C H W"))
-    return image * _modulation(albedo, floor)
+    return (image.to(accumulator_dtype(image.dtype)) * _modulation(albedo, floor)).to(image.dtype)
 
 
 class Demodulate(nn.Module):
@@ -114,5 +115,6 @@ class Remodulate(nn.Module):
 def _modulation(albedo: Tensor, floor: float) -> Tensor:
     if not floor > 0:
         raise ValueError(f"floor: expected a positive number, found {floor}")
+    albedo = albedo.to(accumulator_dtype(albedo.dtype))
     textured = (albedo >= NO_ALBEDO).any(1, keepdim=True)
     return torch.where(textured, albedo.clamp_min(floor), 1)

@@ -66,8 +66,9 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
     # Finite in the dtype: infinity times dark neighbours would be NaN.
     highest = around * (min(limit, torch.finfo(source.dtype).max) / count)
     bright = brightness > highest
-    factor = torch.where(bright, highest / torch.where(bright, brightness, 1), 1)
-    return (source * factor).to(image.dtype)
+    # Divided first: the ratio of the limit to a very bright pixel, and of that its derivative, is too small a number.
+    clamped = source / torch.where(bright, brightness, 1) * highest
+    return torch.where(bright, clamped, source).to(image.dtype)
 
 
 class ClampFireflies(nn.Module):

@@ -6,6 +6,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._window import accumulator_dtype
 
 
 def downsample(image: Tensor) -> Tensor:
@@ -111,8 +112,10 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
         raise ValueError(f"coarse: expected height and width {half} for {size} of fine, found {sizes['h'], sizes['w']}")
     if sizes["A"] not in (1, sizes["C"]):
         raise ValueError(f"alpha: expected 1 or {sizes['C']} channels, found {sizes['A']}")
+    dtype = accumulator_dtype(fine.dtype)
+    source = fine.to(dtype)
     # Linear in what is upsampled, so one upsampling serves both terms.
-    return fine + alpha * upsample(coarse - downsample(fine), size)
+    return (source + alpha.to(dtype) * upsample(coarse.to(dtype) - downsample(source), size)).to(fine.dtype)
 
 
 class LaplacianFusion(nn.Module):
