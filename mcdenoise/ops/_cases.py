@@ -28,6 +28,7 @@ from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remod
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
+from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
 
 __all__ = ["OPS", "Case", "Inputs", "Kind", "Op", "map_tensors"]
@@ -294,6 +295,37 @@ def _firefly_cases() -> tuple[Case, ...]:
     )
 
 
+def _lag_cases() -> tuple[Case, ...]:
+    both = ("history", "recent")
+
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        change: float,
+        noise: float = 0.2,
+        differentiable: tuple[str, ...] = both,
+        **settings: float,
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            history = _uniform(g, *size, low=0.8)
+            return {"history": history, "recent": change * (1 + noise * _uniform(g, *size, low=-1)) * history}
+
+        return Case(name, kind, tensors, differentiable, settings)
+
+    # Differences from 1 to 2 times the threshold, where the share is neither 0 nor 1: by the settings, not by chance.
+    return (
+        case("5x7", "ordinary", (1, 1, 5, 7), 1.2, threshold=6.0),
+        case("batch of 2, RGB, window of 3", "ordinary", (2, 3, 3, 4), 1.2, threshold=8.0, kernel_size=3),
+        case("window of 5", "ordinary", (1, 3, 4, 3), 1.2, threshold=6.0, kernel_size=5),
+        case("one row, 5 channels", "ordinary", (1, 5, 1, 6), 1.3, threshold=15.0, kernel_size=3),
+        case("no change", "ordinary", (1, 3, 4, 5), 1.0),
+        case("darker by half", "ordinary", (1, 3, 4, 5), 0.5),
+        # Without noise only the smallest visible difference counts.
+        case("brighter by 4.5 thousandths, no noise", "stiff", (1, 1, 1, 1), 1.0045, 0.0),
+    )
+
+
 def _camera(batch: int, eye_z: float, unit: float) -> Tensor:
     """Row-vector world-to-clip matrices that look along +z, with a little of everything in every entry."""
     matrix = torch.tensor(
@@ -514,6 +546,7 @@ OPS: tuple[Op, ...] = (
         images=_IMAGE,
         rounding=extreme.firefly_rounding,
     ),
+    Op(history_lag, _reference.history_lag, _lag_cases() + extreme.lags(), HistoryLag),
     Op(
         motion_from_position,
         _reference.motion_from_position,

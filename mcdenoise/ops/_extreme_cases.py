@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from mcdenoise.ops._case import Case, Inputs, Rounding, map_tensors, normal, radiance, uniform
+from mcdenoise.ops._case import Case, Inputs, Rounding, normal, radiance, uniform
 from mcdenoise.ops._window import Border, inside, offsets, pad, shifted, unpad
 from mcdenoise.ops.fireflies import clamp_fireflies
 from mcdenoise.ops.temporal import Surface, reproject
@@ -127,7 +127,7 @@ def filter_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     assert isinstance(image, Tensor)
     assert isinstance(kernel, Tensor)
     size = round(kernel.shape[1] ** 0.5)
-    kernel = torch.where(inside(*kernel.shape[-2:], size, kernel.device), kernel, 0)
+    kernel = torch.where(inside(kernel.shape[-2], kernel.shape[-1], size, kernel.device), kernel, 0)
     total = kernel.sum(1, keepdim=True).abs()
     # Over the pixels that a window reaches, which is more than the mean of their absolute values.
     brightest = torch.nn.functional.max_pool2d(image.abs().sum(1, keepdim=True), size, 1, size // 2)
@@ -250,7 +250,7 @@ def bilateral_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 
 def _softmax_gradients(inputs: Inputs, exponent: Tensor, border: Border) -> Inputs:
-    """``w (v - sum(w v))`` is a difference of terms of the size of ``w``; what the exponent is made of inherits them."""
+    """``w (v - sum(w v))`` is a difference of terms of the size of ``w``, and so is all that follows."""
     guides, scales, distance = inputs["guides"], inputs["scales"], inputs["distance_scale"]
     assert isinstance(guides, list)
     assert isinstance(scales, list)
@@ -345,6 +345,25 @@ def firefly_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     before, after = image.sum(1, keepdim=True), clamp_fireflies(image, **settings).sum(1, keepdim=True)
     factor = torch.where(before > 0, after / torch.where(before > 0, before, 1), 1)
     return Rounding(gradients={"image": (2 * image.shape[1] * factor).expand_as(image)})
+
+
+def lags() -> tuple[Case, ...]:
+    """Of ``history_lag``."""
+
+    def case(name: str, size: tuple[int, int, int, int], history: Draw, recent: Draw | None = None) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            return {"history": history(g, *size), "recent": (recent or history)(g, *size)}
+
+        return Case(name, "extreme", tensors, ())
+
+    size = (1, 3, 5, 6)
+    return (
+        *(case(*tried) for tried in _tried()),
+        case("the light goes out", size, radiance, _constant(0.0)),
+        case("the light goes on", size, _constant(0.0), radiance),
+        case("the light goes on at 1e30", size, _constant(0.0), _constant(1e30)),
+        case("1e30 and 1e-30", size, _constant(1e30), _constant(1e-30)),
+    )
 
 
 def motions() -> tuple[Case, ...]:
@@ -456,14 +475,16 @@ def history_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     motion, previous = inputs["motion"], inputs["previous"]
     assert isinstance(motion, Tensor)
     assert isinstance(previous, Tensor)
-    # The derivative in the motion is a difference of neighbours, and of a sum of kept taps and the sum of their weights.
-    surfaces = (inputs.get("surface"), inputs.get("previous_surface"))
-    images = [inputs[name] for name in ("previous", "previous_length") if name in inputs]
+    # The derivative in the motion is a difference of neighbours, and one of the kept taps and of their weights.
+    here, there = inputs.get("surface"), inputs.get("previous_surface")
+    assert here is None or isinstance(here, Surface)
+    assert there is None or isinstance(there, Surface)
+    images = [image for image in (previous, inputs.get("previous_length")) if isinstance(image, Tensor)]
     around = [torch.nn.functional.max_pool2d(image.nan_to_num().abs(), 3, 1, 1) for image in images if len(motion)]
     rules = {name: value for name, value in settings.items() if name != "alpha_min"}
     gradient = torch.zeros_like(motion)
     if around:
-        largest, kept = reproject(torch.cat(around, 1), motion, *surfaces, **rules)
+        largest, kept = reproject(torch.cat(around, 1), motion, here, there, **rules)
         terms = largest.sum(1, keepdim=True)
         if "color" in inputs:
             color = inputs["color"]

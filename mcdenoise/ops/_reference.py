@@ -181,6 +181,43 @@ def clamp_fireflies(image: Tensor, *, limit: float = 30.0, kernel_size: int = 7)
     return _tensor(out, image.shape)
 
 
+def history_lag(history: Tensor, recent: Tensor, *, threshold: float = 3.0, kernel_size: int = 7) -> Tensor:
+    """``clamp((z^2 / threshold^2 - 1) / 3, 0, 1)`` of the difference of local means in standard errors ``z``."""
+    batch, channels, height, width = history.shape
+    shape = (batch, 1, height, width)
+    long, short = (
+        [
+            [
+                [math.fsum(image[b][c][y][x] for c in range(channels)) / channels for x in range(width)]
+                for y in range(height)
+            ]
+            for b in range(batch)
+        ]
+        for image in (history.tolist(), recent.tolist())
+    )
+    radius = kernel_size // 2
+
+    def window(b: int, y: int, x: int) -> list[tuple[int, int]]:
+        rows = range(max(y - radius, 0), min(y + radius + 1, height))
+        columns = range(max(x - radius, 0), min(x + radius + 1, width))
+        return list(itertools.product(rows, columns))
+
+    def mean(image: Image, b: int, y: int, x: int) -> float:
+        pixels = window(b, y, x)
+        return math.fsum(image[b][row][column] for row, column in pixels) / len(pixels)
+
+    out = _zeros(shape)
+    for b, _, y, x in _indices(shape):
+        pixels = window(b, y, x)
+        deviations = [short[b][row][column] - mean(short, b, row, column) for row, column in pixels]
+        variance = math.fsum(deviation**2 for deviation in deviations) / len(pixels)
+        long_mean, short_mean = mean(long, b, y, x), mean(short, b, y, x)
+        noise = variance / len(pixels) + (1e-3 * (abs(long_mean) + abs(short_mean)) / 2) ** 2
+        z2 = (short_mean - long_mean) ** 2 / noise if noise > 0 else 0.0
+        out[b][0][y][x] = min(max((z2 / threshold**2 - 1) / 3, 0.0), 1.0)
+    return _tensor(out, shape)
+
+
 def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
     """``clip = [x y z 1] @ M``; ``motion = ((clip.xy / clip.w + 1) / 2) (W, H) - centre``; infinite for ``w <= 0``."""
     batch, _, height, width = position.shape

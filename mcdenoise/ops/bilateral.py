@@ -177,8 +177,8 @@ class _Exponent(Function):
         radius: int,
     ) -> Tensor:
         height, width = start.shape[-2:]
-        # One plane after the other, whatever the layout of the kernel: every tap is updated on its own. The copy it takes
-        # makes infinite logits finite, so that of two of them none is NaN, but half.
+        # One plane after the other, whatever the layout of the kernel: every tap is updated on its own. The copy that
+        # this takes makes infinite logits finite, so that the weight of each of two of them is not NaN, but half.
         dtype = accumulator_dtype(start.dtype)
         largest = torch.finfo(dtype).max
         result = start.to(dtype, memory_format=torch.contiguous_format).clamp(-largest, largest)
