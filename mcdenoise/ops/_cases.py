@@ -303,7 +303,7 @@ def _lag_cases() -> tuple[Case, ...]:
         kind: Kind,
         size: tuple[int, int, int, int],
         change: float,
-        noise: float = 0.2,
+        noise: float = 0.5,
         differentiable: tuple[str, ...] = both,
         **settings: float,
     ) -> Case:
@@ -315,10 +315,10 @@ def _lag_cases() -> tuple[Case, ...]:
 
     # Differences from 1 to 2 times the threshold, where the share is neither 0 nor 1: by the settings, not by chance.
     return (
-        case("5x7", "ordinary", (1, 1, 5, 7), 1.2, threshold=6.0),
-        case("batch of 2, RGB, window of 3", "ordinary", (2, 3, 3, 4), 1.2, threshold=8.0, kernel_size=3),
-        case("window of 5", "ordinary", (1, 3, 4, 3), 1.2, threshold=6.0, kernel_size=5),
-        case("one row, 5 channels", "ordinary", (1, 5, 1, 6), 1.3, threshold=15.0, kernel_size=3),
+        case("5x7", "ordinary", (1, 1, 5, 7), 2.0, threshold=5.0),
+        case("batch of 2, RGB, window of 3", "ordinary", (2, 3, 3, 4), 2.0, threshold=14.0, kernel_size=3),
+        case("window of 5", "ordinary", (1, 3, 4, 3), 2.0, threshold=9.0, kernel_size=5),
+        case("one row, 5 channels", "ordinary", (1, 5, 1, 6), 2.0, threshold=9.0, kernel_size=3),
         case("no change", "ordinary", (1, 3, 4, 5), 1.0),
         case("darker by half", "ordinary", (1, 3, 4, 5), 0.5),
         # Without noise only the smallest visible difference counts.

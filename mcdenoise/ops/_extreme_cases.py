@@ -360,7 +360,7 @@ def lags() -> tuple[Case, ...]:
     return (
         *(case(*tried) for tried in _tried()),
         case("the light goes out", size, radiance, _constant(0.0)),
-        case("the light goes on", size, _constant(0.0), radiance),
+        case("the light goes on", size, _constant(0.0), lambda g, *shape: uniform(g, *shape, low=0.5)),
         case("the light goes on at 1e30", size, _constant(0.0), _constant(1e30)),
         case("1e30 and 1e-30", size, _constant(1e30), _constant(1e-30)),
     )

@@ -44,9 +44,10 @@ def cross_bilateral_weights(
 
     Args:
         kernel: ``(B, K*K, H, W)``, odd ``K``, taps row by row from top left: weights ``w`` for ``"none"``, logits
-            for ``"softmax"``. A plain cross-bilateral filter has ones, respectively zeros.
-        guides: any number of ``(B, C_g, H, W)`` feature images, any channels and unit.
-        scales: one ``(B, 1, H, W)`` per guide, the ``f_g >= 0`` (1 / guide unit squared).
+            for ``"softmax"``. A plain cross-bilateral filter has ones, respectively zeros. A logit may be infinite: the
+            limit of a large one.
+        guides: any number of ``(B, C_g, H, W)`` feature images, any channels and unit, finite, at most 1e15.
+        scales: one ``(B, 1, H, W)`` per guide, the ``f_g >= 0`` (1 / guide unit squared), at most 1e8.
         distance_scale: ``(B, 1, H, W)``, the ``f_d >= 0`` (1 / pixel squared); ``None`` leaves the term out.
         normalize: ``"softmax"`` or ``"none"``.
         border: what a tap outside the image sees: ``"replicate"`` the guide's nearest edge pixel, ``"zeros"`` a guide
@@ -60,7 +61,7 @@ def cross_bilateral_weights(
         ValueError: shapes disagree, ``K`` is even, the numbers of guides and scales differ, or a mode is unknown.
 
     Differentiable in ``kernel``, ``guides``, ``scales`` and ``distance_scale``, to any order. Half precision sums
-    the exponent in float32.
+    the exponent in float32. A weight is known to eps times its exponent ``|logit| + E``.
 
     Source: the paper's Eqs. 5-8; Eisemann and Durand 2004, Petschnigg et al. 2004 (cross/joint bilateral filter).
 

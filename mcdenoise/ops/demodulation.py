@@ -28,7 +28,8 @@ def demodulate(color: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         floor: smallest albedo that is divided by, above 0; no value grows by more than ``1 / floor``.
 
     Returns:
-        ``(B, C, H, W)`` demodulated radiance.
+        ``(B, C, H, W)`` demodulated radiance, to rounding at any radiance and albedo whose quotient the dtype holds.
+        Half precision is computed in float32.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -61,7 +62,7 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         floor: as given to :func:`demodulate`.
 
     Returns:
-        ``(B, C, H, W)`` radiance.
+        ``(B, C, H, W)`` radiance, to rounding as :func:`demodulate`.
 
     Raises:
         TypeError: an argument is no floating-point tensor.

@@ -33,7 +33,8 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
 
     Returns:
         ``(B, C, H, W)`` in the dtype of ``image``; what is below the limit is equal bit by bit. Half precision is
-        summed in float32. An image of one pixel has no neighbours and is returned as it is.
+        summed in float32. Holds from black to 1e30, to rounding also where both are in one window. An image of one
+        pixel has no neighbours and is returned as it is.
 
     Raises:
         TypeError: the image is no floating-point tensor.

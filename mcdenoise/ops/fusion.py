@@ -16,7 +16,7 @@ def downsample(image: Tensor) -> Tensor:
     only the pixels that exist.
 
     Args:
-        image: ``(B, C, H, W)``, any unit and range.
+        image: ``(B, C, H, W)``, any unit, up to a quarter of the largest number.
 
     Returns:
         ``(B, C, ceil(H / 2), ceil(W / 2))``.
@@ -82,13 +82,13 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     ``o = i_f - alpha * U(D(i_f)) + alpha * U(i_c)`` with :func:`downsample` ``D`` and :func:`upsample` ``U``.
 
     Args:
-        fine: ``(B, C, H, W)`` image ``i_f``, any unit and range.
+        fine: ``(B, C, H, W)`` image ``i_f``, any unit, up to a quarter of the largest number.
         coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` image ``i_c`` of the same unit.
         alpha: ``(B, 1, H, W)`` or ``(B, C, H, W)`` blending weight; 0 keeps ``fine``, 1 takes all low frequencies
             from ``coarse``.
 
     Returns:
-        ``(B, C, H, W)``.
+        ``(B, C, H, W)`` in the dtype of ``fine``. Half precision is computed in float32.
 
     Raises:
         TypeError: an argument is no floating-point tensor.

@@ -35,7 +35,9 @@ def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") 
             (0 where that sum is 0), so that the result is a weighted mean everywhere.
 
     Returns:
-        ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32.
+        ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32. Holds while the sum of
+        ``|kernel image|`` is below the largest number; with ``"renormalize"``, also for the gradient, where the sum of
+        the weights is 0 or between 1e-15 and 1e15.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -77,7 +79,8 @@ def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate")
             that all of every pixel stays inside.
 
     Returns:
-        ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32.
+        ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32. Holds in the range of
+        :func:`kernel_conv`.
 
     Raises:
         TypeError: an argument is no floating-point tensor.

@@ -67,14 +67,15 @@ def history_lag(
     largest = torch.maximum(history.detach().abs(), recent.detach().abs()).to(dtype).amax((1, 2, 3), keepdim=True)
     largest = torch.where(largest > 0, largest, 1)
     long, short = ((image.to(dtype) / largest).mean(1, keepdim=True) for image in (history, recent))
-    long_mean, mean = _box(long, kernel_size), _box(short, kernel_size)
+    # Not the difference of the means, which cancels.
+    mean, difference = _box(short, kernel_size), _box(short - long, kernel_size)
     count = _box(torch.ones_like(short), kernel_size, divide=False)
-    # Not the mean of squares less the square of the mean, which cancels.
+    # Nor is this the mean of squares less the square of the mean.
     variance = _box((short - mean).square(), kernel_size) / count
-    smallest = SMALLEST * (long_mean.abs() + mean.abs()) / 2
+    smallest = SMALLEST * ((mean - difference).abs() + mean.abs()) / 2
     noise = threshold**2 * (variance + smallest.square())
     some = noise > 0
-    ratio = torch.where(some, (mean - long_mean).square() / torch.where(some, noise, 1), 0)
+    ratio = torch.where(some, difference.square() / torch.where(some, noise, 1), 0)
     return ((ratio - 1) / 3).clamp(0, 1).to(history.dtype)
 
 

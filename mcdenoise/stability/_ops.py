@@ -200,18 +200,14 @@ def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact])
     conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype)
     largest = max((leaf.abs().max().item() for leaf in exact[len(trial.leaves) :] if leaf.numel()), default=0.0)
     cancelling = _by_leaf(trial, [torch.zeros_like(leaf) for leaf in exact[: len(trial.leaves)]], rounding.gradients)
-    # Where a result is infinite by right, so may its derivative be, or be nothing at all.
+    # Where a result is infinite by right, so may its derivative be, or be nothing at all; elsewhere nothing excuses it.
     defined = all(result.value.isfinite().all() for result in results)
-    return [
-        _bounded(
-            value.nan_to_num(nan=0.0, posinf=math.inf, neginf=-math.inf) if defined else value,
-            condition + largest * terms,
-            fan_in,
-            trial.dtype,
-            trial.dtype,
-        )
-        for value, terms, (condition, fan_in) in zip(trial.gradients(exact), cancelling, conditions, strict=True)
-    ]
+    bounded = []
+    for value, terms, (condition, fan_in) in zip(trial.gradients(exact), cancelling, conditions, strict=True):
+        excused = ~value.isnan() | (not defined)
+        condition = torch.where(excused, condition + largest * terms, 0)
+        bounded.append(_bounded(torch.where(excused, value, 0), condition, fan_in, trial.dtype, trial.dtype))
+    return bounded
 
 
 def _magnitudes(trial: _Trial, leaves: list[Tensor], rounding: Rounding, dtype: torch.dtype) -> list[Tensor]:

@@ -271,6 +271,16 @@ REFUSED: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], type[Ex
     (ops.motion_from_position, (THREE, image(4, 4)), {}, ValueError, "previous_view_projection: expected shape"),
     (ops.motion_from_position, (THREE, image(2, 4, 4)), {}, ValueError, "previous_view_projection: expected B = 1"),
     (ops.reproject, (THREE, THREE), {}, ValueError, "motion: expected shape (B, 2, H, W), found (1, 3, 4, 5)"),
+    (ops.history_lag, (THREE, ONE), {}, ValueError, "recent: expected C = 3 as in history, found 1"),
+    (ops.history_lag, (THREE, THREE.int()), {}, TypeError, "recent: expected a floating-point dtype"),
+    (ops.history_lag, (THREE, THREE), {"threshold": 0.0}, ValueError, "threshold: expected above 0, found 0.0"),
+    (
+        ops.history_lag,
+        (THREE, THREE),
+        {"kernel_size": 4},
+        ValueError,
+        "kernel_size: expected odd and at least 3, found 4",
+    ),
     (ops.reproject, (THREE, THREE[:, :2]), {"rule": "svgf"}, ValueError, "rule: expected 'relative' or 'bmfr'"),
     (
         ops.reproject,
