@@ -3,9 +3,10 @@
     python examples/unseen_scenes.py path/to/scene path/to/another --peers oidn --markdown
     python examples/unseen_scenes.py path/to/scene --models cascaded --weights runs/mine/cascaded.safetensors
 
-Prints for every scene, and for the mean over the scenes, the mean over the frames with a reference of: SMAPE and relMSE
-(scene-linear, lower is better), PSNR and SSIM (as displayed, higher is better), FLIP (as displayed, lower is better),
-and tSMAPE (scene-linear) and tRMSE (as displayed), the errors of the change from frame to frame, lower is better.
+Prints for every scene, and for the mean over the scenes, the mean over the frames with a reference of: SMAPE, relMSE
+and RMSE (scene-linear, lower is better), PSNR and SSIM (as displayed, higher is better), FLIP (as displayed, lower is
+better), and tSMAPE (scene-linear) and tRMSE (as displayed), the errors of the change from frame to frame, lower is
+better. Where the renderer has noted the references' own noise, also what the truth would score because of it.
 
 Peers are shown at their best: a row that stands for several settings takes, for each metric by itself, the setting that
 the reference says is best. OIDN is Intel Open Image Denoise in 36 settings: fast, balanced and high; albedo and normal
@@ -34,6 +35,7 @@ from mcdenoise.evaluate import (
     Score,
     check_references,
     folded,
+    noise_floor,
     reference_noise,
     score_sequence,
     summary,
@@ -122,11 +124,15 @@ def main() -> None:
     if means:
         print(f"\n{table(means, options.markdown)}")
     noise = {sequence.name: reference_noise(sequence) for sequence in sequences}
+    floors = {sequence.name: noise_floor(sequence) for sequence in sequences}
     notes = [
-        f"{name}: the references' own SMAPE against the truth is about {value:.4g}."
+        f"{name}: the references' own SMAPE against the truth is about {value:.4g}; the truth would score about "
+        + ", ".join(f"{metric} {floor:.4g}" for metric, floor in floors[name].items())
+        + "."
         for name, value in noise.items()
         if value
     ]
+    notes += dict.fromkeys(f"no {metric}: {reason}." for score in scores for metric, reason in score.left_out.items())
     if "FLIP" in metrics and options.flip_every > 1:
         notes.append(f"FLIP: of one in {options.flip_every} frames.")
     against = [verdict for name in names for verdict in verdicts(scores, name)] if "oidn" in options.peers else []
@@ -140,6 +146,7 @@ def main() -> None:
             "summary": [asdict(score) for score in means],
             "verdicts": [asdict(v) | {"ahead": v.ahead, "won": v.won} for v in against],
             "reference_noise": noise,
+            "noise_floor": floors,
             "flip_every": options.flip_every,
             "threads": torch.get_num_threads(),
         }

@@ -190,10 +190,12 @@ def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
         >>> replaced, clean[0, :, 1, 1].tolist()
         (1, [1.0, 1.0, 1.0])
     """
+    # One pass sees whether there is anything to look for: a NaN comes through.
+    low, high = torch.aminmax(color)
+    if low >= 0 and high < torch.inf:
+        return color, 0
     usable = (torch.isfinite(color) & (color >= 0)).all(dim=1, keepdim=True)
     replaced = int((~usable).sum())
-    if replaced == 0:
-        return color, 0
     zeroed = torch.where(usable, color, 0)
     # Divided before they are summed, and never in half precision: bright neighbours must not add up to infinity.
     dtype = torch.promote_types(color.dtype, torch.float32)
@@ -212,6 +214,23 @@ def _check_buffer(name: str, value: object) -> None:
 
 def _check_values(name: str, value: Tensor) -> Tensor:
     spec = BUFFERS.get(name, _MATRIX)
+    low, high = (float(extreme) for extreme in torch.aminmax(value))
+    # A NaN comes through the extremes and fails the comparison; only then is it worth to look at every value again.
+    if not -_UNBOUNDED < low <= high < _UNBOUNDED:
+        _refuse_illegal(name, spec, value)
+    if spec.high == _UNBOUNDED and spec.low == -_UNBOUNDED:
+        return value
+    if low >= spec.low and high <= spec.high:
+        return value
+    if low < spec.low - _ROUNDING or high > spec.high + spec.slack:
+        raise InputError(
+            f"buffer '{name}': expected values in [{spec.low:g}, {spec.high:g}] ({spec.meaning}), "
+            f"found [{low:.4g}, {high:.4g}]"
+        )
+    return value.clamp(spec.low, spec.high)
+
+
+def _refuse_illegal(name: str, spec: BufferSpec, value: Tensor) -> None:
     bad = ~torch.isfinite(value)
     if spec.infinite:
         bad = torch.isnan(value) | ((value == -_UNBOUNDED) & (spec.low != -_UNBOUNDED))
@@ -222,14 +241,3 @@ def _check_values(name: str, value: Tensor) -> Tensor:
             f"buffer '{name}': expected finite values ({spec.meaning}), "
             f"found {int(bad.sum())} NaN or infinite ones, {place}; render the buffer again or leave it out"
         )
-    if spec.high == _UNBOUNDED and spec.low == -_UNBOUNDED:
-        return value
-    low, high = float(value.min()), float(value.max())
-    if low >= spec.low and high <= spec.high:
-        return value
-    if low < spec.low - _ROUNDING or high > spec.high + spec.slack:
-        raise InputError(
-            f"buffer '{name}': expected values in [{spec.low:g}, {spec.high:g}] ({spec.meaning}), "
-            f"found [{low:.4g}, {high:.4g}]"
-        )
-    return value.clamp(spec.low, spec.high)

@@ -8,11 +8,12 @@ import io
 import itertools
 import json as jsonlib
 import math
+import shlex
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -20,6 +21,10 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from rich.table import Table
 
 from mcdenoise.errors import InputError
+from mcdenoise.heap import keep_heap
+
+if TYPE_CHECKING:
+    from mcdenoise.evaluate import Evaluation
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Json = Path | None
@@ -49,6 +54,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(version("mcdenoise"))
         return
     name, rest = arguments[0], arguments[1:]
+    keep_heap()
     if name not in COMMANDS:
         print(f"mcdenoise: unknown command '{name}'; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(2)
@@ -98,6 +104,8 @@ def _demo() -> Callable[..., int | None]:
     def demo(out: Out = Path("demo"), model: str = "cascaded", json: Json = None) -> None:
         """Render 16 frames of a small scene at one sample a pixel, denoise them, print errors and times.
 
+        Ends with a report of error against run time: all models, and what other denoisers are installed.
+
         Args:
             out: folder to write to; what an earlier run rendered there is used again.
             model: name of a model with shipped weights.
@@ -106,16 +114,18 @@ def _demo() -> Callable[..., int | None]:
         with _progress() as progress:
             rendering = progress.add_task("render", total=None)
             denoising = progress.add_task("denoise", total=FRAMES)
+            comparing = progress.add_task("compare", total=None)
             result = run_demo(
                 out,
                 model=model,
                 on_render=lambda done, total: progress.update(rendering, completed=done, total=total),
                 on_frame=lambda: progress.advance(denoising),
+                on_compare=lambda done, total: progress.update(comparing, completed=done, total=total),
             )
         scores = [asdict(score) for score in result.scores]
         _print_scores(scores)
         _print_times(result.report.milliseconds)
-        print(f"clean frames: {result.denoised}\npicture: {result.picture}")
+        print(f"clean frames: {result.denoised}\npicture: {result.picture}\nreport: {result.page}")
         _write_json(json, {"scores": scores, "milliseconds": result.report.milliseconds})
 
     return demo
@@ -191,26 +201,62 @@ def _denoise() -> Callable[..., int | None]:
     return denoise
 
 
+@dataclass(frozen=True)
+class RenderOptions:
+    """How a sequence is rendered, whatever the scene.
+
+    Args:
+        spp: samples a pixel of the noisy color.
+        realisations: noisy colors of each frame, with independent noise.
+        reference_spp: samples a pixel of the references; 0 renders none. With --noise-level the most.
+        noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
+        reference_frames: which frames get a reference, such as 8-11; all by default.
+        size: WIDTHxHEIGHT in pixels.
+        workers: processes that render frames side by side; of use with scalar_rgb.
+        variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
+    """
+
+    spp: int = 1
+    realisations: int = 1
+    reference_spp: int = 512
+    noise_level: float | None = None
+    reference_frames: str | None = None
+    size: str = "640x360"
+    workers: int = 1
+    variant: str | None = None
+
+    def arguments(self) -> dict[str, Any]:
+        """Those of :func:`mcdenoise.render.render_sequence`."""
+        from mcdenoise.data.sequences import parse_frames
+
+        if self.reference_spp < 0:
+            raise InputError(f"--reference-spp: expected at least 0, found {self.reference_spp}")
+        frames = self.reference_frames
+        referenced = None if frames is None else parse_frames(frames, name="--reference-frames")
+        return {
+            "spp": self.spp,
+            "realisations": self.realisations,
+            "reference_spp": max(self.reference_spp, 1),
+            "noise_level": self.noise_level,
+            "reference_frames": referenced if self.reference_spp > 0 else [],
+            "size": _size(self.size),
+            "workers": self.workers,
+            "variant": self.variant,
+        }
+
+
 def _render() -> Callable[..., int | None]:
     """Render a Mitsuba 3 scene along a camera path to a noisy sequence with references."""
-    from mcdenoise.data.sequences import parse_frames
     from mcdenoise.render import load_shot, render_sequence
 
     def render(
         scene: tyro.conf.Positional[Path],
         camera_path: Path,
         out: Out,
+        rendering: tyro.conf.OmitArgPrefixes[RenderOptions],
         frames: int | None = None,
         every: int = 1,
-        spp: int = 1,
-        realisations: int = 1,
-        reference_spp: int = 512,
-        noise_level: float | None = None,
-        reference_frames: str | None = None,
-        size: str = "640x360",
         seed: int = 0,
-        workers: int = 1,
-        variant: str | None = None,
     ) -> None:
         """Render a Mitsuba 3 scene along a camera path to a sequence in the BMFR layout.
 
@@ -222,23 +268,14 @@ def _render() -> Callable[..., int | None]:
                 'frames' of cameras with 'position' and 'look_at'; or a folder of Tungsten scenes, one per frame.
                 Objects of the scene move with 'objects': for each id a list of 4x4 matrices, one per frame.
             out: folder of the sequence; finished frames in it are kept.
+            rendering: samples, references, size and processors.
             frames: render the first so many cameras; all by default.
             every: take only every n-th camera of the path.
-            spp: samples a pixel of the noisy color.
-            realisations: noisy colors of each frame, with independent noise.
-            reference_spp: samples a pixel of the references; 0 renders none. With --noise-level the most.
-            noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
-            reference_frames: which frames get a reference, such as 8-11; all by default.
-            size: WIDTHxHEIGHT in pixels.
             seed: of the noise.
-            workers: processes that render frames side by side; of use with scalar_rgb.
-            variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
         """
-        if reference_spp < 0:
-            raise InputError(f"--reference-spp: expected at least 0, found {reference_spp}")
-        referenced = None if reference_frames is None else parse_frames(reference_frames, name="--reference-frames")
         if every < 1:
             raise InputError(f"--every: expected at least 1, found {every}")
+        arguments = rendering.arguments()
         shot = load_shot(camera_path)
         with _progress() as progress:
             task = progress.add_task("render", total=None)
@@ -246,18 +283,11 @@ def _render() -> Callable[..., int | None]:
                 scene,
                 shot.cameras[::every],
                 out,
-                size=_size(size),
                 frames=frames,
-                spp=spp,
-                realisations=realisations,
-                reference_spp=max(reference_spp, 1),
-                noise_level=noise_level,
-                reference_frames=referenced if reference_spp > 0 else [],
                 moves={name: path[::every] for name, path in shot.moves.items()},
                 seed=seed,
-                workers=workers,
-                variant=variant,
                 progress=lambda done, total: progress.update(task, completed=done, total=total),
+                **arguments,
             )
         print(written)
 
@@ -272,18 +302,13 @@ def _generate() -> Callable[..., int | None]:
 
     def generate(
         out: Out,
+        rendering: tyro.conf.OmitArgPrefixes[RenderOptions] = RenderOptions(
+            realisations=3, reference_spp=64, size="160x160"
+        ),
         seeds: str = "0-15",
         frames: int = 12,
-        spp: int = 1,
-        realisations: int = 3,
-        reference_spp: int = 64,
-        noise_level: float | None = None,
-        reference_frames: str | None = None,
-        noise_seed: int | None = None,
-        size: str = "160x160",
         zoom: float = 1.0,
-        workers: int = 1,
-        variant: str | None = None,
+        noise_seed: int | None = None,
     ) -> None:
         """Render random rooms, courts and still lifes to sequences to train on: OUT/random0000, OUT/random0001, ...
 
@@ -291,25 +316,17 @@ def _generate() -> Callable[..., int | None]:
 
         Args:
             out: folder of the sequences; finished frames in it are kept.
+            rendering: samples, references, size and processors.
             seeds: which scenes, such as 0-99,200.
             frames: frames of each sequence.
-            spp: samples a pixel of the noisy color.
-            realisations: noisy colors of each frame, with independent noise.
-            reference_spp: samples a pixel of the references. With --noise-level the most.
-            noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
-            reference_frames: which frames get a reference, such as 8-11; all by default.
-            noise_seed: of the noise of all scenes; by default each has the noise of its own seed.
-            size: WIDTHxHEIGHT in pixels.
             zoom: render the middle of an image that is so many times as wide and high.
-            workers: processes that render frames side by side; of use with scalar_rgb.
-            variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
+            noise_seed: of the noise of all scenes; by default each has the noise of its own seed.
         """
         if frames < 1:
             raise InputError(f"--frames: expected at least 1, found {frames}")
         if not 0 < zoom < math.inf:
             raise InputError(f"--zoom: expected a positive number, found {zoom:g}")
-        chosen = parse_frames(seeds, name="--seeds")
-        referenced = None if reference_frames is None else parse_frames(reference_frames, name="--reference-frames")
+        chosen, arguments = parse_frames(seeds, name="--seeds"), rendering.arguments()
         with _progress() as progress:
             whole = progress.add_task("scenes", total=len(chosen))
             for seed in chosen:
@@ -323,17 +340,10 @@ def _generate() -> Callable[..., int | None]:
                     made.scene,
                     made.cameras,
                     out / f"random{seed:04d}",
-                    size=_size(size),
-                    spp=spp,
-                    realisations=realisations,
-                    reference_spp=reference_spp,
-                    noise_level=noise_level,
-                    reference_frames=referenced,
                     seed=seed if noise_seed is None else noise_seed,
                     moves=made.moves,
-                    workers=workers,
-                    variant=variant,
                     progress=show,
+                    **arguments,
                 )
                 progress.remove_task(task)
                 progress.advance(whole)
@@ -395,6 +405,171 @@ def _train() -> Callable[..., int | None]:
             print(weights)
 
     return train
+
+
+def _evaluate() -> Callable[..., int | None]:
+    """Compare a folder of denoised images with references."""
+    from mcdenoise.data import open_sequence
+    from mcdenoise.evaluate import evaluate_folder
+    from mcdenoise.metrics.protocols import ProtocolName
+
+    def evaluate(
+        sequence: tyro.conf.Positional[Path],
+        images: tyro.conf.Positional[Path],
+        protocol: ProtocolName = "strict",
+        frames: str | None = None,
+        json: Json = None,
+    ) -> None:
+        """Compare a folder of denoised images, ours or not, with the references of a sequence.
+
+        Args:
+            sequence: folder of a sequence with references.
+            images: folder of one EXR a frame, such as denoised12.exr or frame.0012.exr, scene-linear RGB.
+            protocol: how a publication computed its numbers; they are printed beside the strict ones.
+            frames: which frames, such as 0-59,70; all that have a reference by default.
+            json: write the printed figures to this file too.
+        """
+        opened = open_sequence(sequence, frames)
+        with _progress() as progress:
+            task = progress.add_task("evaluate", total=len(opened.reference_numbers))
+            result = evaluate_folder(opened, images, protocol=protocol, on_frame=lambda number: progress.advance(task))
+        _print_evaluation(result)
+        _write_json(json, result.as_json())
+
+    return evaluate
+
+
+def _benchmark() -> Callable[..., int | None]:
+    """Measure error against run time of models and other denoisers."""
+    import torch
+
+    from mcdenoise.benchmark import Settings, benchmark_ops, choose_candidates, parse_sizes, run_benchmark
+    from mcdenoise.benchmark.sizes import SIZES
+    from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows
+    from mcdenoise.data import open_sequence
+    from mcdenoise.report import check_packages, write_report
+
+    def benchmark(
+        sequences: tyro.conf.Positional[list[Path]] = [],  # noqa: B006 - tyro reads it
+        out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None,
+        models: str | None = None,
+        peers: str = "all",
+        precisions: str = "float32,bfloat16",
+        frames: str | None = None,
+        rounds: int | None = None,
+        threads: int | None = None,
+        device: str = "cpu",
+        sizes: str = SIZES,
+        pictures: int = 4,
+        ops: bool = False,
+        size: str = "1280x720",
+        json: Json = None,
+    ) -> int:
+        """Measure error against run time: models, other denoisers and doing nothing, on the same frames, taking turns.
+
+        Writes OUT/index.html, the report, with its plots, results.json, results.csv and images; OUT must not exist.
+        Exit status 1 if a method failed on a scene. With --ops, measures the operators instead: time, error, and how
+        near they come to a copy.
+
+        Args:
+            sequences: folders of sequences with references.
+            out: folder to make; needed except with --ops.
+            models: names separated by commas, or safetensors files; by default all with shipped weights; or none.
+            peers: oidn, bilateral, or all, or none. Doing nothing and accumulation alone are always there.
+            precisions: of the models' convolutions: float32, bfloat16, or both.
+            frames: which frames of each sequence, such as 0-59,70; all by default.
+            rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.
+            threads: CPU threads of all methods; torch's choice by default.
+            device: cpu or cuda.
+            sizes: of images of which only the cost is measured, such as 1280x720,3840x2160, or none.
+            pictures: of how many frames of each scene images are kept.
+            ops: measure the operators.
+            size: of the images with --ops, WIDTHxHEIGHT.
+            json: write what is in results.json, or ops.json, to this file too.
+        """
+        threads = torch.get_num_threads() if threads is None else threads
+        if not 1 <= threads <= _MOST_THREADS:
+            raise InputError(f"--threads: expected 1 to {_MOST_THREADS}, found {threads}")
+        if ops == bool(sequences):
+            raise InputError(
+                "expected the folders of sequences, or --ops, and not both; see `mcdenoise benchmark --help`"
+            )
+        rounds = rounds if rounds is not None else 5 if ops else 3
+        if ops:
+            with _progress() as progress:
+                task = progress.add_task("ops", total=None)
+                costs = benchmark_ops(
+                    size=_size(size),
+                    rounds=rounds,
+                    threads=threads,
+                    device=device,
+                    out=out,
+                    command=_command(
+                        "benchmark", "--ops", out=out, size=size, rounds=rounds, threads=threads, device=device
+                    ),
+                    on_step=lambda done, total: progress.update(task, completed=done, total=total),
+                )
+            _print_rows(op_rows(costs))
+            print(f"a copy moves {costs.bandwidth:.1f} GB/s, read and written")
+            _write_json(json, asdict(costs))
+            return 0
+        if out is None:
+            raise InputError("--out: expected a folder to write to, found none; give one with -o")
+        settings = Settings(
+            rounds=rounds,
+            threads=threads,
+            device=device,
+            sizes=tuple(parse_sizes(sizes)),
+            pictures=pictures,
+            command=_command(
+                "benchmark",
+                *sequences,
+                out=out,
+                models=models,
+                peers=peers,
+                precisions=precisions,
+                frames=frames,
+                rounds=rounds,
+                threads=threads,
+                device=device,
+                sizes=sizes,
+                pictures=pictures,
+            ),
+        )
+        check_packages()
+        opened = [open_sequence(sequence, frames) for sequence in sequences]
+        candidates = choose_candidates(models, peers, precisions=precisions, threads=threads, device=device)
+        with _progress() as progress:
+            task = progress.add_task("benchmark", total=None)
+            results = run_benchmark(
+                opened,
+                candidates,
+                out,
+                settings,
+                on_step=lambda done, total: progress.update(task, completed=done, total=total),
+            )
+        _print_rows(scene_rows(results))
+        for line in [*remarks(results), f"report: {write_report(out)}"]:
+            print(line)
+        _write_json(json, asdict(results))
+        return 1 if results.failed else 0
+
+    return benchmark
+
+
+def _report() -> Callable[..., int | None]:
+    """Write the page and the plots of a finished benchmark."""
+    from mcdenoise.report import write_report
+
+    def report(folder: tyro.conf.Positional[Path]) -> None:
+        """Write FOLDER/index.html and FOLDER/plots/ from the results and pictures of a finished benchmark.
+
+        Args:
+            folder: what `mcdenoise benchmark` wrote: results.json and images/.
+        """
+        print(write_report(folder))
+
+    return report
 
 
 def _gradcheck() -> Callable[..., int | None]:
@@ -516,6 +691,9 @@ COMMANDS: dict[str, Callable[[], Callable[..., int | None]]] = {
     "render": _render,
     "generate": _generate,
     "train": _train,
+    "evaluate": _evaluate,
+    "benchmark": _benchmark,
+    "report": _report,
     "gradcheck": _gradcheck,
     "stability": _stability,
     "models": _models,
@@ -528,6 +706,12 @@ def _size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal()):
         raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{text}'")
     return int(width), int(height)
+
+
+def _command(*arguments: object, **options: object) -> str:
+    """A command line with every choice in it, also those that were made by default."""
+    chosen = [f"--{name}={value}" for name, value in options.items() if value is not None]
+    return shlex.join(["mcdenoise", *map(str, arguments), *chosen])
 
 
 def _progress() -> Progress:
@@ -546,6 +730,14 @@ def _show(table: Table) -> None:
     # A pipe has no width: never fold what a script may read.
     console = Console()
     Console(width=None if console.is_terminal else 200).print(table)
+
+
+def _print_rows(rows: list[dict[str, str]]) -> None:
+    if rows:
+        table = Table(*rows[0])
+        for row in rows:
+            table.add_row(*row.values())
+        _show(table)
 
 
 def _print_scores(rows: list[dict[str, Any]]) -> None:
@@ -591,6 +783,42 @@ def _print_long_runs(runs: list[Any]) -> None:
         allowed = f"{run.allowed:.2g}" if run.allowed else "-"
         table.add_row(run.name, run.dtype, over_time or "-", allowed, ghost, "ok" if run.passed else run.message)
     _show(table)
+
+
+def _print_evaluation(result: "Evaluation") -> None:
+    strict = result.tables["strict"]
+    for name, own in result.tables.items():
+        columns = []
+        for metric in own.mean:
+            columns.append((metric, own, "" if own is strict else name))
+            # Only these are the same quantity; a protocol's SMAPE may be one of displayed values.
+            if own is not strict and metric in ("PSNR", "SSIM") and metric in strict.mean:
+                columns.append((metric, strict, "strict"))
+        table = Table("frame", *(f"{metric} {of}".strip() for metric, _, of in columns))
+        for number in own.frames:
+            table.add_row(str(number), *(_figure(of.frames[number].get(metric)) for metric, of, _ in columns))
+        table.add_section()
+        table.add_row("mean", *(_figure(of.mean[metric]) for metric, of, _ in columns))
+        if own is strict and result.floor:
+            table.add_row("perfect", *(_figure(result.floor.get(metric)) for metric, _, _ in columns))
+        if columns:
+            _show(table)
+        print(f"{name}: {own.description}")
+        for reason in dict.fromkeys(own.left_out.values()):
+            without = [metric for metric, why in own.left_out.items() if why == reason]
+            print(f"{name}: no {', '.join(without)}: {reason}")
+    if result.warping_error:
+        ours, theirs = result.warping_error
+        print(f"warping error (Lai et al. 2018): {ours:.4g}; of the references {theirs:.4g}")
+    if result.reference_noise is not None:
+        print(
+            f"perfect: estimate of what the truth would score, since the references' own SMAPE against it is about "
+            f"{result.reference_noise:.4g}"
+        )
+
+
+def _figure(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
 
 
 def _print_times(milliseconds: dict[str, float]) -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import shlex
+import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from mcdenoise.benchmark import Settings, choose_candidates, run_benchmark
 from mcdenoise.buffers import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
@@ -18,6 +22,8 @@ from mcdenoise.denoiser import Denoiser, Images
 from mcdenoise.evaluate import Score, Scorer
 from mcdenoise.metrics import displayed
 from mcdenoise.render import render_sequence
+from mcdenoise.report import check_packages, write_report
+from mcdenoise.results import FILE
 
 FRAMES = 16
 SIZE = (320, 180)
@@ -36,12 +42,14 @@ class DemoResult:
         report: run times by stage, and what was done.
         picture: noisy, accumulated, denoised and reference side by side, with close-ups.
         denoised: folder of the clean EXRs.
+        page: the report of error against run time of all models and of what other denoisers are installed.
     """
 
     scores: list[Score]
     report: SequenceReport
     picture: Path
     denoised: Path
+    page: Path
 
 
 def run_demo(
@@ -51,21 +59,25 @@ def run_demo(
     variant: str | None = "scalar_rgb",
     on_render: Callable[[int, int], None] = lambda done, total: None,
     on_frame: Callable[[], None] = lambda: None,
+    on_compare: Callable[[int, int], None] = lambda done, total: None,
 ) -> DemoResult:
     """Render 16 frames at one sample a pixel, denoise them, and compare the last ones with references.
 
-    What an earlier run has rendered into the same folder is used again.
+    What an earlier run has rendered into the same folder is used again; its report is replaced.
 
     Args:
-        out: folder to write to: ``sequence/``, ``denoised/`` and ``demo.png``.
+        out: folder to write to: ``sequence/``, ``denoised/``, ``demo.png`` and ``report/``.
         model: name of a model with shipped weights.
         variant: of Mitsuba; ``"scalar_rgb"`` needs nothing but its package.
         on_render: called with finished and total paths a pixel.
         on_frame: called after each denoised frame.
+        on_compare: called with finished and all steps of the comparison that is reported.
 
     Raises:
-        InputError: Mitsuba is missing, the model is unknown, or the folder cannot be written to.
+        InputError: Mitsuba or a package of the report is missing, the model is unknown, or the folder cannot be
+            written to.
     """
+    check_packages()
     denoiser = Denoiser(model)
     make_folder(out)
     render_sequence(
@@ -90,7 +102,21 @@ def run_demo(
     report = denoise_sequence(sequence, out / "denoised", denoiser, model, references=True, on_frame=show)
     picture = out / "demo.png"
     write_png(picture, _sheet(*last[0]))
-    return DemoResult(scorer.scores(), report, picture, out / "denoised")
+    page = write_report(_compare(out, on_compare))
+    return DemoResult(scorer.scores(), report, picture, out / "denoised", page)
+
+
+def _compare(out: Path, on_step: Callable[[int, int], None]) -> Path:
+    """All models and peers on the frames of the demonstration; the folder of the results."""
+    folder, threads = out / "report", torch.get_num_threads()
+    if (folder / FILE).exists():
+        shutil.rmtree(folder)
+    settings = Settings(
+        rounds=1, threads=threads, pictures=len(REFERENCE_FRAMES), command=f"mcdenoise demo -o {shlex.quote(str(out))}"
+    )
+    sequence = replace(open_sequence(out / "sequence"), name="demo")
+    run_benchmark([sequence], choose_candidates(threads=threads), folder, settings, on_step=on_step)
+    return folder
 
 
 def _sheet(frame: Frame, images: Images) -> Picture:

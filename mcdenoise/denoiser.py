@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from mcdenoise.buffers import Frame
 from mcdenoise.errors import InputError
 from mcdenoise.history import Accumulated, History
-from mcdenoise.models import create_model
+from mcdenoise.models import Denoised, create_model
 from mcdenoise.ops import Accumulate, HistoryLag, remodulate
 
 Precision = Literal["float32", "bfloat16"]
@@ -124,11 +124,17 @@ class Denoiser:
         Raises:
             InputError: a feature buffer holds NaN, an illegal infinity or a value far out of range.
         """
-        return self.images(frame).denoised
+        frame, _, result = self._network(frame)
+        return self._remodulated(frame, result.final)[0]
 
-    @torch.inference_mode()
     def images(self, frame: Frame) -> Images:
         """As calling the denoiser, with the images on the way to the result."""
+        frame, past, result = self._network(frame)
+        return Images(frame.color, *self._remodulated(frame, past.color, result.initial, result.final))
+
+    @torch.inference_mode()
+    def _network(self, frame: Frame) -> tuple[Frame, Accumulated, Denoised]:
+        """The valid frame, its accumulated color, and what the network makes of it."""
         self.report = report = FrameReport()
         with self._timed("validate"):
             frame, report.replaced_pixels = frame.to(self.device).to(torch.float32).validate()
@@ -140,14 +146,16 @@ class Denoiser:
         history = {"current": past.current, "length": past.length} if self._takes_history else {}
         bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
         with self._timed("network"), bfloat16:
-            initial, final = self.model(*self._inputs(frame, past), **history)
+            result = Denoised(*self.model(*self._inputs(frame, past), **history))
+        return frame, past, result
+
+    @torch.inference_mode()
+    def _remodulated(self, frame: Frame, *images: Tensor) -> list[Tensor]:
         with self._timed("remodulate"):
             # A network that ends with a convolution hands out its precision.
-            accumulated, initial, final = (
-                image.float() if frame.albedo is None else remodulate(image.float(), frame.albedo)
-                for image in (past.color, initial, final)
-            )
-        return Images(frame.color, accumulated, initial, final)
+            return [
+                image.float() if frame.albedo is None else remodulate(image.float(), frame.albedo) for image in images
+            ]
 
     def _inputs(self, frame: Frame, past: Accumulated) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The network's inputs; a feature that the frame lacks is constant, which guides nothing."""

@@ -27,6 +27,31 @@ _STILL = 0.05  # pixels
 _RECENT_ALPHA = 0.25
 
 
+def surface_before(frame: Frame) -> Surface:
+    """What a frame shows, at the positions that it had in the frame before; its normals and depths are the current."""
+    before = frame.position if frame.previous_position is None else frame.previous_position
+    return Surface(before, frame.normal, frame.depth)
+
+
+def motion_to_previous(frame: Frame, previous_view_projection: Tensor | None) -> Tensor | None:
+    """Where each pixel's surface point was in the frame before, relative to where it is now.
+
+    Args:
+        frame: the current frame.
+        previous_view_projection: ``(B, 4, 4)`` of the frame before; needed where the frame has no motion of its own.
+
+    Returns:
+        ``(B, 2, H, W)`` pixels: the frame's own motion, else that of its previous positions (its positions, where it
+        has none) seen from the previous camera; ``None`` where it has neither.
+    """
+    if frame.motion is not None:
+        return frame.motion
+    position = surface_before(frame).position
+    if position is None or previous_view_projection is None:
+        return None
+    return motion_from_position(position, previous_view_projection)
+
+
 class Accumulated(NamedTuple):
     """One frame after accumulation.
 
@@ -126,14 +151,10 @@ class History:
             return first, recent
         if state.color.shape != color.shape or state.color.device != color.device:
             return first._replace(reset="size change"), recent
-        before = frame.position if frame.previous_position is None else frame.previous_position
-        if frame.motion is not None:
-            motion = frame.motion
-        elif before is not None and state.view_projection is not None:
-            motion = motion_from_position(before, state.view_projection)
-        else:
+        motion = motion_to_previous(frame, state.view_projection)
+        if motion is None:
             return first._replace(reset="no motion, and no position with a previous camera"), recent
-        surface = Surface(before, frame.normal, frame.depth)
+        surface = surface_before(frame)
         accumulated, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
         if float((length > 1).float().mean()) < _CUT_SHARE:
             return first._replace(reset="cut"), recent

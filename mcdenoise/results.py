@@ -13,6 +13,7 @@ from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 
 FILE = "results.json"
+OPS_FILE = "ops.json"
 IMAGES = "images"
 VERSION = 1
 STAGES = ("read", "accumulate", "network", "filter", "write")
@@ -126,8 +127,11 @@ class Cell:
         errors_spread: median and quartiles over the scored frames, by the same names.
         whole: milliseconds a frame, from reading to writing.
         stages: milliseconds a frame of each stage, by name in :data:`STAGES`; what a method does not do is left out.
-        memory: peak memory in mebibytes that denoising added, where it could be measured.
+        memory: peak memory in mebibytes that making the method and denoising two frames added, in a process of its own
+            (on a GPU: there), where it could be measured.
         failure: why the method failed on this scene; nothing else is known then.
+        computing: milliseconds a frame of what happens in memory, without reading and writing files; measured around
+            all of it, so that the stages may add up to a little less.
     """
 
     scene: str
@@ -138,12 +142,7 @@ class Cell:
     stages: dict[str, Spread] = field(default_factory=dict)
     memory: float | None = None
     failure: str = ""
-
-    @property
-    def denoising(self) -> float | None:
-        """Median milliseconds of what happens in memory, without reading and writing files."""
-        own = [spread.median for stage, spread in self.stages.items() if stage not in ("read", "write")]
-        return sum(own) if self.stages else None
+    computing: Spread | None = None
 
 
 @dataclass(frozen=True)
@@ -168,6 +167,8 @@ class Cost:
 @dataclass(frozen=True)
 class Fit:
     """How cost grows with the number of pixels: ``milliseconds = fixed + per_megapixel * megapixels``.
+
+    The line through the medians with the least squares of relative deviations: each size counts the same.
 
     Args:
         method: name.
@@ -197,6 +198,7 @@ class Results:
         costs: by method and size.
         fits: by method.
         version: of this format.
+        notes: what to know about the run as a whole, such as a metric that is left out, and why.
     """
 
     command: str
@@ -209,14 +211,30 @@ class Results:
     costs: list[Cost] = field(default_factory=list)
     fits: list[Fit] = field(default_factory=list)
     version: int = VERSION
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def failed(self) -> bool:
+        """Whether a method failed on a scene."""
+        return any(one.failure for one in self.cells)
 
     def cell(self, scene: str, method: str) -> Cell | None:
         """What is known of a method on a scene."""
         return next((one for one in self.cells if (one.scene, one.method) == (scene, method)), None)
 
+    def megapixels_per_second(self, cell: Cell) -> float | None:
+        """How many pixels a method denoises, without reading and writing files."""
+        scene = next(one for one in self.scenes if one.name == cell.scene)
+        return scene.width * scene.height / 1e3 / cell.computing.median if cell.computing else None
+
     def write(self, folder: Path) -> None:
-        """Write ``results.json``."""
-        write_text(folder / FILE, json.dumps(asdict(self), indent=1) + "\n")
+        """Write ``results.json``.
+
+        Raises:
+            InputError: it cannot be written.
+            ValueError: a number is NaN or infinite, which is no JSON.
+        """
+        write_text(folder / FILE, json.dumps(asdict(self), indent=1, allow_nan=False) + "\n")
 
     @classmethod
     def read(cls, folder: Path) -> Results:
@@ -239,6 +257,75 @@ class Results:
             raise InputError(f"{path}: expected the results of `mcdenoise benchmark`, found damage: {error}") from error
 
 
+@dataclass(frozen=True)
+class OpCost:
+    """What one op costs in one backend and dtype, and how exact it is.
+
+    Args:
+        op: name in :mod:`mcdenoise.ops`.
+        backend: ``torch`` for plain torch.
+        dtype: such as ``float32``.
+        case: of the op's cases, the one that was enlarged.
+        milliseconds: of one call; ``None`` where it failed.
+        error: largest relative error over the op's ordinary cases, against its equation in float64 on the same inputs;
+            ``None`` where it failed.
+        mebibytes: inputs and outputs together, each once: what must move at least.
+        copy: milliseconds that a copy takes which moves as much.
+        failure: why there is no result.
+    """
+
+    op: str
+    backend: str
+    dtype: str
+    case: str
+    milliseconds: Spread | None = None
+    error: float | None = None
+    mebibytes: float | None = None
+    copy: float | None = None
+    failure: str = ""
+
+    @property
+    def over_copy(self) -> float | None:
+        """How many times as long as that copy it takes; 1 is as fast as memory is."""
+        return self.milliseconds.median / self.copy if self.milliseconds and self.copy else None
+
+
+@dataclass(frozen=True)
+class OpResults:
+    """What ``mcdenoise benchmark --ops`` found out.
+
+    Args:
+        command: the command line that measured it.
+        created: UTC time in ISO format.
+        machine: where.
+        width: pixels.
+        height: pixels.
+        rounds: calls of each, without the warm-up.
+        bandwidth: of a copy in the same run, gigabytes (1e9) a second, read and written.
+        costs: by op, backend and dtype.
+        version: of this format.
+    """
+
+    command: str
+    created: str
+    machine: Machine
+    width: int
+    height: int
+    rounds: int
+    bandwidth: float
+    costs: list[OpCost]
+    version: int = VERSION
+
+    def write(self, folder: Path) -> None:
+        """Write ``ops.json``.
+
+        Raises:
+            InputError: it cannot be written.
+            ValueError: a number is NaN or infinite, which is no JSON.
+        """
+        write_text(folder / OPS_FILE, json.dumps(asdict(self), indent=1, allow_nan=False) + "\n")
+
+
 def _results(data: dict[str, Any]) -> Results:
     def spread(value: dict[str, Any] | None) -> Spread | None:
         return None if value is None else Spread(**value)
@@ -252,6 +339,7 @@ def _results(data: dict[str, Any]) -> Results:
             | {
                 "errors_spread": spreads(one["errors_spread"]),
                 "whole": spread(one["whole"]),
+                "computing": spread(one.get("computing")),
                 "stages": spreads(one["stages"]),
             }
         )

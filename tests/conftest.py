@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +11,15 @@ from torch import Tensor
 from mcdenoise.buffers import Frame
 from mcdenoise.data.bmfr import write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
+from mcdenoise.data.color_space import import_colour
 
 HEIGHT, WIDTH, FRAMES = 20, 24, 4
+
+
+@pytest.fixture(scope="session")
+def colour() -> Any:
+    """The package colour-science."""
+    return import_colour()
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import json
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -16,13 +17,13 @@ import numpy as np
 import pytest
 import torch
 
-from mcdenoise.cli import COMMANDS, main
+from mcdenoise.cli import COMMANDS, RenderOptions, main
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.models import create_model, list_models, pretrained_models, save_weights
 from mcdenoise.train import TrainConfig
 
 RGB = ["R", "G", "B"]
-POSITIONAL = {"sequence", "sequences", "scene", "ops"}
+POSITIONAL = {"folder", "sequence", "sequences", "scene", "images", "ops"}
 
 
 @pytest.fixture(autouse=True)
@@ -112,8 +113,9 @@ def test_help_names_every_option(run: Callable[..., tuple[int, str, str]], comma
     assert (status, errors) == (0, "")
     parameters = inspect.signature(COMMANDS[command]()).parameters
     names = set(parameters) - POSITIONAL
-    if "config" in names:
-        names = names - {"config"} | {field.name for field in dataclasses.fields(TrainConfig)}
+    for group, settings in (("config", TrainConfig), ("rendering", RenderOptions)):
+        if group in names:
+            names = names - {group} | {field.name for field in dataclasses.fields(settings)}
     for name in names:
         assert f"--{name.replace('_', '-')}" in text, name
     if "out" in names:
@@ -336,6 +338,76 @@ def test_ops(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
     names = [entry["name"] for entry in json.loads(path.read_text())]
     assert "kernel_conv" in names
     assert all(name in text for name in names)
+
+
+@pytest.fixture
+def colors(small_sequence: Path, tmp_path: Path) -> Path:
+    """The noisy colors of the sequence as somebody's result."""
+    folder = tmp_path / "result"
+    folder.mkdir()
+    for number in range(4):
+        shutil.copy(small_sequence / "inputs" / f"color{number}.exr", folder / f"frame.{number:04d}.exr")
+    return folder
+
+
+def test_evaluate(run: Callable[..., tuple[int, str, str]], small_sequence: Path, colors: Path, tmp_path: Path) -> None:
+    pytest.importorskip("flip_evaluator")
+    path = tmp_path / "errors.json"
+    status, text, _ = run("evaluate", small_sequence, colors, "--protocol", "meng2020", "--json", path)
+    assert status == 0
+    stored = json.loads(path.read_text())
+    assert (stored["sequence"], stored["images"]) == ("plane", str(colors))
+    strict, meng = (stored["protocols"][name] for name in ("strict", "meng2020"))
+    assert list(strict["frames"]) == list(meng["frames"]) == ["0", "1", "2", "3"]
+    first, second = text.split("strict: clamped")
+    assert all(name in first for name in ("SMAPE", "relMSE", "RMSE", "PSNR", "SSIM", "FLIP", "HDR-FLIP", "tRMSE"))
+    assert all(f"{strict['mean'][name]:.4g}" in first for name in ("SMAPE", "RMSE", "HDR-FLIP", "wRMSE"))
+    # The number of old stands beside the strict one.
+    row = next(line for line in second.splitlines() if "mean" in line)
+    values = [f"{table['mean'][name]:.4g}" for name in ("PSNR", "SSIM") for table in (meng, strict)]
+    assert re.findall(r"[\d.]+", row)[:4] == values
+    assert "data range 2" in " ".join(second.split())
+    assert "no flicker: " in text
+
+
+def test_evaluate_our_own_result_of_some_frames(
+    run: Callable[..., tuple[int, str, str]], small_sequence: Path, denoise: list[Any], out: Path, tmp_path: Path
+) -> None:
+    assert run(*denoise, "--frames", "1-2")[0] == 0
+    path = tmp_path / "errors.json"
+    assert run("evaluate", small_sequence, out, "--frames", "1-2", "--json", path)[0] == 0
+    assert list(json.loads(path.read_text())["protocols"]["strict"]["frames"]) == ["1", "2"]
+
+
+def test_evaluate_what_cannot_be_compared(
+    run: Callable[..., tuple[int, str, str]], refused: Callable[..., str], small_sequence: Path, colors: Path
+) -> None:
+    evaluate = ["evaluate", small_sequence, colors]
+    assert "--protocol" in refused(*evaluate, "--protocol", "loose")
+    edit(colors / "frame.0001.exr", lambda pixels: pixels.fill(np.nan))
+    assert "found 480 NaN or infinite ones" in refused(*evaluate)
+    write_exr(colors / "frame.0001.exr", np.zeros((10, 24, 3)), RGB)
+    assert "expected 24 x 20 pixels like the sequence, found 24 x 10" in refused(*evaluate)
+    (colors / "frame.0001.exr").unlink()
+    assert "found none of frame 1" in refused(*evaluate)
+    (colors / "other.exr").touch()
+    assert "one number that tells the frame" in refused(*evaluate)
+    for path in (small_sequence / "inputs").glob("reference*.exr"):
+        path.unlink()
+    assert "expected references" in refused(*evaluate)
+    assert "no such folder" in refused("evaluate", small_sequence / "nowhere", colors)
+
+
+def test_evaluate_images_smaller_than_a_window(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
+    sequence, result = tmp_path / "tiny", tmp_path / "result"
+    for folder, name in ((sequence, "color"), (sequence, "reference"), (result, "denoised")):
+        folder.mkdir(exist_ok=True)
+        write_exr(folder / f"{name}0.exr", np.full((5, 6, 3), 0.5), RGB)
+    for protocol in ("strict", "meng2020", "fan2021", "noisebase"):
+        status, text, _ = run("evaluate", sequence, result, "--protocol", protocol)
+        assert status == 0
+        assert "strict: no SSIM: SSIM's window: expected at least 11 x 11 pixels, found 5 x 6" in text
+        assert "| inf" in text.replace("│", "|")
 
 
 def test_gradcheck(run: Callable[..., tuple[int, str, str]], refused: Callable[..., str], tmp_path: Path) -> None:

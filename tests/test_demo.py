@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from mcdenoise.data import open_sequence, read_exr
+from mcdenoise.results import Results
 
 pytest.importorskip("mitsuba", reason="the demo renders with Mitsuba, which is not installed")
 
@@ -37,6 +38,12 @@ def test_demo_renders_denoises_and_shows(small_demo, tmp_path):
         "denoised2.exr",
         "denoise.json",
     }
+    assert result.page == tmp_path / "report" / "index.html"
+    found = Results.read(tmp_path / "report")
+    assert (found.scenes[0].scored, found.scenes[0].pictures, found.failed) == ([1, 2], [1, 2], False)
+    ours = found.cell(found.scenes[0].name, "cascaded")
+    assert ours is not None
+    assert ours.errors["SMAPE"] == pytest.approx(scores["denoised"].values["SMAPE"], rel=1e-5)
     sheet = result.picture.read_bytes()
     assert sheet.startswith(b"\x89PNG")
 
@@ -44,7 +51,9 @@ def test_demo_renders_denoises_and_shows(small_demo, tmp_path):
     before = read_exr(result.denoised / "denoised2.exr")[0]
     files = {path: path.stat().st_mtime_ns for path in (tmp_path / "sequence" / "inputs").glob("*.exr")}
     assert len(files) == 3 * 5 + 2
+    report = result.page.stat().st_mtime_ns
     again = small_demo.run_demo(tmp_path)
+    assert again.page.stat().st_mtime_ns > report
     assert {path: path.stat().st_mtime_ns for path in files} == files
     np.testing.assert_array_equal(read_exr(again.denoised / "denoised2.exr")[0], before)
     assert open_sequence(tmp_path / "sequence").reference_numbers == [1, 2]

@@ -33,10 +33,11 @@ LIBRARY = SIGNAL | {
     "render",
     "denoiser",
 }
-REPORTS = {"denoise", "evaluate", "peers", "report", "run_folder"}
-TOOLS = REPORTS | {"benchmark", "demo", "export", "gradcheck", "ops_overview", "stability", "train"}
+REPORTS = {"benchmark", "denoise", "evaluate", "ops_overview", "peers", "report", "run_folder"}
+TOOLS = REPORTS | {"demo", "export", "gradcheck", "stability", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
+    "heap": set(),
     "ops": set(),
     "buffers": {"errors"},
     "metrics": SIGNAL,
@@ -51,19 +52,23 @@ ALLOWED: dict[str, set[str]] = {
     "denoiser": SIGNAL | {"models", "history", "plan"},
     "denoise": LIBRARY,
     "run_folder": SIGNAL | {"data"},
+    "ops_overview": {"ops"},
     "peers": SIGNAL | {"models", "history", "denoiser"},
     "evaluate": LIBRARY | {"denoise", "peers"},
     "results": SIGNAL | {"data"},
-    "report": LIBRARY | {"results"},
+    "report": LIBRARY | {"evaluate", "results"},
+    "benchmark": LIBRARY | {"evaluate", "ops_overview", "peers", "results", "run_folder"},
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"results"}),
-    "cli": LIBRARY | TOOLS,
+    "cli": LIBRARY | TOOLS | {"heap"},
     "__main__": {"cli"},
     # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.
     "": LIBRARY,
 }
 OPS_KNOW = {"torch", "kornia"}
+# Fast forms are imported when one is chosen; `_backend` looks whether that is possible.
+FAST_OPS_KNOW = OPS_KNOW | {"numba", "numpy"}
 # `import mcdenoise` leaves these alone: optional, slow to load, or of use to the command line only.
-LAZY = {"OpenImageIO", "matplotlib", "tyro"}
+LAZY = {"OpenImageIO", "PIL", "colour", "jinja2", "matplotlib", "numba", "tyro"}
 LAZY |= {"drjit", "mitsuba", "pyoidn", "flip_evaluator", "lightning", "lightning_fabric", "tensorboard"}
 SECONDS = 0.5
 
@@ -96,7 +101,8 @@ def arrows(module: str, source: str) -> Iterator[str]:
     for name in imported(module, source):
         outermost = name.partition(".")[0]
         if outermost != "mcdenoise":
-            if room == "ops" and outermost not in OPS_KNOW | sys.stdlib_module_names:
+            known = FAST_OPS_KNOW if module.startswith(("mcdenoise.ops._fast", "mcdenoise.ops._backend")) else OPS_KNOW
+            if room == "ops" and outermost not in known | sys.stdlib_module_names:
                 yield f"{module} imports {name}: ops know torch, kornia and the standard library only"
         elif room_of(name) not in ALLOWED[room] | {room}:
             yield f"{module} imports {name}: not allowed by the table in {Path(__file__).name}"
@@ -128,6 +134,9 @@ def test_no_import_goes_up(module: str) -> None:
     [
         ("mcdenoise.ops._check", "import numpy", True),
         ("mcdenoise.ops._check", "import OpenImageIO as oiio", True),
+        ("mcdenoise.ops._check", "import numba", True),
+        ("mcdenoise.ops._fast._filter", "import numba", False),
+        ("mcdenoise.ops._fast._filter", "import OpenImageIO", True),
         ("mcdenoise.ops._check", "from mcdenoise.buffers import Frame", True),
         ("mcdenoise.ops._check", "from ..buffers import Frame", True),
         ("mcdenoise.ops._check", "def f():\n    from mcdenoise import buffers", True),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -51,6 +52,38 @@ def atomic_path(path: Path) -> Iterator[Path]:
         # Gone already after a successful rename; a folder that refuses this refused the file too.
         with suppress(OSError):
             os.unlink(temporary)
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Give a temporary folder beside ``path`` to write to, and rename it to ``path`` if the block succeeds.
+
+    If the block fails or is interrupted, the temporary folder is removed with all that is in it.
+
+    Args:
+        path: the folder to be made; nothing may be there.
+
+    Yields:
+        An empty folder in the same place.
+
+    Raises:
+        InputError: there is something at ``path``, or the operating system refused to write.
+    """
+    if os.path.lexists(path):
+        raise InputError(f"{path}: expected nothing there yet, found something; choose a new folder, or remove it")
+    temporary = path.absolute().with_name(f".{path.absolute().name}.{os.getpid()}.tmp")
+    try:
+        temporary.mkdir(parents=True)
+        yield temporary
+        # Over a folder that has come meanwhile, unless it is empty, this fails.
+        os.rename(temporary, path)
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise InputError(
+            f"{path}: cannot be written ({reason}); check the folder, its permissions and free space"
+        ) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:

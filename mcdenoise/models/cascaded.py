@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.unet import UNet
-from mcdenoise.ops import cross_bilateral_weights, downsample, kernel_conv, laplacian_fusion, upsample
+from mcdenoise.ops import cross_bilateral_filter, downsample, laplacian_fusion, upsample
 
 FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, its share 1
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of f1, f2, f3
@@ -116,17 +116,16 @@ class KernelPredictor(nn.Module):
         top = torch.log1p(image).amax((1, 2, 3), keepdim=True)
         images: list[Tensor] = []
         for head, level in zip(self.heads, levels, strict=True):
-            # The filter reads tap after tap: planes, not channels-last pixels.
-            prediction = _at_least_float32(head(level)).contiguous()
+            prediction = head(level)
             logits = prediction[:, : self.taps]
-            if self.bilateral:
-                f1_f2_f3 = F.softplus(prediction[:, self.taps :]).split(1, 1)
-                scales = [f * unit for f, unit in zip(f1_f2_f3, SCALE_UNITS, strict=True)]
-                weights = cross_bilateral_weights(logits, [normal, depth], scales[:2], scales[2], border="renormalize")
-            else:
-                weights = cross_bilateral_weights(logits, border="renormalize")
             # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
-            images.append(torch.log1p(kernel_conv(image, weights, border="zeros")))
+            if self.bilateral:
+                f1_f2_f3 = F.softplus(_at_least_float32(prediction[:, self.taps :]).contiguous()).split(1, 1)
+                f1, f2, f3 = (f * unit for f, unit in zip(f1_f2_f3, SCALE_UNITS, strict=True))
+                filtered = cross_bilateral_filter(image, logits, [normal, depth], [f1, f2], f3, border="renormalize")
+            else:
+                filtered = cross_bilateral_filter(image, logits, border="renormalize")
+            images.append(torch.log1p(filtered))
             image, normal, depth = downsample(image), downsample(normal), downsample(depth)
         # Each scale is a weighted mean; their fusion could leave the range of the input.
         return torch.expm1(torch.minimum(_fuse(images, self.fusions).clamp_min(0), top))

@@ -51,7 +51,7 @@ class UNet(nn.Module):
             x = F.pad(x, missing, mode="replicate")
         skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):
-            x = block(x if level == 0 else F.max_pool2d(x, 2))
+            x = block(x if level == 0 else _max_pool(x))
             skips.append(x)
         skips.pop()
         features: list[Tensor] = []
@@ -62,13 +62,35 @@ class UNet(nn.Module):
         return [f[..., : -(-height // 2**s), : -(-width // 2**s)] for s, f in enumerate(finest_first)]
 
 
+class _ReLU(nn.Module):
+    """ReLU in place: neither the convolution before it nor its own derivative needs what it overwrites."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        if x.dtype == torch.bfloat16 and _plain_inference(x):
+            # The sign of a bfloat16 is that of its bits as an integer, which a CPU clamps ten times as fast.
+            x.view(torch.int16).clamp_min_(0)
+            return x
+        return F.relu(x, inplace=True)
+
+
+def _max_pool(x: Tensor) -> Tensor:
+    """``F.max_pool2d(x, 2)``, in half the time where nobody asks which of the pixels it was."""
+    if not _plain_inference(x):
+        return F.max_pool2d(x, 2)
+    rows = torch.maximum(x[..., ::2, :], x[..., 1::2, :])
+    return torch.maximum(rows[..., ::2], rows[..., 1::2])
+
+
+def _plain_inference(x: Tensor) -> bool:
+    return x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
+
+
 def _block(in_channels: int, out_channels: int) -> nn.Sequential:
-    # In place: neither convolution nor ReLU needs the values before the ReLU, and fresh memory is slow on a CPU.
     block = nn.Sequential(
         nn.Conv2d(in_channels, out_channels, 3, padding=1),
-        nn.ReLU(inplace=True),
+        _ReLU(),
         nn.Conv2d(out_channels, out_channels, 3, padding=1),
-        nn.ReLU(inplace=True),
+        _ReLU(),
     )
     for layer in block:
         if isinstance(layer, nn.Conv2d):

@@ -1,6 +1,7 @@
 """Differentiable image operators: tensor in, tensor out; no weights, no files."""
 
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
+from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
 from mcdenoise.ops.demodulation import NO_ALBEDO, Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
@@ -12,6 +13,7 @@ __all__ = [
     "NO_ALBEDO",
     "Accumulate",
     "ClampFireflies",
+    "CrossBilateralFilter",
     "CrossBilateralWeights",
     "Demodulate",
     "HistoryLag",
@@ -22,6 +24,7 @@ __all__ = [
     "Surface",
     "accumulate",
     "clamp_fireflies",
+    "cross_bilateral_filter",
     "cross_bilateral_weights",
     "demodulate",
     "downsample",

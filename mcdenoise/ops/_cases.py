@@ -12,6 +12,7 @@ point on purpose, the inputs concerned are not among its ``differentiable`` ones
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -24,6 +25,7 @@ from mcdenoise.ops._case import normal as _normal
 from mcdenoise.ops._case import radiance as _radiance
 from mcdenoise.ops._case import uniform as _uniform
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
+from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
@@ -142,6 +144,25 @@ def _bilateral_cases() -> tuple[Case, ...]:
         case("logits of 50", "extreme", (1, 2, 3), 3, "softmax", logit=50.0, channels=(1,)),
         case("all but the centre vanish", "extreme", (1, 2, 3), 3, "softmax", "zeros", largest_scale=6e4),
     )
+
+
+def _bilateral_filter_cases() -> tuple[Case, ...]:
+    """Those of the weights, with an image to filter."""
+
+    def with_image(case: Case) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            inputs = case.tensors(g)
+            kernel = inputs["kernel"]
+            assert isinstance(kernel, Tensor)
+            if case.settings["normalize"] == "none":
+                # Weights of both signs may have the sum zero.
+                inputs["kernel"] = kernel = kernel.abs() + 0.1
+            batch, _, height, width = kernel.shape
+            return {"image": _normal(g, batch, 2, height, width), **inputs}
+
+        return replace(case, tensors=tensors, differentiable=("image", *case.differentiable))
+
+    return tuple(map(with_image, _bilateral_cases()))
 
 
 def _image_cases(sizes: Callable[[int, int], tuple[int, int]], with_size: bool) -> tuple[Case, ...]:
@@ -504,6 +525,14 @@ OPS: tuple[Op, ...] = (
         CrossBilateralWeights,
         weights=_softmax,
         rounding=extreme.bilateral_rounding,
+    ),
+    Op(
+        cross_bilateral_filter,
+        _reference.cross_bilateral_filter,
+        _bilateral_filter_cases() + extreme.bilateral_filters(),
+        CrossBilateralFilter,
+        images=_IMAGE,
+        rounding=extreme.bilateral_filter_rounding,
     ),
     Op(
         downsample,

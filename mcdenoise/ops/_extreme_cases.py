@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Generator, Tensor
 
-from mcdenoise.ops._case import Case, Inputs, Rounding, normal, radiance, uniform
+from mcdenoise.ops._case import Case, Inputs, Rounding, map_tensors, normal, radiance, uniform
 from mcdenoise.ops._window import Border, inside, offsets, pad, shifted, unpad
+from mcdenoise.ops.bilateral import cross_bilateral_weights
 from mcdenoise.ops.fireflies import clamp_fireflies
 from mcdenoise.ops.temporal import Surface, reproject
 
@@ -247,6 +249,44 @@ def bilateral_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     exponent = torch.where(exists | (settings["border"] != "renormalize"), kernel - terms, -torch.inf)
     weights = torch.softmax(exponent.clamp(-1e300, 1e300), 1)
     return Rounding({"kernel": own + terms}, gradients=_softmax_gradients(inputs, 2 * weights, settings["border"]))
+
+
+def bilateral_filters() -> tuple[Case, ...]:
+    """Of ``cross_bilateral_filter``: those of the weights, with an image."""
+
+    def with_image(case: Case) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            inputs = case.tensors(g)
+            kernel = inputs["kernel"]
+            assert isinstance(kernel, Tensor)
+            return {"image": radiance(g, kernel.shape[0], 3, *kernel.shape[2:]), **inputs}
+
+        return replace(case, tensors=tensors, differentiable=())
+
+    # A mean with an infinite weight is none.
+    return tuple(with_image(case) for case in bilateral() if case.name != "one weight infinite")
+
+
+def bilateral_filter_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
+    """What is rounded in the weights, and differences of terms of the size of a weight times the image.
+
+    So it is where the weights are normalised, by a softmax or by the sum of those inside the image.
+    """
+    weights = bilateral_rounding(inputs, settings)
+    image, kernel = inputs["image"], inputs["kernel"]
+    assert isinstance(image, Tensor)
+    assert isinstance(kernel, Tensor)
+    if not len(image) or (settings["normalize"] == "none" and settings["border"] != "renormalize"):
+        return weights
+    if settings["normalize"] == "none":
+        unsigned = {name: value for name, value in inputs.items() if name != "image"} | {"kernel": kernel.abs()}
+        shares = cross_bilateral_weights(**unsigned, **settings)  # type: ignore[arg-type]
+        shares = shares / shares.sum(1, keepdim=True).clamp_min(torch.finfo(shares.dtype).tiny)
+        gradients = _softmax_gradients(inputs, 2 * shares.nan_to_num(), "renormalize")
+        gradients["kernel"] = 2 * shares.nan_to_num() / kernel.abs()
+        weights = replace(weights, gradients=gradients)
+    brightest = image.abs().sum(1, keepdim=True).amax((2, 3), keepdim=True)
+    return Rounding(weights.arguments, gradients=map_tensors(lambda size: brightest * size, weights.gradients))
 
 
 def _softmax_gradients(inputs: Inputs, exponent: Tensor, border: Border) -> Inputs:

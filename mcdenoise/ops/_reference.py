@@ -108,6 +108,21 @@ def _softmax(exponents: dict[int, list[float]]) -> dict[int, float]:
         return {t: float(weight / total) for t, weight in zip(exponents, weights, strict=True)}
 
 
+def cross_bilateral_filter(
+    image: Tensor,
+    kernel: Tensor,
+    guides: Sequence[Tensor] = (),
+    scales: Sequence[Tensor] = (),
+    distance_scale: Tensor | None = None,
+    *,
+    normalize: str = "softmax",
+    border: str = "replicate",
+) -> Tensor:
+    """Eqs. 4-8, one after the other."""
+    weights = cross_bilateral_weights(kernel, guides, scales, distance_scale, normalize=normalize, border=border)
+    return kernel_conv(image, weights, border=border)
+
+
 def downsample(image: Tensor) -> Tensor:
     """``D`` of Eq. 2: the mean of those pixels of each 2x2 block that exist."""
     batch, channels, height, width = image.shape

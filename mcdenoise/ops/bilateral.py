@@ -72,7 +72,7 @@ def cross_bilateral_weights(
         >>> weights[0, 3:6, 0, 1].tolist()  # left, centre, right of the middle pixel
         [0.5, 0.5, 0.0]
     """
-    kernel_size = _check(kernel, guides, scales, distance_scale, normalize, border)
+    kernel_size = check_weights(kernel, guides, scales, distance_scale, normalize, border)
     radius = kernel_size // 2
     log_domain = normalize == "softmax"
     start = kernel if log_domain else torch.zeros_like(kernel)
@@ -98,7 +98,7 @@ class CrossBilateralWeights(nn.Module):
 
     def __init__(self, normalize: Normalize = "softmax", border: Border = "replicate") -> None:
         super().__init__()
-        _check_normalize(normalize)
+        check_normalize(normalize)
         check_border(border)
         self.normalize: Normalize = normalize
         self.border: Border = border
@@ -120,12 +120,13 @@ def _inside(kernel: Tensor, kernel_size: int) -> Tensor:
     return inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
 
 
-def _check_normalize(normalize: str) -> None:
+def check_normalize(normalize: str) -> None:
+    """``ValueError`` for an unknown normalisation."""
     if normalize not in ("softmax", "none"):
         raise ValueError(f"normalize: expected 'softmax' or 'none', found {normalize!r}")
 
 
-def _check(
+def check_weights(
     kernel: Tensor,
     guides: Sequence[Tensor],
     scales: Sequence[Tensor],
@@ -133,6 +134,7 @@ def _check(
     normalize: str,
     border: str,
 ) -> int:
+    """The kernel size of arguments that :func:`cross_bilateral_weights` accepts; its errors for others."""
     if len(guides) != len(scales):
         raise ValueError(f"scales: expected one for each of the {len(guides)} guides, found {len(scales)}")
     arguments = {"kernel": (kernel, "B T H W")}
@@ -142,7 +144,7 @@ def _check(
     if distance_scale is not None:
         arguments["distance_scale"] = (distance_scale, "B 1 H W")
     sizes = check_shapes(**arguments)
-    _check_normalize(normalize)
+    check_normalize(normalize)
     check_border(border)
     return kernel_size_of(sizes["T"], "kernel")
 

@@ -8,6 +8,7 @@ import torch
 from kornia.geometry.grid import create_meshgrid
 from torch import Tensor, nn
 
+from mcdenoise.ops._backend import Backend, check_backend, choose_backend
 from mcdenoise.ops._check import check_shapes
 
 Rule = Literal["relative", "bmfr"]
@@ -134,8 +135,7 @@ def reproject(
         ([1.5, 2.5, 3.0], [1.0, 1.0, 0.5])
     """
     sizes = check_shapes(previous=(previous, "B C H W"), motion=(motion, "B 2 H W"))
-    if rule not in ("relative", "bmfr"):
-        raise ValueError(f"rule: expected 'relative' or 'bmfr', found {rule!r}")
+    _check_known(rule)
     here, there = _comparable(surface, previous_surface, previous)
     if surface is not None and previous_surface is not None:
         _check_rule(rule, here, position_limit, normal_limit)
@@ -194,6 +194,7 @@ def accumulate(
     rule: Rule = "relative",
     position_limit: float | None = None,
     normal_limit: float | None = None,
+    backend: Backend | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Blend a noisy frame with its reprojected history: an average at first, an exponential window later.
 
@@ -213,6 +214,8 @@ def accumulate(
         rule: see :func:`reproject`.
         position_limit: see :func:`reproject`.
         normal_limit: see :func:`reproject`.
+        backend: ``"torch"``, ``"numba"`` (CPU only, without derivatives), or ``None`` for the faster of those that
+            can run.
 
     Returns:
         ``(B, C, H, W)`` accumulated radiance in the dtype of ``color``, and ``(B, 1, H, W)`` history length in that of
@@ -222,7 +225,8 @@ def accumulate(
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, ``alpha_min`` is outside (0, 1], or as in :func:`reproject`.
+        ValueError: shapes disagree, ``alpha_min`` is outside (0, 1], the backend cannot run, or as in
+            :func:`reproject`.
 
     Differentiable in ``color``, ``previous``, ``previous_length`` (not with ``"bmfr"``, which rounds it) and
     ``motion``, to any order.
@@ -243,6 +247,10 @@ def accumulate(
     )
     if not 0 < alpha_min <= 1:
         raise ValueError(f"alpha_min: expected in (0, 1], found {alpha_min}")
+    images = (color, previous, previous_length, motion)
+    surfaces = (*(surface or ()), *(previous_surface or ()))
+    if choose_backend(backend, *images, *surfaces, differentiable=False) == "numba":
+        return _accumulate_numba(*images, surface, previous_surface, alpha_min, rule, position_limit, normal_limit)
     dtype = torch.promote_types(color.dtype, torch.float32)
     channels = color.shape[1]
     both, weight = reproject(
@@ -264,6 +272,35 @@ def accumulate(
     return accumulated.to(color.dtype), length.to(previous_length.dtype)
 
 
+def _accumulate_numba(
+    color: Tensor,
+    previous: Tensor,
+    previous_length: Tensor,
+    motion: Tensor,
+    surface: Surface | None,
+    previous_surface: Surface | None,
+    alpha_min: float,
+    rule: Rule,
+    position_limit: float | None,
+    normal_limit: float | None,
+) -> tuple[Tensor, Tensor]:
+    from mcdenoise.ops._fast import temporal as fast
+
+    _check_known(rule)
+    here, there = _comparable(surface, previous_surface, previous)
+    if surface is not None and previous_surface is not None:
+        _check_rule(rule, here, position_limit, normal_limit)
+    if position_limit is None:
+        position_limit = DEPTH_LIMIT if here.position is None else PLANE_LIMIT
+    if normal_limit is None:
+        normal_limit = NORMAL_LIMIT_SQUARED
+    settings = (alpha_min, rule == "bmfr", position_limit, normal_limit)
+    result: tuple[Tensor, Tensor] = fast.accumulate(
+        color, previous, previous_length, motion, list(here), list(there), *settings
+    )
+    return result
+
+
 class Accumulate(nn.Module):
     """:func:`accumulate` with its rule and limits stored.
 
@@ -272,6 +309,7 @@ class Accumulate(nn.Module):
         rule: see :func:`accumulate`.
         position_limit: see :func:`accumulate`.
         normal_limit: see :func:`accumulate`.
+        backend: see :func:`accumulate`.
     """
 
     def __init__(
@@ -280,8 +318,11 @@ class Accumulate(nn.Module):
         rule: Rule = "relative",
         position_limit: float | None = None,
         normal_limit: float | None = None,
+        backend: Backend | None = None,
     ) -> None:
         super().__init__()
+        check_backend(backend)
+        self.backend: Backend | None = backend
         self.alpha_min = alpha_min
         self.rule: Rule = rule
         self.position_limit = position_limit
@@ -308,6 +349,7 @@ class Accumulate(nn.Module):
             rule=self.rule,
             position_limit=self.position_limit,
             normal_limit=self.normal_limit,
+            backend=self.backend,
         )
 
 
@@ -331,6 +373,11 @@ def _comparable(surface: Surface | None, previous: Surface | None, like: Tensor)
         )
         pairs.append((a.detach(), b.detach()))
     return Surface(*(a for a, _ in pairs)), Surface(*(b for _, b in pairs))
+
+
+def _check_known(rule: str) -> None:
+    if rule not in ("relative", "bmfr"):
+        raise ValueError(f"rule: expected 'relative' or 'bmfr', found {rule!r}")
 
 
 def _check_rule(rule: Rule, surface: Surface, position_limit: float | None, normal_limit: float | None) -> None:

@@ -69,6 +69,8 @@ class Tracer:
         except ImportError as error:
             raise InputError(f"Mitsuba variant '{variant}' does not run here: {_first_line(error)}") from error
         self._dr = importlib.import_module("drjit")
+        # On a single core, loading a scene whose parts refer to each other waits for a second thread forever.
+        self._dr.set_thread_count(max(2, self._dr.thread_count()))
         self._scalar = variant.startswith("scalar")
         self.name = f"mitsuba {mi.__version__} ({variant}, drjit {self._dr.__version__}), path integrator"
         # Merged meshes could no longer move each for itself.

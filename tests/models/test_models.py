@@ -20,6 +20,7 @@ from mcdenoise.models import (
     KernelPredictor,
     PixelPredictor,
     UNet,
+    cascaded,
     create_model,
     describe_weights,
     list_models,
@@ -30,6 +31,7 @@ from mcdenoise.models import (
     save_weights,
 )
 from mcdenoise.models.cascaded import FEATURES, auto_exposure, normalize_depth
+from mcdenoise.ops import cross_bilateral_weights, kernel_conv
 
 SHIPPED = Path(__file__).parents[2] / "mcdenoise" / "models" / "weights"
 WIDTH = 8
@@ -114,6 +116,37 @@ def test_full_width_at_180x320() -> None:
         initial, final = create_model("cascaded")(*inputs(180, 320))
     assert initial.shape == final.shape == (1, 3, 180, 320)
     assert torch.isfinite(final).all()
+
+
+@pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("name", ["cascaded", "cascaded_tiny"])
+def test_weights_and_filter_in_one_give_the_same_image(
+    name: str, precision: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = create_model(name, pretrained=True).to(memory_format=torch.channels_last).eval()
+    bfloat16 = torch.autocast("cpu", torch.bfloat16, enabled=precision == torch.bfloat16)
+    with torch.no_grad(), bfloat16:
+        image = model(*inputs(97, 131)).final
+
+        def in_two_steps(image: Tensor, logits: Tensor, *arguments: Any, border: Any) -> Tensor:
+            weights = cross_bilateral_weights(logits.float(), *arguments, border=border)
+            return kernel_conv(image, weights, border="zeros", backend="torch")
+
+        monkeypatch.setattr(cascaded, "cross_bilateral_filter", in_two_steps)
+        torch.testing.assert_close(image, model(*inputs(97, 131)).final, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+def test_shortcuts_of_inference_change_no_feature(dtype: torch.dtype) -> None:
+    torch.manual_seed(0)
+    net = UNet(4, WIDTH).to(dtype=dtype, memory_format=torch.channels_last)
+    image = torch.randn(1, 4, 21, 34).to(dtype)
+    trained = net(image)
+    with torch.no_grad():
+        inferred = net(image)
+    for a, b in zip(trained, inferred, strict=True):
+        assert b.isfinite().all()
+        assert torch.equal(a, b)
 
 
 @pytest.mark.parametrize("name", list_models())

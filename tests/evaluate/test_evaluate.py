@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -303,3 +304,22 @@ def test_the_noise_of_the_references_is_the_renderers(small_sequence: Path) -> N
     assert reference_noise(open_sequence(small_sequence, "1-3")) == pytest.approx(0.03)
     described.unlink()
     assert reference_noise(open_sequence(small_sequence)) is None
+
+
+def test_a_metric_that_cannot_be_computed_is_left_out_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    scorer = Scorer("small", metrics=("SMAPE", "SSIM", "FLIP"))
+    image = torch.full((1, 3, 10, 20), 0.5)
+    scorer.add(Frame(color=image, reference=image), Images(image, image, image, image))
+    (score, *_) = scorer.scores()
+    assert score.values == {"SMAPE": 0}
+    assert "11 x 11 pixels, found 10 x 20" in score.left_out["SSIM"]
+    assert "flip-evaluator" in score.left_out["FLIP"]
+
+
+def test_a_wrong_shape_is_not_left_out() -> None:
+    scorer = Scorer("wrong")
+    image = torch.full((1, 3, 12, 12), 0.5)
+    small = image[..., :6]
+    with pytest.raises(ValueError, match="reference: expected the shape of image"):
+        scorer.add(Frame(color=image, reference=image), Images(image, image, small, image))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -12,20 +13,22 @@ from kornia.metrics import psnr
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from mcdenoise.errors import InputError
 from mcdenoise.losses import cascade_loss
 from mcdenoise.metrics import (
+    UncomputableError,
     displayed,
+    flip_hdr,
     flip_srgb,
     psnr_srgb,
     relmse_linear,
+    rmse_linear,
     smape_linear,
     ssim_srgb,
     temporal_rmse_srgb,
     temporal_smape_linear,
 )
 
-IMAGE_METRICS = [smape_linear, relmse_linear, psnr_srgb, ssim_srgb, flip_srgb]
+IMAGE_METRICS = [smape_linear, relmse_linear, rmse_linear, psnr_srgb, ssim_srgb, flip_srgb, flip_hdr]
 CLIP_METRICS = [temporal_smape_linear, temporal_rmse_srgb]
 
 
@@ -58,6 +61,11 @@ def test_relmse_written_out() -> None:
     color = torch.tensor([1.0, 2.0, 3.0]).reshape(1, 3, 1, 1)
     reference = torch.tensor([1.0, 2.0, 6.0]).reshape(1, 3, 1, 1)
     assert relmse_linear(color, reference).item() == pytest.approx((0 + 0 + 9) / (3**2 + 0.01) / 3)
+
+
+def test_rmse_written_out() -> None:
+    # One of two pixels is 2 off in every channel: sqrt((4 + 0) / 2).
+    assert rmse_linear(image(1.0, 5.0), image(3.0, 5.0)).item() == pytest.approx(math.sqrt(2))
 
 
 def test_psnr_written_out() -> None:
@@ -108,7 +116,7 @@ def test_ssim_is_that_of_scikit_image() -> None:
 
 
 def test_ssim_needs_a_window() -> None:
-    with pytest.raises(ValueError, match="at least 11 x 11 pixels, found 10 x 20"):
+    with pytest.raises(UncomputableError, match="at least 11 x 11 pixels, found 10 x 20"):
         ssim_srgb(torch.rand(1, 3, 10, 20), torch.rand(1, 3, 10, 20))
 
 
@@ -135,9 +143,44 @@ def test_flip_of_flat_images_written_out() -> None:
     assert flip_srgb(9 * white, white).item() == 0
 
 
+def test_hdr_flip_is_that_of_its_authors() -> None:
+    flip = pytest.importorskip("flip_evaluator")
+    image, reference = (40 * x for x in noisy_pair(20, 24))
+    test, truth = (x[0].permute(1, 2, 0).contiguous().numpy() for x in (image, reference))
+    errors, _, settings = flip.evaluate(truth, test, "HDR", applyMagma=False)
+    assert 0.05 < errors.mean() < 0.9
+    assert settings["tonemapper"].upper() == "ACES"
+    assert flip_hdr(image, reference).item() == pytest.approx(float(errors.mean()), rel=1e-4)
+
+
+def test_hdr_flip_sees_what_a_display_clamps() -> None:
+    pytest.importorskip("flip_evaluator")
+    # Half the image is twenty times as bright as white.
+    reference = torch.full((1, 3, 16, 16), 0.5)
+    reference[..., 8:] = 20
+    dimmer = reference.clamp_max(10)
+    assert flip_srgb(dimmer, reference).item() == 0
+    assert flip_hdr(dimmer, reference).item() > 0.05
+    # Exposures are chosen by the reference alone, so what is wrong beyond all of them is finite too.
+    assert 0 < flip_hdr(torch.full_like(reference, 1e9), reference).item() <= 1
+
+
+def test_hdr_flip_of_darkness() -> None:
+    pytest.importorskip("flip_evaluator")
+    images = torch.rand(2, 3, 16, 16)
+    black = images.clone()
+    black[1] = 0
+    with pytest.raises(UncomputableError, match="found a black one"):
+        flip_hdr(images, black)
+    # A candle in a cellar is enough, and a flat reference has one exposure.
+    black[1, 2, 3, 4] = 2e-5
+    assert flip_hdr(images, black).isfinite().all()
+    assert flip_hdr(images, torch.full_like(images, 0.5)).isfinite().all()
+
+
 def test_flip_without_its_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    with pytest.raises(InputError, match=r"FLIP needs flip-evaluator.*mcdenoise\[peers\]"):
+    with pytest.raises(UncomputableError, match=r"FLIP needs flip-evaluator.*mcdenoise\[peers\]"):
         flip_srgb(torch.rand(1, 3, 4, 4), torch.rand(1, 3, 4, 4))
 
 
@@ -173,6 +216,13 @@ def test_a_display_clamps_and_bends() -> None:
     torch.testing.assert_close(shown, torch.tensor([0.0, 0.0, 1.055 * 0.5 ** (1 / 2.4) - 0.055, 1.0, 1.0]))
 
 
+def test_a_display_is_that_of_colour_science(colour: Any) -> None:
+    values = torch.linspace(0, 1, 1001, dtype=torch.float64).expand(3, 1, 1001)
+    expected = colour.cctf_encoding(values[0, 0].numpy(), "sRGB")
+    # Measured: 2e-8, where the straight part meets the curve.
+    torch.testing.assert_close(displayed(values)[0, 0], torch.from_numpy(expected), atol=1e-7, rtol=0)
+
+
 @pytest.mark.parametrize("metric", IMAGE_METRICS)
 def test_whatever_stands_before_the_image_is_a_batch(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
     torch.manual_seed(0)
@@ -184,7 +234,7 @@ def test_whatever_stands_before_the_image_is_a_batch(metric: Callable[[Tensor, T
             torch.testing.assert_close(together[b, t], metric(images[b, t], references[b, t]))
 
 
-@pytest.mark.parametrize("metric", [smape_linear, relmse_linear, flip_srgb])
+@pytest.mark.parametrize("metric", [smape_linear, relmse_linear, rmse_linear, flip_srgb, flip_hdr])
 def test_no_error_is_zero(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
     images = torch.rand(2, 3, 4, 5) * 100
     assert metric(images, images).tolist() == [0, 0]

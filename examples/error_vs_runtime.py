@@ -1,0 +1,60 @@
+"""Draw error over run time: every model with weights and every other denoiser that is installed, on your scenes.
+
+    python examples/error_vs_runtime.py path/to/scene path/to/another -o figure.svg
+    python examples/error_vs_runtime.py path/to/scene -o figure.png --metric PSNR --frames 0-11 --threads 2
+
+The mean over the scenes, each at its own size; bars are quartiles, the dashed line is the Pareto front. All methods
+take turns on every frame (see `mcdenoise benchmark`, which writes a whole report). Prints the figures that it draws.
+"""
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+
+from mcdenoise.benchmark import Settings, choose_candidates, run_benchmark
+from mcdenoise.data import open_sequence
+from mcdenoise.errors import InputError
+from mcdenoise.evaluate import METRICS
+from mcdenoise.report import check_packages, write_error_plot
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("sequences", type=Path, nargs="+", metavar="SEQUENCE", help="folder of frames with references")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="figure to write: .svg or .png")
+    parser.add_argument("--metric", choices=METRICS, default="SMAPE")
+    parser.add_argument("--models", metavar="NAMES", help="separated by commas; all with weights by default")
+    parser.add_argument("--peers", default="all", metavar="NAMES", help="oidn, bilateral, all or none")
+    parser.add_argument("--frames", metavar="NUMBERS", help="which frames to use, such as 0-15")
+    parser.add_argument("--rounds", type=int, default=3, help="how often each method denoises each frame")
+    parser.add_argument("--threads", type=int, metavar="N", help="of all methods")
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = parse()
+    check_packages()
+    threads = options.threads or torch.get_num_threads()
+    sequences = [open_sequence(path, options.frames) for path in options.sequences]
+    candidates = choose_candidates(options.models, options.peers, threads=threads)
+    settings = Settings(rounds=options.rounds, threads=threads, pictures=0)
+    with tempfile.TemporaryDirectory() as folder:
+        results = run_benchmark(sequences, candidates, Path(folder) / "results", settings)
+    machine = results.machine
+    print(f"{machine.processor}, {machine.device}, {machine.threads} threads; {len(results.scenes)} scenes")
+    for row in write_error_plot(results, options.metric, options.out):
+        value, time = row.errors.get(options.metric), row.milliseconds
+        shown = f"{value.value:.4g} in {time.value:.1f} ms" if value and time else row.reason
+        print(f"{row.method.name:<44} {shown}")
+    print(options.out)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)

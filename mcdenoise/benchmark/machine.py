@@ -1,0 +1,125 @@
+"""What it is measured on: the machine, its threads, its clock, its memory."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import OpenImageIO as oiio
+import torch
+
+from mcdenoise.errors import InputError
+from mcdenoise.results import Machine
+from mcdenoise.run_folder import source_commit
+
+_PACKAGES = ("torch", "kornia", "numpy", "openimageio", "pyoidn", "flip-evaluator")
+_CGROUP = Path("/sys/fs/cgroup")
+
+# What a stopwatch marks: a number of milliseconds, or a CUDA event.
+Moment: TypeAlias = Any
+
+
+class Stopwatch:
+    """Marks moments of a device: by CUDA events on a GPU, else by the clock.
+
+    Args:
+        device: where the work is done.
+    """
+
+    def __init__(self, device: torch.device | str) -> None:
+        self._cuda = torch.device(device).type == "cuda"
+
+    def mark(self) -> Moment:
+        """Now; on a GPU, when it will have done what it was told to do so far."""
+        if not self._cuda:
+            return time.perf_counter() * 1e3
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event
+
+    def between(self, start: Moment, end: Moment) -> float:
+        """Milliseconds from one moment to another; waits until the latter has come."""
+        if not self._cuda:
+            return float(end - start)
+        end.synchronize()
+        return float(start.elapsed_time(end))
+
+
+def check_device(device: str) -> None:
+    """See that torch can use a device.
+
+    Raises:
+        InputError: it cannot.
+    """
+    if device not in ("cpu", "cuda"):
+        raise InputError(f"--device: expected cpu or cuda, found '{device}'")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device: expected a GPU that torch can use, found none; take cpu")
+
+
+def fix_threads(threads: int) -> None:
+    """Let torch, and the reading and writing of EXRs, use so many threads."""
+    torch.set_num_threads(threads)
+    oiio.attribute("threads", threads)
+    oiio.attribute("exr_threads", threads)
+
+
+def describe_machine(device: str) -> Machine:
+    """The machine as it is, with the threads that torch has now."""
+    return Machine(
+        processor=_processor(),
+        cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        memory=round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        device=torch.cuda.get_device_name() if device == "cuda" else "cpu",
+        threads=torch.get_num_threads(),
+        system=platform.platform(),
+        packages=_versions(),
+    )
+
+
+def available_memory(device: str) -> int | None:
+    """Bytes that could be allocated on the device now; ``None`` where the system does not say."""
+    if device == "cuda":
+        return torch.cuda.mem_get_info()[0]
+    sizes = [size for size in (_free_memory(), _left_of_limit()) if size is not None]
+    return min(sizes, default=None)
+
+
+def _free_memory() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def _left_of_limit() -> int | None:
+    """Of a container."""
+    try:
+        limit, used = ((_CGROUP / name).read_text().strip() for name in ("memory.max", "memory.current"))
+    except OSError:
+        return None
+    return None if limit == "max" else int(limit) - int(used)
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())
+
+
+def _versions() -> dict[str, str]:
+    versions = {"mcdenoise": f"{version('mcdenoise')}, commit {source_commit()}"}
+    for name in _PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return versions

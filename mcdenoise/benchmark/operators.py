@@ -1,0 +1,264 @@
+"""What each op costs in each backend and dtype, how exact it is, and how near to the speed of a copy."""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from mcdenoise.benchmark.machine import Stopwatch, check_device, describe_machine, fix_threads
+from mcdenoise.benchmark.methods import one_line
+from mcdenoise.benchmark.tables import write_ops_csv
+from mcdenoise.data.files import new_folder
+from mcdenoise.errors import InputError
+from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
+from mcdenoise.ops_overview import DTYPES, relative_error
+from mcdenoise.results import OpCost, OpResults, Spread
+
+# Far larger than any cache, so that the copy shows the memory's speed.
+_COPY_BYTES = 2**28
+_WARM_UP = 2
+
+
+@dataclass
+class _Entry:
+    """One op in one backend and dtype."""
+
+    op: Op
+    case: Case
+    backend: str | None
+    dtype: torch.dtype
+    times: list[float] = field(default_factory=list)
+    mebibytes: float = 0.0
+    error: float | None = None
+    failure: str = ""
+
+    def call(self, inputs: dict[str, Any], settings: dict[str, Any]) -> tuple[Tensor, ...]:
+        """The op's results."""
+        if self.backend is not None:
+            settings = {**settings, "backend": self.backend}
+        results = self.op.function(**inputs, **settings)
+        return (results,) if isinstance(results, Tensor) else tuple(results)
+
+    def cost(self, bandwidth: float) -> OpCost:
+        """What was found out; ``bandwidth`` in bytes a second."""
+        about = self.op.name, self.backend or "torch", str(self.dtype).removeprefix("torch."), self.case.name
+        if self.failure:
+            return OpCost(*about, failure=self.failure)
+        copy = self.mebibytes * 2**20 / bandwidth * 1e3
+        return OpCost(*about, Spread.of(self.times), self.error, self.mebibytes, copy)
+
+
+def benchmark_ops(
+    *,
+    size: tuple[int, int] = (1280, 720),
+    rounds: int = 5,
+    threads: int = 1,
+    device: str = "cpu",
+    out: Path | None = None,
+    command: str = "",
+    ops: Iterable[Op] = OPS,
+    on_step: Callable[[int, int], None] = lambda done, total: None,
+) -> OpResults:
+    """Time every op, forward, in each of its backends and in float32, bfloat16 and float16.
+
+    The inputs are those of an ordinary case, see :func:`largest_case`, repeated to the size. All backends and
+    dtypes of an op, and a copy of 256 MiB, take turns; two rounds warm up. The error is that over the op's ordinary
+    cases at their own size, where the equation is written out in float64.
+
+    Args:
+        size: width and height in pixels, at least 2.
+        rounds: calls of each.
+        threads: of torch; sets them.
+        device: ``"cpu"`` or ``"cuda"``.
+        out: folder to make for ``ops.json`` and ``ops.csv``; by default nothing is written.
+        command: the command line, to be stored with the results.
+        ops: which.
+        on_step: called with the number of ops done, and that of all of them.
+
+    Raises:
+        InputError: a number is too small, the device cannot be used, or there is something at ``out``.
+    """
+    width, height = size
+    if min(size) < 2 or rounds < 1 or threads < 1:
+        raise InputError(
+            f"--ops: expected an image of 2x2 pixels at least, rounds and threads, "
+            f"found {width}x{height}, {rounds} and {threads}"
+        )
+    check_device(device)
+    if out is None:
+        return _measure(size, rounds, threads, device, command, list(ops), on_step)
+    with new_folder(out) as folder:
+        results = _measure(size, rounds, threads, device, command, list(ops), on_step)
+        results.write(folder)
+        write_ops_csv(results, folder)
+    return results
+
+
+@torch.inference_mode()
+def _measure(
+    size: tuple[int, int],
+    rounds: int,
+    threads: int,
+    device: str,
+    command: str,
+    ops: list[Op],
+    on_step: Callable[[int, int], None],
+) -> OpResults:
+    fix_threads(threads)
+    source = torch.ones(_COPY_BYTES // 4, device=device)
+    target = torch.empty_like(source)
+    copies: list[float] = []
+    entries: list[_Entry] = []
+    for done, op in enumerate(ops, start=1):
+        own = [_Entry(op, largest_case(op), backend, dtype) for backend in backends(op.function) for dtype in DTYPES]
+        _take_turns(own, size, rounds, device, lambda: target.copy_(source), copies)
+        entries += own
+        on_step(done, len(ops))
+    # Read once, and written once.
+    bandwidth = 2 * _COPY_BYTES * 1e3 / Spread.of(copies).median
+    return OpResults(
+        command=command,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        machine=describe_machine(device),
+        width=size[0],
+        height=size[1],
+        rounds=rounds,
+        bandwidth=bandwidth / 1e9,
+        costs=[entry.cost(bandwidth) for entry in entries],
+    )
+
+
+def _take_turns(
+    entries: list[_Entry],
+    size: tuple[int, int],
+    rounds: int,
+    device: str,
+    copy: Callable[[], object],
+    copies: list[float],
+) -> None:
+    watch = Stopwatch(device)
+    inputs = [enlarged(entry.case, *size, dtype=entry.dtype, device=device) for entry in entries]
+    for turn in range(_WARM_UP + rounds):
+        for entry, (tensors, settings) in zip(entries, inputs, strict=True):
+            if entry.failure:
+                continue
+            try:
+                if turn == 0:
+                    entry.error = _error(entry, device)
+                start = watch.mark()
+                results = entry.call(tensors, settings)
+                taken = watch.between(start, watch.mark())
+            except Exception as error:  # whatever a backend refuses with: the others go on
+                entry.failure = one_line(error)
+                continue
+            entry.mebibytes = (_bytes(tensors) + sum(result.nbytes for result in results)) / 2**20
+            if turn >= _WARM_UP:
+                entry.times.append(taken)
+        start = watch.mark()
+        copy()
+        taken = watch.between(start, watch.mark())
+        if turn >= _WARM_UP:
+            copies.append(taken)
+
+
+def backends(function: Callable[..., Any]) -> list[str | None]:
+    """What can be given as the keyword ``backend`` of an op, by its type; ``[None]`` for an op without it."""
+    if "backend" not in inspect.signature(function).parameters:
+        return [None]
+    return list(_choices(typing.get_type_hints(function)["backend"])) or [None]
+
+
+def _choices(hint: Any) -> Iterator[str]:
+    if typing.get_origin(hint) is Literal:
+        yield from (choice for choice in typing.get_args(hint) if choice is not None)
+    else:
+        for part in typing.get_args(hint):
+            yield from _choices(part)
+
+
+def largest_case(op: Op) -> Case:
+    """The ordinary case of one image, of more than one pixel, with the most values a pixel; in RGB if there is one."""
+
+    def size(case: Case) -> tuple[bool, float]:
+        tensors, (height, width) = _tensors(case.inputs()), _size(case)
+        in_rgb = any(tensor.ndim == 4 and tensor.shape[1] == 3 for tensor in tensors)
+        return in_rgb, sum(tensor.numel() for tensor in tensors) / (height * width)
+
+    def is_one_image(case: Case) -> bool:
+        return max(_size(case)) > 1 and all(tensor.shape[0] == 1 for tensor in _tensors(case.inputs()))
+
+    return max((case for case in op.cases if case.kind == "ordinary" and is_one_image(case)), key=size)
+
+
+def enlarged(
+    case: Case, width: int, height: int, *, dtype: torch.dtype = torch.float32, device: str = "cpu"
+) -> tuple[Inputs, dict[str, Any]]:
+    """The inputs and settings of a case, repeated to a size; what has half the case's size gets half of the size."""
+    old_height, old_width = _size(case)
+
+    def repeat(tensor: Tensor) -> Tensor:
+        if tensor.ndim != 4:
+            return tensor.to(device)
+        whole = tuple(tensor.shape[-2:]) == (old_height, old_width)
+        rows, columns = (height, width) if whole else (_half(height), _half(width))
+        times = -(-rows // tensor.shape[-2]), -(-columns // tensor.shape[-1])
+        return tensor.to(device).repeat(1, 1, *times)[..., :rows, :columns].contiguous()
+
+    settings = case.settings | ({"size": (height, width)} if "size" in case.settings else {})
+    return map_tensors(repeat, case.inputs(dtype)), settings
+
+
+def _half(side: int) -> int:
+    return (side + 1) // 2
+
+
+def _size(case: Case) -> tuple[int, int]:
+    """Height and width of the case's image, or where there are two, of the larger one."""
+    if "size" in case.settings:
+        height, width = case.settings["size"]
+        return height, width
+    sizes = [tuple(tensor.shape[-2:]) for tensor in _tensors(case.inputs()) if tensor.ndim == 4]
+    height, width = max(sizes)
+    return height, width
+
+
+def _tensors(inputs: Inputs) -> list[Tensor]:
+    found: list[Tensor] = []
+
+    def note(tensor: Tensor) -> Tensor:
+        found.append(tensor)
+        return tensor
+
+    map_tensors(note, inputs)
+    return found
+
+
+def _bytes(inputs: Inputs) -> int:
+    return sum(tensor.nbytes for tensor in _tensors(inputs))
+
+
+def _error(entry: _Entry, device: str) -> float:
+    """The largest relative error over the op's ordinary cases."""
+
+    def on_device(**arguments: Any) -> list[Tensor]:
+        inputs = map_tensors(
+            lambda tensor: tensor.to(device), {name: arguments[name] for name in arguments if name not in settings}
+        )
+        return [result.cpu() for result in entry.call(inputs, settings)]
+
+    worst = 0.0
+    for case in entry.op.cases:
+        if case.kind == "ordinary":
+            settings = case.settings
+            worst = max(worst, relative_error(replace(entry.op, function=on_device), case, entry.dtype))
+    if worst == float("inf"):
+        raise ArithmeticError("a result is NaN or infinite where float64 is not")
+    return worst

@@ -1,0 +1,343 @@
+"""The benchmark itself: every method on every scene, frame by frame, taking turns."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from itertools import groupby
+from pathlib import Path
+from typing import NamedTuple
+
+from torch import Tensor
+
+from mcdenoise.benchmark.machine import Stopwatch, check_device, describe_machine, fix_threads
+from mcdenoise.benchmark.memory import peak_memory
+from mcdenoise.benchmark.methods import Candidate, Runner, one_line
+from mcdenoise.benchmark.scoring import Errors
+from mcdenoise.benchmark.sizes import Size, measure_sizes
+from mcdenoise.benchmark.tables import write_csv
+from mcdenoise.buffers import Frame
+from mcdenoise.data import Sequence, open_sequence, write_exr
+from mcdenoise.data.files import new_folder
+from mcdenoise.errors import InputError
+from mcdenoise.evaluate import check_references, reference_noise
+from mcdenoise.results import IMAGES, STAGES, Cell, Cost, Fit, Results, Scene, Spread
+
+_WHOLE, _COMPUTING = "whole", "computing"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to measure.
+
+    Args:
+        rounds: how often each method denoises each frame, and an image of each size, without warming up.
+        threads: of torch, of the peers, and of reading and writing EXRs.
+        device: ``"cpu"`` or ``"cuda"``.
+        sizes: widths and heights for the cost over pixels, see :func:`mcdenoise.benchmark.parse_sizes`.
+        pictures: of how many frames of each scene the images are kept, at most.
+        command: the command line, to be stored with the results.
+
+    Raises:
+        InputError: a number is too small, or torch cannot use the device.
+    """
+
+    rounds: int = 3
+    threads: int = 1
+    device: str = "cpu"
+    sizes: tuple[Size, ...] = ()
+    pictures: int = 4
+    command: str = ""
+
+    def __post_init__(self) -> None:
+        for name, least in (("rounds", 1), ("threads", 1), ("pictures", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"--{name}: expected at least {least}, found {getattr(self, name)}")
+        check_device(self.device)
+
+
+def run_benchmark(
+    sequences: list[Sequence],
+    candidates: list[Candidate],
+    out: Path,
+    settings: Settings | None = None,
+    *,
+    on_step: Callable[[int, int], None] = lambda done, total: None,
+) -> Results:
+    """Find out what each method costs on each scene, and what it leaves wrong.
+
+    Of each scene, all methods denoise one frame after the other, taking turns on each: A B C, A B C. The first pass
+    over the frames warms up: it is not timed; images are compared with the references, and kept, there. Then every
+    round is a pass that is timed. As all see every frame in its order, all histories are right; the first frame of a
+    pass has none, and is not counted where there are others.
+
+    The stages: ``read`` is reading all buffers of a frame and bringing them to the device; it is done once for all
+    methods. Then :class:`mcdenoise.benchmark.methods.ModelRunner` and ``PeerRunner``. ``write`` is bringing the image
+    back and writing it as ``mcdenoise denoise`` does, into the folder of the results.
+
+    Args:
+        sequences: frames with references.
+        candidates: the methods; those that are missing are listed as such.
+        out: folder to make: ``results.json``, ``results.csv`` and ``images/SCENE/METHOD/N.exr``. It comes into being
+            when all is done.
+        settings: how to measure; sets the threads of torch.
+        on_step: called with the number of steps done, and that of all of them.
+
+    Returns:
+        What is in ``results.json``. A method that fails on a scene has a cell that says why; a scene whose files cannot
+        be read fails for all methods.
+
+    Raises:
+        InputError: a sequence has no references, there is something at ``out``, or it cannot be written to.
+    """
+    settings = settings or Settings()
+    for sequence in sequences:
+        check_references(sequence)
+    fix_threads(settings.threads)
+    total = sum((settings.rounds + 1) * len(sequence) for sequence in sequences)
+    total += len(settings.sizes) * (settings.rounds + 2)
+    steps = iter(range(1, total + 1))
+
+    def step() -> None:
+        on_step(next(steps), total)
+
+    with new_folder(out) as folder:
+        left_out: dict[str, str] = {}
+        present = [candidate for candidate in candidates if not candidate.method.missing]
+        made = _Made(present)
+        scenes: list[Scene] = []
+        cells: list[Cell] = []
+        for name, sequence in zip(_unique_names(sequences), sequences, strict=True):
+            run = _SceneRun(name, sequence, present, made, folder, settings)
+            scene, own = run.measure(step)
+            left_out |= run.errors.left_out
+            scenes.append(scene)
+            cells += own
+        costs, fits = _costs(present, made, settings, step)
+        results = Results(
+            command=settings.command,
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
+            machine=describe_machine(settings.device),
+            rounds=settings.rounds,
+            scenes=scenes,
+            methods=[candidate.method for candidate in candidates],
+            cells=cells,
+            costs=costs,
+            fits=fits,
+            notes=[f"{name} is left out where it cannot be computed: {reason}" for name, reason in left_out.items()],
+        )
+        results.write(folder)
+        write_csv(results, folder)
+    return results
+
+
+class _Made:
+    """The methods that could be made, and why the others could not."""
+
+    def __init__(self, candidates: list[Candidate]) -> None:
+        self.runners: dict[str, Runner] = {}
+        self.failures: dict[str, str] = {}
+        for candidate in candidates:
+            try:
+                self.runners[candidate.method.name] = candidate.make()
+            except Exception as error:  # whatever a method fails with: the others go on
+                self.failures[candidate.method.name] = one_line(error)
+
+
+class _Read(NamedTuple):
+    number: int
+    frame: Frame
+    milliseconds: float
+
+
+class _SceneRun:
+    """All methods on one scene."""
+
+    def __init__(
+        self,
+        name: str,
+        sequence: Sequence,
+        candidates: list[Candidate],
+        made: _Made,
+        folder: Path,
+        settings: Settings,
+    ) -> None:
+        self.errors = Errors()
+        self._sequence, self._candidates, self._settings = sequence, candidates, settings
+        self._runners = made.runners
+        self._failures = dict(made.failures)
+        self._folder, self._written = folder, folder / ".written.exr"
+        self._watch = Stopwatch(settings.device)
+        self._times: dict[str, dict[str, list[float]]] = {name: {} for name in self._runners}
+        height, width = sequence.size
+        self._scene = Scene(
+            name,
+            width,
+            height,
+            sequence.numbers,
+            sequence.reference_numbers,
+            kept_frames(sequence.reference_numbers, settings.pictures),
+            reference_noise(sequence),
+        )
+
+    def measure(self, on_step: Callable[[], None]) -> tuple[Scene, list[Cell]]:
+        """The scene, and a cell for each method that is not missing."""
+        try:
+            self._warm_up(on_step)
+            for _ in range(self._settings.rounds):
+                self._round(on_step)
+        except InputError as error:
+            # A frame cannot be read: nobody has seen the whole scene.
+            reason = one_line(error)
+            self._failures = {candidate.method.name: reason for candidate in self._candidates}
+            self._scene = replace(self._scene, pictures=[])
+            shutil.rmtree(self._folder / IMAGES / self._scene.name, ignore_errors=True)
+        finally:
+            self._written.unlink(missing_ok=True)
+        return self._scene, [self._cell(candidate) for candidate in self._candidates]
+
+    def _warm_up(self, on_step: Callable[[], None]) -> None:
+        """Every method on every frame: what its images are worth, and look like."""
+        for number, frame, _ in self._frames(reference=True):
+            kept = number in self._scene.pictures
+            if kept and frame.reference is not None:
+                self._keep("reference", number, frame.reference)
+            for candidate, runner in self._at_work():
+                name = candidate.method.name
+                image: Tensor | None = None
+                with self._noted(name):
+                    image = runner(frame)
+                    if not image.isfinite().all():
+                        raise ArithmeticError(f"frame {number} has NaN or infinite values")
+                    if frame.reference is not None:
+                        self.errors.add(name, number, image, frame.reference)
+                if kept and image is not None and name not in self._failures:
+                    self._keep(candidate.method.folder, number, image)
+            on_step()
+
+    def _round(self, on_step: Callable[[], None]) -> None:
+        first = self._sequence.numbers[0]
+        for number, frame, reading in self._frames(reference=False):
+            metadata = self._sequence.metadata(number)
+            for candidate, runner in self._at_work():
+                name = candidate.method.name
+                with self._noted(name):
+                    start = self._watch.mark()
+                    image = runner(frame)
+                    done = self._watch.mark()
+                    computing = self._watch.between(start, done)
+                    start = self._watch.mark()
+                    self._write(self._written, image, metadata)
+                    writing = self._watch.between(start, self._watch.mark())
+                    if number == first and len(self._sequence) > 1:
+                        continue
+                    taken = {
+                        _WHOLE: reading + computing + writing,
+                        _COMPUTING: computing,
+                        "read": reading,
+                        **runner.stages,
+                        "write": writing,
+                    }
+                    for stage, milliseconds in taken.items():
+                        self._times[name].setdefault(stage, []).append(milliseconds)
+            on_step()
+
+    def _frames(self, *, reference: bool) -> Iterator[_Read]:
+        for runner in self._runners.values():
+            runner.reset()
+        for number in self._sequence.numbers:
+            start = self._watch.mark()
+            frame = self._sequence.frame(number, reference=reference).to(self._settings.device)
+            reading = self._watch.between(start, self._watch.mark())
+            try:
+                frame, _ = frame.validate()
+            except InputError as error:
+                raise InputError(f"{self._sequence.root}, frame {number}: {error}") from error
+            yield _Read(number, frame, reading)
+
+    def _at_work(self) -> Iterator[tuple[Candidate, Runner]]:
+        for candidate in self._candidates:
+            if candidate.method.name not in self._failures:
+                yield candidate, self._runners[candidate.method.name]
+
+    @contextmanager
+    def _noted(self, name: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # whatever a method fails with: the others go on
+            self._failures[name] = one_line(error)
+
+    def _keep(self, folder: str, number: int, image: Tensor) -> None:
+        path = self._folder / IMAGES / self._scene.name / folder / f"{number}.exr"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._write(path, image, {})
+
+    @staticmethod
+    def _write(path: Path, image: Tensor, metadata: dict[str, str | int | float | tuple[float, ...]]) -> None:
+        pixels = image[0].permute(1, 2, 0).cpu().numpy()
+        write_exr(path, pixels, ["R", "G", "B"], metadata=metadata)
+
+    def _cell(self, candidate: Candidate) -> Cell:
+        name = candidate.method.name
+        if name in self._failures:
+            shutil.rmtree(self._folder / IMAGES / self._scene.name / candidate.method.folder, ignore_errors=True)
+            return Cell(self._scene.name, name, failure=self._failures[name])
+        times = {stage: Spread.of(values) for stage, values in self._times[name].items()}
+        frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
+        return Cell(
+            self._scene.name,
+            name,
+            self.errors.means(name),
+            self.errors.spreads(name),
+            whole=times[_WHOLE],
+            stages={stage: times[stage] for stage in STAGES if stage in times},
+            memory=peak_memory(candidate.make, frames, threads=self._settings.threads, device=self._settings.device),
+            computing=times[_COMPUTING],
+        )
+
+
+def kept_frames(numbers: list[int], most: int) -> list[int]:
+    """The last frames of the last run of successive numbers that is long enough, or else of the longest.
+
+    Example:
+        >>> kept_frames([0, 1, 2, 3, 5, 6, 7, 20], 3)
+        [5, 6, 7]
+    """
+    runs = [[number for _, number in run] for _, run in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
+    longest = max(runs, key=lambda run: (min(len(run), most), run[-1]), default=[])
+    return longest[-most:] if most else []
+
+
+def _costs(
+    candidates: list[Candidate], made: _Made, settings: Settings, on_step: Callable[[], None]
+) -> tuple[list[Cost], list[Fit]]:
+    # What does nothing has no cost.
+    timed = [candidate for candidate in candidates if candidate.method.name != "noisy"]
+    return measure_sizes(
+        timed,
+        made.runners,
+        list(settings.sizes),
+        rounds=settings.rounds,
+        threads=settings.threads,
+        device=settings.device,
+        on_step=on_step,
+    )
+
+
+def _first_two_frames(root: Path, numbers: tuple[int, ...]) -> list[Frame]:
+    sequence = open_sequence(root, ",".join(map(str, numbers)))
+    return [sequence.frame(number, reference=False).validate()[0] for number in numbers]
+
+
+def _unique_names(sequences: list[Sequence]) -> list[str]:
+    names: list[str] = []
+    for sequence in sequences:
+        name, number = sequence.name, 2
+        while name in names:
+            name, number = f"{sequence.name} ({number})", number + 1
+        names.append(name)
+    return names

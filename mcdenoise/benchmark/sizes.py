@@ -1,0 +1,197 @@
+"""How the cost of a method grows with the number of pixels."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+
+from mcdenoise.benchmark.machine import Stopwatch, available_memory
+from mcdenoise.benchmark.memory import peak_memory
+from mcdenoise.benchmark.methods import Candidate, Runner, one_line
+from mcdenoise.buffers import Frame
+from mcdenoise.errors import InputError
+from mcdenoise.results import Cost, Fit, Spread
+
+Size = tuple[int, int]
+
+SIZES = "320x180,640x360,960x540,1280x720,1920x1080"
+
+_LARGEST_SIDE = 16384
+# Smaller images are tried without asking whether there is memory for them.
+_SMALL = 1_000_000
+# Of the memory that is free; the histories of the other methods and all that is not foreseen have the rest.
+_USABLE_SHARE = 0.5
+
+
+def parse_sizes(text: str) -> list[Size]:
+    """Read a choice of sizes.
+
+    Args:
+        text: widths and heights in pixels, such as ``"320x180,1280x720"``, or ``"none"``.
+
+    Returns:
+        Widths and heights, each once, from few to many pixels.
+
+    Raises:
+        InputError: the text is something else, or a side is longer than 16384 pixels.
+
+    Example:
+        >>> parse_sizes("1280x720,320x180")
+        [(320, 180), (1280, 720)]
+    """
+    sizes = set()
+    for part in [] if text == "none" else text.lower().split(","):
+        sides = [int(side) if side.strip().isdecimal() else 0 for side in part.split("x")]
+        if len(sides) != 2 or not all(1 <= side <= _LARGEST_SIDE for side in sides):
+            raise InputError(
+                f"--sizes: expected WIDTHxHEIGHT up to {_LARGEST_SIDE}, separated by commas, or none, found '{text}'"
+            )
+        sizes.add((sides[0], sides[1]))
+    return sorted(sizes, key=lambda size: size[0] * size[1])
+
+
+def synthetic_frame(width: int, height: int) -> Frame:
+    """A wall in noisy light that slides by a third of a pixel, with every buffer that a method may want.
+
+    The time depends on the number of pixels only; what matters is that the history of the wall is found again.
+    """
+    generator = torch.Generator().manual_seed(0)
+    albedo = torch.rand(1, 3, height, width, generator=generator)
+    light = -torch.log(torch.rand(1, 3, height, width, generator=generator).clamp_min(1e-6))
+    rows, columns = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / height, indexing="ij")
+    facing = torch.tensor([0.0, 0.0, -1.0]).reshape(1, 3, 1, 1)
+    return Frame(
+        color=albedo * light,
+        albedo=albedo,
+        normal=facing.repeat(1, 1, height, width),
+        depth=torch.ones(1, 1, height, width),
+        position=torch.stack([columns, -rows, torch.ones_like(rows)])[None],
+        motion=torch.full((1, 2, height, width), 1 / 3),
+    )
+
+
+def measure_sizes(
+    candidates: list[Candidate],
+    runners: Mapping[str, Runner],
+    sizes: list[Size],
+    *,
+    rounds: int,
+    threads: int,
+    device: str,
+    on_step: Callable[[], None] = lambda: None,
+) -> tuple[list[Cost], list[Fit]]:
+    """Time every method on synthetic frames of every size, taking turns: A B C, A B C.
+
+    Two frames warm up, the second of them with a history, and are not counted. A method is not tried where it would
+    need more than half of the memory that is free, as foretold by what it takes at a half and at a quarter of the side.
+
+    Args:
+        candidates: what to time.
+        runners: those that could be made, by name.
+        sizes: widths and heights, ascending.
+        rounds: frames of each.
+        threads: for measuring memory.
+        device: ``"cpu"`` or ``"cuda"``.
+        on_step: called ``rounds + 2`` times for each size.
+
+    Returns:
+        Milliseconds in memory, without files, by size and method; a line through them for each method that was timed
+        at two sizes or more.
+    """
+    memory = _Memory(threads, device)
+    candidates = [candidate for candidate in candidates if candidate.method.name in runners]
+    costs: list[Cost] = []
+    for width, height in sizes:
+        times: dict[str, list[float]] = {}
+        failures: dict[str, str] = {}
+        for candidate in candidates:
+            reason = memory.lack(candidate, width, height)
+            if reason:
+                failures[candidate.method.name] = reason
+        frame = synthetic_frame(width, height).to(device)
+        watch = Stopwatch(device)
+        for turn in range(rounds + 2):
+            for candidate in candidates:
+                name = candidate.method.name
+                if name in failures:
+                    continue
+                try:
+                    start = watch.mark()
+                    runners[name](frame)
+                    taken = watch.between(start, watch.mark())
+                except Exception as error:  # whatever a method fails with: the others go on
+                    failures[name] = one_line(error)
+                    continue
+                if turn >= 2:
+                    times.setdefault(name, []).append(taken)
+            on_step()
+        for candidate in candidates:
+            name = candidate.method.name
+            runners[name].reset()
+            failed = failures.get(name, "")
+            costs.append(Cost(name, width, height, None if failed else Spread.of(times[name]), failed))
+    fits = [fit_line(candidate.method.name, costs) for candidate in candidates]
+    return costs, [fit for fit in fits if fit is not None]
+
+
+def fit_line(method: str, costs: list[Cost]) -> Fit | None:
+    """The line through a method's medians with the least squares of relative deviations; ``None`` for less than two.
+
+    Example:
+        >>> costs = [Cost("a", 1000, h, Spread(5 + 2 * h, 0, 0, 1)) for h in (1, 4, 9)]
+        >>> fit = fit_line("a", costs)
+        >>> round(fit.fixed, 6), round(fit.per_megapixel, 6), round(fit.deviation, 6)
+        (5.0, 2000.0, 0.0)
+    """
+    points = [
+        (cost.width * cost.height / 1e6, cost.milliseconds.median)
+        for cost in costs
+        if cost.method == method and cost.milliseconds is not None
+    ]
+    if len({pixels for pixels, _ in points}) < 2:
+        return None
+    megapixels, milliseconds = np.array(points).T
+    # A plain fit would be that of the largest image alone.
+    per_megapixel, fixed = np.polyfit(megapixels, milliseconds, 1, w=1 / milliseconds)
+    deviation = np.abs(fixed + per_megapixel * megapixels - milliseconds) / milliseconds
+    return Fit(method, float(fixed), float(per_megapixel), float(deviation.max()))
+
+
+class _Memory:
+    """Foretells the memory a method takes."""
+
+    def __init__(self, threads: int, device: str) -> None:
+        self._threads, self._device = threads, device
+        self._known: dict[tuple[str, Size], float | None] = {}
+
+    def lack(self, candidate: Candidate, width: int, height: int) -> str:
+        """Why there is too little memory for an image, or ``""`` where there is enough, or nothing is known."""
+        if width * height <= _SMALL:
+            return ""
+        smaller, small = ((max(width // share, 1), max(height // share, 1)) for share in (4, 2))
+        lower, upper = self._peak(candidate, smaller), self._peak(candidate, small)
+        available = available_memory(self._device)
+        if lower is None or upper is None or available is None:
+            return ""
+        pixels, known, less = width * height, small[0] * small[1], smaller[0] * smaller[1]
+        needed = upper + max(upper - lower, 0.0) / (known - less) * (pixels - known)
+        usable = _USABLE_SHARE * available / 2**20
+        return (
+            ""
+            if needed <= usable
+            else f"too little memory: expected to need {needed:.0f} MiB, found {usable:.0f} MiB that may be used"
+        )
+
+    def _peak(self, candidate: Candidate, size: Size) -> float | None:
+        key = candidate.method.name, size
+        if key not in self._known:
+            frames = functools.partial(_two_frames, *size)
+            self._known[key] = peak_memory(candidate.make, frames, threads=self._threads, device=self._device)
+        return self._known[key]
+
+
+def _two_frames(width: int, height: int) -> list[Frame]:
+    return [synthetic_frame(width, height)] * 2

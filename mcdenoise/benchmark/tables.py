@@ -1,0 +1,165 @@
+"""Results as a table: one row for each scene and method."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from mcdenoise.data.files import write_text
+from mcdenoise.results import STAGES, Cell, Method, OpResults, Results, Scene, Spread
+
+CSV = "results.csv"
+OPS_CSV = "ops.csv"
+
+# Metrics of the printed table, as far as they are there.
+_SHOWN = ("SMAPE", "PSNR", "SSIM", "FLIP")
+
+
+def write_csv(results: Results, folder: Path) -> None:
+    """Write ``results.csv``: a row for each scene and method, also of those that are missing."""
+    rows = [
+        _row(scene, method, _cell(results, scene, method), results)
+        for scene in results.scenes
+        for method in results.methods
+    ]
+    _write(folder / CSV, rows)
+
+
+def write_ops_csv(results: OpResults, folder: Path) -> None:
+    """Write ``ops.csv``: a row for each op, backend and dtype."""
+    rows = [
+        {
+            "op": cost.op,
+            "backend": cost.backend,
+            "dtype": cost.dtype,
+            "width": results.width,
+            "height": results.height,
+            "case": cost.case,
+            "relative error": cost.error,
+            **_times("ms", cost.milliseconds),
+            "MiB": cost.mebibytes,
+            "copy ms": cost.copy,
+            "failure": cost.failure,
+        }
+        for cost in results.costs
+    ]
+    _write(folder / OPS_CSV, rows)
+
+
+def scene_rows(results: Results) -> list[dict[str, str]]:
+    """What to print of each method that did its work: error and run time, scene by scene, the best first."""
+    rows = []
+    names = [name for name in _SHOWN if any(name in cell.errors for cell in results.cells)]
+    for scene in results.scenes:
+        cells = [cell for cell in results.cells if cell.scene == scene.name and not cell.failure]
+        for cell in sorted(cells, key=lambda cell: cell.errors.get("SMAPE", math.inf)):
+            rows.append(
+                {
+                    "scene": scene.name,
+                    "method": cell.method,
+                    **{name: _number(cell.errors.get(name), ".4g") for name in names},
+                    "ms": _number(_median(cell.computing), ".1f"),
+                    "quartiles": "" if cell.computing is None else _range(cell.computing),
+                    "ms with files": _number(_median(cell.whole), ".1f"),
+                    "megapixels/s": _number(results.megapixels_per_second(cell), ".2f"),
+                    "peak MiB": _number(cell.memory, ".0f"),
+                }
+            )
+    return rows
+
+
+def remarks(results: Results) -> list[str]:
+    """What to print below: what failed, what is missing, what is left out, each with its reason."""
+    lines = [f"failed: {cell.scene}, {cell.method}: {cell.failure}" for cell in results.cells if cell.failure]
+    lines += [
+        f"not tried: {one.method}, {one.width}x{one.height}: {one.failure}" for one in results.costs if one.failure
+    ]
+    missing = sorted((method for method in results.methods if method.missing), key=lambda method: method.missing)
+    for reason, methods in groupby(missing, lambda method: method.missing):
+        lines.append(f"missing: {'; '.join(method.name for method in methods)}: {reason}")
+    return lines + results.notes
+
+
+def op_rows(results: OpResults) -> list[dict[str, str]]:
+    """What to print of each op, backend and dtype."""
+    return [
+        {
+            "op": cost.op,
+            "backend": cost.backend,
+            "dtype": cost.dtype,
+            "relative error": _number(cost.error, ".1e"),
+            "ms": _number(_median(cost.milliseconds), ".2f"),
+            "quartiles": "" if cost.milliseconds is None else _range(cost.milliseconds),
+            "MiB": _number(cost.mebibytes, ".1f"),
+            "copy ms": _number(cost.copy, ".2f"),
+            "/ copy": _number(cost.over_copy, ".1f"),
+            "failure": cost.failure,
+        }
+        for cost in results.costs
+    ]
+
+
+def _cell(results: Results, scene: Scene, method: Method) -> Cell:
+    """Also of a method that is missing."""
+    found = results.cell(scene.name, method.name)
+    return found or Cell(scene.name, method.name, failure=f"missing: {method.missing}")
+
+
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
+
+
+def _range(spread: Spread) -> str:
+    return f"{spread.lower:.1f} to {spread.upper:.1f}"
+
+
+def _row(scene: Scene, method: Method, cell: Cell, results: Results) -> dict[str, Any]:
+    metrics = dict.fromkeys(name for one in results.cells for name in one.errors)
+    errors: dict[str, Any] = {}
+    for name in metrics:
+        spread = cell.errors_spread.get(name)
+        errors[name] = cell.errors.get(name)
+        errors |= _quartiles(name, spread)
+    return {
+        "scene": scene.name,
+        "method": method.name,
+        "kind": method.kind,
+        "family": method.family,
+        "parameters": method.parameters,
+        "width": scene.width,
+        "height": scene.height,
+        "frames": len(scene.frames),
+        "scored": len(scene.scored),
+        **errors,
+        **_times("ms", cell.computing),
+        **_times("whole ms", cell.whole),
+        **{f"{stage} ms": _median(cell.stages.get(stage)) for stage in STAGES},
+        "megapixels per second": results.megapixels_per_second(cell),
+        "peak MiB": cell.memory,
+        "failure": cell.failure,
+    }
+
+
+def _times(name: str, spread: Spread | None) -> dict[str, float | None]:
+    return {name: _median(spread), **_quartiles(name, spread)}
+
+
+def _median(spread: Spread | None) -> float | None:
+    return None if spread is None else spread.median
+
+
+def _quartiles(name: str, spread: Spread | None) -> dict[str, float | None]:
+    lower, upper = (None, None) if spread is None else (spread.lower, spread.upper)
+    return {f"{name} lower": lower, f"{name} upper": upper}
+
+
+def _write(path: Path, rows: list[dict[str, Any]]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0] if rows else [], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())

@@ -1,0 +1,355 @@
+"""A folder of images, denoised by whatever program, against the references of its sequence."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mcdenoise.buffers import Frame
+from mcdenoise.data import Sequence, read_exr
+from mcdenoise.data.color_space import to_rec709
+from mcdenoise.data.exr import read_exr_header
+from mcdenoise.errors import InputError
+from mcdenoise.evaluate.noise import noise_floor, reference_noise
+from mcdenoise.evaluate.scores import METRICS, check_references, measure
+from mcdenoise.history import motion_to_previous, surface_before
+from mcdenoise.metrics import (
+    PROTOCOLS,
+    Flicker,
+    Metric,
+    UncomputableError,
+    flip_hdr,
+    warped_rmse_srgb,
+    warping_error_srgb,
+)
+from mcdenoise.metrics.protocols import ProtocolName
+from mcdenoise.ops import Surface
+
+STRICT: ProtocolName = "strict"
+WARPED, FLICKER = "wRMSE", "flicker"
+_METRICS = {**METRICS, "HDR-FLIP": Metric(flip_hdr)}
+_OURS = re.compile(r"denoised(\d+)")
+# The largest motion, in pixels, of a shot in which nothing moves.
+_STILL = 0.05
+
+
+@dataclass
+class Table:
+    """Values of one protocol.
+
+    Args:
+        description: how the protocol gets its values.
+        frames: by frame number and metric; a temporal one stands at the later frame of its pair.
+        left_out: why a metric could not be computed, or not for every frame.
+        shots: metrics of whole shots, with the number of frames.
+    """
+
+    description: str
+    frames: dict[int, dict[str, float]] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    shots: dict[str, tuple[float, int]] = field(default_factory=dict)
+
+    @property
+    def mean(self) -> dict[str, float]:
+        """Mean over the frames, by metric, and the metrics of whole shots."""
+        return {name: sum(own) / len(own) for name, own in self._columns().items()} | {
+            name: value for name, (value, _) in self.shots.items()
+        }
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of frames in each mean."""
+        return {name: len(own) for name, own in self._columns().items()} | {
+            name: count for name, (_, count) in self.shots.items()
+        }
+
+    def _columns(self) -> dict[str, list[float]]:
+        columns: dict[str, list[float]] = defaultdict(list)
+        for values in self.frames.values():
+            for name, value in values.items():
+                columns[name].append(value)
+        return columns
+
+
+@dataclass
+class Evaluation:
+    """Errors of a folder of images.
+
+    Args:
+        sequence: its name.
+        images: the folder.
+        tables: by protocol; ``"strict"`` is always there, with every metric.
+        warping_error: Lai's warping error of the images and of the references, mean over the pairs of frames.
+        reference_noise: the references' own SMAPE against the truth, where the renderer has noted it.
+        floor: what a perfect result would score against references with that noise, by metric.
+    """
+
+    sequence: str
+    images: Path
+    tables: dict[str, Table]
+    warping_error: tuple[float, float] | None = None
+    reference_noise: float | None = None
+    floor: dict[str, float] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, Any]:
+        """For a JSON file; ``null`` stands for the infinite PSNR of equal images."""
+        tables = {
+            name: {
+                "description": table.description,
+                "frames": {str(number): _finite(values) for number, values in table.frames.items()},
+                "mean": _finite(table.mean),
+                "counts": table.counts,
+                "left_out": table.left_out,
+            }
+            for name, table in self.tables.items()
+        }
+        ours, theirs = self.warping_error or (None, None)
+        return {
+            "sequence": self.sequence,
+            "images": str(self.images),
+            "protocols": tables,
+            "warping_error": {"images": ours, "references": theirs},
+            "reference_noise": self.reference_noise,
+            "perfect": _finite(self.floor),
+        }
+
+
+def _finite(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+
+
+def find_images(folder: Path, numbers: Collection[int]) -> dict[int, Path]:
+    """The EXR file of each frame, by the number in its name.
+
+    Files ``denoisedN.exr`` are taken wherever there are any. Else all EXR files of the folder must be named alike up to
+    one number, such as ``frame.0012.exr`` or ``shot02_0012.exr``; a name may hold further numbers that never change.
+
+    Args:
+        folder: of the images.
+        numbers: frames that are needed.
+
+    Raises:
+        InputError: there is no such folder, the names do not tell the frames, or a frame is missing.
+    """
+    if not os.path.isdir(folder):
+        found = "a file" if os.path.isfile(folder) else "no such folder"
+        raise InputError(f"{folder}: expected a folder of denoised EXR images, found {found}; check the path")
+    stems = [path.stem for path in sorted(folder.glob("*.exr")) if not path.name.startswith(".")]
+    if not stems:
+        raise InputError(f"{folder}: expected denoised EXR images, found none; check the path")
+    files: dict[int, Path] = {}
+    for number, stem in _numbered(folder, [stem for stem in stems if _OURS.fullmatch(stem)] or stems):
+        path = folder / f"{stem}.exr"
+        other = files.setdefault(number, path)
+        if other is not path:
+            raise InputError(f"{folder}: expected one file a frame, found {other.name} and {path.name}; remove one")
+    missing = [number for number in numbers if number not in files]
+    if missing:
+        raise InputError(
+            f"{folder}: expected an image of every frame with a reference, found none of frame "
+            f"{', '.join(map(str, missing[:8]))}{', ...' if len(missing) > 8 else ''} "
+            f"(it has frames {min(files)} to {max(files)}); denoise all frames, or choose some with --frames"
+        )
+    return {number: files[number] for number in numbers}
+
+
+def _numbered(folder: Path, stems: list[str]) -> list[tuple[int, str]]:
+    """Frame number and file stem, from the one number in which the stems differ."""
+    # Text and numbers alternate: the odd parts are the numbers.
+    split = [re.split(r"(\d+)", stem) for stem in stems]
+    alike = {tuple(parts[::2]) for parts in split}
+    changing = [i for i in range(1, len(split[0]), 2) if len({parts[i] for parts in split if i < len(parts)}) > 1]
+    if len(stems) == 1 and len(split[0]) == 3:
+        changing = [1]
+    if len(alike) > 1 or len(changing) != 1:
+        shown = ", ".join(f"{stem}.exr" for stem in (stems[0], stems[-1])[: len(stems)])
+        raise InputError(
+            f"{folder}: expected names with one number that tells the frame, such as denoised12.exr or "
+            f"frame.0012.exr, found {shown}; leave one series of images in the folder"
+        )
+    return [(int(parts[changing[0]]), stem) for parts, stem in zip(split, stems, strict=True)]
+
+
+@torch.inference_mode()
+def evaluate_folder(
+    sequence: Sequence,
+    folder: Path,
+    *,
+    protocol: ProtocolName = STRICT,
+    on_frame: Callable[[int], None] = lambda number: None,
+) -> Evaluation:
+    """Compare the images of a folder with the references of a sequence.
+
+    Temporal metrics take pairs of frames with successive numbers and references; those along the motion need motion, or
+    positions with cameras; flicker needs shots in which nothing moves by more than 0.05 pixels.
+
+    Args:
+        sequence: frames with references.
+        folder: an EXR image of each, see :func:`find_images`: channels R, G, B (an alpha is ignored), scene-linear,
+            with the primaries that its ``chromaticities`` state, or else Rec. 709. The references have those that the
+            color files state.
+        protocol: name in :data:`mcdenoise.metrics.PROTOCOLS`; its values come beside the strict ones.
+        on_frame: called with the number of each frame that is done.
+
+    Raises:
+        InputError: the sequence has no references; an image is missing, damaged, of another size, has other channels,
+            or pixels that are not finite; or a buffer has invalid values.
+    """
+    check_references(sequence)
+    numbers = sequence.reference_numbers
+    files = find_images(folder, numbers)
+    for path in files.values():
+        _check_header(path, sequence.size)
+
+    chosen = PROTOCOLS[protocol]
+    strict = Table(PROTOCOLS[STRICT].description)
+    tables: dict[str, Table] = {STRICT: strict}
+    if protocol != STRICT:
+        tables[protocol] = Table(chosen.description)
+    pairs = _Pairs(strict)
+    past: tuple[int, Tensor, Tensor] | None = None
+    for number in numbers:
+        image, frame, reference = _read(sequence, number, files[number])
+        before = past[1:] if past is not None and past[0] == number - 1 else None
+        strict.frames[number] = measure(_METRICS, image, reference, before, strict.left_out)
+        pairs.add(number, frame, image, reference, before)
+        if protocol != STRICT and number in sequence.numbers[chosen.skipped_frames :]:
+            own, skipped = tables[protocol], number - 1 not in sequence.numbers[chosen.skipped_frames :]
+            own.frames[number] = measure(chosen.metrics, image, reference, None if skipped else before, own.left_out)
+        past = number, image, reference
+        on_frame(number)
+    pairs.finish()
+    _explain(strict, [*_temporal(_METRICS), WARPED])
+    if protocol != STRICT:
+        tables[protocol].left_out |= chosen.missing
+        if tables[protocol].frames:
+            _explain(tables[protocol], _temporal(chosen.metrics))
+        else:
+            reason = (
+                f"{protocol} leaves out the first {chosen.skipped_frames} frames; this sequence has no reference later"
+            )
+            tables[protocol].left_out |= dict.fromkeys(chosen.metrics, reason)
+    floor = noise_floor(sequence, metrics=[name for name in METRICS if name not in ("RMSE", "FLIP")])
+    return Evaluation(sequence.name, folder, tables, pairs.warping_error, reference_noise(sequence), floor)
+
+
+class _Pairs:
+    """What needs the motion between frames: the warped errors, and flicker where there is none."""
+
+    def __init__(self, table: Table) -> None:
+        self._table = table
+        self._frame: Frame | None = None
+        self._warping: list[tuple[float, float]] = []
+        self._flicker: Flicker | None = None
+        self._shots: list[Flicker] = []
+
+    def add(
+        self, number: int, frame: Frame, image: Tensor, reference: Tensor, before: tuple[Tensor, Tensor] | None
+    ) -> None:
+        """The next frame, and image and reference of its predecessor."""
+        past, self._frame = self._frame, frame
+        motion = None
+        if before is not None and past is not None:
+            motion = motion_to_previous(frame, past.view_projection)
+            if motion is None:
+                self._table.left_out[WARPED] = "the frames have no motion, and no positions with cameras"
+        if motion is None or before is None or past is None:
+            self._flicker = None
+            return
+        surface, previous = surface_before(frame), Surface(past.position, past.normal, past.depth)
+        clip, truth = torch.stack([before[0], image], 1), torch.stack([before[1], reference], 1)
+        try:
+            value = float(warped_rmse_srgb(clip, truth, motion, surface, previous))
+            self._table.frames[number][WARPED] = value
+            ours, theirs = (float(warping_error_srgb(x, motion, surface, previous)) for x in (clip, truth))
+            self._warping.append((ours, theirs))
+        except UncomputableError as error:
+            self._table.left_out[WARPED] = str(error)
+        if not _is_still(motion):
+            self._flicker = None
+            return
+        if self._flicker is None:
+            self._flicker = Flicker()
+            self._flicker.add(*before)
+            self._shots.append(self._flicker)
+        self._flicker.add(image, reference)
+
+    def finish(self) -> None:
+        """Put the flicker of all static shots into the table, each weighted by its frames."""
+        frames = sum(shot.frames for shot in self._shots)
+        if frames:
+            mean = sum(shot.frames * float(shot.value()) for shot in self._shots) / frames
+            self._table.shots[FLICKER] = mean, frames
+        else:
+            self._table.left_out[FLICKER] = "no two successive frames with references between which nothing moves"
+
+    @property
+    def warping_error(self) -> tuple[float, float] | None:
+        if not self._warping:
+            return None
+        ours, theirs = zip(*self._warping, strict=True)
+        return sum(ours) / len(ours), sum(theirs) / len(theirs)
+
+
+def _is_still(motion: Tensor) -> bool:
+    """Whether all motion that is known is next to nothing."""
+    length = torch.hypot(motion[:, 0], motion[:, 1])
+    known = length[torch.isfinite(length)]
+    return known.numel() > 0 and float(known.max()) < _STILL
+
+
+def _temporal(metrics: Mapping[str, Metric]) -> list[str]:
+    return [name for name, metric in metrics.items() if metric.temporal]
+
+
+def _explain(table: Table, temporal: Iterable[str]) -> None:
+    """Say of temporal metrics why there are none, where nothing else has said so."""
+    counts = table.counts
+    for name in temporal:
+        if name not in counts:
+            table.left_out.setdefault(name, "no two successive frames with references")
+
+
+def _check_header(path: Path, size: tuple[int, int]) -> None:
+    header = read_exr_header(path)
+    if header.channels[:3] != ["R", "G", "B"] or header.channels[3:] not in ([], ["A"]):
+        raise InputError(
+            f"{path}: expected channels R, G, B, found {', '.join(header.channels[:8])}; write the color alone"
+        )
+    if header.size != size:
+        raise InputError(
+            f"{path}: expected {size[1]} x {size[0]} pixels like the sequence, found {header.size[1]} x "
+            f"{header.size[0]}; denoise at the size of the references"
+        )
+
+
+def _read(sequence: Sequence, number: int, path: Path) -> tuple[Tensor, Frame, Tensor]:
+    """Image, frame and reference, both images with the primaries of Rec. 709."""
+    pixels, _, metadata = read_exr(path)
+    image = torch.from_numpy(pixels[..., :3]).permute(2, 0, 1)[None].contiguous()
+    bad = ~torch.isfinite(image).all(1)[0]
+    if bad.any():
+        row, column = bad.nonzero()[0].tolist()
+        raise InputError(
+            f"{path}: expected finite pixels, found {int(bad.sum())} NaN or infinite ones of {bad.numel()}, first at "
+            f"row {row}, column {column}; no error is defined with them: repair them, or leave the frame out"
+        )
+    try:
+        frame, _ = sequence.frame(number).with_depth().validate()
+    except InputError as error:
+        raise InputError(f"{sequence.root}, frame {number}: {error}") from error
+    if frame.reference is None:
+        raise InputError(f"{sequence.root}: expected the reference of frame {number}, found none; render it")
+    try:
+        return to_rec709(image, metadata), frame, to_rec709(frame.reference, sequence.metadata(number))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error

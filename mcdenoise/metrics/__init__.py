@@ -1,0 +1,41 @@
+"""How far an image is from its reference: one value for each image, with the domain in the name.
+
+Images are ``(..., 3, H, W)`` scene-linear radiance; whatever stands before the last three axes is a batch.
+"""
+
+from mcdenoise.metrics._check import UncomputableError
+from mcdenoise.metrics.display import displayed, flip_hdr, flip_srgb, psnr_srgb, ssim_srgb
+from mcdenoise.metrics.linear import relmse_linear, rmse_linear, smape_linear
+from mcdenoise.metrics.metric import Metric
+from mcdenoise.metrics.protocols import PROTOCOLS, Protocol, aces_displayed, gamma_displayed
+from mcdenoise.metrics.temporal import (
+    Flicker,
+    flicker_srgb,
+    temporal_rmse_srgb,
+    temporal_smape_linear,
+    warped_rmse_srgb,
+    warping_error_srgb,
+)
+
+__all__ = [
+    "PROTOCOLS",
+    "Flicker",
+    "Metric",
+    "Protocol",
+    "UncomputableError",
+    "aces_displayed",
+    "displayed",
+    "flicker_srgb",
+    "flip_hdr",
+    "flip_srgb",
+    "gamma_displayed",
+    "psnr_srgb",
+    "relmse_linear",
+    "rmse_linear",
+    "smape_linear",
+    "ssim_srgb",
+    "temporal_rmse_srgb",
+    "temporal_smape_linear",
+    "warped_rmse_srgb",
+    "warping_error_srgb",
+]

@@ -1,0 +1,25 @@
+"""What images and clips must be alike in."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from mcdenoise.errors import InputError
+
+
+class UncomputableError(InputError):
+    """A metric that these images, or this installation, do not allow; the message says why."""
+
+
+def check_images(image: Tensor, reference: Tensor) -> None:
+    if image.shape != reference.shape or image.ndim < 3:
+        raise ValueError(
+            f"reference: expected the shape of image and (..., C, H, W), found {tuple(reference.shape)} "
+            f"for {tuple(image.shape)}"
+        )
+
+
+def check_clip(clip: Tensor, reference: Tensor) -> None:
+    check_images(clip, reference)
+    if clip.ndim < 4 or clip.shape[-4] < 2:
+        raise ValueError(f"clip: expected (..., T, C, H, W) with at least 2 frames, found {tuple(clip.shape)}")

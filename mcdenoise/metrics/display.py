@@ -1,0 +1,167 @@
+"""Errors of what a display shows: clamped to [0, 1] on the sRGB curve, or (HDR-FLIP) at every exposure."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Literal
+
+import torch
+from kornia.color import linear_rgb_to_rgb
+from kornia.metrics import ssim
+from torch import Tensor
+
+from mcdenoise.metrics._check import UncomputableError, check_images
+
+_SSIM_WINDOW = 11
+_LARGEST = 65504.0
+# Of a reference darker than this HDR-FLIP finds no exposures, and ends the process.
+_BLACK = 1e-5
+
+
+def displayed(image: Tensor) -> Tensor:
+    """Scene-linear radiance as a display shows it: clamped to [0, 1], sRGB curve (IEC 61966-2-1).
+
+    Args:
+        image: ``(..., 3, H, W)`` scene-linear radiance, Rec. 709 primaries.
+
+    Returns:
+        The same shape, in [0, 1].
+    """
+    return linear_rgb_to_rgb(image.clamp(0, 1))
+
+
+def psnr_srgb(image: Tensor, reference: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio as displayed: clamped to [0, 1], sRGB curve, peak 1.
+
+    ``kornia.metrics.psnr`` on these values gives the same for one image; it averages a batch before the logarithm.
+
+    Args:
+        image: ``(..., 3, H, W)`` scene-linear radiance.
+        reference: of the same shape.
+
+    Returns:
+        ``(...)`` decibels, higher is better; infinite for equal images.
+
+    Raises:
+        ValueError: the shapes differ.
+    """
+    check_images(image, reference)
+    difference = displayed(image) - displayed(reference)
+    return -10 * torch.log10(difference.square().mean((-3, -2, -1)))
+
+
+def ssim_srgb(image: Tensor, reference: Tensor) -> Tensor:
+    """Structural similarity as displayed: clamped to [0, 1], sRGB curve, data range 1.
+
+    Gaussian window of 11x11 pixels with sigma 1.5, K1 = 0.01, K2 = 0.03, weighted (not sample) covariance, each channel
+    by itself; the mean over channels and those pixels whose window lies within the image. It is
+    ``kornia.metrics.ssim`` with ``padding="valid"``, and agrees with scikit-image's ``structural_similarity`` with
+    ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1``; published values with that
+    function's defaults (7x7 uniform window, and once a data range of 2) are higher.
+
+    Args:
+        image: ``(..., 3, H, W)`` scene-linear radiance, H and W at least 11.
+        reference: of the same shape.
+
+    Returns:
+        ``(...)`` in [-1, 1], higher is better, 1 for equal images.
+
+    Raises:
+        ValueError: the shapes differ.
+        UncomputableError: the images are smaller than the window.
+
+    Source: Wang et al. 2004.
+
+    Example:
+        >>> image = torch.rand(1, 3, 16, 16)
+        >>> ssim_srgb(image, image).tolist()
+        [1.0]
+    """
+    check_images(image, reference)
+    if min(image.shape[-2:]) < _SSIM_WINDOW:
+        raise UncomputableError(
+            f"SSIM's window: expected at least 11 x 11 pixels, found {image.shape[-2]} x {image.shape[-1]}"
+        )
+    shown, expected = (displayed(x).reshape(-1, *x.shape[-3:]) for x in (image, reference))
+    # Without kornia's epsilon, which the denominator does not need (it is at least K1^2 K2^2), equal images give 1.
+    similarity = ssim(shown, expected, _SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid")
+    return similarity.mean((-3, -2, -1)).reshape(image.shape[:-3])
+
+
+def flip_srgb(image: Tensor, reference: Tensor) -> Tensor:
+    """Mean LDR-FLIP as displayed: clamped to [0, 1], sRGB curve, 67 pixels a degree; what a viewer sees on flipping.
+
+    Computed by the authors' ``flip-evaluator``, on the CPU, about 1 microsecond a pixel; no gradient.
+
+    Args:
+        image: ``(..., 3, H, W)`` scene-linear radiance.
+        reference: of the same shape.
+
+    Returns:
+        ``(...)`` in [0, 1], lower is better.
+
+    Raises:
+        ValueError: the shapes differ.
+        UncomputableError: the package ``flip-evaluator`` is not installed.
+
+    Source: Andersson et al. 2020.
+    """
+    check_images(image, reference)
+    return flip(displayed(image), displayed(reference), "LDR")
+
+
+def flip_hdr(image: Tensor, reference: Tensor) -> Tensor:
+    """Mean HDR-FLIP: the worst LDR-FLIP of each pixel over the exposures that the reference's luminances call for.
+
+    Scene-linear radiance, not clamped; every exposure goes through the ACES curve of the metric's authors. 67 pixels a
+    degree. Computed by the authors' ``flip-evaluator`` with its defaults, on the CPU; as slow as so many LDR-FLIPs as
+    there are exposures (2 to about 15). No gradient.
+
+    Args:
+        image: ``(..., 3, H, W)`` scene-linear radiance; what is outside [0, 65504] is clamped.
+        reference: of the same shape.
+
+    Returns:
+        ``(...)`` in [0, 1], lower is better.
+
+    Raises:
+        ValueError: the shapes differ.
+        UncomputableError: a reference is black, or the package ``flip-evaluator`` is not installed.
+
+    Source: Andersson et al. 2021, Visualizing Errors in Rendered High Dynamic Range Images.
+    """
+    check_images(image, reference)
+    if bool((reference.amax((-3, -2, -1)) < _BLACK).any()):
+        raise UncomputableError("HDR-FLIP's exposures: expected a reference with light in it, found a black one")
+    return flip(image.clamp(0, _LARGEST), reference.clamp(0, _LARGEST), "HDR")
+
+
+def flip(image: Tensor, reference: Tensor, dynamic_range: Literal["LDR", "HDR"]) -> Tensor:
+    """Mean FLIP of images that are already in the metric's own domain.
+
+    Args:
+        image: ``(..., 3, H, W)`` in [0, 1] on the sRGB curve for ``"LDR"``, else scene-linear and at least 0.
+        reference: of the same shape.
+        dynamic_range: which of the two metrics.
+
+    Returns:
+        ``(...)`` in [0, 1], lower is better.
+
+    Raises:
+        UncomputableError: the package ``flip-evaluator`` is not installed.
+    """
+    try:
+        evaluator = importlib.import_module("flip_evaluator")
+    except ImportError as error:
+        raise UncomputableError(
+            "FLIP needs flip-evaluator, which is not installed; pip install 'mcdenoise[peers]', or leave FLIP out"
+        ) from error
+    tests, truths = (
+        x.detach().reshape(-1, *x.shape[-3:]).permute(0, 2, 3, 1).float().cpu().contiguous().numpy()
+        for x in (image, reference)
+    )
+    means = [
+        evaluator.evaluate(truth, test, dynamic_range, applyMagma=False)[1]
+        for test, truth in zip(tests, truths, strict=True)
+    ]
+    return torch.tensor(means, dtype=image.dtype, device=image.device).reshape(image.shape[:-3])

@@ -1,0 +1,205 @@
+"""How published numbers were computed: tone curve, rounding, windows, data range, and what is left out.
+
+A number means little without its protocol: at the same error the SSIM of ``meng2020`` is higher than that of
+``strict`` by 0.04 to 0.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from mcdenoise.metrics._check import check_images
+from mcdenoise.metrics._similarity import gaussian, multiscale_similarity, similarity, uniform
+from mcdenoise.metrics.display import displayed, flip, psnr_srgb, ssim_srgb
+from mcdenoise.metrics.metric import Metric
+
+ProtocolName = Literal["strict", "meng2020", "fan2021", "noisebase"]
+
+# Both codes write 1 / 2.2 in this way.
+_GAMMA = 0.454545
+# The ACES fit by Stephen Hill (BakingLab): linear sRGB to the curve's space and back, and the curve between.
+_ACES_IN = ((0.59719, 0.35458, 0.04823), (0.07600, 0.90834, 0.01566), (0.02840, 0.13383, 0.83777))
+_ACES_OUT = ((1.60475, -0.53108, -0.07367), (-0.10208, 1.10813, -0.00605), (-0.00327, -0.07276, 1.07602))
+_REC709_LUMINANCE = (0.2126, 0.7152, 0.0722)
+# Noisebase renders 1080 rows and leaves out as many at the top and at the bottom, so that 1024 remain.
+_NOISEBASE_ROWS, _NOISEBASE_CUT = 1080, 28
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What a publication did to get its numbers from scene-linear images.
+
+    Args:
+        description: tone curve, rounding, SSIM and what is left out, in one line.
+        show: the values it compares, of ``(..., 3, H, W)`` scene-linear radiance.
+        metrics: by name, of scene-linear radiance like those of :mod:`mcdenoise.metrics`.
+        skipped_frames: so many frames at the start of a sequence are not compared.
+        missing: what it also defines and is not computed here, with the reason.
+    """
+
+    description: str
+    show: Callable[[Tensor], Tensor]
+    metrics: Mapping[str, Metric]
+    skipped_frames: int = 0
+    missing: Mapping[str, str] = field(default_factory=dict)
+
+
+def gamma_displayed(image: Tensor) -> Tensor:
+    """Scene-linear radiance by a plain gamma: ``min(max(x, 0)^0.454545, 1)``, as Meng et al. and Fan et al. show it.
+
+    Args:
+        image: scene-linear radiance of any shape.
+
+    Returns:
+        The same shape, in [0, 1].
+    """
+    return image.clamp_min(0).pow(_GAMMA).clamp_max(1)
+
+
+def aces_displayed(image: Tensor) -> Tensor:
+    """Scene-linear radiance by Stephen Hill's fit of the ACES curves, clamped to [0, 1], then a gamma of 1/2.2.
+
+    Args:
+        image: ``(..., 3, H, W)`` scene-linear radiance, Rec. 709 primaries.
+
+    Returns:
+        The same shape, in [0, 1].
+    """
+    x = _matrix(_ACES_IN, image)
+    x = (x * (x + 0.0245786) - 0.000090537) / (x * (0.983729 * x + 0.4329510) + 0.238081)
+    return _matrix(_ACES_OUT, x).clamp(0, 1).pow(1 / 2.2)
+
+
+def _matrix(rows: tuple[tuple[float, ...], ...], image: Tensor) -> Tensor:
+    return torch.einsum("ji,...ihw->...jhw", torch.tensor(rows, dtype=image.dtype, device=image.device), image)
+
+
+def _show_meng2020(image: Tensor) -> Tensor:
+    return torch.floor(gamma_displayed(image) * 255 + 0.5) / 255
+
+
+def _show_noisebase(image: Tensor) -> Tensor:
+    if image.shape[-2] == _NOISEBASE_ROWS:
+        image = image[..., _NOISEBASE_CUT:-_NOISEBASE_CUT, :]
+    return torch.floor(aces_displayed(image) * 255) / 255
+
+
+def _of_shown(
+    show: Callable[[Tensor], Tensor], function: Callable[[Tensor, Tensor], Tensor]
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """A metric of shown values as one of scene-linear radiance."""
+
+    def metric(image: Tensor, reference: Tensor) -> Tensor:
+        check_images(image, reference)
+        return function(show(image), show(reference))
+
+    return metric
+
+
+def _mse(image: Tensor, reference: Tensor) -> Tensor:
+    return (image - reference).square().mean((-3, -2, -1))
+
+
+def _rmse(image: Tensor, reference: Tensor) -> Tensor:
+    return _mse(image, reference).sqrt()
+
+
+def _psnr(image: Tensor, reference: Tensor) -> Tensor:
+    return -10 * torch.log10(_mse(image, reference))
+
+
+def _ssim_default(image: Tensor, reference: Tensor) -> Tensor:
+    """What scikit-image below 0.20 gives for floats: 7x7 box, sample covariance, and a data range of 2."""
+    tests, truths = (x.reshape(-1, *x.shape[-3:]) for x in (image, reference))
+    values, _ = similarity(tests, truths, uniform(), data_range=2, sample_covariance=True)
+    return values.mean(1).reshape(image.shape[:-3])
+
+
+def _smape_percent(image: Tensor, reference: Tensor) -> Tensor:
+    ratio = 2 * (image - reference).abs() / (image.abs() + reference.abs() + 1e-7)
+    return 100 * ratio.mean((-3, -2, -1))
+
+
+def _relmse(image: Tensor, reference: Tensor) -> Tensor:
+    return ((image - reference).square() / (reference.square() + 1e-7)).mean((-3, -2, -1))
+
+
+def _luminance(shown: Tensor) -> Tensor:
+    """``(B, 1, H, W)`` luminance of values on a gamma of 2.2."""
+    weights = torch.tensor(_REC709_LUMINANCE, dtype=shown.dtype, device=shown.device).reshape(3, 1, 1)
+    return (shown.reshape(-1, *shown.shape[-3:]).pow(2.2) * weights).sum(1, keepdim=True)
+
+
+def _ssim_luminance(image: Tensor, reference: Tensor) -> Tensor:
+    values, _ = similarity(_luminance(image), _luminance(reference), gaussian(), data_range=1)
+    return values.reshape(image.shape[:-3])
+
+
+def _ms_ssim_luminance(image: Tensor, reference: Tensor) -> Tensor:
+    values = multiscale_similarity(_luminance(image), _luminance(reference), data_range=1)
+    return values.reshape(image.shape[:-3])
+
+
+def _temporal_psnr(clip: Tensor, reference: Tensor) -> Tensor:
+    return _psnr(clip.diff(dim=-4), reference.diff(dim=-4)).mean(-1)
+
+
+def _temporal_rmae(clip: Tensor, reference: Tensor) -> Tensor:
+    """The third is noisebase's: it divides a mean over the channels by their number once more."""
+    moved, truth = clip.diff(dim=-4), reference.diff(dim=-4)
+    return ((moved - truth).abs() / (truth.abs() + 0.01)).mean((-3, -2, -1)).mean(-1) / 3
+
+
+_meng2020 = partial(_of_shown, _show_meng2020)
+_fan2021 = partial(_of_shown, gamma_displayed)
+_noisebase = partial(_of_shown, _show_noisebase)
+
+PROTOCOLS: dict[ProtocolName, Protocol] = {
+    "strict": Protocol(
+        "clamped to [0, 1], sRGB curve, floats; SSIM with an 11x11 Gaussian window and data range 1; every frame",
+        displayed,
+        {"PSNR": Metric(psnr_srgb, higher_is_better=True), "SSIM": Metric(ssim_srgb, higher_is_better=True)},
+    ),
+    "meng2020": Protocol(
+        "x^0.454545, clamped to [0, 1], rounded to 8 bits; SSIM with a 7x7 box window, sample covariance and data "
+        "range 2; RMSE, SMAPE (in per cent) and relMSE of the same values",
+        _show_meng2020,
+        {
+            "PSNR": Metric(_meng2020(_psnr), higher_is_better=True),
+            "SSIM": Metric(_meng2020(_ssim_default), higher_is_better=True),
+            "RMSE": Metric(_meng2020(_rmse)),
+            "SMAPE": Metric(_meng2020(_smape_percent)),
+            "relMSE": Metric(_meng2020(_relmse)),
+        },
+    ),
+    "fan2021": Protocol(
+        "x^0.454545, clamped to [0, 1], floats; SSIM with a 7x7 box window, sample covariance and data range 2",
+        gamma_displayed,
+        {
+            "PSNR": Metric(_fan2021(_psnr), higher_is_better=True),
+            "SSIM": Metric(_fan2021(_ssim_default), higher_is_better=True),
+        },
+    ),
+    "noisebase": Protocol(
+        "ACES fit, clamped to [0, 1], gamma 1/2.2, truncated to 8 bits; SSIM with an 11x11 Gaussian window and data "
+        "range 1 of the luminance of x^2.2; without the first 16 frames, and of 1080 rows the middle 1024",
+        _show_noisebase,
+        {
+            "PSNR": Metric(_noisebase(_psnr), higher_is_better=True),
+            "SSIM": Metric(_noisebase(_ssim_luminance), higher_is_better=True),
+            "MS-SSIM": Metric(_noisebase(_ms_ssim_luminance), higher_is_better=True),
+            "FLIP": Metric(_noisebase(partial(flip, dynamic_range="LDR"))),
+            "MSE": Metric(_noisebase(_mse)),
+            "tPSNR": Metric(_noisebase(_temporal_psnr), higher_is_better=True, temporal=True),
+            "tRMAE": Metric(_noisebase(_temporal_rmae), temporal=True),
+        },
+        skipped_frames=16,
+        missing={"FVVDP": "FovVideoVDP is a video metric of another package, pyfvvdp"},
+    ),
+}

@@ -1,0 +1,201 @@
+"""The pictures of one scene: what the comparer shows, close-ups, and temporal profiles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mcdenoise.data.exr import read_exr
+from mcdenoise.errors import InputError
+from mcdenoise.report.pictures import (
+    Codes,
+    Crop,
+    Image,
+    choose_crops,
+    choose_row,
+    crop_errors,
+    data_uri,
+    decode,
+    encode,
+    halved,
+    to_srgb,
+)
+from mcdenoise.results import IMAGES, Method, Results, Scene
+
+REFERENCE = "reference"
+_THUMBNAIL_WIDTH = 480
+
+
+@dataclass(frozen=True)
+class CloseUp:
+    """A crop of one method's image.
+
+    Args:
+        crop: which part.
+        picture: image file as a data URI.
+        psnr: of the crop, as displayed, in decibels; ``None`` for the reference itself.
+        smape: of the crop, scene-linear.
+    """
+
+    crop: Crop
+    picture: str
+    psnr: float | None = None
+    smape: float | None = None
+
+
+@dataclass(frozen=True)
+class Stripe:
+    """What temporal profiles are cut from.
+
+    Args:
+        row: of the frame.
+        left: first column.
+        width: columns.
+        frames: numbers of the frames.
+    """
+
+    row: int
+    left: int
+    width: int
+    frames: list[int]
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """The pictures of one scene that were kept.
+
+    Args:
+        scene: whose.
+        factor: by how much the pictures of the comparer are smaller than the frames.
+        codes: by method (or ``"reference"``) and frame, see :func:`mcdenoise.report.pictures.encode`.
+        frame: that of the close-ups; ``None`` if there is no reference to compare with.
+        thumbnail: that frame's reference, as a data URI.
+        close_ups: by method, the same crops for each.
+        stripe: ``None`` if fewer than two frames were kept.
+        profiles: by method, as data URIs: one row of pixels for each frame.
+    """
+
+    scene: Scene
+    factor: int
+    codes: dict[str, dict[int, Codes]]
+    frame: int | None
+    thumbnail: str
+    close_ups: dict[str, list[CloseUp]]
+    stripe: Stripe | None
+    profiles: dict[str, str]
+
+
+def read_gallery(folder: Path, results: Results, scene: Scene, *, factor: int = 1) -> Gallery:
+    """Read the pictures of a scene.
+
+    Args:
+        folder: of the benchmark.
+        results: of it.
+        scene: one of its scenes.
+        factor: a power of two; the comparer's pictures are made smaller by it.
+
+    Raises:
+        InputError: a picture is damaged, or of another size than the scene.
+    """
+    files = _files(folder, results, scene)
+    codes = {
+        name: {number: encode(_smaller(_read(path, scene), factor)) for number, path in own.items()}
+        for name, own in files.items()
+    }
+    denoisers = {method.name for method in results.methods if method.kind != "baseline"}
+    frame = max(files.get(REFERENCE, {}), default=None)
+    close_ups, thumbnail = ({}, "") if frame is None else _close_ups(files, scene, frame, denoisers)
+    stripe = _stripe(codes, factor, denoisers)
+    profiles = {} if stripe is None else {name: _profile(own, stripe, factor) for name, own in codes.items()}
+    return Gallery(
+        scene,
+        factor,
+        codes,
+        frame,
+        thumbnail,
+        close_ups,
+        stripe,
+        {name: picture for name, picture in profiles.items() if picture},
+    )
+
+
+def picture_pixels(folder: Path, results: Results) -> int:
+    """How many pixels all kept pictures have together."""
+    return sum(
+        scene.width * scene.height * sum(len(own) for own in _files(folder, results, scene).values())
+        for scene in results.scenes
+    )
+
+
+def _files(folder: Path, results: Results, scene: Scene) -> dict[str, dict[int, Path]]:
+    """Files by method and frame, the reference last; what was not kept is not in it."""
+    sources = {method.name: method.folder for method in results.methods if _ran(results, scene, method)}
+    found = {
+        name: {number: folder / IMAGES / scene.name / place / f"{number}.exr" for number in scene.pictures}
+        for name, place in (sources | {REFERENCE: REFERENCE}).items()
+    }
+    existing = {name: {number: path for number, path in own.items() if path.exists()} for name, own in found.items()}
+    return {name: own for name, own in existing.items() if own}
+
+
+def _ran(results: Results, scene: Scene, method: Method) -> bool:
+    cell = results.cell(scene.name, method.name)
+    return not method.missing and cell is not None and not cell.failure
+
+
+def _read(path: Path, scene: Scene) -> Image:
+    pixels, channels, _ = read_exr(path)
+    if pixels.shape[:2] != (scene.height, scene.width) or len(channels) < 3:
+        raise InputError(
+            f"{path}: expected an RGB picture of {scene.width}x{scene.height}, found {len(channels)} channels of "
+            f"{pixels.shape[1]}x{pixels.shape[0]}; run the benchmark again"
+        )
+    return np.ascontiguousarray(pixels[..., :3])
+
+
+def _smaller(image: Image, factor: int) -> Image:
+    while factor > 1:
+        image, factor = halved(image), factor // 2
+    return image
+
+
+def _close_ups(
+    files: dict[str, dict[int, Path]], scene: Scene, frame: int, denoisers: set[str]
+) -> tuple[dict[str, list[CloseUp]], str]:
+    images = {name: _read(own[frame], scene) for name, own in files.items() if frame in own}
+    reference = images[REFERENCE]
+    crops = choose_crops([image for name, image in images.items() if name in denoisers], reference)
+    close_ups = {}
+    for name, image in images.items():
+        shown = to_srgb(image)
+        close_ups[name] = [
+            CloseUp(
+                crop,
+                data_uri(crop.of(shown)),
+                *(() if name == REFERENCE else crop_errors(crop.of(image), crop.of(reference))),
+            )
+            for crop in crops
+        ]
+    step = 1
+    while scene.width // step > _THUMBNAIL_WIDTH:
+        step *= 2
+    return close_ups, data_uri(to_srgb(_smaller(reference, step)), "jpeg", quality=88)
+
+
+def _stripe(codes: dict[str, dict[int, Codes]], factor: int, denoisers: set[str]) -> Stripe | None:
+    clips = [list(own.values()) for name, own in codes.items() if name in denoisers and len(own) > 1]
+    if not clips:
+        return None
+    row, left, width = choose_row(clips)
+    frames = sorted({number for own in codes.values() for number in own})
+    return Stripe(row * factor, left * factor, width * factor, frames)
+
+
+def _profile(pictures: dict[int, Codes], stripe: Stripe, factor: int) -> str:
+    if set(pictures) != set(stripe.frames):
+        return ""
+    row, left, width = (length // factor for length in (stripe.row, stripe.left, stripe.width))
+    rows = np.stack([pictures[number][row, left : left + width] for number in stripe.frames])
+    return data_uri(to_srgb(decode(rows).astype(np.float32)))

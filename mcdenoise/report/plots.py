@@ -1,0 +1,420 @@
+"""The plots: error over time, stages, cost over pixels; for papers, and as text in a page that is dark or light."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
+
+from mcdenoise.data.files import atomic_path
+from mcdenoise.errors import InputError
+from mcdenoise.evaluate import METRICS
+from mcdenoise.report.labels import Box, place_labels
+from mcdenoise.report.views import Point, Range, Row, View, pareto_front, points
+from mcdenoise.results import STAGES, Cost, Method, Results
+
+Layout = Literal["wide", "narrow"]
+
+# Okabe and Ito 2008: told apart with every kind of colour blindness.
+_FAMILIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+_BASELINE = "#767676"
+_STAGES = dict(zip(STAGES, ("#b5b5b5", "#56b4e9", "#0072b2", "#d55e00", "#8a8a8a"), strict=True))
+_INK, _MUTED, _RULE, _PAPER = "#1c1c1e", "#6b6b70", "#e2e2e4", "#fefefe"
+# In the page a colour is a variable of its style sheet, so that it follows the reader's light or dark.
+_VARIABLES = {_INK: "ink", _MUTED: "muted", _RULE: "rule", _PAPER: "paper", _BASELINE: "baseline"}
+_VARIABLES |= {color: f"hue-{index}" for index, color in enumerate(_FAMILIES)}
+_VARIABLES |= {_STAGES["read"]: "stage-read", _STAGES["write"]: "stage-write"}
+_MARKERS = {"model": "o", "peer": "s", "baseline": "D"}
+_SIZES = {"wide": (10.4, 5.6), "narrow": (4.9, 4.9)}
+# What the names beside the last points of the cost plot take, in parts of the axis.
+_ROOM = {"wide": 0.3, "narrow": 0.04}
+# What the labels of the vertical ticks take, in points.
+_TICK_ROOM = 46.0
+# A label farther than this from its point, in points, is tied to it by a line.
+_LEADER = 10.0
+_STYLE: Any = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": _MUTED,
+    "axes.facecolor": "none",
+    "axes.labelcolor": _INK,
+    "axes.linewidth": 0.7,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "figure.dpi": 72,
+    "figure.facecolor": "none",
+    "font.family": "DejaVu Sans",
+    "font.size": 9.5,
+    "grid.color": _RULE,
+    "grid.linewidth": 0.6,
+    "savefig.facecolor": "none",
+    "svg.fonttype": "none",
+    "svg.hashsalt": "mcdenoise",
+    "text.color": _INK,
+    # A method's name is no formula, even with a dollar sign in it.
+    "text.parse_math": False,
+    "xtick.color": _MUTED,
+    "ytick.color": _MUTED,
+    "xtick.labelcolor": _INK,
+    "ytick.labelcolor": _INK,
+}
+
+
+@contextmanager
+def plot_style() -> Iterator[None]:
+    """The look of every plot: make and save figures inside."""
+    with matplotlib.rc_context(_STYLE):
+        yield
+
+
+def family_colors(methods: Sequence[Method]) -> dict[str, str]:
+    """A colour for each family, baselines grey; the first family of models has the first colour.
+
+    Returns:
+        ``#rrggbb`` by family.
+    """
+    kinds = {kind: [method.family for method in methods if method.kind == kind] for kind in _MARKERS}
+    families = [family for family in dict.fromkeys(kinds["model"] + kinds["peer"]) if family]
+    colors = {family: _FAMILIES[index % len(_FAMILIES)] for index, family in enumerate(families)}
+    return dict.fromkeys(kinds["baseline"], _BASELINE) | colors
+
+
+def css_color(color: str) -> str:
+    """A colour of the plots as the style sheet knows it."""
+    return f"var(--{_VARIABLES[color]})" if color in _VARIABLES else color
+
+
+def stage_colors() -> dict[str, str]:
+    """The colour of each stage's bars, as :func:`css_color` gives it."""
+    return {stage: css_color(color) for stage, color in _STAGES.items()}
+
+
+def error_over_time(view: View, metric: str, colors: dict[str, str], layout: Layout = "wide") -> Figure:
+    """Error of each method over its milliseconds a frame, with quartiles and the Pareto front.
+
+    Args:
+        view: the methods.
+        metric: name in :data:`mcdenoise.evaluate.METRICS`.
+        colors: of :func:`family_colors`.
+        layout: ``"narrow"`` has the methods' numbers for labels.
+    """
+    figure, axes = _figure(layout)
+    higher = METRICS[metric].higher_is_better
+    shown = points(view, metric)
+    idle = [row for row in view.rows if row.milliseconds and row.milliseconds.value == 0 and metric in row.errors]
+    axes.set_xlabel("milliseconds a frame, without reading and writing files")
+    better = "higher" if higher else "lower"
+    axes.set_title(f"{metric} ({better} is better)", loc="left", fontsize=9.5, color=_INK)
+    if not shown:
+        return _empty(axes)
+    _log_axis(axes, "x", [point.milliseconds for point in shown])
+    if higher:
+        _linear_axis(axes, [point.error for point in shown])
+    else:
+        _log_axis(axes, "y", [point.error for point in shown])
+    front = pareto_front([(point.milliseconds.value, point.error.value) for point in shown], higher_is_better=higher)
+    _draw_front(axes, [(shown[index].milliseconds.value, shown[index].error.value) for index in front])
+    for point in shown:
+        color = colors[point.row.method.family]
+        for start, end in _bars(point):
+            axes.plot(*zip(start, end, strict=True), color=color, linewidth=1.1, alpha=0.65, zorder=3)
+        _mark(axes, point.row.method, point.milliseconds.value, point.error.value, color)
+    _draw_idle(axes, idle, metric)
+    _label(
+        axes,
+        [(point.milliseconds.value, point.error.value) for point in shown],
+        [_name(point.row, layout) for point in shown],
+        bars=[bar for point in shown for bar in _bars(point)],
+        bold=set(front),
+    )
+    return figure
+
+
+def stage_bars(view: View, layout: Layout = "wide") -> Figure:
+    """How the median time of each method divides into stages, files included."""
+    rows = [row for row in view.rows if row.stages]
+    width = _SIZES[layout][0]
+    axes = _axes(width, 0.75 + 0.44 * max(len(rows), 1), left=6)
+    axes.grid(axis="x")
+    axes.spines["left"].set_visible(False)
+    axes.yaxis.set_major_locator(NullLocator())
+    axes.set_xlabel("milliseconds a frame, medians of the stages")
+    if not rows:
+        return _empty(axes)
+    for place, row in enumerate(rows):
+        left = 0.0
+        for stage, time in row.stages.items():
+            axes.barh(-place, time.value, left=left, height=0.36, color=_STAGES[stage], edgecolor=_PAPER, linewidth=0.4)
+            left += time.value
+        axes.text(0, -place + 0.24, row.method.name, fontsize=9, va="bottom")
+        axes.annotate(
+            _three_digits(left),
+            (left, -place),
+            (4, 0),
+            textcoords="offset points",
+            fontsize=8.5,
+            va="center",
+            color=_MUTED,
+        )
+    axes.set_ylim(-len(rows) + 0.6, 0.85)
+    axes.set_xlim(0, 1.12 * max(sum(time.value for time in row.stages.values()) for row in rows))
+    return _figure_of(axes)
+
+
+def cost_over_pixels(results: Results, colors: dict[str, str], layout: Layout = "wide") -> Figure:
+    """Milliseconds over megapixels: medians with quartiles, and the lines fitted to them."""
+    figure, axes = _figure(layout)
+    axes.set_xlabel("megapixels a frame")
+    axes.set_title("milliseconds a frame, without files", loc="left", fontsize=9.5, color=_INK)
+    measured = [cost for cost in results.costs if cost.milliseconds is not None]
+    if not measured:
+        return _empty(axes)
+    _log_axis(axes, "x", [Range(*[_megapixels(cost)] * 3) for cost in measured])
+    low, high = axes.get_xlim()
+    axes.set_xlim(low, high * (high / low) ** _ROOM[layout])
+    spreads = [cost.milliseconds for cost in measured if cost.milliseconds is not None]
+    _log_axis(axes, "y", [Range(spread.median, spread.lower, spread.upper) for spread in spreads])
+    fits = {fit.method: fit for fit in results.fits}
+    anchors, names = [], []
+    for number, method in enumerate(results.methods, start=1):
+        own = sorted((cost for cost in measured if cost.method == method.name), key=_megapixels)
+        if not own:
+            continue
+        color = colors[method.family]
+        pixels = [_megapixels(cost) for cost in own]
+        if method.name in fits:
+            fit = fits[method.name]
+            steps = [pixels[0] * (pixels[-1] / pixels[0]) ** (step / 32) for step in range(33)]
+            line = [(x, fit.fixed + fit.per_megapixel * x) for x in steps]
+            # A fit with a negative fixed part has no logarithm near zero.
+            line = [(x, y) for x, y in line if y > 0]
+            axes.plot(*zip(*line, strict=True), color=color, linewidth=1.2, zorder=2)
+        for cost, x in zip(own, pixels, strict=True):
+            if cost.milliseconds is not None:
+                axes.plot([x, x], [cost.milliseconds.lower, cost.milliseconds.upper], color=color, linewidth=1.1)
+                _mark(axes, method, x, cost.milliseconds.median, color)
+        if own[-1].milliseconds is not None:
+            anchors.append((pixels[-1], own[-1].milliseconds.median))
+            names.append(method.name if layout == "wide" else str(number))
+    _label(axes, anchors, names, right=True)
+    return figure
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure on white, for papers, as its ending says.
+
+    Raises:
+        InputError: the ending is unknown, or the file cannot be written.
+    """
+    kind = path.suffix.removeprefix(".")
+    if kind not in figure.canvas.get_supported_filetypes():
+        raise InputError(f"{path}: expected a figure's ending such as .svg, .png or .pdf, found '{path.suffix}'")
+    with atomic_path(path) as temporary:
+        metadata = {"Date": None} if kind == "svg" else None
+        figure.savefig(temporary, format=kind, dpi=220, facecolor="white", metadata=metadata)
+
+
+def inline_svg(figure: Figure, name: str, description: str) -> str:
+    """The figure as an ``<svg>`` element: text as text, colours as variables of the page, ids of its own.
+
+    Args:
+        figure: to draw.
+        name: unique in the page.
+        description: what a screen reader says.
+    """
+    file = io.StringIO()
+    figure.savefig(file, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
+    svg = file.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*|<style.*?</style>\s*", "", svg, flags=re.S)
+    svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace("xlink:href", "href")
+    for color, variable in _VARIABLES.items():
+        svg = svg.replace(color, f"var(--{variable})")
+    used = set(re.findall(r'(?:url\(|href=")#([^)"]+)', svg))
+    svg = re.sub(r' id="([^"]+)"', lambda found: f' id="{name}-{found[1]}"' if found[1] in used else "", svg)
+    svg = re.sub(r'(url\(|href=")#', rf"\1#{name}-", svg)
+    svg = re.sub(r' (?:d|x|y|transform)="[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found[0]), svg)
+    head, rest = svg.split(">", 1)
+    head = re.sub(r' (width|height|version)="[^"]*"', "", head)
+    return f'{head} role="img" aria-label="{_attribute(description)}">{rest}'
+
+
+def ticks(low: float, high: float) -> list[float]:
+    """Round numbers for a logarithmic axis: as few as are enough.
+
+    Example:
+        >>> ticks(0.04, 0.5), ticks(3, 2000)
+        ([0.05, 0.1, 0.2, 0.5], [10.0, 100.0, 1000.0])
+    """
+    decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
+    steps: list[list[float]] = [[1], [1, 3], [1, 2, 5], [1, 1.5, 2, 3, 4, 5, 7], [1 + step / 10 for step in range(90)]]
+    found: list[float] = []
+    for parts in steps:
+        found = [float(f"{part}e{decade}") for decade in decades for part in parts]
+        found = [value for value in found if low <= value <= high]
+        if len(found) >= 3:
+            break
+    return found[:: max(1, len(found) // 7)]
+
+
+def _figure(layout: Layout) -> tuple[Figure, Axes]:
+    axes = _axes(*_SIZES[layout], left=_TICK_ROOM)
+    axes.grid(True)
+    axes.tick_params(length=3)
+    return _figure_of(axes), axes
+
+
+def _axes(width: float, height: float, *, left: float) -> Axes:
+    """Axes in a new figure, inches; ``left`` is the room for the ticks' labels in points.
+
+    Margins are fixed, because finding them takes longer than everything else, and there are many plots.
+    """
+    figure = Figure(figsize=(width, height))
+    across, up = 1 / (72 * width), 1 / (72 * height)
+    figure.subplots_adjust(left=left * across, right=1 - 6 * across, bottom=36 * up, top=1 - 22 * up)
+    return figure.add_subplot()
+
+
+def _figure_of(axes: Axes) -> Figure:
+    figure = axes.get_figure()
+    assert isinstance(figure, Figure)
+    return figure
+
+
+def _empty(axes: Axes) -> Figure:
+    axes.text(0.5, 0.5, "nothing to show", transform=axes.transAxes, ha="center", color=_MUTED)
+    return _figure_of(axes)
+
+
+def _log_axis(axes: Axes, which: Literal["x", "y"], ranges: Sequence[Range]) -> None:
+    positive = [value for one in ranges for value in (one.value, one.lower, one.upper) if value > 0]
+    low, high = min(positive), max(positive)
+    margin = max((high / low) ** 0.06, 1.06)
+    # Labels stand to the right of their points more often than not.
+    low, high = low / margin, high * (margin**2.2 if which == "x" else margin)
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
+    (axes.set_xlim if which == "x" else axes.set_ylim)(low, high)
+    places = ticks(low, high)
+    axis.set_major_locator(FixedLocator(places))
+    axis.set_major_formatter(FixedFormatter([f"{place:g}" for place in places]))
+    axis.set_minor_locator(NullLocator())
+
+
+def _linear_axis(axes: Axes, ranges: Sequence[Range]) -> None:
+    values = [value for one in ranges for value in (one.value, one.lower, one.upper) if math.isfinite(value)]
+    low, high = min(values, default=0.0), max(values, default=1.0)
+    margin = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
+    axes.set_ylim(low - margin, high + margin)
+
+
+def _bars(point: Point) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
+    """Both ends of the bar of each spread."""
+    x, y = point.milliseconds, point.error
+    yield (x.lower, y.value), (x.upper, y.value)
+    yield (x.value, y.lower), (x.value, y.upper)
+
+
+def _mark(axes: Axes, method: Method, x: float, y: float, color: str) -> None:
+    marker = _MARKERS[method.kind]
+    axes.plot(x, y, marker, color=color, markersize=6.5, markeredgecolor=_PAPER, markeredgewidth=0.8, zorder=4)
+
+
+def _draw_front(axes: Axes, front: Sequence[tuple[float, float]]) -> None:
+    """From each point of the front at its error to the time of the next: what can be had for that time."""
+    x, y = [value for value, _ in front], [value for _, value in front]
+    far, worst = axes.get_xlim()[1], axes.get_ylim()[axes.get_ylim()[1] > 0 and y[0] >= y[-1]]
+    axes.step([x[0], *x, far], [worst, *y, y[-1]], where="post", color=_MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
+
+
+def _draw_idle(axes: Axes, rows: Sequence[Row], metric: str) -> None:
+    """What takes no time has no place on a logarithmic axis: a line across, or a note where it lies far off."""
+    low, high = axes.get_ylim()
+    for row in rows:
+        value = row.errors[metric].value
+        text = f"{row.method.name} {value:.3g}"
+        if low <= value <= high:
+            axes.axhline(value, color=_BASELINE, linewidth=0.8, linestyle=":")
+            axes.text(0.995, value, text, transform=axes.get_yaxis_transform(), ha="right", va="bottom", fontsize=8.5)
+        else:
+            arrow = "↑" if value > high else "↓"
+            axes.text(
+                1.0,
+                1.015,
+                f"{text} {arrow} (0 ms, off the scale)",
+                transform=axes.transAxes,
+                ha="right",
+                va="bottom",
+                fontsize=8.5,
+                color=_MUTED,
+            )
+
+
+def _label(
+    axes: Axes,
+    anchors: Sequence[tuple[float, float]],
+    names: Sequence[str],
+    *,
+    bars: Sequence[tuple[tuple[float, float], tuple[float, float]]] = (),
+    bold: Collection[int] = (),
+    right: bool = False,
+) -> None:
+    """Write each name beside its point; ``right`` keeps them to the right of the leftmost point."""
+    figure = _figure_of(axes)
+    ground = {"facecolor": _PAPER, "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
+    texts = [
+        axes.text(0, 0, name, fontsize=9, fontweight="bold" if index in bold else "normal", bbox=ground, zorder=5)
+        for index, name in enumerate(names)
+    ]
+    extents = [text.get_window_extent() for text in texts]
+    to_pixels, to_data = axes.transData.transform, axes.transData.inverted().transform
+    places = [_pair(to_pixels(anchor)) for anchor in anchors]
+    frame = axes.get_window_extent()
+    left = min((x for x, _ in places), default=frame.x0) + 4 if right else frame.x0
+    obstacles = [Box(x - 4, y - 4, x + 4, y + 4) for x, y in places]
+    for start, end in bars:
+        (x0, y0), (x1, y1) = _pair(to_pixels(start)), _pair(to_pixels(end))
+        obstacles.append(Box(x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5))
+    boxes = place_labels(
+        places,
+        [(extent.width + 3, extent.height) for extent in extents],
+        Box(left, frame.y0, figure.bbox.x1, frame.y1),
+        obstacles,
+    )
+    for text, box, place in zip(texts, boxes, places, strict=True):
+        text.set_position(_pair(to_data(((box.left + box.right) / 2, (box.bottom + box.top) / 2))))
+        text.set_horizontalalignment("center")
+        text.set_verticalalignment("center")
+        end = box.nearest(*place)
+        if math.dist(end, place) > _LEADER:
+            line = zip(_pair(to_data(place)), _pair(to_data(end)), strict=True)
+            axes.plot(*line, color=_MUTED, linewidth=0.5, zorder=2.5, clip_on=False)
+
+
+def _pair(values: Any) -> tuple[float, float]:
+    x, y = values
+    return float(x), float(y)
+
+
+def _name(row: Row, layout: Layout) -> str:
+    return row.method.name if layout == "wide" else str(row.number)
+
+
+def _megapixels(cost: Cost) -> float:
+    return cost.width * cost.height / 1e6
+
+
+def _three_digits(value: float) -> str:
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def _attribute(text: str) -> str:
+    return text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")

@@ -1,0 +1,221 @@
+"""What the plots and tables show: every method on one scene, or in the mean over the scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from mcdenoise.errors import InputError
+from mcdenoise.evaluate import METRICS
+from mcdenoise.results import STAGES, Cell, Method, Results, Spread
+
+FILE_STAGES = ("read", "write")
+
+
+@dataclass(frozen=True)
+class Range:
+    """A value with the quartiles of what it summarises; the mean of skewed values may lie outside of them.
+
+    Args:
+        value: mean or median.
+        lower: first quartile.
+        upper: third quartile.
+    """
+
+    value: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method in a view.
+
+    Args:
+        method: which.
+        number: its place among all methods, from 1; the same in every view.
+        errors: by metric.
+        milliseconds: a frame, without reading and writing files.
+        whole: milliseconds a frame with files.
+        stages: milliseconds of each stage that the method has, in the order of :data:`mcdenoise.results.STAGES`.
+        throughput: megapixels a second, without files.
+        memory: mebibytes.
+        reason: why there are no figures, or ``""``.
+    """
+
+    method: Method
+    number: int
+    errors: dict[str, Range] = field(default_factory=dict)
+    milliseconds: Range | None = None
+    whole: Range | None = None
+    stages: dict[str, Range] = field(default_factory=dict)
+    throughput: float | None = None
+    memory: float | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class View:
+    """Every method on one scene, or in the mean over the scenes.
+
+    Args:
+        name: of the scene, or ``mean of N scenes``.
+        rows: in the order of the methods; those without figures too.
+    """
+
+    name: str
+    rows: list[Row]
+
+
+@dataclass(frozen=True)
+class Point:
+    """A method in the plot of error over time.
+
+    Args:
+        row: whose.
+        milliseconds: a frame.
+        error: in the metric of the plot.
+    """
+
+    row: Row
+    milliseconds: Range
+    error: Range
+
+
+def views(results: Results) -> list[View]:
+    """The mean over the scenes, where there are several, and each scene.
+
+    In the mean every scene counts the same, and a method that failed on one of them has a reason and no figures.
+    """
+    scenes = [
+        View(scene.name, [_row(results, number, method, scene.name) for number, method in _numbered(results)])
+        for scene in results.scenes
+    ]
+    if len(scenes) < 2:
+        return scenes
+    rows = [_mean([view.rows[number - 1] for view in scenes], results) for number, _ in _numbered(results)]
+    return [View(f"mean of {len(scenes)} scenes", rows), *scenes]
+
+
+def metrics(results: Results) -> list[str]:
+    """Names of the metrics that were computed, in the order of :data:`mcdenoise.evaluate.METRICS`.
+
+    Raises:
+        InputError: a metric that this version does not know.
+    """
+    found = {name for cell in results.cells for name in cell.errors}
+    unknown = sorted(found - set(METRICS))
+    if unknown:
+        raise InputError(
+            f"results: expected metrics out of {', '.join(METRICS)}, found {', '.join(unknown)}; "
+            "use the version that measured them"
+        )
+    return [name for name in METRICS if name in found]
+
+
+def points(view: View, metric: str) -> list[Point]:
+    """The methods that have both a time and an error."""
+    return [
+        Point(row, row.milliseconds, row.errors[metric])
+        for row in view.rows
+        if row.milliseconds is not None and row.milliseconds.value > 0 and metric in row.errors
+    ]
+
+
+def pareto_front(values: Sequence[tuple[float, float]], *, higher_is_better: bool = False) -> list[int]:
+    """Those that no other beats in one value without being beaten in the other.
+
+    Args:
+        values: cost, lower is better, and error.
+        higher_is_better: whether the second value is a similarity.
+
+    Returns:
+        Indices, by rising cost; of several with the same values, the first.
+
+    Example:
+        >>> pareto_front([(1.0, 5.0), (2.0, 6.0), (3.0, 2.0), (3.0, 3.0)])
+        [0, 2]
+    """
+    sign = -1 if higher_is_better else 1
+    front: list[int] = []
+    for index in sorted(range(len(values)), key=lambda index: (values[index][0], sign * values[index][1])):
+        if not front or sign * values[index][1] < sign * values[front[-1]][1]:
+            front.append(index)
+    return front
+
+
+def _numbered(results: Results) -> Iterable[tuple[int, Method]]:
+    return enumerate(results.methods, start=1)
+
+
+def _row(results: Results, number: int, method: Method, scene: str) -> Row:
+    cell = results.cell(scene, method.name)
+    if method.missing or cell is None or cell.failure:
+        failed = f"failed: {cell.failure}" if cell and cell.failure else "not measured"
+        return Row(method, number, reason=f"missing: {method.missing}" if method.missing else failed)
+    milliseconds = None if cell.computing is None else _range(cell.computing)
+    # What only hands its input on takes no time worth a place on a logarithmic axis.
+    if milliseconds and not cell.stages.keys() - set(FILE_STAGES):
+        milliseconds = Range(0.0, 0.0, 0.0)
+    size = next((one.width * one.height for one in results.scenes if one.name == scene), 0)
+    return Row(
+        method,
+        number,
+        {name: _error(cell, name) for name in cell.errors},
+        milliseconds,
+        None if cell.whole is None else _range(cell.whole),
+        {stage: _range(cell.stages[stage]) for stage in STAGES if stage in cell.stages},
+        size / milliseconds.value / 1e3 if milliseconds and milliseconds.value > 0 else None,
+        cell.memory,
+    )
+
+
+def _error(cell: Cell, name: str) -> Range:
+    value, spread = cell.errors[name], cell.errors_spread.get(name)
+    return Range(value, spread.lower, spread.upper) if spread else Range(value, value, value)
+
+
+def _range(spread: Spread) -> Range:
+    return Range(spread.median, spread.lower, spread.upper)
+
+
+def _mean(rows: list[Row], results: Results) -> Row:
+    first = rows[0]
+    reasons = [f"{scene.name}: {row.reason}" for scene, row in zip(results.scenes, rows, strict=True) if row.reason]
+    if first.method.missing:
+        return first
+    if reasons:
+        return Row(first.method, first.number, reason="; ".join(reasons))
+    known = [name for name in first.errors if all(name in row.errors for row in rows)]
+    stages = [stage for stage in STAGES if any(stage in row.stages for row in rows)]
+    # A stage that a scene does without, such as one with no albedo to divide out, takes no time there.
+    nothing = Range(0.0, 0.0, 0.0)
+    return Row(
+        first.method,
+        first.number,
+        {name: _mean_range([row.errors[name] for row in rows]) for name in known},
+        _mean_of([row.milliseconds for row in rows]),
+        _mean_of([row.whole for row in rows]),
+        {stage: _mean_range([row.stages.get(stage, nothing) for row in rows]) for stage in stages},
+        _mean_number([row.throughput for row in rows]),
+        _mean_number([row.memory for row in rows]),
+    )
+
+
+def _mean_range(ranges: list[Range]) -> Range:
+    count = len(ranges)
+    return Range(
+        sum(one.value for one in ranges) / count,
+        sum(one.lower for one in ranges) / count,
+        sum(one.upper for one in ranges) / count,
+    )
+
+
+def _mean_of(ranges: list[Range | None]) -> Range | None:
+    known = [one for one in ranges if one is not None]
+    return _mean_range(known) if len(known) == len(ranges) else None
+
+
+def _mean_number(numbers: list[float | None]) -> float | None:
+    known = [one for one in numbers if one is not None]
+    return sum(known) / len(known) if len(known) == len(numbers) else None

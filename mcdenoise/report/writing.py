@@ -1,0 +1,298 @@
+"""Writing the report of a benchmark."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterable
+from datetime import datetime
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mcdenoise.data.files import write_text
+from mcdenoise.errors import InputError
+from mcdenoise.evaluate import METRICS
+from mcdenoise.report.gallery import REFERENCE, Gallery, picture_pixels, read_gallery
+from mcdenoise.report.pictures import BRIGHTEST, data_uris, decode
+from mcdenoise.report.views import Range, Row, View, metrics, pareto_front, points, views
+from mcdenoise.results import STAGES, Results
+
+FILE = "index.html"
+PLOTS = "plots"
+# Characters of all pictures of the comparer; the rest of the page is a few million.
+_PICTURE_BUDGET = 20_000_000
+# Beyond this many pixels even coarse JPEG does not fit: then the pictures are made smaller.
+_MOST_PIXELS = 60_000_000
+# Where the heat map of SMAPE ends; what is worse looks the same.
+_HEAT_END = 0.5
+# In place of a figure that is not known.
+_UNKNOWN = "\N{EN DASH}"
+
+
+def write_report(folder: Path) -> Path:
+    """Write ``index.html``, and ``plots/*.svg`` and ``plots/*.png``, from a finished benchmark.
+
+    The page is one file that needs no network and no server: plots, tables that sort, an image comparer, close-ups and
+    temporal profiles. Its pictures are 8-bit previews, and are made coarser or smaller where they would be more than 20
+    megabytes; every figure is of the full data.
+
+    Args:
+        folder: with ``results.json`` and, where pictures were kept, ``images/``.
+
+    Returns:
+        The path of ``index.html``.
+
+    Raises:
+        InputError: the results are missing or damaged, a picture is, a package of ``mcdenoise[report]`` is not
+            installed, or a file cannot be written.
+    """
+    results = Results.read(folder)
+    names = metrics(results)
+    check_packages()
+    galleries = _galleries(folder, results)
+    shown = views(results)
+    content = {
+        "results": results,
+        "created": _date(results.created),
+        "metrics": [_metric(name) for name in names],
+        "columns": [_column(shown, name) for name in names],
+        "views": shown,
+        "stages": STAGES,
+        "number": _number,
+        "plots": _write_plots(folder, results, shown, names),
+        "sizes": sorted({(cost.width, cost.height) for cost in results.costs}, key=lambda size: size[0] * size[1]),
+        "costs": {(cost.method, cost.width, cost.height): cost for cost in results.costs},
+        "fits": {fit.method: fit for fit in results.fits},
+        "galleries": galleries,
+        "reference": REFERENCE,
+        "heat": {"end": _HEAT_END, "gradient": ", ".join(_css_rgb(color) for color in _heat_colors()[::15])},
+        "brightest": f"{BRIGHTEST:g}",
+    } | _comparer(results, galleries, shown, names)
+    path = folder / FILE
+    write_text(path, _render(content))
+    return path
+
+
+def write_error_plot(results: Results, metric: str, path: Path) -> list[Row]:
+    """Draw error over time alone: the mean over the scenes, or the one scene.
+
+    Args:
+        results: of a benchmark.
+        metric: name in :data:`mcdenoise.evaluate.METRICS`.
+        path: of the figure; its ending says which kind, such as ``.svg`` or ``.png``.
+
+    Returns:
+        What is drawn, by method.
+
+    Raises:
+        InputError: the metric was not computed, the ending is unknown, or the file cannot be written.
+    """
+    check_packages()
+    from mcdenoise.report import plots
+
+    if metric not in (known := metrics(results)):
+        raise InputError(f"metric: expected one of {', '.join(known)}, found {metric}")
+    shown = views(results)[0]
+    with plots.plot_style():
+        figure = plots.error_over_time(shown, metric, plots.family_colors(results.methods))
+        plots.write_figure(figure, path)
+    return shown.rows
+
+
+def check_packages() -> None:
+    """See that a report can be written.
+
+    Raises:
+        InputError: a package of ``mcdenoise[report]`` is not installed.
+    """
+    for package in ("jinja2", "matplotlib", "PIL"):
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise InputError(
+                f"a report needs {package}, which is not installed; pip install 'mcdenoise[report]'"
+            ) from error
+
+
+def _render(content: dict[str, Any]) -> str:
+    import jinja2
+
+    page = Path(__file__).parent / "page"
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(page),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    # Methods and frames are in an order of their own.
+    environment.policies["json.dumps_kwargs"] = {"sort_keys": False}
+    parts = {name: (page / f"report.{name}").read_text(encoding="utf-8") for name in ("css", "js")}
+    return environment.get_template("report.html.jinja").render(**content, **parts)
+
+
+def _write_plots(folder: Path, results: Results, shown: list[View], names: list[str]) -> dict[str, Any]:
+    """Plots as files, and for the page each in a wide and a narrow layout."""
+    from mcdenoise.report import plots
+
+    target = folder / PLOTS
+    try:
+        target.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{target}: cannot be made ({error.strerror}); check the folder and its permissions"
+        ) from error
+    colors = plots.family_colors(results.methods)
+    errors: list[dict[str, Any]] = []
+    stages: list[dict[str, str]] = []
+
+    def both(name: str, description: str, wide: Any, narrow: Any) -> dict[str, str]:
+        made = {
+            "wide": plots.inline_svg(wide, f"{name}-wide", description),
+            "narrow": plots.inline_svg(narrow, f"{name}-narrow", description),
+        }
+        for suffix in ("svg", "png"):
+            plots.write_figure(wide, target / f"{name}.{suffix}")
+        return made
+
+    with plots.plot_style():
+        for place, view in enumerate(shown):
+            suffix = _file_name(view.name, place)
+            for metric in names:
+                described = f"{metric} over milliseconds a frame, {view.name}; the table below has the figures"
+                wide, narrow = (plots.error_over_time(view, metric, colors, layout) for layout in ("wide", "narrow"))
+                made = both(f"{metric.lower()}-{suffix}", described, wide, narrow)
+                errors.append({"view": place, "metric": metric, "front": _front(view, metric), **made})
+            described = f"Milliseconds of each stage, {view.name}; the table below has the figures"
+            stages.append(both(f"stages-{suffix}", described, plots.stage_bars(view), plots.stage_bars(view, "narrow")))
+        described = "Milliseconds a frame over megapixels; the table below has the figures"
+        wide, narrow = (plots.cost_over_pixels(results, colors, layout) for layout in ("wide", "narrow"))
+        cost = both("cost", described, wide, narrow) if results.costs else {}
+    return {
+        "errors": errors,
+        "stages": stages,
+        "cost": cost,
+        "colors": {family: plots.css_color(color) for family, color in colors.items()},
+        "stage_colors": plots.stage_colors(),
+    }
+
+
+def _front(view: View, metric: str) -> list[str]:
+    """Names on the Pareto front, by rising cost."""
+    shown = points(view, metric)
+    values = [(point.milliseconds.value, point.error.value) for point in shown]
+    return [
+        shown[index].row.method.name
+        for index in pareto_front(values, higher_is_better=METRICS[metric].higher_is_better)
+    ]
+
+
+def _file_name(name: str, place: int) -> str:
+    """A name that is safe in a path; the place keeps it unique if characters had to go."""
+    safe = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in name)
+    return safe if safe == name else f"{safe}-{place}"
+
+
+def _galleries(folder: Path, results: Results) -> list[Gallery]:
+    pixels, factor = picture_pixels(folder, results), 1
+    while pixels > _MOST_PIXELS * factor**2:
+        factor *= 2
+    return [read_gallery(folder, results, scene, factor=factor) for scene in results.scenes]
+
+
+def _comparer(results: Results, galleries: list[Gallery], shown: list[View], names: list[str]) -> dict[str, Any]:
+    """What the comparer's script needs, in what format the pictures are, and with what it begins."""
+    pictures = [codes for gallery in galleries for own in gallery.codes.values() for codes in own.values()]
+    encoded = data_uris(pictures, _PICTURE_BUDGET)
+    if encoded is None:
+        raise InputError(
+            f"pictures: expected at most {_PICTURE_BUDGET / 1e6:g} MB of them, found more even as coarse JPEG; "
+            "keep pictures of fewer frames"
+        )
+    files = iter(encoded[0])
+    scenes = [
+        {
+            "name": gallery.scene.name,
+            "width": gallery.scene.width // gallery.factor,
+            "height": gallery.scene.height // gallery.factor,
+            "frames": gallery.scene.pictures,
+            "pictures": {
+                name: dict(zip(map(str, own), islice(files, len(own)), strict=True))
+                for name, own in gallery.codes.items()
+            },
+        }
+        for gallery in galleries
+        if gallery.codes
+    ]
+    return {
+        "format": encoded[1],
+        "factor": max((gallery.factor for gallery in galleries), default=1),
+        "first": _first_pair(results, shown, names),
+        "data": {
+            "scenes": scenes,
+            "linear": [float(f"{value:.5g}") for value in decode(np.arange(256)).tolist()],
+            "heat": _heat_colors(),
+            "heatEnd": _HEAT_END,
+            "first": _first_pair(results, shown, names),
+        },
+    }
+
+
+def _first_pair(results: Results, shown: list[View], names: list[str]) -> list[str]:
+    """The first method, and that model (or else that peer) which the first metric likes best."""
+    if not results.methods:
+        return []
+    rows = [row for row in shown[0].rows if names and names[0] in row.errors and row.method.kind != "baseline"]
+    rows = [row for row in rows if row.method.kind == "model"] or rows
+    sign = -1 if names and METRICS[names[0]].higher_is_better else 1
+    best = min(rows, key=lambda row: sign * row.errors[names[0]].value, default=None)
+    return [results.methods[0].name, best.method.name if best else REFERENCE]
+
+
+def _metric(name: str) -> dict[str, Any]:
+    """Its name, which way is better, and the first line of its docstring in parts, every other one of them code."""
+    line = (METRICS[name].function.__doc__ or "").strip().splitlines()[0]
+    return {"name": name, "higher": METRICS[name].higher_is_better, "text": line.split("``")}
+
+
+def _column(shown: list[View], name: str) -> dict[str, Any]:
+    """How a metric's column is printed, and what is best in it in each view."""
+    higher = METRICS[name].higher_is_better
+    values = [[row.errors[name].value for row in view.rows if name in row.errors] for view in shown]
+    finite = [abs(value) for own in values for value in own if math.isfinite(value) and value != 0]
+    decimals = min(max(2 - math.floor(math.log10(min(finite))), 2), 4) if finite else 2
+    best = [(max if higher else min)(own, default=None) for own in values]
+    return {"name": name, "higher": higher, "decimals": decimals, "best": best}
+
+
+def _number(value: Range | float | None, decimals: int | None = None) -> str:
+    """A figure of a table: a fixed number of decimals, or three digits; a dash for what is not known."""
+    if value is None:
+        return _UNKNOWN
+    figure = value.value if isinstance(value, Range) else value
+    if not math.isfinite(figure):
+        return "∞" if figure > 0 else _UNKNOWN
+    if decimals is not None and abs(figure) < 100:
+        return f"{figure:.{decimals}f}"
+    return f"{figure:,.0f}" if abs(figure) >= 100 else f"{figure:.3g}"
+
+
+def _date(text: str) -> str:
+    """Such as ``21 October 2026, 12:00 UTC``; what is no ISO time is shown as it is."""
+    try:
+        return f"{datetime.fromisoformat(text):%-d %B %Y, %H:%M} UTC"
+    except ValueError:
+        return text
+
+
+def _heat_colors() -> list[list[int]]:
+    import matplotlib
+
+    return [[round(255 * part) for part in color[:3]] for color in map(matplotlib.colormaps["inferno"], range(256))]
+
+
+def _css_rgb(color: Iterable[int]) -> str:
+    return f"rgb({' '.join(map(str, color))})"

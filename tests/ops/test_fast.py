@@ -1,0 +1,316 @@
+"""The compiled forms against the plain ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from mcdenoise import ops
+from mcdenoise.ops import _backend
+from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
+from mcdenoise.ops._fast import _filter
+
+FAST = [op for op in OPS if op.name in ("kernel_conv", "kernel_splat", "cross_bilateral_filter")]
+# Of the largest number in the case. Half precision is rounded once, after a sum in float32; a derivative in float32
+# is a sum over up to 49 taps of products of sums.
+TOLERANCE = {
+    torch.float64: 1e-13,
+    torch.float32: 32 * torch.finfo(torch.float32).eps,
+    torch.bfloat16: torch.finfo(torch.bfloat16).eps,
+    torch.float16: torch.finfo(torch.float16).eps,
+}
+every_op = pytest.mark.parametrize("op", FAST, ids=lambda op: op.name)
+every_dtype = pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+
+
+@pytest.fixture(autouse=True)
+def nan_in_fresh_memory() -> Iterator[None]:
+    """Fills what is left to be written with NaN, so that what was forgotten shows."""
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+def leaves_of(inputs: Inputs, case: Case) -> list[Tensor]:
+    leaves: list[Tensor] = []
+    map_tensors(
+        lambda tensor: leaves.append(tensor.requires_grad_()) or tensor,
+        {name: inputs[name] for name in case.differentiable},
+    )
+    return leaves
+
+
+def outcomes(op: Op, case: Case, inputs: Inputs, backend: str) -> list[Tensor]:
+    """The result and, times a random upstream gradient, each derivative."""
+    leaves = leaves_of(inputs, case)
+    result = op.function(**inputs, **case.settings, backend=backend)
+    upstream = torch.randn(result.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return [result.detach(), *torch.autograd.grad(result, leaves, upstream.to(result.dtype))]
+
+
+def assert_same(actual: list[Tensor], exact: list[Tensor], tolerance: float) -> None:
+    largest = max(1.0, *(tensor.abs().max().item() for tensor in exact))
+    for a, e in zip(actual, exact, strict=True):
+        assert a.shape == e.shape
+        assert (a.double() - e).abs().max().item() <= tolerance * largest
+
+
+@every_dtype
+@pytest.mark.parametrize(
+    ("op", "case"), [pytest.param(op, case, id=f"{op.name}-{case.name}") for op in FAST for case in op.cases]
+)
+def test_result_and_derivatives_are_those_of_the_plain_form(op: Op, case: Case, dtype: torch.dtype) -> None:
+    actual = outcomes(op, case, case.inputs(dtype), "numba")
+    assert {tensor.dtype for tensor in actual} == {dtype}
+    # The same numbers in float64: what differs is the arithmetic.
+    exact = outcomes(op, case, map_tensors(lambda tensor: tensor.double(), case.inputs(dtype)), "torch")
+    assert_same(actual, exact, TOLERANCE[dtype])
+
+
+def drawn(batch: int, channels: int, height: int, width: int, kernel_size: int, op: Op, **settings: Any) -> Case:
+    def tensors(g: torch.Generator) -> Inputs:
+        def draw(count: int) -> Tensor:
+            return torch.rand(batch, count, height, width, generator=g, dtype=torch.float64)
+
+        inputs: Inputs = {"image": draw(channels), "kernel": draw(kernel_size**2) + 0.1}
+        if op.name == "cross_bilateral_filter":
+            inputs |= {"guides": [draw(3), draw(1)], "scales": [draw(1), 3 * draw(1)], "distance_scale": draw(1)}
+        return inputs
+
+    names = ("image", "kernel", "guides", "scales", "distance_scale")
+    return Case("drawn", "ordinary", tensors, names if op.name == "cross_bilateral_filter" else names[:2], settings)
+
+
+# Wider than a run of pixels, taller than a share, smaller than the kernel.
+@pytest.mark.parametrize("size", [(1, 3, 3, 300, 5), (1, 4, 40, 2, 7), (2, 3, 7, 9, 3), (1, 1, 1, 1, 5)], ids=str)
+@pytest.mark.parametrize("border", ["replicate", "zeros", "renormalize"])
+@every_op
+def test_sizes(op: Op, border: str, size: tuple[int, int, int, int, int]) -> None:
+    case = drawn(*size, op, border=border)
+    assert_same(
+        outcomes(op, case, case.inputs(), "numba"), outcomes(op, case, case.inputs(), "torch"), TOLERANCE[torch.float64]
+    )
+
+
+@pytest.mark.parametrize("border", ["replicate", "zeros", "renormalize"])
+@every_op
+def test_threads_change_nothing(op: Op, border: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_filter, "_PIXELS_A_THREAD", 1)
+    case = drawn(2, 3, 9, 6, 5, op, border=border)
+    threads, results = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            results.append(outcomes(op, case, case.inputs(torch.float32), "numba"))
+    finally:
+        torch.set_num_threads(threads)
+    for result in results[1:]:
+        assert all(map(torch.equal, result, results[0]))
+
+
+def channels_last(tensor: Tensor) -> Tensor:
+    return tensor.contiguous(memory_format=torch.channels_last)
+
+
+def slice_of_pixels(tensor: Tensor) -> Tensor:
+    """Channels-last with other channels beside its own, as a network's prediction holds its logits."""
+    return channels_last(torch.cat([torch.full_like(tensor, torch.nan), tensor], 1))[:, tensor.shape[1] :]
+
+
+def every_other_column(tensor: Tensor) -> Tensor:
+    return torch.stack([tensor, torch.full_like(tensor, torch.nan)], -1).flatten(-2)[..., ::2]
+
+
+def transposed(tensor: Tensor) -> Tensor:
+    return tensor.transpose(-1, -2).contiguous().transpose(-1, -2)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("layout", [channels_last, slice_of_pixels, every_other_column, transposed])
+@every_op
+def test_layout_in_memory_changes_nothing(op: Op, layout: Callable[[Tensor], Tensor], dtype: torch.dtype) -> None:
+    case = drawn(2, 3, 5, 7, 3, op)
+    inputs = {
+        name: [layout(part) for part in value] if isinstance(value, list) else layout(value)
+        for name, value in case.inputs(dtype).items()
+    }
+    laid_out = outcomes(op, case, inputs, "numba")
+    assert all(map(torch.equal, laid_out, outcomes(op, case, case.inputs(dtype), "numba")))
+
+
+@every_op
+def test_other_dtypes_beside_the_image(op: Op) -> None:
+    case = drawn(1, 3, 5, 7, 3, op)
+    inputs = case.inputs(torch.float32)
+    inputs["kernel"] = inputs["kernel"].bfloat16()
+    actual = outcomes(op, case, inputs, "numba")
+    assert [tensor.dtype for tensor in actual[:3]] == [torch.float32, torch.float32, torch.bfloat16]
+    exact = outcomes(op, case, map_tensors(lambda tensor: tensor.detach().double(), inputs), "torch")
+    of_kernel = actual.pop(2), exact.pop(2)
+    assert_same(actual, exact, TOLERANCE[torch.float32])
+    assert_same([of_kernel[0]], [of_kernel[1]], TOLERANCE[torch.bfloat16])
+
+
+@every_op
+def test_first_derivatives_are_difference_quotients_and_second_ones_go_the_plain_way(op: Op) -> None:
+    for border in ("replicate", "renormalize"):
+        case = drawn(1, 2, 2, 3, 3, op, border=border)
+        inputs = case.inputs()
+        leaves = leaves_of(inputs, case)
+
+        def function(*tensors: Tensor, inputs: Inputs = inputs, case: Case = case) -> Tensor:
+            rest = iter(tensors)
+            return op.function(**map_tensors(lambda _: next(rest), inputs), **case.settings, backend="numba")
+
+        assert torch.autograd.gradcheck(function, leaves, fast_mode=False)
+        assert torch.autograd.gradgradcheck(function, leaves, fast_mode=False)
+
+
+def test_second_derivatives_where_one_argument_is_computed_from_another() -> None:
+    image = torch.rand(1, 1, 3, 3, dtype=torch.float64, requires_grad=True)
+
+    def function(image: Tensor) -> Tensor:
+        return ops.kernel_conv(image, image.expand(1, 9, 3, 3) * 2, backend="numba")
+
+    assert torch.autograd.gradgradcheck(function, image, fast_mode=False)
+
+
+# The compiler raises deprecation warnings of torch's own making.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@every_op
+def test_goes_through_the_compiler(op: Op) -> None:
+    case = drawn(2, 3, 5, 7, 3, op)
+    torch.compiler.reset()
+    compiled = torch.compile(op.function, fullgraph=True, backend="aot_eager")
+    through = Op(compiled, op.reference, op.cases)
+    assert_same(outcomes(through, case, case.inputs(), "numba"), outcomes(op, case, case.inputs(), "numba"), 1e-15)
+
+
+class _Filter(torch.nn.Module):
+    def __init__(self, backend: Any) -> None:
+        super().__init__()
+        self.filter = ops.CrossBilateralFilter(backend=backend)
+
+    def forward(self, image: Tensor, kernel: Tensor, guide: Tensor, scale: Tensor) -> Tensor:
+        return self.filter(image, kernel, [guide], [scale])
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_is_exported_where_it_is_named() -> None:
+    # Large enough that it would run compiled.
+    arguments = (torch.rand(1, 3, 96, 96), torch.rand(1, 9, 96, 96), torch.rand(1, 2, 96, 96), torch.rand(1, 1, 96, 96))
+    for backend, there in (("numba", True), (None, False)):
+        program = torch.export.export(_Filter(backend), arguments)
+        assert ("mcdenoise.cross_bilateral_filter" in str(program.graph)) is there
+        torch.testing.assert_close(program.module()(*arguments), _Filter("torch")(*arguments))
+
+
+@pytest.mark.parametrize("needed", [("image",), ("kernel",), ("scales",), ("guides",)])
+def test_derivatives_of_some_arguments_only(needed: tuple[str, ...]) -> None:
+    op = FAST[-1]
+    case = drawn(1, 3, 5, 7, 3, op)
+    partial = Case("partial", "ordinary", case.tensors, needed, {})
+    assert_same(
+        outcomes(op, partial, partial.inputs(), "numba"), outcomes(op, partial, partial.inputs(), "torch"), 1e-13
+    )
+
+
+def test_an_empty_batch() -> None:
+    image, kernel = torch.rand(0, 3, 4, 5, requires_grad=True), torch.rand(0, 9, 4, 5)
+    result = ops.kernel_conv(image, kernel, backend="numba")
+    assert result.shape == image.shape
+    assert torch.autograd.grad(result.sum(), image)[0].shape == image.shape
+
+
+def test_what_runs_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    large, small = torch.rand(2, 3, 64, 64), torch.rand(1, 3, 64, 64)
+    assert _backend.choose_backend(None, large) == "numba"
+    assert _backend.choose_backend(None, small) == "torch"
+    assert _backend.choose_backend("torch", large) == "torch"
+    assert _backend.choose_backend(None, large.to("meta")) == "torch"
+    assert _backend.choose_backend("numba", small) == "numba"
+    monkeypatch.setattr(_backend, "_no_numba", lambda: "cannot be imported")
+    assert _backend.choose_backend(None, large) == "torch"
+
+
+def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, kernel = torch.rand(1, 3, 4, 5), torch.rand(1, 9, 4, 5)
+    with pytest.raises(ValueError, match="backend: expected one of torch, numba, found 'cuda'"):
+        ops.kernel_conv(image, kernel, backend="cuda")  # type: ignore[arg-type]
+    for module in (ops.KernelConv, ops.KernelSplat, ops.CrossBilateralFilter, ops.Accumulate):
+        with pytest.raises(ValueError, match="backend: expected one of torch, numba, found 'c'"):
+            module(backend="c")
+    with pytest.raises(ValueError, match="found 'numba', which runs on the CPU, not on meta"):
+        ops.kernel_conv(image.to("meta"), kernel.to("meta"), backend="numba")
+    monkeypatch.setattr(_backend, "_no_numba", lambda: "cannot be imported (gone); install mcdenoise[fast]")
+    with pytest.raises(ValueError, match=r"found 'numba', which cannot be imported \(gone\); install mcdenoise\[fast"):
+        ops.cross_bilateral_filter(image, kernel, backend="numba")
+
+
+ACCUMULATE = next(op for op in OPS if op.name == "accumulate")
+
+
+@every_dtype
+@pytest.mark.parametrize("case", ACCUMULATE.cases, ids=lambda case: case.name)
+def test_accumulation_is_that_of_the_plain_form(case: Case, dtype: torch.dtype) -> None:
+    inputs = case.inputs(dtype)
+    actual = ops.accumulate(**inputs, **case.settings, backend="numba")
+    for result, plain in zip(actual, ops.accumulate(**inputs, **case.settings, backend="torch"), strict=True):
+        assert result.dtype == dtype
+        # Both round to half precision once.
+        eps = torch.finfo(dtype).eps
+        torch.testing.assert_close(result, plain, rtol=8 * eps, atol=8 * eps)
+
+
+@pytest.mark.parametrize("rule", ["relative", "bmfr"])
+@pytest.mark.parametrize("layout", [channels_last, slice_of_pixels, every_other_column, transposed])
+def test_accumulation_of_any_layout_and_by_any_number_of_threads(
+    layout: Callable[[Tensor], Tensor], rule: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_filter, "_PIXELS_A_THREAD", 1)
+    case = next(case for case in ACCUMULATE.cases if "all buffers" in case.name)
+    inputs = case.inputs()
+    limits: dict[str, Any] = {"rule": rule, "position_limit": 0.05, "normal_limit": 0.3}
+    plain = ops.accumulate(**inputs, **limits, backend="torch")
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            results = ops.accumulate(**map_tensors(layout, inputs), **limits, backend="numba")
+            for result, expected in zip(results, plain, strict=True):
+                torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-12)
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_accumulation_goes_through_the_compiler() -> None:
+    case = ACCUMULATE.cases[1]
+    torch.compiler.reset()
+    compiled = torch.compile(ops.accumulate, fullgraph=True, backend="aot_eager")
+    results = compiled(**case.inputs(), **case.settings, backend="numba")
+    for result, expected in zip(results, ops.accumulate(**case.inputs(), **case.settings), strict=True):
+        torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_accumulation_with_derivatives_is_plain() -> None:
+    case = ACCUMULATE.cases[0]
+    inputs = case.inputs()
+    leaves_of(inputs, case)
+    with pytest.raises(ValueError, match="found 'numba', which has no derivatives of this op"):
+        ops.accumulate(**inputs, **case.settings, backend="numba")
+    color = torch.rand(1, 3, 96, 96, requires_grad=True)
+    result, _ = ops.accumulate(color, color.detach(), color.detach()[:, :1] + 1, torch.zeros(1, 2, 96, 96))
+    assert torch.autograd.grad(result.sum(), color)[0].shape == color.shape
+
+
+@pytest.mark.parametrize(("settings", "message"), [({"rule": "svgf"}, "rule: expected"), ({"rule": "bmfr"}, "needs")])
+def test_accumulation_refuses_what_the_plain_form_refuses(settings: dict[str, Any], message: str) -> None:
+    inputs = ACCUMULATE.cases[1].inputs()
+    for backend in ("torch", "numba"):
+        with pytest.raises(ValueError, match=message):
+            ops.accumulate(**inputs, **settings, backend=backend)

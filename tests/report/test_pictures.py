@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from mcdenoise.report.pictures import (
+    BRIGHTEST,
+    FORMATS,
+    choose_crops,
+    choose_row,
+    crop_errors,
+    data_uri,
+    data_uris,
+    decode,
+    encode,
+    halved,
+    to_srgb,
+)
+
+
+def opened(uri: str) -> np.ndarray:
+    return np.asarray(PIL.Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))))
+
+
+def test_a_code_is_the_nearest_one():
+    radiance = np.geomspace(1e-6, BRIGHTEST, 5000).astype(np.float32)
+    codes = encode(radiance).astype(float)
+    assert (decode(np.maximum(codes - 0.5, 0)) <= radiance * (1 + 1e-5)).all()
+    # Half a step above the last code there is nothing to decode.
+    below = codes < 255
+    assert (decode(codes[below] + 0.5) >= radiance[below] * (1 - 1e-5)).all()
+
+
+def test_error_where_pictures_mostly_are():
+    radiance = np.geomspace(0.1, 2.0, 2000).astype(np.float32)
+    error = np.abs(decode(encode(radiance)) / radiance - 1)
+    assert error.max() < 0.018
+
+
+def test_codes_of_known_values():
+    # By hand: x = 1 is 1/2 of 64/65, and (65/128)^(1/2.2) = 0.7350, times 255 = 187.4.
+    assert encode(np.float32([0, 1, BRIGHTEST, 1e9, np.inf, np.nan, -3])).tolist() == [0, 187, 255, 255, 255, 0, 0]
+    assert decode(np.array([0, 255])) == pytest.approx([0, BRIGHTEST])
+    assert (encode(decode(np.arange(256)).astype(np.float32)) == np.arange(256)).all()
+
+
+def test_the_first_format_loses_nothing():
+    codes = np.random.default_rng(0).integers(0, 256, (13, 17, 3), dtype=np.uint8)
+    assert (opened(data_uri(codes)) == codes).all()
+
+
+def test_coarser_formats_when_the_budget_is_small():
+    codes = encode(np.random.default_rng(0).gamma(1, 1, (3, 64, 64, 3)).astype(np.float32))
+    sizes = [sum(len(data_uri(one, name, **options)) for one in codes) for name, options in FORMATS]
+    assert sizes == sorted(sizes, reverse=True)
+    assert data_uris(codes, sizes[0])[1] == "lossless WebP"
+    files, name = data_uris(codes, sizes[1])
+    assert name == "JPEG of quality 95"
+    assert sum(map(len, files)) <= sizes[1]
+    assert data_uris(codes, sizes[-1] - 1) is None
+
+
+def test_halved_is_the_mean_of_four():
+    image = np.arange(5 * 4 * 3, dtype=np.float32).reshape(5, 4, 3)
+    small = halved(image)
+    assert small.shape == (2, 2, 3)
+    assert small[0, 1, 2] == np.mean([image[0, 2, 2], image[0, 3, 2], image[1, 2, 2], image[1, 3, 2]])
+
+
+def test_srgb_of_known_values():
+    shown = to_srgb(np.float32([[[0, 0.0031308, 0.5], [1, 7, 0.2140411]]]))
+    assert shown.tolist() == [[[0, 10, 188], [255, 255, 127]]]
+
+
+def test_crops_are_where_images_differ_and_where_detail_is():
+    random = np.random.default_rng(0)
+    reference = np.full((120, 240, 3), 0.5, np.float32)
+    reference[10:40, 190:230] += 0.3 * (random.random((30, 40, 1)) > 0.5)  # fine detail at the top right
+    first, second = reference.copy(), reference.copy()
+    second[80:110, 30:70] += 0.4  # differs at the bottom left
+    crops = choose_crops([first, second], reference)
+    assert len(crops) == 3
+    differ, detail = crops[0], crops[2]
+    assert differ.left <= 50 <= differ.left + differ.width
+    assert differ.top <= 95 <= differ.top + differ.height
+    assert detail.left <= 210 <= detail.left + detail.width
+    assert detail.top <= 25 <= detail.top + detail.height
+    covered = np.zeros((120, 240), int)
+    for crop in crops:
+        crop.of(covered)[...] += 1
+    assert covered.max() == 1
+
+
+def test_a_frame_too_small_for_three_crops_has_fewer():
+    crops = choose_crops([], np.random.default_rng(0).random((9, 20, 3), np.float32))
+    assert [(crop.left, crop.top, crop.width, crop.height) for crop in crops] == [(0, 0, 20, 9)]
+
+
+def test_errors_of_a_crop():
+    # Linear 0.2140411 is shown as 0.5, 1 as 1: a difference of 0.5 is 6.02 dB. SMAPE: 0.786 / (1.214 + 0.01).
+    psnr, smape = crop_errors(np.full((4, 5, 3), 0.2140411, np.float32), np.ones((4, 5, 3), np.float32))
+    assert psnr == pytest.approx(6.0206, abs=1e-3)
+    assert smape == pytest.approx((1 - 0.2140411) / (1.2140411 + 0.01), abs=1e-5)
+
+
+def test_row_of_the_profile_is_where_something_flickers():
+    still = np.full((40, 200, 3), 90, np.uint8)
+    flicker = still.copy()
+    flicker[23, 120:200] = 200
+    flicker[0] = 255  # what enters at the border is no flicker
+    row, left, columns = choose_row([[still, flicker, still]])
+    assert (row, columns) == (23, 100)
+    assert left <= 120
+    assert left + columns >= 200

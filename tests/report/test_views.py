@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from mcdenoise.errors import InputError
+from mcdenoise.report.views import Range, metrics, pareto_front, points, views
+from mcdenoise.results import Cell, Results, Spread
+
+
+def test_front_of_known_points():
+    #         dominated by 1    front       front       dominated    tie in cost, worse   costly and worst
+    values = [(2.0, 9.0), (1.0, 8.0), (4.0, 3.0), (5.0, 3.0), (4.0, 4.0), (9.0, 8.5)]
+    assert pareto_front(values) == [1, 2]
+
+
+def test_front_of_a_similarity():
+    assert pareto_front([(1.0, 20.0), (2.0, 25.0), (3.0, 24.0), (4.0, 30.0)], higher_is_better=True) == [0, 1, 3]
+
+
+def test_front_of_equal_points_is_the_first():
+    assert pareto_front([(1.0, 1.0), (1.0, 1.0)]) == [0]
+    assert pareto_front([]) == []
+
+
+def test_every_method_off_the_front_is_beaten_by_one_on_it():
+    values = [((7 * i) % 11 + 1.0, (5 * i) % 13 + 1.0) for i in range(30)]
+    front = pareto_front(values)
+    for cost, error in values:
+        assert any(values[i][0] <= cost and values[i][1] <= error for i in front)
+    errors = [values[i][1] for i in front]
+    assert errors == sorted(errors, reverse=True)
+    assert len(set(errors)) == len(errors)
+
+
+def test_mean_over_scenes(folder: Path):
+    results = Results.read(folder)
+    mean, first, second = views(results)
+    assert [view.name for view in (mean, first, second)] == ["mean of 2 scenes", "first", "second"]
+    for one, other, both in zip(first.rows[:3], second.rows[:3], mean.rows[:3], strict=True):
+        for metric in ("SMAPE", "PSNR"):
+            expected = (one.errors[metric].value + other.errors[metric].value) / 2
+            assert both.errors[metric].value == pytest.approx(expected, rel=1e-12)
+    # Without files: the network alone, 10 ms of the second method, with its quartiles.
+    assert mean.rows[1].milliseconds == Range(10.0, 9.0, 12.0)
+    assert mean.rows[1].throughput == pytest.approx(96 * 64 / 0.010 / 1e6)
+
+
+def test_a_method_that_failed_once_has_no_mean_but_a_reason(folder: Path):
+    mean, first, second = views(Results.read(folder))
+    assert mean.rows[3].reason == "second: failed: RuntimeError: out of <memory>"
+    assert not mean.rows[3].errors
+    assert first.rows[3].errors
+    assert not first.rows[3].reason
+    assert second.rows[3].reason == "failed: RuntimeError: out of <memory>"
+    assert {view.rows[4].reason for view in (mean, first, second)} == {"missing: the package <absent> is not installed"}
+
+
+def test_a_method_that_was_not_measured_says_so(folder: Path):
+    results = Results.read(folder)
+    results.cells.remove(next(cell for cell in results.cells if cell.method == "ours"))
+    assert views(results)[1].rows[1].reason == "not measured"
+
+
+def test_one_scene_has_no_mean(folder: Path):
+    results = Results.read(folder)
+    one = dataclasses.replace(results, scenes=results.scenes[:1])
+    assert [view.name for view in views(one)] == ["first"]
+
+
+def test_points_are_those_with_time_and_error(folder: Path):
+    shown = points(views(Results.read(folder))[1], "SMAPE")
+    # Doing nothing takes no time, which has no place on a logarithmic axis.
+    assert [point.row.number for point in shown] == [2, 3, 4]
+
+
+def test_order_of_metrics_and_unknown_ones(folder: Path):
+    results = Results.read(folder)
+    assert metrics(results) == ["SMAPE", "PSNR"]
+    results.cells.append(Cell("first", "ours", {"beauty": 1.0}, {"beauty": Spread.of([1.0])}))
+    with pytest.raises(InputError, match="found beauty"):
+        metrics(results)
