@@ -16,7 +16,7 @@ from mcdenoise.buffers import Frame
 from mcdenoise.errors import InputError
 from mcdenoise.history import Accumulated, History
 from mcdenoise.models import Denoised, create_model
-from mcdenoise.ops import Accumulate, remodulate
+from mcdenoise.ops import Accumulate, HistoryLag, remodulate
 
 Precision = Literal["float32", "bfloat16"]
 PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
@@ -67,6 +67,8 @@ class Denoiser:
         weights: a safetensors file of other weights for a model given by name.
         device: where to run; frames may come from anywhere and images stay here.
         alpha_min: smallest weight of the current frame in the accumulation, see :func:`mcdenoise.ops.accumulate`.
+        anti_lag: give up the past where the light has changed, see :class:`mcdenoise.history.History`. The shipped
+            weights were trained without it.
         precision: ``"bfloat16"`` runs the network's convolutions in bfloat16, which is about twice as fast on
             processors that have it; everything else stays in float32.
 
@@ -89,6 +91,7 @@ class Denoiser:
         weights: Path | str | None = None,
         device: torch.device | str = "cpu",
         alpha_min: float = 0.1,
+        anti_lag: bool = False,
         precision: Precision = "float32",
     ) -> None:
         self.device = _device(device)
@@ -101,7 +104,7 @@ class Denoiser:
         model.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.model = model.eval()
         self._takes_history = bool(getattr(model, "takes_history", False))
-        self.history = History(Accumulate(alpha_min))
+        self.history = History(Accumulate(alpha_min), anti_lag=HistoryLag() if anti_lag else None)
         self.report = FrameReport()
 
     def reset(self) -> None:
