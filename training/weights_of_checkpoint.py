@@ -1,6 +1,6 @@
 """Write the weights of a training run that has not ended, as it would if it ended at its last checkpoint.
 
-    python training/weights_of_checkpoint.py RUN -o WEIGHTS.safetensors
+python training/weights_of_checkpoint.py RUN -o WEIGHTS.safetensors
 """
 
 import argparse
