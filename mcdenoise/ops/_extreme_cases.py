@@ -259,6 +259,9 @@ def bilateral_filters() -> tuple[Case, ...]:
             inputs = case.tensors(g)
             kernel = inputs["kernel"]
             assert isinstance(kernel, Tensor)
+            if case.settings["normalize"] == "none":
+                # Weights of both signs may have the sum zero.
+                inputs["kernel"] = kernel.abs()
             return {"image": radiance(g, kernel.shape[0], 3, *kernel.shape[2:]), **inputs}
 
         return replace(case, tensors=tensors, differentiable=())

@@ -61,7 +61,9 @@ def assert_same(actual: list[Tensor], exact: list[Tensor], tolerance: float) -> 
 
 @every_dtype
 @pytest.mark.parametrize(
-    ("op", "case"), [pytest.param(op, case, id=f"{op.name}-{case.name}") for op in FAST for case in op.cases]
+    ("op", "case"),
+    # The extreme ones have bounds of their own, see `mcdenoise stability`.
+    [pytest.param(op, case, id=f"{op.name}-{case.name}") for op in FAST for case in op.cases if case.differentiable],
 )
 def test_result_and_derivatives_are_those_of_the_plain_form(op: Op, case: Case, dtype: torch.dtype) -> None:
     actual = outcomes(op, case, case.inputs(dtype), "numba")
