@@ -128,7 +128,7 @@ class Cell:
         whole: milliseconds a frame, from reading to writing.
         stages: milliseconds a frame of each stage, by name in :data:`STAGES`; what a method does not do is left out.
         memory: peak memory in mebibytes that making the method and denoising two frames added, in a process of its own
-            (on a GPU: there), where it could be measured.
+            (on a GPU: there), where it could be measured; of the first scene of this size.
         failure: why the method failed on this scene; nothing else is known then.
         computing: milliseconds a frame of what happens in memory, without reading and writing files; measured around
             all of it, so that the stages may add up to a little less.

@@ -136,11 +136,12 @@ def run_benchmark(
 
 
 class _Made:
-    """The methods that could be made, and why the others could not."""
+    """The methods that could be made, why the others could not, and what memory they took at each size of image."""
 
     def __init__(self, candidates: list[Candidate]) -> None:
         self.runners: dict[str, Runner] = {}
         self.failures: dict[str, str] = {}
+        self.memory: dict[tuple[str, tuple[int, int]], float | None] = {}
         for candidate in candidates:
             try:
                 self.runners[candidate.method.name] = candidate.make()
@@ -168,7 +169,7 @@ class _SceneRun:
     ) -> None:
         self.errors = Errors()
         self._sequence, self._candidates, self._settings = sequence, candidates, settings
-        self._runners = made.runners
+        self._runners, self._memory = made.runners, made.memory
         self._failures = dict(made.failures)
         self._folder, self._written = folder, folder / ".written.exr"
         self._watch = Stopwatch(settings.device)
@@ -287,7 +288,11 @@ class _SceneRun:
             shutil.rmtree(self._folder / IMAGES / self._scene.name / candidate.method.folder, ignore_errors=True)
             return Cell(self._scene.name, name, failure=self._failures[name])
         times = {stage: Spread.of(values) for stage, values in self._times[name].items()}
-        frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
+        place = name, self._sequence.size
+        if place not in self._memory:
+            frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
+            threads, device = self._settings.threads, self._settings.device
+            self._memory[place] = peak_memory(candidate.make, frames, threads=threads, device=device)
         return Cell(
             self._scene.name,
             name,
@@ -295,7 +300,7 @@ class _SceneRun:
             self.errors.spreads(name),
             whole=times[_WHOLE],
             stages={stage: times[stage] for stage in STAGES if stage in times},
-            memory=peak_memory(candidate.make, frames, threads=self._settings.threads, device=self._settings.device),
+            memory=self._memory[place],
             computing=times[_COMPUTING],
         )
 
