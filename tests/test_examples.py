@@ -18,11 +18,12 @@ from mcdenoise.models import create_model, save_weights
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data" / "train"
-SECONDS = 60
+# A busy machine takes several times as long as a quiet one.
+SECONDS = 240
 
 
 def run(name: str, *arguments: Path | str) -> str:
-    """Run an example as a person would, and return what it prints; it must succeed within a minute."""
+    """Run an example as a person would, and return what it prints; it must succeed within minutes."""
     command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
     assert done.returncode == 0, done.stderr
@@ -90,9 +91,9 @@ def test_denoise_sequence_writes_every_frame(small_sequence: Path, weights: Path
 
 
 def test_gradcheck_passes() -> None:
-    lines = run("gradcheck_ops.py").splitlines()
-    assert lines[0].startswith("passed  my_filter")
-    assert len(lines) > 30
+    lines = run("gradcheck_ops.py", "demodulate", "kernel_conv").splitlines()
+    assert lines[0].startswith("passed  my_filter in color, albedo, normal, logits, scale, distance_scale")
+    assert {line.split()[1].rstrip(",") for line in lines[1:]} == {"demodulate", "kernel_conv"}
     assert all(line.startswith("passed") for line in lines)
 
 
@@ -204,6 +205,21 @@ def test_run_time_prints_a_line_for_each_network(tmp_path: Path) -> None:
     assert [line[:28].strip() for line in lines[2:]] == names
     assert lines[2].endswith(" 1.00")
     assert {name: len(times) for name, times in json.loads(file.read_text()).items()} == dict.fromkeys(names, 2)
+
+
+def test_error_vs_runtime_draws_what_it_prints(small_sequence: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="plots need the packages of mcdenoise[report]")
+    figure = tmp_path / "figure.svg"
+    arguments = (small_sequence, "-o", figure, "--models", "cascaded_tiny", "--peers", "none", "--rounds", "1")
+    first, *lines, last = run("error_vs_runtime.py", *arguments, "--frames", "1-2", "--threads", "1").splitlines()
+    assert first.endswith("1 threads; 1 scenes")
+    assert last == str(figure)
+    printed = {line[:44].strip(): line[44:].strip() for line in lines}
+    assert all(re.fullmatch(r"0\.\d+ in \d+\.\d ms", figures) for figures in printed.values())
+    drawn = figure.read_text()
+    assert drawn.startswith("<?xml")
+    assert {"noisy", "accumulated", "cascaded_tiny"} <= printed.keys()
+    assert all(name in drawn for name in printed)
 
 
 # The paper's tables

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.gradcheck import check_case, select
+from mcdenoise.ops._case import uniform
 from mcdenoise.ops._cases import OPS, Case, Op
 
 
@@ -18,7 +19,7 @@ class _Wrong(torch.autograd.Function):
 
 
 def result_of(function: object) -> tuple[bool, str]:
-    case = Case("pixels", "ordinary", lambda g: {"image": torch.rand(1, 1, 2, 2, generator=g)}, ("image",))
+    case = Case("pixels", "ordinary", lambda g: {"image": uniform(g, 1, 1, 2, 2)}, ("image",))
     op = Op(function, function, (case,))  # type: ignore[arg-type]
     result = check_case(op, case)
     return result.passed, result.message

@@ -43,7 +43,7 @@ def demodulate(color: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
     Example:
         >>> color = torch.tensor([0.2, 0.1, 5.0]).reshape(1, 3, 1, 1)
         >>> demodulate(color, torch.tensor([0.5, 0.5, 0.0]).reshape(1, 3, 1, 1)).flatten().tolist()
-        [0.4000000059604645, 0.20000000298023224, 500.0]
+        [0.4000000059604645, 0.20000000298023224, 125.0]
         >>> demodulate(color, torch.zeros(1, 3, 1, 1)).equal(color)
         True
     """

@@ -349,6 +349,13 @@ def scene_digest(scene: Scene) -> str:
                 feed(item)
         elif isinstance(value, np.ndarray):
             digest.update(str(value.shape).encode() + value.tobytes())
+        elif isinstance(value, list | tuple):
+            digest.update(f"{len(value)}:".encode())
+            for item in value:
+                feed(item)
+        elif isinstance(value, np.generic):
+            # How numpy writes its own numbers is a setting of the process, which colour-science changes.
+            feed(value.item())
         else:
             digest.update(f"{value!r};".encode())
 
