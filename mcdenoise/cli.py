@@ -136,6 +136,7 @@ def _denoise() -> Callable[..., int | None]:
     from mcdenoise.data import open_sequence
     from mcdenoise.denoise import denoise_sequence
     from mcdenoise.denoiser import Denoiser, Precision
+    from mcdenoise.plan import TOLERANCE, Plan
 
     def denoise(
         sequence: tyro.conf.Positional[Path],
@@ -148,6 +149,8 @@ def _denoise() -> Callable[..., int | None]:
         precision: Precision = "float32",
         alpha_min: float = 0.1,
         full_float: bool = False,
+        keep_all: bool = False,
+        tolerance: float = TOLERANCE,
         json: Json = None,
     ) -> None:
         """Denoise a folder of frames: writes OUT/denoisedN.exr and OUT/denoise.json.
@@ -163,6 +166,9 @@ def _denoise() -> Callable[..., int | None]:
             precision: of the network's convolutions; bfloat16 is faster on processors that have it.
             alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
             full_float: write 32-bit instead of half floats.
+            keep_all: leave nothing out, whether the sequence needs it or not.
+            tolerance: noise, or change, relative to its mean, below which a tile of a still shot is not denoised again; 0
+                leaves out only what makes no difference.
             json: write the run times to this file too.
         """
         if threads is not None:
@@ -172,7 +178,8 @@ def _denoise() -> Callable[..., int | None]:
         if not 0 < alpha_min <= 1:
             raise InputError(f"--alpha-min: expected in (0, 1], found {alpha_min}")
         opened = open_sequence(sequence, frames)
-        denoiser = Denoiser(model, weights=weights, device=device, alpha_min=alpha_min, precision=precision)
+        plan = Plan(keep_all=keep_all, tolerance=tolerance)
+        denoiser = Denoiser(model, weights=weights, device=device, alpha_min=alpha_min, precision=precision, plan=plan)
         height, width = opened.size
         print(f"{opened.name}: {opened.layout} layout, {len(opened)} frames of {width}x{height}")
         with _progress() as progress:
@@ -185,8 +192,8 @@ def _denoise() -> Callable[..., int | None]:
                 half=not full_float,
                 on_frame=lambda frame, images: progress.advance(task),
             )
-        for stage, plan in report.stages.items():
-            print(f"  {stage}: {'kept' if plan['kept'] else 'left out'} ({plan['reason']})")
+        for row in report.plan:
+            print(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
         if report.replaced_pixels:
             print(f"replaced {report.replaced_pixels} NaN, infinite or negative pixels of the noisy color")
         _print_times(report.milliseconds)
@@ -676,6 +683,11 @@ def _progress() -> Progress:
         TimeRemainingColumn(),
     )
     return Progress(*columns, console=console, disable=not console.is_terminal)
+
+
+def _kept(row: dict[str, Any]) -> str:
+    share = row["left_out"]
+    return "kept" if share == 0 else "left out" if share == 1 else f"{share:.1%} left out"
 
 
 def _show(table: Table) -> None:

@@ -15,6 +15,7 @@ _CUT_SHARE = 0.05
 # What a mirror or glass shows does not move as its surface does: a long history would smear it.
 _SPECULAR_LENGTH = 2
 _STILL = 0.05  # pixels
+_NO_WAY = "no motion, and no position with a previous camera"
 
 
 def surface_before(frame: Frame) -> Surface:
@@ -162,7 +163,8 @@ class History:
         state = self._state
         first = Accumulated(color, color, torch.ones_like(color[:, :1]), "first frame")
         if state is None:
-            return first
+            lost = frame.motion is None and (frame.position is None or frame.view_projection is None)
+            return first._replace(reset=_NO_WAY) if lost else first
         if state.color.shape != color.shape or state.color.device != color.device:
             return first._replace(reset="size change")
         motion = None
@@ -170,7 +172,7 @@ class History:
             still = frame.motion is None and self.is_still(frame)
             motion = torch.zeros_like(color[:, :2]) if still else motion_to_previous(frame, state.view_projection)
             if motion is None:
-                return first._replace(reset="no motion, and no position with a previous camera")
+                return first._replace(reset=_NO_WAY)
         surface = surface_before(frame)
         accumulated, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
         if float((length > 1).float().mean()) < _CUT_SHARE:

@@ -70,7 +70,7 @@ class Candidate:
 class ModelRunner:
     """A model with everything :class:`mcdenoise.denoiser.Denoiser` does around it.
 
-    Its stages are ``accumulate`` (also looking at every value), ``network`` (U-Nets and convolutions) and ``filter``
+    Its stages are ``accumulate`` (also looking at every value, and planning), ``network`` (U-Nets and convolutions) and ``filter``
     (all the rest: kernel weights, kernel convolution, fusion, remodulation). The second is told from the third by hooks
     on the modules, which read a clock.
 
@@ -92,7 +92,8 @@ class ModelRunner:
         self._denoiser = Denoiser(model, weights=weights, precision=precision, device=device)
         self._watch = Stopwatch(device)
         self._marks: list[Moment] = []
-        for module in _networks(self._denoiser.model):
+        self._networks = list(_networks(self._denoiser.model))
+        for module in self._networks:
             module.register_forward_pre_hook(self._mark)
             module.register_forward_hook(self._mark)
 
@@ -106,9 +107,9 @@ class ModelRunner:
         image = self._denoiser(frame)
         times = self._denoiser.report.milliseconds
         pairs = zip(self._marks[::2], self._marks[1::2], strict=True)
-        network = sum(self._watch.between(start, end) for start, end in pairs) if self._marks else times["network"]
+        network = sum(self._watch.between(start, end) for start, end in pairs) if self._networks else times["network"]
         self.stages = {
-            "accumulate": times["validate"] + times["accumulate"],
+            "accumulate": times["validate"] + times["plan"] + times["accumulate"],
             "network": network,
             # On a GPU the two are told by different clocks.
             "filter": max(times["network"] - network, 0.0) + times["remodulate"],
