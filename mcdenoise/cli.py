@@ -446,7 +446,7 @@ def _benchmark() -> Callable[..., int | None]:
 
     from mcdenoise.benchmark import Settings, benchmark_ops, choose_candidates, parse_sizes, run_benchmark
     from mcdenoise.benchmark.sizes import SIZES
-    from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows
+    from mcdenoise.benchmark.tables import left_out_rows, op_rows, remarks, scene_rows
     from mcdenoise.data import open_sequence
     from mcdenoise.report import check_packages, write_report
 
@@ -462,6 +462,7 @@ def _benchmark() -> Callable[..., int | None]:
         device: str = "cpu",
         sizes: str = SIZES,
         pictures: int = 4,
+        keep_all: bool = False,
         ops: bool = False,
         size: str = "1280x720",
         json: Json = None,
@@ -484,6 +485,7 @@ def _benchmark() -> Callable[..., int | None]:
             device: cpu or cuda.
             sizes: of images of which only the cost is measured, such as 1280x720,3840x2160, or none.
             pictures: of how many frames of each scene images are kept.
+            keep_all: measure each model a second time, leaving nothing out, to see what leaving out saves and costs.
             ops: measure the operators.
             size: of the images with --ops, WIDTHxHEIGHT.
             json: write what is in results.json, or ops.json, to this file too.
@@ -525,6 +527,7 @@ def _benchmark() -> Callable[..., int | None]:
             command=_command(
                 "benchmark",
                 *sequences,
+                *(["--keep-all"] if keep_all else []),
                 out=out,
                 models=models,
                 peers=peers,
@@ -539,7 +542,9 @@ def _benchmark() -> Callable[..., int | None]:
         )
         check_packages()
         opened = [open_sequence(sequence, frames) for sequence in sequences]
-        candidates = choose_candidates(models, peers, precisions=precisions, threads=threads, device=device)
+        candidates = choose_candidates(
+            models, peers, precisions=precisions, threads=threads, device=device, keep_all=keep_all
+        )
         with _progress() as progress:
             task = progress.add_task("benchmark", total=None)
             results = run_benchmark(
@@ -550,6 +555,7 @@ def _benchmark() -> Callable[..., int | None]:
                 on_step=lambda done, total: progress.update(task, completed=done, total=total),
             )
         _print_rows(scene_rows(results))
+        _print_rows(left_out_rows(results))
         for line in [*remarks(results), f"report: {write_report(out)}"]:
             print(line)
         _write_json(json, asdict(results))
