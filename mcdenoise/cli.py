@@ -133,6 +133,7 @@ def _denoise() -> Callable[..., int | None]:
     """Denoise a folder of frames."""
     import torch
 
+    from mcdenoise.budget import choose_model
     from mcdenoise.data import open_sequence
     from mcdenoise.denoise import denoise_sequence
     from mcdenoise.denoiser import Denoiser, Precision
@@ -151,6 +152,9 @@ def _denoise() -> Callable[..., int | None]:
         full_float: bool = False,
         keep_all: bool = False,
         tolerance: float = TOLERANCE,
+        budget_ms: float | None = None,
+        max_error: float | None = None,
+        results: Path | None = None,
         json: Json = None,
     ) -> None:
         """Denoise a folder of frames: writes OUT/denoisedN.exr and OUT/denoise.json.
@@ -169,6 +173,10 @@ def _denoise() -> Callable[..., int | None]:
             keep_all: leave nothing out, whether the sequence needs it or not.
             tolerance: noise, or change, relative to its mean, below which a tile of a still shot is not denoised again; 0
                 leaves out only what makes no difference.
+            budget_ms: take the shipped model and precision with the least error (or, where no error is known, the slowest)
+                that needs no more milliseconds a frame on this machine, measured once and without files.
+            max_error: take the fastest one with an SMAPE that is no larger.
+            results: folder of a finished benchmark to take errors from; those of the sequence's references by default.
             json: write the run times to this file too.
         """
         if threads is not None:
@@ -178,6 +186,21 @@ def _denoise() -> Callable[..., int | None]:
         if not 0 < alpha_min <= 1:
             raise InputError(f"--alpha-min: expected in (0, 1], found {alpha_min}")
         opened = open_sequence(sequence, frames)
+        if budget_ms is not None or max_error is not None:
+            if weights is not None:
+                raise InputError("--budget-ms, --max-error: expected no --weights, which are of one model")
+            with _progress() as progress:
+                task = progress.add_task("measure models", total=None)
+                choice = choose_model(
+                    opened,
+                    budget=budget_ms,
+                    max_error=max_error,
+                    results=results,
+                    device=device,
+                    on_step=lambda done, total: progress.update(task, completed=done, total=total),
+                )
+            print(f"picked {choice}")
+            model, precision = choice.model, choice.precision
         plan = Plan(keep_all=keep_all, tolerance=tolerance)
         denoiser = Denoiser(model, weights=weights, device=device, alpha_min=alpha_min, precision=precision, plan=plan)
         height, width = opened.size
