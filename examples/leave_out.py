@@ -5,9 +5,9 @@
 
 Five shots are made of each scene: the flythrough as it is; the same without albedo; the same with a sky over its upper
 half; a static shot of its last frame that has a reference, with new noise in every frame (one sample a pixel); and an
-editor's viewport, twice as long, that shows one image of that frame (64 samples a pixel) again and again, until a corner
-of it is changed and rendered anew (one sample a pixel). Each frame is denoised twice, taking turns: with the plan, and
-with everything kept. The last column is the change of SMAPE.
+editor's viewport, twice as long, that shows one image of that frame (64 samples a pixel) again and again, until a
+corner of it is changed and rendered anew (one sample a pixel). Each frame is denoised twice, taking turns: with the
+plan, and with everything kept. The last column is the change of SMAPE.
 """
 
 import argparse

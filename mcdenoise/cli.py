@@ -171,10 +171,10 @@ def _denoise() -> Callable[..., int | None]:
             alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
             full_float: write 32-bit instead of half floats.
             keep_all: leave nothing out, whether the sequence needs it or not.
-            tolerance: noise, or change, relative to its mean, below which a tile of a still shot is not denoised again; 0
-                leaves out only what makes no difference.
-            budget_ms: take the shipped model and precision with the least error (or, where no error is known, the slowest)
-                that needs no more milliseconds a frame on this machine, measured once and without files.
+            tolerance: noise, or change, relative to its mean, below which a tile of a still shot is not denoised again;
+                0 leaves out only what makes no difference.
+            budget_ms: take the shipped model and precision with the least error (or, where no error is known, the
+                slowest) that needs no more milliseconds a frame on this machine, measured once and without files.
             max_error: take the fastest one with an SMAPE that is no larger.
             results: folder of a finished benchmark to take errors from; those of the sequence's references by default.
             json: write the run times to this file too.

@@ -66,7 +66,8 @@ class Denoiser:
         model: a model's name in the zoo (its shipped weights are loaded), or a module that takes demodulated color,
             albedo, normal and depth and returns :class:`mcdenoise.models.Denoised`; with an attribute ``takes_history``
             that is true, it also gets ``current`` and ``length`` of :class:`mcdenoise.history.Accumulated`, and with
-            ``takes_plan``, ``guides``, ``known`` and ``parts``, see :class:`mcdenoise.models.Cascade`. A module of yours is moved to the device, made channels-last and put into evaluation mode.
+            ``takes_plan``, ``guides``, ``known`` and ``parts``, see :class:`mcdenoise.models.Cascade`. A module of
+            yours is moved to the device, made channels-last and put into evaluation mode.
         weights: a safetensors file of other weights for a model given by name.
         device: where to run; frames may come from anywhere and images stay here.
         alpha_min: smallest weight of the current frame in the accumulation, see :func:`mcdenoise.ops.accumulate`.

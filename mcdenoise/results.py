@@ -257,7 +257,9 @@ class Results:
             row = LeftOut(cell.scene, cell.method, ", ".join(f"{name} {share:.0%}" for name, share in shares.items()))
             if whole is not None and whole.computing is not None and cell.computing is not None:
                 saved = whole.computing.median - cell.computing.median
-                change = {name: value - whole.errors[name] for name, value in cell.errors.items() if name in whole.errors}
+                change = {
+                    name: value - whole.errors[name] for name, value in cell.errors.items() if name in whole.errors
+                }
                 row = LeftOut(row.scene, row.method, row.stages, saved, change)
             rows.append(row)
         return rows

@@ -85,8 +85,7 @@ def test_the_choice(sequence: Sequence, results: Path, limits: dict[str, float],
 def test_what_nothing_meets_is_told_in_one_line(sequence: Sequence, results: Path) -> None:
     message = refused(lambda: choose_model(sequence, budget=10))
     assert message == (
-        "--budget-ms: expected a model that takes at most 10 ms, found at best "
-        "cascaded_tiny, bfloat16: 48.0 ms a frame"
+        "--budget-ms: expected a model that takes at most 10 ms, found at best cascaded_tiny, bfloat16: 48.0 ms a frame"
     )
     message = refused(lambda: choose_model(sequence, budget=100, max_error=0.01, results=results))
     assert message.endswith("at most 0.01 in 100 ms, found at best cascaded_tiny: 80.0 ms a frame, SMAPE 0.08")
@@ -141,7 +140,9 @@ def test_the_command_line(small_sequence: Path, tmp_path: Path, capsys: pytest.C
     with pytest.raises(SystemExit) as stop:
         main([*command, "--budget-ms", "1"])
     assert stop.value.code == 2
-    assert capsys.readouterr().err.startswith("mcdenoise denoise: --budget-ms: expected a model that takes at most 1 ms")
+    assert capsys.readouterr().err.startswith(
+        "mcdenoise denoise: --budget-ms: expected a model that takes at most 1 ms"
+    )
 
 
 def test_a_measurement_is_that_of_frames_with_a_history(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -371,7 +371,9 @@ def wall(color: Tensor, **buffers: Any) -> Frame:
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     camera = torch.diag(torch.tensor([1 / 1.7, 1 / 1.3, 1.0, 0.0]))
     camera[2, 3] = 1.0
-    position = torch.stack([(2 * columns / width - 1) * 1.7, (2 * rows / height - 1) * 1.3, torch.ones_like(rows)])[None]
+    position = torch.stack([(2 * columns / width - 1) * 1.7, (2 * rows / height - 1) * 1.3, torch.ones_like(rows)])[
+        None
+    ]
     return Frame(color=color, **{"position": position * 3, "view_projection": camera[None], **buffers})
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -290,7 +290,7 @@ def test_a_tile_does_not_switch_to_and_fro() -> None:
                 frame = wall(number).replace(albedo=None, color=1 + noise * (draw(number) - 0.5))
                 past = history.update(frame)
                 states.append(tiles.decide(frame, past.color, past.current, past.length).passed[..., ::32, ::32])
-        changes[name] = sum((a != b).sum() for a, b in zip(states[:-1], states[1:], strict=True))
+        changes[name] = sum((a != b).sum() for a, b in pairwise(states))
     assert changes["without"] > 100
     # Each of the 35 tiles at most once.
     assert changes["with"] <= 35

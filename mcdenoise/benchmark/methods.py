@@ -71,9 +71,9 @@ class Candidate:
 class ModelRunner:
     """A model with everything :class:`mcdenoise.denoiser.Denoiser` does around it.
 
-    Its stages are ``accumulate`` (also looking at every value, and planning), ``network`` (U-Nets and convolutions) and ``filter``
-    (all the rest: kernel weights, kernel convolution, fusion, remodulation). The second is told from the third by hooks
-    on the modules, which read a clock.
+    Its stages are ``accumulate`` (also looking at every value, and planning), ``network`` (U-Nets and convolutions) and
+    ``filter`` (all the rest: kernel weights, kernel convolution, fusion, remodulation). The second is told from the
+    third by hooks on the modules, which read a clock.
 
     Args:
         model: see :class:`mcdenoise.denoiser.Denoiser`.
@@ -267,9 +267,7 @@ def _with_folders(candidates: list[Candidate]) -> list[Candidate]:
     return unique
 
 
-def _model_candidates(
-    model: str, precisions: list[Precision], device: str, keep_all: bool
-) -> Iterator[Candidate]:
+def _model_candidates(model: str, precisions: list[Precision], device: str, keep_all: bool) -> Iterator[Candidate]:
     path = Path(model) if model.endswith(".safetensors") else None
     name = model if path is None else path.stem
     architecture = model if path is None else str(describe_weights(path)["architecture"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -53,7 +52,9 @@ def regions(needed: Tensor, halo: int) -> list[Region]:
         Rectangles that do not overlap, without the halo; none where nothing is needed.
     """
     size = height, width = needed.shape[-2], needed.shape[-1]
-    padded = F.pad(needed.any(0, keepdim=True).float().reshape(1, 1, height, width), (0, -width % _TILE, 0, -height % _TILE))
+    padded = F.pad(
+        needed.any(0, keepdim=True).float().reshape(1, 1, height, width), (0, -width % _TILE, 0, -height % _TILE)
+    )
     tiles = F.max_pool2d(padded, _TILE)[0, 0] > 0
     boxes = [
         Region(top * _TILE, left * _TILE, min(bottom * _TILE, height), min(right * _TILE, width))

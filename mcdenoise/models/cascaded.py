@@ -269,9 +269,8 @@ class Cascade(nn.Module):
     @property
     def halo(self) -> int:
         """Margin around a rectangle without which its pixels would not be the same, in pixels."""
-        unets = [module for module in self.modules() if isinstance(module, UNet)]
-        multiple = max((unet.multiple for unet in unets), default=1)
-        reach = max(part.reach for part in (self.first, self.second) if part is not None)
+        multiple = max((module.multiple for module in self.modules() if isinstance(module, UNet)), default=1)
+        reach = max(int(part.reach) for part in (self.first, self.second) if part is not None)  # type: ignore[arg-type]
         return -(-reach // multiple) * multiple
 
     def _completed(
@@ -336,8 +335,8 @@ def normalize_depth(depth: Tensor) -> Tensor:
 
 def _reach(unet: UNet, radius: int) -> int:
     """Of a head, a filter and the fusions behind a U-Net: a pixel each, and the filter's radius, at their scales."""
-    fusions = sum(2**scale for scale in range(UNet.scales - 1))
-    return max(unet.reach(scale) + (1 + radius) * 2**scale for scale in range(UNet.scales)) + fusions
+    fusions = sum(1 << scale for scale in range(UNet.scales - 1))
+    return max(unet.reach(scale) + ((1 + radius) << scale) for scale in range(UNet.scales)) + fusions
 
 
 def _fuse(images: list[Tensor], fusions: nn.ModuleList) -> Tensor:

@@ -32,7 +32,7 @@ class UNet(nn.Module):
         if levels <= self.scales:
             raise ValueError(f"levels: expected at least {self.scales + 1}, found {levels}")
         self.levels = levels
-        self.multiple = 2 ** (levels - 1)
+        self.multiple: int = 2 ** (levels - 1)
         self.encoder = nn.ModuleList(_block(in_channels if level == 0 else width, width) for level in range(levels))
         self.up = nn.ModuleList(nn.ConvTranspose2d(width, width, 2, stride=2) for _ in range(levels - 1))
         self.decoder = nn.ModuleList(_block(2 * width, width) for _ in range(levels - 1))
@@ -43,7 +43,7 @@ class UNet(nn.Module):
         Two 3x3 convolutions at each level on the way down and up again, and the rest of a block of the coarsest pixels.
         """
         down, up = range(self.levels), range(scale, self.levels - 1)
-        return sum(2 * 2**level for level in (*down, *up)) + self.multiple - 1
+        return sum(2 << level for level in (*down, *up)) + self.multiple - 1
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """Features at full, half and quarter resolution.

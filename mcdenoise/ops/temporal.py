@@ -248,7 +248,9 @@ def accumulate(
     images = (color, previous, previous_length)
     surfaces = (*(surface or ()), *(previous_surface or ()))
     if choose_backend(backend, *images, motion, *surfaces, differentiable=False) == "numba":
-        return _accumulate_numba(*images, motion, surface, previous_surface, alpha_min, rule, position_limit, normal_limit)
+        return _accumulate_numba(
+            *images, motion, surface, previous_surface, alpha_min, rule, position_limit, normal_limit
+        )
     dtype = torch.promote_types(color.dtype, torch.float32)
     channels = color.shape[1]
     both, weight = reproject(

@@ -21,14 +21,14 @@ _LEAST_WITNESSES = 100
 def noise_free(inspected: Inspected) -> Tensor | None:
     """Pixels whose radiance has no noise to remove.
 
-    Nothing was hit there, or what was hit has no albedo and is bright. And in the cell of 8x8 pixels and those around it,
-    where at least 100 pixels are of this kind, no two of them side by side differ by more than 2 %. Fog before a
-    background, a rough mirror, or glass that reflects one sample and refracts the next do not pass; nor does a background
-    of detail, such as stars, which has no noise but cannot be told from it.
+    Nothing was hit there, or what was hit has no albedo and is bright. And in the cell of 8x8 pixels and those around
+    it, where at least 100 pixels are of this kind, no two of them side by side differ by more than 2 %. Fog before a
+    background, a rough mirror, or glass that reflects one sample and refracts the next do not pass; nor does a
+    background of detail, such as stars, which has no noise but cannot be told from it.
 
     Args:
-        inspected: a frame with its depth. Without a depth, nothing is known to be background; without an albedo, nothing
-            to be an emitter.
+        inspected: a frame with its depth. Without a depth, nothing is known to be background; without an albedo,
+            nothing to be an emitter.
 
     Returns:
         ``(B, 1, H, W)`` bool, or ``None`` where there is no such pixel.

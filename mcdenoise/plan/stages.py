@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import Frame, Inspected
+from mcdenoise.buffers import Inspected
 from mcdenoise.errors import InputError
 from mcdenoise.ops import NO_ALBEDO
 from mcdenoise.plan.noise_free import noise_free
@@ -73,15 +73,16 @@ class Shortcut(NamedTuple):
 class Plan:
     """Looks at each frame of a shot and says which stages it needs.
 
-    Left out exactly, so that all pixels stay the same: reprojection where nothing moves in the image; accumulation where
-    there is no way to reproject; demodulation where there is no albedo, or one that would not change a pixel; bilateral
-    weights of a guide that is constant; the memory of a frame that no other reads; and the network where there is no
-    noise (:func:`mcdenoise.plan.noise_free`), since pixels without noise are copied, by every plan.
+    Left out exactly, so that all pixels stay the same: reprojection where nothing moves in the image; accumulation
+    where there is no way to reproject; demodulation where there is no albedo, or one that would not change a pixel;
+    bilateral weights of a guide that is constant; the memory of a frame that no other reads; and the network where
+    there is no noise (:func:`mcdenoise.plan.noise_free`), since pixels without noise are copied, by every plan.
 
-    Left out up to a tolerance, while nothing moves in the image: tiles of 32x32 pixels whose accumulated noise has fallen
-    below it are passed through; tiles that have changed by less, as far around them as a network sees, since they were
-    last computed are not computed again. Neither switches to and fro: a tile that is passed through comes back only at
-    twice the noise, and one is reused only when it changes by less than a quarter of the tolerance from frame to frame.
+    Left out up to a tolerance, while nothing moves in the image: tiles of 32x32 pixels whose accumulated noise has
+    fallen below it are passed through; tiles that have changed by less, as far around them as a network sees, since
+    they were last computed are not computed again. Neither switches to and fro: a tile that is passed through comes
+    back only at twice the noise, and one is reused only when it changes by less than a quarter of the tolerance from
+    frame to frame.
 
     Args:
         keep_all: leave nothing out.
@@ -193,7 +194,7 @@ class Plan:
     def _needs(self, stage: str, reason_against: str, reason: str) -> bool:
         """Whether a stage is kept, which is noted."""
         needed = self.keep_all or not reason_against
-        self._note(stage, reason if not reason_against else reason_against, left_out=not needed)
+        self._note(stage, reason_against or reason, left_out=not needed)
         return needed
 
     def _note_pixels(self, name: str, pixels: Tensor | None, reason: str, *, exact: bool) -> None:
@@ -212,7 +213,8 @@ def summarize(frames: list[list[Stage]]) -> list[dict[str, Any]]:
 
     Returns:
         For each stage, in order: ``stage``; ``kept``, false if all of it was left out of all frames; ``left_out``, its
-        mean share, from 0 to 1; ``reason``, the most frequent one for leaving it out, or else for keeping it; ``exact``.
+        mean share, from 0 to 1; ``reason``, the most frequent one for leaving it out, or else for keeping it; and
+        ``exact``.
     """
     rows = []
     for name in dict.fromkeys(stage.name for stages in frames for stage in stages):
@@ -220,9 +222,7 @@ def summarize(frames: list[list[Stage]]) -> list[dict[str, Any]]:
         share = sum(stage.left_out for stage in found) / len(frames)
         telling = [stage for stage in found if stage.left_out > 0] or found
         reason = Counter(stage.reason for stage in telling).most_common(1)[0][0]
-        rows.append(
-            {"stage": name, "kept": share < 1, "left_out": share, "reason": reason, "exact": found[0].exact}
-        )
+        rows.append({"stage": name, "kept": share < 1, "left_out": share, "reason": reason, "exact": found[0].exact})
     return rows
 
 

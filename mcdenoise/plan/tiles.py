@@ -75,7 +75,7 @@ class Tiles:
         passed = self._converged(color, current, length)
         reused = torch.zeros_like(passed)
         if self._seen is not None and self.results is not None:
-            reused = self._unchanged(frame, (color, share, *self._seen)) & ~passed
+            reused = self._unchanged(frame, color, share, self._seen) & ~passed
         self._passed, self._reused = passed, reused
         size = color.shape[-2:]
         decided = Decided(_pixels(passed, size), _pixels(reused, size))
@@ -101,8 +101,8 @@ class Tiles:
         variance = _means((current - color).square().mean(1, keepdim=True) * factor, TILE // _STRIDE)
         mean = _means(color.mean(1, keepdim=True), TILE // _STRIDE)
         residual = _means((current - color).square().mean(1, keepdim=True), TILE // _STRIDE).sqrt()
-        # Where nothing differs, either there is no noise, or a renderer at rest repeats it: nothing can be told. What is
-        # black so far may still be hit by light.
+        # Where nothing differs, either there is no noise, or a renderer at rest repeats it: nothing can be told. What
+        # is black so far may still be hit by light.
         noise = torch.where(residual > _LEAST_RESIDUAL * mean, variance.sqrt() / mean, torch.inf)
         stays = self._tolerance * _NOISE_HYSTERESIS
         limit = self._tolerance if self._passed is None else torch.where(self._passed, stays, self._tolerance)
@@ -115,11 +115,12 @@ class Tiles:
         later = window + (alpha - window) * (1 - alpha) ** (2 * (length - longest).clamp_min(0))
         return torch.where(length <= longest, 1 / length.clamp_min(1), later)
 
-    def _unchanged(self, frame: Frame, images: tuple[Tensor, ...]) -> Tensor:
+    def _unchanged(self, frame: Frame, color: Tensor, share: Tensor, seen: tuple[Tensor, Tensor]) -> Tensor:
         """Tiles that, as far as a network sees, have changed by less than the tolerance since they were computed."""
         start = self._tolerance * _CHANGE_HYSTERESIS
         limit = start if self._reused is None else torch.where(self._reused, self._tolerance, start)
-        calm = self._change(*(_thinned(image) for image in images), tile=TILE // _STRIDE) <= limit
+        thin = _change(_thinned(color), _thinned(share), _thinned(seen[0]), _thinned(seen[1]), TILE // _STRIDE)
+        calm: Tensor = thin <= limit
         marks, self._marks = self._marks, None
         if not calm.any():
             return calm
@@ -127,14 +128,15 @@ class Tiles:
         if marks is None or marks.shape != self._marks.shape:
             return torch.zeros_like(calm)
         same = (marks == self._marks).all(1, keepdim=True).all(0, keepdim=True)
-        changed = ~(same & (self._change(*images, tile=TILE) <= limit))
+        changed = ~(same & (_change(color, share, *seen, TILE) <= limit))
         return F.max_pool2d(changed.float(), 2 * _SEEN + 1, 1, _SEEN) == 0
 
-    @staticmethod
-    def _change(color: Tensor, share: Tensor, old_color: Tensor, old_share: Tensor, tile: int) -> Tensor:
-        squares = _means((color - old_color).square().mean(1, keepdim=True), tile)
-        change = torch.where(squares > 0, squares.sqrt() / _means(color.mean(1, keepdim=True), tile), 0)
-        return (change + _WEIGHT_OF_SHARE * _means((share - old_share).abs(), tile)).amax(0, keepdim=True)
+
+def _change(color: Tensor, share: Tensor, old_color: Tensor, old_share: Tensor, tile: int) -> Tensor:
+    """Of each tile, relative to its mean."""
+    squares = _means((color - old_color).square().mean(1, keepdim=True), tile)
+    change = torch.where(squares > 0, squares.sqrt() / _means(color.mean(1, keepdim=True), tile), 0)
+    return (change + _WEIGHT_OF_SHARE * _means((share - old_share).abs(), tile)).amax(0, keepdim=True)
 
 
 def _thinned(image: Tensor) -> Tensor:
