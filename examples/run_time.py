@@ -6,7 +6,8 @@
 Every round runs each of them once, one after the other, so that whatever else the machine does hits all alike; the
 first round warms up and is not counted. Prints the median and the quartiles, and the ratio to Open Image Denoise's
 fastest network. The input is noise, which costs as much as any picture: the time depends on the number of pixels only.
-The time of Open Image Denoise includes copies to its layout and back, 10 to 20 ms at 1280x720 on one core.
+The time of Open Image Denoise includes copies to its layout and back, 10 to 20 ms at 1280x720 on one core. As in the
+commands of the package, freed memory is kept (mcdenoise/heap.py); --no-heap leaves that to the system.
 """
 
 import argparse
@@ -24,6 +25,7 @@ from torch import Tensor
 from mcdenoise import models
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
+from mcdenoise.heap import keep_heap
 from mcdenoise.peers import Oidn, Quality
 
 OIDN: dict[str, tuple[Quality, bool]] = {
@@ -70,6 +72,7 @@ def main() -> None:
     parser.add_argument("--size", default="1280x720", metavar="WxH")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--no-heap", action="store_true", help="give freed memory back to the system at once")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every time to this file too")
     options = parser.parse_args()
 
@@ -80,6 +83,8 @@ def main() -> None:
     if not match:
         raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{options.size}'")
     torch.set_num_threads(options.threads)
+    if not options.no_heap:
+        keep_heap()
     width, height = int(match[1]), int(match[2])
     torch.manual_seed(0)
     normal = torch.nn.functional.normalize(torch.randn(1, 3, height, width))

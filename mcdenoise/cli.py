@@ -21,6 +21,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from rich.table import Table
 
 from mcdenoise.errors import InputError
+from mcdenoise.heap import keep_heap
 
 if TYPE_CHECKING:
     from mcdenoise.evaluate import Evaluation
@@ -53,6 +54,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(version("mcdenoise"))
         return
     name, rest = arguments[0], arguments[1:]
+    keep_heap()
     if name not in COMMANDS:
         print(f"mcdenoise: unknown command '{name}'; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(2)
@@ -149,6 +151,7 @@ def _denoise() -> Callable[..., int | None]:
         threads: int | None = None,
         precision: Precision = "float32",
         alpha_min: float = 0.1,
+        anti_lag: bool = False,
         full_float: bool = False,
         keep_all: bool = False,
         tolerance: float = TOLERANCE,
@@ -169,6 +172,7 @@ def _denoise() -> Callable[..., int | None]:
             threads: CPU threads; torch's choice by default.
             precision: of the network's convolutions; bfloat16 is faster on processors that have it.
             alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
+            anti_lag: give up the accumulated past where the light has changed.
             full_float: write 32-bit instead of half floats.
             keep_all: leave nothing out, whether the sequence needs it or not.
             tolerance: noise, or change, relative to its mean, below which a tile of a still shot is not denoised again;
@@ -202,7 +206,15 @@ def _denoise() -> Callable[..., int | None]:
             print(f"picked {choice}")
             model, precision = choice.model, choice.precision
         plan = Plan(keep_all=keep_all, tolerance=tolerance)
-        denoiser = Denoiser(model, weights=weights, device=device, alpha_min=alpha_min, precision=precision, plan=plan)
+        denoiser = Denoiser(
+            model,
+            weights=weights,
+            device=device,
+            alpha_min=alpha_min,
+            anti_lag=anti_lag,
+            precision=precision,
+            plan=plan,
+        )
         height, width = opened.size
         print(f"{opened.name}: {opened.layout} layout, {len(opened)} frames of {width}x{height}")
         with _progress() as progress:
@@ -630,6 +642,47 @@ def _gradcheck() -> Callable[..., int | None]:
     return gradcheck
 
 
+def _stability() -> Callable[..., int | None]:
+    """Check operators, models and the denoiser on stiff and extreme inputs, in every precision."""
+    from mcdenoise.stability import FRAMES, Check, LongRun, as_json, parse_dtypes, stages
+
+    def stability(
+        ops: tyro.conf.Positional[list[str]] = [],  # noqa: B006 - tyro reads it
+        models: list[str] = [],  # noqa: B006
+        dtypes: list[str] = ["float32", "bfloat16", "float16"],  # noqa: B006
+        frames: int = FRAMES,
+        json: Json = None,
+    ) -> int:
+        """Check operators, models and the denoiser on ordinary, stiff and extreme inputs, and over thousands of frames.
+
+        Errors are in units of the dtype's epsilon times the condition number of the case; bounds come from analysis.
+
+        Args:
+            ops: names of operators; all by default.
+            models: names of models with shipped weights; all by default, none where operators are named.
+            dtypes: precisions to try.
+            frames: length of the long runs.
+            json: write every check to this file too, and the errors of the long runs over time.
+        """
+        if frames < 1:
+            raise InputError(f"--frames: expected at least 1, found {frames}")
+        chosen = stages(ops or None, models or None, parse_dtypes(dtypes), frames)
+        checks: list[Check] = []
+        runs: list[LongRun] = []
+        with _progress() as progress:
+            for stage in progress.track(chosen, description="stability"):
+                for result in stage.run():
+                    checks.append(result) if isinstance(result, Check) else runs.append(result)
+        _print_checks(checks)
+        _print_long_runs(runs)
+        _write_json(json, as_json(checks, runs))
+        failed = sum(not check.passed for check in checks) + sum(not run.passed for run in runs)
+        print(f"{len(checks) + len(runs)} checks, {failed} failed")
+        return 1 if failed else 0
+
+    return stability
+
+
 def _models() -> Callable[..., int | None]:
     """List the models with their size and cost."""
     from mcdenoise.models import overview
@@ -684,6 +737,7 @@ COMMANDS: dict[str, Callable[[], Callable[..., int | None]]] = {
     "benchmark": _benchmark,
     "report": _report,
     "gradcheck": _gradcheck,
+    "stability": _stability,
     "models": _models,
     "ops": _ops,
 }
@@ -737,6 +791,44 @@ def _print_scores(rows: list[dict[str, Any]]) -> None:
     table = Table("image", *rows[0]["values"], "frames")
     for row in rows:
         table.add_row(row["method"], *(f"{value:.4g}" for value in row["values"].values()), str(row["frames"]))
+    _show(table)
+
+
+def _print_checks(checks: list[Any]) -> None:
+    """One row for each subject, dtype and backend: error and bound of what was nearest to its bound."""
+    from mcdenoise.stability import summarize
+
+    if not checks:
+        return
+    rows: dict[tuple[str, str, str], list[Any]] = {}
+    for summary in summarize(checks):
+        rows.setdefault((summary.subject, summary.dtype, summary.backend), []).append(summary)
+    table = Table("what", "dtype", "backend", "checks", "condition", "forward", "gradient", "holds", "result")
+    for key, summaries in rows.items():
+        found = {summary.what: summary for summary in summaries}
+        errors = []
+        for what in ("forward", "gradient"):
+            worst = found[what].worst if what in found else None
+            errors.append(f"{worst.error:.2g} of {worst.allowed:.2g}" if worst and worst.allowed else "-")
+        holds = ", ".join(what for what, summary in found.items() if not summary.failed)
+        failed = [check for summary in summaries for check in summary.failed]
+        result = (
+            "ok" if not failed else f"{len(failed)} FAILED: {failed[0].what}, {failed[0].case}: {failed[0].message}"
+        )
+        condition = max(summary.condition for summary in summaries)
+        table.add_row(*key, str(sum(s.checks for s in summaries)), f"{condition:.1g}", *errors, holds, result)
+    _show(table)
+
+
+def _print_long_runs(runs: list[Any]) -> None:
+    if not runs:
+        return
+    table = Table("long run", "dtype", "error after frames", "at most", "ghost", "result")
+    for run in runs:
+        over_time = ", ".join(f"{number}: {error:.1g}" for number, error in zip(run.frames, run.errors, strict=True))
+        ghost = "-" if run.ghost is None else f"{run.ghost} frames"
+        allowed = f"{run.allowed:.2g}" if run.allowed else "-"
+        table.add_row(run.name, run.dtype, over_time or "-", allowed, ghost, "ok" if run.passed else run.message)
     _show(table)
 
 

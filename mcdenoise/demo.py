@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -114,9 +114,8 @@ def _compare(out: Path, on_step: Callable[[int, int], None]) -> Path:
     settings = Settings(
         rounds=1, threads=threads, pictures=len(REFERENCE_FRAMES), command=f"mcdenoise demo -o {shlex.quote(str(out))}"
     )
-    run_benchmark(
-        [open_sequence(out / "sequence")], choose_candidates(threads=threads), folder, settings, on_step=on_step
-    )
+    sequence = replace(open_sequence(out / "sequence"), name="demo")
+    run_benchmark([sequence], choose_candidates(threads=threads), folder, settings, on_step=on_step)
     return folder
 
 

@@ -8,7 +8,15 @@ import torch
 from torch import Tensor
 
 from mcdenoise.buffers import Frame
-from mcdenoise.ops import NO_ALBEDO, Accumulate, ClampFireflies, Surface, demodulate, motion_from_position
+from mcdenoise.ops import (
+    NO_ALBEDO,
+    Accumulate,
+    ClampFireflies,
+    HistoryLag,
+    Surface,
+    demodulate,
+    motion_from_position,
+)
 
 # A cut leaves a few accidental matches; a fast pan keeps far more than this share of the image.
 _CUT_SHARE = 0.05
@@ -16,6 +24,8 @@ _CUT_SHARE = 0.05
 _SPECULAR_LENGTH = 2
 _STILL = 0.05  # pixels
 _NO_WAY = "no motion, and no position with a previous camera"
+# Of the shorter history that the long one is compared with: four frames have half the noise of one.
+_RECENT_ALPHA = 0.25
 
 
 def surface_before(frame: Frame) -> Surface:
@@ -72,6 +82,7 @@ class Accumulated(NamedTuple):
 
 class _State(NamedTuple):
     color: Tensor
+    recent: Tensor | None
     length: Tensor
     surface: Surface
     view_projection: Tensor | None
@@ -92,6 +103,12 @@ class History:
     reflections do not move with the surface. Emitters and background have no albedo either and are treated alike; they
     have little noise to lose. A frame without an albedo buffer says nothing of mirrors, and its past is kept.
 
+    Where a light is switched or moves, the past is wrong although every surface is still there, and fades in some 40
+    frames. With ``anti_lag`` it is given up where local means say so (:func:`mcdenoise.ops.history_lag`), in two steps:
+    a second history of about four frames is compared with the current frame, and the long one with that.
+
+    Half-precision frames are accumulated in float32, which holds 10,000 frames as well as ten.
+
     The past is thrown away by :meth:`reset`, when the image size changes, and at a cut (less than 5 % of the pixels
     find their surface in the previous frame).
 
@@ -101,6 +118,7 @@ class History:
         fireflies: how fireflies are clamped; ``ClampFireflies(math.inf)`` leaves them.
         specular_length: the longest history of what is seen in mirrors and through glass while the image moves, in
             frames, at least 0; infinity treats them as everything else.
+        anti_lag: the test for changes of light; ``None`` makes none. It doubles the time that accumulating takes.
 
     Raises:
         ValueError: ``specular_length`` is negative.
@@ -111,12 +129,14 @@ class History:
         accumulate: Accumulate | None = None,
         fireflies: ClampFireflies | None = None,
         specular_length: float = _SPECULAR_LENGTH,
+        anti_lag: HistoryLag | None = None,
     ) -> None:
         if not specular_length >= 0:
             raise ValueError(f"specular_length: expected at least 0, found {specular_length}")
         self.accumulate = Accumulate() if accumulate is None else accumulate
         self.fireflies = ClampFireflies() if fireflies is None else fireflies
         self.specular_length = specular_length
+        self.anti_lag = anti_lag
         self._state: _State | None = None
 
     def reset(self) -> None:
@@ -154,32 +174,48 @@ class History:
         color = frame.color
         if demodulates and frame.albedo is not None:
             color = demodulate(color, frame.albedo)
-        result = self._blend(frame, self.fireflies(color), reprojects)
+        color = self.fireflies(color)
+        color = color.to(torch.promote_types(color.dtype, torch.float32))
+        result, recent = self._blend(frame, color, reprojects)
         surface = Surface(frame.position, frame.normal, frame.depth)
-        self._state = _State(result.color, result.length, surface, frame.view_projection) if keeps else None
+        self._state = _State(result.color, recent, result.length, surface, frame.view_projection) if keeps else None
         return result
 
-    def _blend(self, frame: Frame, color: Tensor, reprojects: bool) -> Accumulated:
-        state = self._state
+    def _blend(self, frame: Frame, color: Tensor, reprojects: bool) -> tuple[Accumulated, Tensor | None]:
+        """The frame with its past, and with its recent past alone if that is kept."""
+        state, recent = self._state, None if self.anti_lag is None else color
         first = Accumulated(color, color, torch.ones_like(color[:, :1]), "first frame")
         if state is None:
             lost = frame.motion is None and (frame.position is None or frame.view_projection is None)
-            return first._replace(reset=_NO_WAY) if lost else first
+            return (first._replace(reset=_NO_WAY) if lost else first), recent
         if state.color.shape != color.shape or state.color.device != color.device:
-            return first._replace(reset="size change")
+            return first._replace(reset="size change"), recent
         motion = None
         if reprojects:
             still = frame.motion is None and self.is_still(frame)
             motion = torch.zeros_like(color[:, :2]) if still else motion_to_previous(frame, state.view_projection)
             if motion is None:
-                return first._replace(reset=_NO_WAY)
+                return first._replace(reset=_NO_WAY), recent
         surface = surface_before(frame)
         accumulated, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
         if float((length > 1).float().mean()) < _CUT_SHARE:
-            return first._replace(reset="cut")
+            return first._replace(reset="cut"), recent
         if frame.albedo is not None and motion is not None:
             accumulated, length = self._shortened(color, accumulated, length, frame.albedo, motion)
-        return Accumulated(accumulated, color, length, "")
+        if self.anti_lag is not None and state.recent is not None:
+            recent, _ = self._shorter(color, state.recent, state.length, motion, surface, state.surface)
+            recent = torch.lerp(recent, color, self.anti_lag(recent, color))
+            lag = self.anti_lag(accumulated, recent)
+            accumulated = torch.lerp(accumulated, recent, lag)
+            length = torch.lerp(length, length.clamp_max(1 / self._shorter.alpha_min), lag)
+        return Accumulated(accumulated, color, length, ""), recent
+
+    @property
+    def _shorter(self) -> Accumulate:
+        """As ``accumulate``, with a shorter memory."""
+        rule = self.accumulate
+        alpha = max(rule.alpha_min, _RECENT_ALPHA)
+        return Accumulate(alpha, rule.rule, rule.position_limit, rule.normal_limit)
 
     def _shortened(
         self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor

@@ -80,5 +80,7 @@ def _relative_error(out: Tensor, reference: Tensor) -> float:
     representable = torch.isfinite(reference.to(out.dtype))
     if not torch.equal(torch.isfinite(out), representable):
         return float("inf")
+    if not out.numel():
+        return 0.0
     difference = torch.where(representable, out.double() - reference, 0).abs().max().item()
     return difference / max(torch.where(representable, reference, 0).abs().max().item(), torch.finfo(out.dtype).tiny)

@@ -298,7 +298,7 @@ def test_missing_peers_are_said_to_be_missing(
     smape = [cell.errors["SMAPE"] for name in order for cell in results.cells if cell.method == name]
     assert smape == sorted(smape)
     line = f"missing: {'; '.join(missing)}: {results.methods[4].missing}"
-    assert printed.splitlines()[-3:] == [line, results.notes[0], str(out)]
+    assert printed.splitlines()[-3:] == [line, results.notes[0], f"report: {out / 'index.html'}"]
 
     # results.csv has the same numbers.
     with (out / "results.csv").open(newline="") as text:

@@ -13,7 +13,7 @@ from torch import Tensor
 from mcdenoise.buffers import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.history import History
-from mcdenoise.ops import Accumulate, ClampFireflies, accumulate, demodulate, remodulate
+from mcdenoise.ops import Accumulate, ClampFireflies, HistoryLag, accumulate, demodulate, remodulate
 
 HEIGHT, WIDTH = 5, 6
 
@@ -444,3 +444,74 @@ def test_a_frame_that_is_not_kept_is_no_past() -> None:
     last = history.update(still(color), keeps=False)
     assert last.length.unique().tolist() == [2]
     assert history.update(still(color)).reset == "first frame"
+
+
+# Changes of light
+
+
+def switched(off_at: int, count: int, level: float = 0.0) -> list[Frame]:
+    """Noisy light that falls to ``level``; nothing moves."""
+    g, frames = torch.Generator().manual_seed(0), []
+    for number in range(count):
+        noise = -torch.log(torch.rand(1, 3, 16, 16, generator=g).clamp_min(1e-6))
+        frames.append(still(noise if number < off_at else level * noise))
+    return frames
+
+
+@pytest.mark.parametrize("level", [0.0, 0.1])
+def test_the_past_is_given_up_where_the_light_changes(level: float) -> None:
+    lagging, history = History(), History(anti_lag=HistoryLag())
+    for frame in switched(20, 21, level):
+        ghost, past = lagging.update(frame), history.update(frame)
+    # A tenth of the new light, nine of the old; and nothing but the new one.
+    assert abs(ghost.color.mean() - (0.1 * level + 0.9)) < 0.1
+    torch.testing.assert_close(past.color, frame.color, rtol=0.2, atol=0.05 * level)
+    assert past.length.max() <= 4
+    assert past.reset == ""
+
+
+def test_brighter_light_comes_sooner() -> None:
+    """The brighter it is, the more noise there is to hide the change: some frames are needed."""
+    lagging, history = History(), History(anti_lag=HistoryLag())
+    for frame in switched(20, 24, 5.0):
+        expected, past = lagging.update(frame), history.update(frame)
+    assert expected.color.mean() < 2.5
+    assert past.color.mean() > 4
+
+
+def test_steady_light_keeps_its_past() -> None:
+    lagging, history = History(), History(anti_lag=HistoryLag())
+    for frame in switched(20, 20):
+        expected, past = lagging.update(frame), history.update(frame)
+    torch.testing.assert_close(past.color, expected.color)
+    assert torch.equal(past.length, expected.length)
+
+
+def test_after_a_change_a_new_past_grows() -> None:
+    history = History(anti_lag=HistoryLag())
+    for frame in switched(20, 30, 0.2):
+        past = history.update(frame)
+    assert past.length.min() > 9
+    assert abs(past.color.mean() - 0.2) < 0.02
+
+
+def test_a_first_frame_a_cut_and_another_size_begin_a_recent_past_too() -> None:
+    history, fresh = History(anti_lag=HistoryLag()), History(anti_lag=HistoryLag())
+    floor = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
+    for frame in (still(constant(3, 9.0, (4, 4))), still(constant(3, 5.0), normal=floor.roll(1, 1))):
+        history.update(frame)
+    for value in (1.0, 2.0, 3.0):
+        frame = still(constant(3, value), normal=floor)
+        past, expected = history.update(frame), fresh.update(frame)
+        assert torch.equal(past.color, expected.color)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_frames_are_accumulated_in_float32(dtype: torch.dtype) -> None:
+    history, twin = History(Accumulate(1e-6)), History(Accumulate(1e-6))
+    for color in torch.rand(300, 1, 3, 4, 4, generator=torch.Generator().manual_seed(0)).to(dtype):
+        past, expected = history.update(still(color)), twin.update(still(color.float()))
+    assert past.color.dtype == past.length.dtype == torch.float32
+    assert torch.equal(past.color, expected.color)
+    # More than bfloat16 can count.
+    assert past.length.unique().tolist() == [300]

@@ -37,6 +37,7 @@ REPORTS = {"benchmark", "denoise", "evaluate", "ops_overview", "peers", "report"
 TOOLS = REPORTS | {"budget", "demo", "export", "gradcheck", "stability", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
+    "heap": set(),
     "ops": set(),
     "buffers": {"errors"},
     "metrics": SIGNAL,
@@ -56,9 +57,9 @@ ALLOWED: dict[str, set[str]] = {
     "evaluate": LIBRARY | {"denoise", "peers"},
     "results": SIGNAL | {"data"},
     "report": LIBRARY | {"evaluate", "results"},
-    "benchmark": LIBRARY | {"evaluate", "ops_overview", "peers", "results"},
+    "benchmark": LIBRARY | {"evaluate", "ops_overview", "peers", "results", "run_folder"},
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"results"}),
-    "cli": LIBRARY | TOOLS,
+    "cli": LIBRARY | TOOLS | {"heap"},
     "__main__": {"cli"},
     # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.
     "": LIBRARY,

@@ -21,6 +21,8 @@ Metadata: TypeAlias = dict[str, MetadataValue]
 
 LARGEST_HALF = 65504.0
 _LARGEST_PIXEL_COUNT = 2**28
+# Black pixels in a byte of file: zlib's limit is 1032, and PXR24 drops a quarter before; DWA leaves one number of 64.
+_LARGEST_RATIO, _LARGEST_DWA_RATIO = 2_000, 200_000
 # These describe how one file stores its pixels, not what they show; the next file has its own.
 _STORAGE_PREFIXES = ("oiio:", "openexr:", "compression")
 _TUPLE_TYPES = {"FramesPerSecond": "rational", "smpte:TimeCode": "timecode"}
@@ -142,10 +144,20 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
         found = "no channels"
     elif min(spec.width, spec.height) < 1 or spec.width * spec.height > _LARGEST_PIXEL_COUNT:
         found = f"{spec.width} x {spec.height} pixels"
+    elif _is_hollow(path, spec):
+        # Told before memory is taken for them.
+        found = f"{spec.width} x {spec.height} pixels of {spec.nchannels} channels, but not the data for them"
     if found:
         file.close()
         raise _unreadable(path, found, "render a flat EXR of at most 2^28 pixels")
     return file, ExrHeader((spec.height, spec.width), list(spec.channelnames), _metadata(spec))
+
+
+def _is_hollow(path: Path, spec: oiio.ImageSpec) -> bool:
+    """Whether a header promises more than its file can hold, however it is compressed."""
+    dwa = str(spec.getattribute("compression")).startswith("dwa")
+    ratio = _LARGEST_DWA_RATIO if dwa else _LARGEST_RATIO
+    return spec.width * spec.height * int(spec.pixel_bytes(True)) > ratio * os.path.getsize(path)
 
 
 def _metadata(spec: oiio.ImageSpec) -> Metadata:

@@ -123,7 +123,7 @@ class PixelPredictor(nn.Module):
         top = logs.amax((1, 2, 3), keepdim=True) if top is None else top
         images: list[Tensor] = []
         for head, level in zip(self.heads, levels, strict=True):
-            images.append(head(level).float() + logs)
+            images.append(_at_least_float32(head(level)) + logs)
             logs = downsample(logs)
         return torch.expm1(torch.minimum(_fuse(images, self.fusions).clamp_min(0), top))
 
@@ -172,7 +172,7 @@ class KernelPredictor(nn.Module):
             logits = prediction[:, : self.taps]
             # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
             if self.bilateral:
-                f1_f2_f3 = F.softplus(prediction[:, self.taps :].float().contiguous()).split(1, 1)
+                f1_f2_f3 = F.softplus(_at_least_float32(prediction[:, self.taps :]).contiguous()).split(1, 1)
                 *scales, f3 = (f * unit for f, unit in zip(f1_f2_f3, SCALE_UNITS, strict=True))
                 scales = [scale for scale, name in zip(scales, GUIDES, strict=True) if name in guiding]
                 filtered = cross_bilateral_filter(
@@ -303,18 +303,20 @@ def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
     the logarithm by a lamp in view.
 
     Args:
-        color: ``(B, C, H, W)`` radiance.
+        color: ``(B, C, H, W)`` radiance up to 1e35; what is below 1e-30 counts as that.
         key: radiance that the typical block is brought to.
 
     Returns:
         ``(B, 1, 1, 1)`` positive factor; 1 for a black image. The factor has no gradient.
     """
-    luminance = color.detach().float().mean(1, keepdim=True)
+    luminance = _at_least_float32(color.detach()).mean(1, keepdim=True)
     blocks = F.avg_pool2d(luminance, 16, ceil_mode=True, count_include_pad=False)
     mean = blocks.mean((1, 2, 3), keepdim=True)
-    # Black blocks count as a thousandth of the mean.
-    typical = torch.exp(torch.log(torch.maximum(blocks, mean * 1e-3).clamp_min(1e-30)).mean((1, 2, 3), keepdim=True))
-    return torch.where(mean > 0, key / typical, 1).to(color.dtype)
+    lit = mean > 0
+    # Of the mean, so that the logarithms are small numbers at any exposure. Black blocks count as a thousandth of it.
+    shares = (blocks / torch.where(lit, mean, 1)).clamp_min(1e-3)
+    typical = (mean * torch.exp(torch.log(shares).mean((1, 2, 3), keepdim=True))).clamp_min(1e-30)
+    return torch.where(lit, key / typical, 1).to(color.dtype)
 
 
 def normalize_depth(depth: Tensor) -> Tensor:
@@ -327,10 +329,17 @@ def normalize_depth(depth: Tensor) -> Tensor:
         ``(B, 1, H, W)`` in [0, 1]. The typical depth is the image's geometric mean over what was hit.
     """
     hit = torch.isfinite(depth)
-    finite = torch.where(hit, depth, 1).float().clamp_min(1e-30)
+    finite = _at_least_float32(torch.where(hit, depth, 0)).clamp_min(1e-30)
+    # Of the largest, so that the logarithms are small numbers in any unit.
+    shares = finite / finite.amax((1, 2, 3), keepdim=True)
     count = hit.sum((1, 2, 3), keepdim=True).clamp_min(1)
-    typical = torch.exp((torch.log(finite) * hit).sum((1, 2, 3), keepdim=True) / count)
-    return torch.where(hit, finite / (finite + typical), 1).to(depth.dtype)
+    typical = torch.exp((torch.log(shares) * hit).sum((1, 2, 3), keepdim=True) / count)
+    return torch.where(hit, shares / (shares + typical), 1).to(depth.dtype)
+
+
+def _at_least_float32(tensor: Tensor) -> Tensor:
+    """Half precision as float32, float64 as it is: the shipped weights also run in float64, to measure what rounds."""
+    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
 def _reach(unet: UNet, radius: int) -> int:

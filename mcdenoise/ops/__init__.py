@@ -6,6 +6,7 @@ from mcdenoise.ops.demodulation import NO_ALBEDO, Demodulate, Remodulate, demodu
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
+from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "CrossBilateralFilter",
     "CrossBilateralWeights",
     "Demodulate",
+    "HistoryLag",
     "KernelConv",
     "KernelSplat",
     "LaplacianFusion",
@@ -26,6 +28,7 @@ __all__ = [
     "cross_bilateral_weights",
     "demodulate",
     "downsample",
+    "history_lag",
     "kernel_conv",
     "kernel_splat",
     "laplacian_fusion",

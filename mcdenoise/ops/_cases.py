@@ -12,99 +12,28 @@ point on purpose, the inputs concerned are not among its ``differentiable`` ones
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
-from torch import Generator, Tensor, nn
+from torch import Generator, Tensor
 
+from mcdenoise.ops import _extreme_cases as extreme
 from mcdenoise.ops import _reference
+from mcdenoise.ops._case import Case, Inputs, Kind, Op, map_tensors
+from mcdenoise.ops._case import normal as _normal
+from mcdenoise.ops._case import radiance as _radiance
+from mcdenoise.ops._case import uniform as _uniform
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
 from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
+from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
 
-Kind = Literal["ordinary", "stiff", "extreme"]
-Value = Tensor | list[Tensor] | Surface | None
-Inputs = dict[str, Value]
-
-
-@dataclass(frozen=True)
-class Case:
-    """One set of inputs of an op.
-
-    Args:
-        name: what is special about it; unique within its op.
-        kind: ``"ordinary"``, ``"stiff"`` (results change fast with the inputs) or ``"extreme"`` (valid, but at the end
-            of what is).
-        tensors: draws the tensor arguments by name, in float64.
-        differentiable: the arguments among them that have a derivative here.
-        settings: the other arguments, those that the Module twin stores.
-    """
-
-    name: str
-    kind: Kind
-    tensors: Callable[[Generator], Inputs]
-    differentiable: tuple[str, ...]
-    settings: dict[str, Any] = field(default_factory=dict)
-
-    def inputs(self, dtype: torch.dtype = torch.float64, seed: int = 0) -> Inputs:
-        """The tensor arguments: the same numbers for the same seed, in any dtype."""
-        drawn = self.tensors(torch.Generator().manual_seed(seed))
-        return map_tensors(lambda tensor: tensor.to(dtype), drawn)
-
-
-@dataclass(frozen=True)
-class Op:
-    """An op and what is known about it.
-
-    Args:
-        function: the public function.
-        reference: the same as its equation, in float64; see :mod:`mcdenoise.ops._reference`.
-        cases: at least four, among them ordinary ones.
-        module: the Module twin, if there is one.
-        least_dtype: results are at least as precise as this; other results have the dtype of the inputs.
-    """
-
-    function: Callable[..., Any]
-    reference: Callable[..., Any]
-    cases: tuple[Case, ...]
-    module: type[nn.Module] | None = None
-    least_dtype: torch.dtype | None = None
-
-    @property
-    def name(self) -> str:
-        """The function's name."""
-        return self.function.__name__
-
-
-def map_tensors(function: Callable[[Tensor], Tensor], inputs: Inputs) -> Inputs:
-    """``inputs`` with ``function`` applied to each tensor in them."""
-
-    def apply(value: Value) -> Value:
-        if isinstance(value, Surface):
-            return Surface(*(None if part is None else function(part) for part in value))
-        if isinstance(value, list):
-            return [function(part) for part in value]
-        return None if value is None else function(value)
-
-    return {name: apply(value) for name, value in inputs.items()}
-
-
-def _uniform(g: Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
-    return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
-
-
-def _normal(g: Generator, *shape: int) -> Tensor:
-    return torch.randn(*shape, generator=g, dtype=torch.float64)
-
-
-def _radiance(g: Generator, *shape: int) -> Tensor:
-    """Over six decades, as 1-spp renderings are: mostly dark, fireflies up to 1e4."""
-    return 10 ** _uniform(g, *shape, low=-2, high=4)
+__all__ = ["OPS", "Case", "Inputs", "Kind", "Op", "map_tensors"]
 
 
 def _filter_cases() -> tuple[Case, ...]:
@@ -387,6 +316,37 @@ def _firefly_cases() -> tuple[Case, ...]:
     )
 
 
+def _lag_cases() -> tuple[Case, ...]:
+    both = ("history", "recent")
+
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        change: float,
+        noise: float = 0.5,
+        differentiable: tuple[str, ...] = both,
+        **settings: float,
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            history = _uniform(g, *size, low=0.8)
+            return {"history": history, "recent": change * (1 + noise * _uniform(g, *size, low=-1)) * history}
+
+        return Case(name, kind, tensors, differentiable, settings)
+
+    # Differences from 1 to 2 times the threshold, where the share is neither 0 nor 1: by the settings, not by chance.
+    return (
+        case("5x7", "ordinary", (1, 1, 5, 7), 2.0, threshold=5.0),
+        case("batch of 2, RGB, window of 3", "ordinary", (2, 3, 3, 4), 2.0, threshold=14.0, kernel_size=3),
+        case("window of 5", "ordinary", (1, 3, 4, 3), 2.0, threshold=9.0, kernel_size=5),
+        case("one row, 5 channels", "ordinary", (1, 5, 1, 6), 2.0, threshold=9.0, kernel_size=3),
+        case("no change", "ordinary", (1, 3, 4, 5), 1.0),
+        case("darker by half", "ordinary", (1, 3, 4, 5), 0.5),
+        # Without noise only the smallest visible difference counts.
+        case("brighter by 4.5 thousandths, no noise", "stiff", (1, 1, 1, 1), 1.0045, 0.0),
+    )
+
+
 def _camera(batch: int, eye_z: float, unit: float) -> Tensor:
     """Row-vector world-to-clip matrices that look along +z, with a little of everything in every entry."""
     matrix = torch.tensor(
@@ -535,18 +495,107 @@ def _history_cases(accumulating: bool) -> tuple[Case, ...]:
     )
 
 
+def _softmax(settings: dict[str, Any]) -> bool:
+    return bool(settings["normalize"] == "softmax")
+
+
+_IMAGE, _HISTORY = ("image",), ("color", "previous")
+
 OPS: tuple[Op, ...] = (
-    Op(kernel_conv, _reference.kernel_conv, _filter_cases(), KernelConv),
-    Op(kernel_splat, _reference.kernel_splat, _filter_cases(), KernelSplat),
-    Op(cross_bilateral_weights, _reference.cross_bilateral_weights, _bilateral_cases(), CrossBilateralWeights),
-    Op(cross_bilateral_filter, _reference.cross_bilateral_filter, _bilateral_filter_cases(), CrossBilateralFilter),
-    Op(downsample, _reference.downsample, _image_cases(lambda height, width: (height, width), with_size=False)),
-    Op(upsample, _reference.upsample, _image_cases(_half, with_size=True)),
-    Op(laplacian_fusion, _reference.laplacian_fusion, _fusion_cases(), LaplacianFusion),
-    Op(demodulate, _reference.demodulate, _demodulation_cases("color"), Demodulate),
-    Op(remodulate, _reference.remodulate, _demodulation_cases("image"), Remodulate),
-    Op(clamp_fireflies, _reference.clamp_fireflies, _firefly_cases(), ClampFireflies),
-    Op(motion_from_position, _reference.motion_from_position, _motion_cases(), least_dtype=torch.float32),
-    Op(reproject, _reference.reproject, _history_cases(accumulating=False)),
-    Op(accumulate, _reference.accumulate, _history_cases(accumulating=True), Accumulate),
+    Op(
+        kernel_conv,
+        _reference.kernel_conv,
+        _filter_cases() + extreme.filters(),
+        KernelConv,
+        images=_IMAGE,
+        rounding=extreme.filter_rounding,
+    ),
+    Op(
+        kernel_splat,
+        _reference.kernel_splat,
+        _filter_cases() + extreme.filters(),
+        KernelSplat,
+        images=_IMAGE,
+        rounding=extreme.filter_rounding,
+    ),
+    Op(
+        cross_bilateral_weights,
+        _reference.cross_bilateral_weights,
+        _bilateral_cases() + extreme.bilateral(),
+        CrossBilateralWeights,
+        weights=_softmax,
+        rounding=extreme.bilateral_rounding,
+    ),
+    Op(
+        cross_bilateral_filter,
+        _reference.cross_bilateral_filter,
+        _bilateral_filter_cases() + extreme.bilateral_filters(),
+        CrossBilateralFilter,
+        images=_IMAGE,
+        rounding=extreme.bilateral_filter_rounding,
+    ),
+    Op(
+        downsample,
+        _reference.downsample,
+        _image_cases(lambda height, width: (height, width), with_size=False) + extreme.images(halved=False),
+        images=_IMAGE,
+    ),
+    Op(
+        upsample,
+        _reference.upsample,
+        _image_cases(_half, with_size=True) + extreme.images(halved=True),
+        images=_IMAGE,
+    ),
+    Op(
+        laplacian_fusion,
+        _reference.laplacian_fusion,
+        _fusion_cases() + extreme.fusions(),
+        LaplacianFusion,
+        images=("fine", "coarse"),
+    ),
+    Op(
+        demodulate,
+        _reference.demodulate,
+        _demodulation_cases("color") + extreme.demodulations("color"),
+        Demodulate,
+        images=("color",),
+    ),
+    Op(
+        remodulate,
+        _reference.remodulate,
+        _demodulation_cases("image") + extreme.demodulations("image"),
+        Remodulate,
+        images=_IMAGE,
+    ),
+    Op(
+        clamp_fireflies,
+        _reference.clamp_fireflies,
+        _firefly_cases() + extreme.fireflies(),
+        ClampFireflies,
+        images=_IMAGE,
+        rounding=extreme.firefly_rounding,
+    ),
+    Op(history_lag, _reference.history_lag, _lag_cases() + extreme.lags(), HistoryLag),
+    Op(
+        motion_from_position,
+        _reference.motion_from_position,
+        _motion_cases() + extreme.motions(),
+        least_dtype=torch.float32,
+        rounding=extreme.motion_rounding,
+    ),
+    Op(
+        reproject,
+        _reference.reproject,
+        _history_cases(accumulating=False) + extreme.histories(accumulating=False),
+        images=("previous",),
+        rounding=extreme.history_rounding,
+    ),
+    Op(
+        accumulate,
+        _reference.accumulate,
+        _history_cases(accumulating=True) + extreme.histories(accumulating=True),
+        Accumulate,
+        images=_HISTORY,
+        rounding=extreme.history_rounding,
+    ),
 )

@@ -10,6 +10,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from decimal import Decimal, localcontext
 from typing import Any
 
 import torch
@@ -70,23 +71,41 @@ def cross_bilateral_weights(
     factor_of_distance = None if distance_scale is None else distance_scale.tolist()
     batch, _, height, width = kernel.shape
     for b, y, x in itertools.product(range(batch), range(height), range(width)):
+        exponents: dict[int, list[float]] = {}
         for t, squared_distance, row, column in _taps(kernel, y, x, border):
-            weight = logits[b][t][y][x] if normalize == "none" else math.exp(logits[b][t][y][x])
             if row is None and border == "renormalize":
-                weight = 0.0
+                continue
+            terms = exponents[t] = []
             for guide, factor in zip(images, factors, strict=True):
                 difference = sum(
                     ((channel[row][column] if row is not None else 0.0) - channel[y][x]) ** 2 for channel in guide[b]
                 )
-                weight *= math.exp(-factor[b][0][y][x] * difference)
+                terms.append(-factor[b][0][y][x] * difference)
             if factor_of_distance is not None:
-                weight *= math.exp(-factor_of_distance[b][0][y][x] * squared_distance)
-            out[b][t][y][x] = weight
+                terms.append(-factor_of_distance[b][0][y][x] * squared_distance)
         if normalize == "softmax":
-            total = sum(taps[y][x] for taps in out[b])
-            for taps in out[b]:
-                taps[y][x] /= total
+            weights = _softmax({t: [logits[b][t][y][x], *terms] for t, terms in exponents.items()})
+        else:
+            weights = {t: logits[b][t][y][x] * math.exp(sum(terms)) for t, terms in exponents.items()}
+        for t, weight in weights.items():
+            out[b][t][y][x] = weight
     return _tensor(out, kernel.shape)
+
+
+def _softmax(exponents: dict[int, list[float]]) -> dict[int, float]:
+    """``exp(sum of the terms)`` of each key over their total: decimal numbers hold what float64 cannot.
+
+    An infinite term is the limit of a large one.
+    """
+    infinite = [any(term == math.inf for term in terms) for terms in exponents.values()]
+    vanishing = [any(term == -math.inf for term in terms) for terms in exponents.values()]
+    if any(infinite) or all(vanishing):
+        chosen = infinite if any(infinite) else vanishing
+        return {t: float(wins) / sum(chosen) for t, wins in zip(exponents, chosen, strict=True)}
+    with localcontext(prec=40):
+        weights = [sum(map(Decimal, terms), Decimal()).exp() for terms in exponents.values()]
+        total = sum(weights, Decimal())
+        return {t: float(weight / total) for t, weight in zip(exponents, weights, strict=True)}
 
 
 def cross_bilateral_filter(
@@ -175,6 +194,43 @@ def clamp_fireflies(image: Tensor, *, limit: float = 30.0, kernel_size: int = 7)
         for c in range(channels):
             out[b][c][y][x] = source[b][c][y][x] * factor
     return _tensor(out, image.shape)
+
+
+def history_lag(history: Tensor, recent: Tensor, *, threshold: float = 3.0, kernel_size: int = 7) -> Tensor:
+    """``clamp((z^2 / threshold^2 - 1) / 3, 0, 1)`` of the difference of local means in standard errors ``z``."""
+    batch, channels, height, width = history.shape
+    shape = (batch, 1, height, width)
+    long, short = (
+        [
+            [
+                [math.fsum(image[b][c][y][x] for c in range(channels)) / channels for x in range(width)]
+                for y in range(height)
+            ]
+            for b in range(batch)
+        ]
+        for image in (history.tolist(), recent.tolist())
+    )
+    radius = kernel_size // 2
+
+    def window(b: int, y: int, x: int) -> list[tuple[int, int]]:
+        rows = range(max(y - radius, 0), min(y + radius + 1, height))
+        columns = range(max(x - radius, 0), min(x + radius + 1, width))
+        return list(itertools.product(rows, columns))
+
+    def mean(image: Image, b: int, y: int, x: int) -> float:
+        pixels = window(b, y, x)
+        return math.fsum(image[b][row][column] for row, column in pixels) / len(pixels)
+
+    out = _zeros(shape)
+    for b, _, y, x in _indices(shape):
+        pixels = window(b, y, x)
+        deviations = [short[b][row][column] - mean(short, b, row, column) for row, column in pixels]
+        variance = math.fsum(deviation**2 for deviation in deviations) / len(pixels)
+        long_mean, short_mean = mean(long, b, y, x), mean(short, b, y, x)
+        noise = variance / len(pixels) + (1e-3 * (abs(long_mean) + abs(short_mean)) / 2) ** 2
+        z2 = (short_mean - long_mean) ** 2 / noise if noise > 0 else 0.0
+        out[b][0][y][x] = min(max((z2 / threshold**2 - 1) / 3, 0.0), 1.0)
+    return _tensor(out, shape)
 
 
 def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:

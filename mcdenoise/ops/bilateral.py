@@ -44,9 +44,10 @@ def cross_bilateral_weights(
 
     Args:
         kernel: ``(B, K*K, H, W)``, odd ``K``, taps row by row from top left: weights ``w`` for ``"none"``, logits
-            for ``"softmax"``. A plain cross-bilateral filter has ones, respectively zeros.
-        guides: any number of ``(B, C_g, H, W)`` feature images, any channels and unit.
-        scales: one ``(B, 1, H, W)`` per guide, the ``f_g >= 0`` (1 / guide unit squared).
+            for ``"softmax"``. A plain cross-bilateral filter has ones, respectively zeros. A logit may be infinite: the
+            limit of a large one.
+        guides: any number of ``(B, C_g, H, W)`` feature images, any channels and unit, finite, at most 1e15.
+        scales: one ``(B, 1, H, W)`` per guide, the ``f_g >= 0`` (1 / guide unit squared), at most 1e8.
         distance_scale: ``(B, 1, H, W)``, the ``f_d >= 0`` (1 / pixel squared); ``None`` leaves the term out.
         normalize: ``"softmax"`` or ``"none"``.
         border: what a tap outside the image sees: ``"replicate"`` the guide's nearest edge pixel, ``"zeros"`` a guide
@@ -60,7 +61,7 @@ def cross_bilateral_weights(
         ValueError: shapes disagree, ``K`` is even, the numbers of guides and scales differ, or a mode is unknown.
 
     Differentiable in ``kernel``, ``guides``, ``scales`` and ``distance_scale``, to any order. Half precision sums
-    the exponent in float32.
+    the exponent in float32. A weight is known to eps times its exponent ``|logit| + E``.
 
     Source: the paper's Eqs. 5-8; Eisemann and Durand 2004, Petschnigg et al. 2004 (cross/joint bilateral filter).
 
@@ -76,10 +77,14 @@ def cross_bilateral_weights(
     log_domain = normalize == "softmax"
     start = kernel if log_domain else torch.zeros_like(kernel)
     exponent = _exponent(start, guides, scales, distance_scale, radius, border)
-    if border == "renormalize":
-        mask = inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
-        exponent = torch.where(mask, exponent, -torch.inf)
-    weights = torch.softmax(exponent, 1) if log_domain else kernel * torch.exp(exponent)
+    if log_domain:
+        if border == "renormalize":
+            exponent = torch.where(_inside(kernel, kernel_size), exponent, -torch.inf)
+        weights = torch.softmax(exponent, 1)
+    else:
+        weights = kernel * torch.exp(exponent)
+        if border == "renormalize":
+            weights = torch.where(_inside(kernel, kernel_size), weights, 0)
     return weights.to(kernel.dtype)
 
 
@@ -109,6 +114,10 @@ class CrossBilateralWeights(nn.Module):
         return cross_bilateral_weights(
             kernel, guides, scales, distance_scale, normalize=self.normalize, border=self.border
         )
+
+
+def _inside(kernel: Tensor, kernel_size: int) -> Tensor:
+    return inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
 
 
 def check_normalize(normalize: str) -> None:
@@ -171,9 +180,11 @@ class _Exponent(Function):
         radius: int,
     ) -> Tensor:
         height, width = start.shape[-2:]
-        # One plane after the other, whatever the layout of the kernel: every tap is updated on its own.
+        # One plane after the other, whatever the layout of the kernel: every tap is updated on its own. The copy that
+        # this takes makes infinite logits finite, so that the weight of each of two of them is not NaN, but half.
         dtype = accumulator_dtype(start.dtype)
-        result = start.to(dtype, copy=True, memory_format=torch.contiguous_format)
+        largest = torch.finfo(dtype).max
+        result = start.to(dtype, memory_format=torch.contiguous_format).clamp(-largest, largest)
         for tap, dy, dx in offsets(2 * radius + 1):
             out = result[:, tap : tap + 1]
             if dy == 0 and dx == 0:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._window import accumulator_dtype
 
 # What a smooth dielectric reflects at normal incidence: on a darker surface most of the light is gloss, which no albedo
 # tints, and dividing it by a smaller number would give sparse, coloured, huge values.
@@ -27,7 +28,8 @@ def demodulate(color: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         floor: smallest albedo that is divided by, above 0; no value grows by more than ``1 / floor``.
 
     Returns:
-        ``(B, C, H, W)`` demodulated radiance.
+        ``(B, C, H, W)`` demodulated radiance, to rounding at any radiance and albedo whose quotient the dtype holds.
+        Half precision is computed in float32.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -46,7 +48,7 @@ def demodulate(color: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         True
     """
     check_shapes(color=(color, "B C H W"), albedo=(albedo, "B C H W"))
-    return color / _modulation(albedo, floor)
+    return (color.to(accumulator_dtype(color.dtype)) / _modulation(albedo, floor)).to(color.dtype)
 
 
 def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor:
@@ -60,7 +62,7 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         floor: as given to :func:`demodulate`.
 
     Returns:
-        ``(B, C, H, W)`` radiance.
+        ``(B, C, H, W)`` radiance, to rounding as :func:`demodulate`.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -76,7 +78,7 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         True
     """
     check_shapes(image=(image, "B C H W"), albedo=(albedo, "B C H W"))
-    return image * _modulation(albedo, floor)
+    return (image.to(accumulator_dtype(image.dtype)) * _modulation(albedo, floor)).to(image.dtype)
 
 
 class Demodulate(nn.Module):
@@ -114,5 +116,6 @@ class Remodulate(nn.Module):
 def _modulation(albedo: Tensor, floor: float) -> Tensor:
     if not floor > 0:
         raise ValueError(f"floor: expected a positive number, found {floor}")
+    albedo = albedo.to(accumulator_dtype(albedo.dtype))
     textured = (albedo >= NO_ALBEDO).any(1, keepdim=True)
     return torch.where(textured, albedo.clamp_min(floor), 1)

@@ -33,7 +33,8 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
 
     Returns:
         ``(B, C, H, W)`` in the dtype of ``image``; what is below the limit is equal bit by bit. Half precision is
-        summed in float32. An image of one pixel has no neighbours and is returned as it is.
+        summed in float32. Holds from black to 1e30, to rounding also where both are in one window. An image of one
+        pixel has no neighbours and is returned as it is.
 
     Raises:
         TypeError: the image is no floating-point tensor.
@@ -66,8 +67,9 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
     # Finite in the dtype: infinity times dark neighbours would be NaN.
     highest = around * (min(limit, torch.finfo(source.dtype).max) / count)
     bright = brightness > highest
-    factor = torch.where(bright, highest / torch.where(bright, brightness, 1), 1)
-    return (source * factor).to(image.dtype)
+    # Divided first: the ratio of the limit to a very bright pixel, and of that its derivative, is too small a number.
+    clamped = source / torch.where(bright, brightness, 1) * highest
+    return torch.where(bright, clamped, source).to(image.dtype)
 
 
 class ClampFireflies(nn.Module):

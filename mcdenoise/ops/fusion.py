@@ -6,6 +6,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._window import accumulator_dtype
 
 
 def downsample(image: Tensor) -> Tensor:
@@ -15,7 +16,7 @@ def downsample(image: Tensor) -> Tensor:
     only the pixels that exist.
 
     Args:
-        image: ``(B, C, H, W)``, any unit and range.
+        image: ``(B, C, H, W)``, any unit, up to a quarter of the largest number.
 
     Returns:
         ``(B, C, ceil(H / 2), ceil(W / 2))``.
@@ -81,13 +82,13 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     ``o = i_f - alpha * U(D(i_f)) + alpha * U(i_c)`` with :func:`downsample` ``D`` and :func:`upsample` ``U``.
 
     Args:
-        fine: ``(B, C, H, W)`` image ``i_f``, any unit and range.
+        fine: ``(B, C, H, W)`` image ``i_f``, any unit, up to a quarter of the largest number.
         coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` image ``i_c`` of the same unit.
         alpha: ``(B, 1, H, W)`` or ``(B, C, H, W)`` blending weight; 0 keeps ``fine``, 1 takes all low frequencies
             from ``coarse``.
 
     Returns:
-        ``(B, C, H, W)``.
+        ``(B, C, H, W)`` in the dtype of ``fine``. Half precision is computed in float32.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -111,8 +112,10 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
         raise ValueError(f"coarse: expected height and width {half} for {size} of fine, found {sizes['h'], sizes['w']}")
     if sizes["A"] not in (1, sizes["C"]):
         raise ValueError(f"alpha: expected 1 or {sizes['C']} channels, found {sizes['A']}")
+    dtype = accumulator_dtype(fine.dtype)
+    source = fine.to(dtype)
     # Linear in what is upsampled, so one upsampling serves both terms.
-    return fine + alpha * upsample(coarse - downsample(fine), size)
+    return (source + alpha.to(dtype) * upsample(coarse.to(dtype) - downsample(source), size)).to(fine.dtype)
 
 
 class LaplacianFusion(nn.Module):

@@ -39,7 +39,9 @@ def kernel_conv(
         backend: ``"torch"``, ``"numba"`` (CPU only), or ``None`` for the faster of those that can run.
 
     Returns:
-        ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32.
+        ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32. Holds while the sum of
+        ``|kernel image|`` is below the largest number; with ``"renormalize"``, also for the gradient, where the sum of
+        the weights is 0 or between 1e-15 and 1e15.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -84,7 +86,8 @@ def kernel_splat(
         backend: see :func:`kernel_conv`.
 
     Returns:
-        ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32.
+        ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32. Holds in the range of
+        :func:`kernel_conv`.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -115,9 +118,10 @@ def kernel_conv_torch(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
     radius = kernel_size // 2
     if border != "renormalize":
         return _Gather.apply(pad(image, radius, border), kernel)
-    # The mean of a few large values fits where their sum does not.
+    # The mean of a few large values fits where their sum does not, and the gradient where its two terms do not.
+    kernel = kernel.to(accumulator_dtype(kernel.dtype))
     total = _Gather.apply(pad(image.to(accumulator_dtype(image.dtype)), radius, border), kernel)
-    return (total * _renormalizer(kernel, kernel_size)).to(image.dtype)
+    return _renormalized(total, kernel, kernel_size).to(image.dtype)
 
 
 def kernel_splat_torch(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
@@ -126,7 +130,8 @@ def kernel_splat_torch(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
     radius = kernel_size // 2
     source = image.to(accumulator_dtype(image.dtype))
     if border == "renormalize":
-        source = source * _renormalizer(kernel, kernel_size).to(source.dtype)
+        kernel = kernel.to(accumulator_dtype(kernel.dtype))
+        source = _renormalized(source, kernel, kernel_size)
     return unpad(_Splat.apply(source, kernel), radius, border).to(image.dtype)
 
 
@@ -176,12 +181,13 @@ def _check(image: Tensor, kernel: Tensor, border: str) -> None:
     kernel_size_of(sizes["T"], "kernel")
 
 
-def _renormalizer(kernel: Tensor, kernel_size: int) -> Tensor:
-    """One over the sum of the weights whose taps are inside the image; 0 where that sum is 0."""
+def _renormalized(values: Tensor, kernel: Tensor, kernel_size: int) -> Tensor:
+    """``values`` over the sum of the weights whose taps are inside the image; 0 where that sum is 0."""
     mask = inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
-    total = torch.where(mask, kernel, 0).sum(1, keepdim=True, dtype=accumulator_dtype(kernel.dtype))
+    total = torch.where(mask, kernel, 0).sum(1, keepdim=True).to(values.dtype)
     empty = total == 0
-    return torch.where(empty, 0, 1 / torch.where(empty, 1, total))
+    # Divided, because the reciprocal of a very small sum is infinite.
+    return torch.where(empty, 0, values / torch.where(empty, 1, total))
 
 
 # Gather, splat and correlate are the three bilinear maps of one trilinear form, sum_{t,p,c} k[t,p] y[c,p] x[c,p+o_t]:

@@ -45,7 +45,8 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
 
     Returns:
         ``(B, 2, H, W)`` motion in pixels, x right and y down, ``previous = current + motion``; infinite where the
-        point was behind the previous camera or is not finite. Half precision gives float32.
+        point was behind the previous camera or is not finite. Half precision gives float32. Holds for any position
+        whose ``clip.w`` is between 1e-15 and 1e15, to eps times the image's size.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -115,6 +116,8 @@ def reproject(
 
     Returns:
         ``(B, C, H, W)`` value in the dtype of ``previous``, and ``(B, 1, H, W)`` kept weight in [0, 1].
+        Holds for any motion, known or not, and whatever is in a tap that is left out; a place in the image is known to
+        eps times its size.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -219,7 +222,9 @@ def accumulate(
 
     Returns:
         ``(B, C, H, W)`` accumulated radiance in the dtype of ``color``, and ``(B, 1, H, W)`` history length in that of
-        ``previous_length``.
+        ``previous_length``. Between ``color`` and ``previous`` for any motion. The error of a history that is stored in
+        the dtype's unit roundoff ``u`` stays below ``u / alpha_min`` of its largest value, however many frames; the
+        length counts up to ``1 / u`` and stays there.
 
     Raises:
         TypeError: an argument is no floating-point tensor.

@@ -384,7 +384,10 @@ def _weigh(
     adjusted = guided or border == _RENORMALIZE
     _read_taps(weights, kernel, b, y, x0, n)
     exponents = weights if log_domain else factors
-    if not log_domain:
+    if log_domain:
+        for t in range(taps):
+            _make_finite(weights[t, :n])
+    else:
         factors[:, :n] = 0 if adjusted else 1
     if guided:
         _read_scales(falloff, scales, distance, b, y, x0, n)
@@ -406,11 +409,14 @@ def _weigh(
     if border == _RENORMALIZE:
         for t in range(taps):
             row, dx = y + t // kernel_size - radius, t % kernel_size - radius
-            if row < 0 or row >= height:
-                exponents[t, :n] = -np.inf
-            else:
-                exponents[t, : min(max(-dx - x0, 0), n)] = -np.inf
-                exponents[t, min(max(width - dx - x0, 0), n) : n] = -np.inf
+            outside = row < 0 or row >= height
+            first = n if outside else min(max(-dx - x0, 0), n)
+            last = n if outside else min(max(width - dx - x0, 0), n)
+            for start, stop in ((0, first), (last, n)):
+                exponents[t, start:stop] = -np.inf
+                if not log_domain:
+                    # An infinite weight times nothing is NaN.
+                    weights[t, start:stop] = 0
     if log_domain:
         top[:] = weights[0, :n]
         for t in range(1, taps):
@@ -449,6 +455,14 @@ def _read_scales(falloff: Any, scales: Any, distance: Any, b: int, y: int, x0: i
 def _exponential(values: Any, offset: Any) -> None:
     for x in range(values.size):
         values[x] = _exp(values[x] - offset[x])
+
+
+@compiled
+def _make_finite(values: Any) -> None:
+    """Infinity as the largest number: the weight of each of two infinite logits is not NaN, but half."""
+    largest = np.finfo(values.dtype).max
+    for x in range(values.size):
+        values[x] = min(max(values[x], -largest), largest)
 
 
 @compiled

@@ -1,0 +1,113 @@
+"""How far an accumulated history lags behind the light: a test of its local mean against that of a shorter one."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._window import accumulator_dtype
+
+THRESHOLD = 3.0
+KERNEL_SIZE = 7
+# Of the local mean: a difference that no eye sees is no lag, however little noise there is.
+SMALLEST = 1e-3
+
+
+def history_lag(
+    history: Tensor, recent: Tensor, *, threshold: float = THRESHOLD, kernel_size: int = KERNEL_SIZE
+) -> Tensor:
+    """How much of a long history to give up for a shorter one, because the light has changed.
+
+    Noise hides a change of the light in a pixel, but not in the mean of a window. With ``y`` the mean over channels,
+    ``m_h`` and ``m_r`` its means over the ``n`` pixels of the window that lie in the image, of ``history`` and of
+    ``recent``, and the standard error of the latter ``s^2 = mean((y_r - m_r)^2) / n``,
+
+    ``z^2 = (m_r - m_h)^2 / (s^2 + (0.001 (|m_h| + |m_r|) / 2)^2)``,
+    ``lag = clamp((z^2 / threshold^2 - 1) / 3, 0, 1)``:
+
+    0 up to ``threshold`` standard errors, 1 from twice as many. One outlier in the window raises ``m_r`` and ``s``
+    alike, and is no lag. Detail is none either: both means contain it.
+
+    Args:
+        history: ``(B, C, H, W)`` radiance of a long history, finite, any unit; usually demodulated.
+        recent: ``(B, C, H, W)`` the same of a shorter history or of the current frame, with more noise and less lag.
+        threshold: standard errors up to which a difference is taken for noise, above 0.
+        kernel_size: side of the window in pixels, odd, at least 3.
+
+    Returns:
+        ``(B, 1, H, W)`` share in [0, 1] in the dtype of ``history``: ``lerp(history, recent, lag)`` has no lag. Half
+        precision is computed in float32. Values are compared in units of the image's largest one; below 1e-15 of it
+        nothing counts as lag.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: a shape or a setting does not fit.
+
+    Differentiable in ``history`` and ``recent``, to any order, where the share is not exactly at its limits.
+
+    Source: the idea of Schied et al. 2018, "Gradient estimation for real-time adaptive temporal filtering" (A-SVGF),
+    and of the fast history of NVIDIA's ReLAX; with a test of means in place of re-shaded samples and of color boxes.
+
+    Example:
+        >>> history = torch.ones(1, 3, 9, 9)
+        >>> history_lag(history, torch.zeros(1, 3, 9, 9)).unique().tolist()  # the light went out
+        [1.0]
+        >>> noise = torch.rand(1, 3, 9, 9, generator=torch.Generator().manual_seed(0)) * 2
+        >>> history_lag(history, noise).unique().tolist()
+        [0.0]
+    """
+    check_shapes(history=(history, "B C H W"), recent=(recent, "B C H W"))
+    _check_settings(threshold, kernel_size)
+    if history.numel() == 0:
+        return history[:, :1]
+    dtype = accumulator_dtype(history.dtype)
+    # Squares keep within range of numbers up to 1. Divided before they are summed, which could overflow.
+    largest = torch.maximum(history.detach().abs(), recent.detach().abs()).to(dtype).amax((1, 2, 3), keepdim=True)
+    largest = torch.where(largest > 0, largest, 1)
+    long, short = ((image.to(dtype) / largest).mean(1, keepdim=True) for image in (history, recent))
+    # Not the difference of the means, which cancels.
+    mean, difference = _box(short, kernel_size), _box(short - long, kernel_size)
+    count = _box(torch.ones_like(short), kernel_size, divide=False)
+    # Nor is this the mean of squares less the square of the mean.
+    variance = _box((short - mean).square(), kernel_size) / count
+    smallest = SMALLEST * ((mean - difference).abs() + mean.abs()) / 2
+    noise = threshold**2 * (variance + smallest.square())
+    some = noise > 0
+    ratio = torch.where(some, difference.square() / torch.where(some, noise, 1), 0)
+    return ((ratio - 1) / 3).clamp(0, 1).to(history.dtype)
+
+
+class HistoryLag(nn.Module):
+    """:func:`history_lag` with its settings stored.
+
+    Args:
+        threshold: see :func:`history_lag`.
+        kernel_size: see :func:`history_lag`.
+    """
+
+    def __init__(self, threshold: float = THRESHOLD, kernel_size: int = KERNEL_SIZE) -> None:
+        super().__init__()
+        _check_settings(threshold, kernel_size)
+        self.threshold = threshold
+        self.kernel_size = kernel_size
+
+    def forward(self, history: Tensor, recent: Tensor) -> Tensor:
+        """See :func:`history_lag`."""
+        return history_lag(history, recent, threshold=self.threshold, kernel_size=self.kernel_size)
+
+
+def _check_settings(threshold: float, kernel_size: int) -> None:
+    if not threshold > 0:
+        raise ValueError(f"threshold: expected above 0, found {threshold}")
+    if kernel_size < 3 or kernel_size % 2 == 0:
+        raise ValueError(f"kernel_size: expected odd and at least 3, found {kernel_size}")
+
+
+def _box(image: Tensor, kernel_size: int, divide: bool = True) -> Tensor:
+    """Mean over the pixels of each window that exist, or with ``divide=False`` the sum, along one axis at a time."""
+    for size, padding in (((1, kernel_size), (0, kernel_size // 2)), ((kernel_size, 1), (kernel_size // 2, 0))):
+        override = None if divide else 1
+        image = F.avg_pool2d(image, size, 1, padding, count_include_pad=False, divisor_override=override)
+    return image

@@ -1,0 +1,180 @@
+"""What must hold for a whole :class:`mcdenoise.denoiser.Denoiser`, whatever the frames are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mcdenoise.buffers import Frame, replace_invalid
+from mcdenoise.denoiser import Denoiser, Precision
+from mcdenoise.errors import InputError
+from mcdenoise.stability._check import DTYPES, Check, name_of
+from mcdenoise.stability._models import ALLOWED, EXPOSURES, relative_change
+
+FRAMES = 3
+_SIZE = (17, 23)
+_MIDDLE = (8, 11)
+_PROBE = 8
+# What is never repaired, but told: no buffer but color may hold NaN.
+_REFUSED = ("albedo", "normal", "depth", "position", "motion", "view_projection")
+
+
+def check_denoiser(model: str = "cascaded", dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
+    """Everything that must hold, with frames in each dtype; bfloat16 also runs the network's convolutions.
+
+    Args:
+        model: name of a model with shipped weights.
+        dtypes: of the frames.
+    """
+    for dtype in dtypes:
+        precision: Precision = "bfloat16" if dtype == torch.bfloat16 else "float32"
+        denoiser = Denoiser(model, precision=precision)
+        for name, frames in _shots(dtype).items():
+            yield _valid(denoiser, name, frames, dtype)
+        for value in (torch.nan, torch.inf, -1.0):
+            yield _contained(denoiser, value, dtype)
+        yield from (_refused(denoiser, name, dtype) for name in _REFUSED)
+        yield from (_exposure(denoiser, exposure, dtype) for exposure in EXPOSURES)
+
+
+def _frame(seed: int, dtype: torch.dtype, size: tuple[int, int] = _SIZE) -> Frame:
+    """A wall of noise and mirrors that moves by a fraction of a pixel, seen from a camera at the origin."""
+    g = torch.Generator().manual_seed(seed)
+    height, width = size
+    depth = 2 + torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(0))
+    position = torch.cat([torch.rand(1, 2, height, width, generator=g) - 0.5, depth], 1)
+    matrix = torch.eye(4)[None]
+    matrix[:, 2, 3], matrix[:, 3, 3] = 1, 0
+    albedo = torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(1)) * (depth < 2.8)
+    normal = torch.tensor([0.0, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, height, width)
+    return Frame(
+        color=10 ** (4 * torch.rand(1, 3, height, width, generator=g) - 2),
+        albedo=albedo,
+        normal=normal,
+        depth=depth,
+        position=position,
+        motion=torch.full((1, 2, height, width), 0.25),
+        view_projection=matrix,
+    ).to(dtype)
+
+
+def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
+    """Short shots of what renderers hand over on a bad day; finite values beyond the dtype are its largest."""
+    frames = [_frame(seed, dtype) for seed in range(FRAMES)]
+    limits = torch.finfo(dtype)
+
+    def with_value(name: str, value: float, only: slice = slice(None)) -> list[Frame]:
+        finite = (
+            value if value in (torch.inf, -torch.inf) or value != value else min(max(value, limits.min), limits.max)
+        )
+        changed = []
+        for frame in frames:
+            buffer = dict(frame.items())[name].clone()
+            buffer[:, :, only] = finite
+            changed.append(frame.replace(**{name: buffer}))
+        return changed
+
+    some = slice(3, 9)
+    shots = {f"radiance {value:g}": with_value("color", value) for value in (0.0, 1e-40, 1e-30, 65504.0, 1e6, 1e30)}
+    shots |= {
+        f"color {value:g} in some rows": with_value("color", value, some) for value in (torch.nan, torch.inf, -1.0)
+    }
+    shots |= {"no valid color": with_value("color", torch.nan)}
+    shots |= {f"albedo {value:g}": with_value("albedo", value) for value in (0.0, 1e-8, 1.0, 1.9)}
+    shots |= {
+        f"depth {value:g} in some rows": with_value("depth", value, some) for value in (0.0, 1e-30, 1e10, torch.inf)
+    }
+    shots |= {f"normal {value:g} in some rows": with_value("normal", value, some) for value in (0.0, 0.1, 1.0)}
+    shots |= {
+        f"motion {value:g} in some rows": with_value("motion", value, some)
+        for value in (1e4, 1e30, torch.inf, -torch.inf)
+    }
+    shots |= {f"position {value:g} in some rows": with_value("position", value, some) for value in (0.0, 1e10)}
+    shots |= {f"{h}x{w}": [_frame(seed, dtype, (h, w)) for seed in range(FRAMES)] for h, w in ((1, 1), (1, 9), (9, 1))}
+    shots |= {"nothing but color": [Frame(color=frame.color) for frame in frames]}
+    return shots
+
+
+def _valid(denoiser: Denoiser, name: str, frames: list[Frame], dtype: torch.dtype) -> Check:
+    """Finite and non-negative, frame after frame."""
+    denoiser.reset()
+    message = ""
+    for number, frame in enumerate(frames):
+        image = denoiser(frame)
+        if not torch.isfinite(image).all() or not (image >= 0).all():
+            message = message or f"frame {number}: NaN, infinite or negative pixels"
+    return _found(name, dtype, "finite", message)
+
+
+def _contained(denoiser: Denoiser, value: float, dtype: torch.dtype) -> Check:
+    """A pixel that is no radiance is repaired: the images are those of frames with its neighbours' mean, exactly."""
+    message, images = "", list[list[Tensor]]()
+    for repaired in (False, True):
+        denoiser.reset()
+        shot = []
+        for seed in range(FRAMES):
+            frame = _frame(seed, dtype).to(torch.float32)
+            color = frame.color.clone()
+            color[(..., *_MIDDLE)] = value
+            mended, count = replace_invalid(color)
+            kept = torch.ones_like(color, dtype=torch.bool)
+            kept[(..., *_MIDDLE)] = False
+            if count != 1 or not torch.equal(mended[kept], color[kept]):
+                message = "another pixel than the broken one was replaced"
+            if repaired:
+                color[(..., *_MIDDLE)] = mended[(..., *_MIDDLE)]
+            shot.append(denoiser(frame.replace(color=color)))
+        images.append(shot)
+    if not all(torch.equal(a, b) for a, b in zip(*images, strict=True)):
+        message = message or "a broken pixel changes its neighbours"
+    return _found(f"one pixel of {value:g}", dtype, "contained", message)
+
+
+def _refused(denoiser: Denoiser, name: str, dtype: torch.dtype) -> Check:
+    """NaN in any other buffer is told, in one line that names it, and leaves the history as it was."""
+    denoiser.reset()
+    frames = [_frame(seed, dtype) for seed in range(2)]
+    buffer = dict(frames[1].items())[name].clone()
+    buffer.reshape(-1)[0] = torch.nan
+    denoiser(frames[0])
+    try:
+        denoiser(frames[1].replace(**{name: buffer}))
+        message = "accepted"
+    except InputError as error:
+        message = "" if name in str(error) and "\n" not in str(error) else f"not one clear line: {error}"
+    again = denoiser(frames[1])
+    denoiser.reset()
+    denoiser(frames[0])
+    if not message and not torch.equal(again, denoiser(frames[1])):
+        message = "the history was changed by a frame that was refused"
+    return _found(f"NaN in {name}", dtype, "refused", message)
+
+
+def _exposure(denoiser: Denoiser, exposure: float, dtype: torch.dtype) -> Check:
+    """``denoise(s x) = s denoise(x)``, after a history.
+
+    Scaling rounds every pixel of every frame, and each stage once more: the bound is as of a model, so many times what
+    a relative change of all colors by ``u`` does to the image.
+    """
+
+    def image(change: Callable[[Tensor], Tensor]) -> Tensor:
+        denoiser.reset()
+        frames = [_frame(seed, dtype).to(torch.float32) for seed in range(FRAMES)]
+        return [denoiser(frame.replace(color=change(frame.color))) for frame in frames][-1]
+
+    signs = torch.randint(0, 2, (1, 3, *_SIZE), generator=torch.Generator().manual_seed(0)) * 2 - 1
+    eps = torch.finfo(torch.bfloat16 if denoiser.precision == "bfloat16" else torch.float32).eps
+    plain = image(lambda color: color)
+    response = relative_change(image(lambda color: color * (1 + _PROBE * eps * signs)), plain) / _PROBE / 2
+    error = relative_change(image(lambda color: color * exposure) / exposure, plain) / eps
+    allowed = ALLOWED * max(response / eps, 1)
+    message = "" if error <= allowed else f"error {error:.3g} eps, expected at most {allowed:.3g}"
+    check = _found(f"exposure {exposure:g}", dtype, "exposure", message)
+    return replace(check, error=error, allowed=allowed, condition=2 * response / eps)
+
+
+def _found(case: str, dtype: torch.dtype, what: str, message: str) -> Check:
+    return Check("Denoiser", case, name_of(dtype), "", what, 0, 0, 0, not message, message)

@@ -1,0 +1,401 @@
+"""Errors of ops and their gradients, against bounds from the analysis of rounding.
+
+The bound of a result ``y = f(x)``. Let ``u`` be the unit roundoff of the dtype in which an op computes (half precision
+computes in float32) and ``v`` that of the result's. An op that is backward stable gives the exact result of inputs off
+by at most ``n u`` of their magnitude ``s``, and rounds the result:
+
+    ``|error| <= v |y| + n u (|y| + sum_j s_j |dy / dx_j|)``
+
+The sum is the (absolute, componentwise) condition number: how far the exact result moves when inputs do. It is not
+taken from derivatives but measured in float64, by moving every input up and down by ``16 u``, so that a kink or a jump
+as near as rounding can reach is in it. ``s_j`` is ``|x_j|``, at least the smallest normal number (below it there are
+fewer digits), and more where an op computes with larger numbers, see :class:`mcdenoise.ops._case.Rounding`.
+
+``n`` is a count of roundings. A sum of ``m`` terms has ``m - 1``, and a result that depends on ``m`` inputs is made of
+sums of at most so many; what is multiplied, divided and exponentiated on the way adds no more than 8. So ``n = m + 8``.
+
+The same holds for gradients, as functions of inputs and upstream gradient; half precision is rounded between the steps
+of an op, since that is what it hands to autograd, so that ``u`` is the dtype's own there.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import get_args, get_type_hints
+
+import torch
+from torch import Tensor
+
+from mcdenoise.errors import InputError
+from mcdenoise.ops._case import Case, Inputs, Op, Rounding, map_tensors
+from mcdenoise.ops._cases import OPS
+from mcdenoise.ops._window import accumulator_dtype
+from mcdenoise.ops.temporal import Surface
+from mcdenoise.stability._check import DTYPES, Check, name_of
+
+_DEPTH = 8
+_PROBE = 16
+_AT_ONCE = 256  # changed inputs in one batch
+_NOISE = 1e-12  # of float64 itself: a vectorised exponential rounds its last elements differently
+_CONSTANT = 0.7
+# Powers of two scale without rounding, so that results must scale bit by bit: 1.2e-4 and 8.2e3.
+_EXPOSURES = (2.0**-13, 2.0**13)
+ADJOINTS = (("kernel_conv", "kernel_splat"),)
+
+Function = Callable[[Sequence[Tensor]], list[Tensor]]
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """An op on a case in a dtype: what it is a function of, and the numbers to try."""
+
+    op: Op
+    case: Case
+    dtype: torch.dtype
+    backend: str
+    inputs: Inputs
+
+    @property
+    def leaves(self) -> list[Tensor]:
+        """The tensors that are rounded; a surface is only compared."""
+        found: list[Tensor] = []
+        map_tensors(lambda tensor: found.append(tensor) or tensor, self.numbers)  # type: ignore[func-returns-value]
+        return found
+
+    @property
+    def numbers(self) -> Inputs:
+        """The arguments that are rounded."""
+        return {name: value for name, value in self.inputs.items() if not isinstance(value, Surface)}
+
+    def run(self, leaves: Sequence[Tensor]) -> list[Tensor]:
+        """The op with other tensors in place of :attr:`leaves`, possibly several batches of them."""
+        remaining = iter(leaves)
+        given = map_tensors(lambda _: next(remaining), self.numbers)
+        copies = leaves[0].shape[0] // max(self.leaves[0].shape[0], 1)
+        surfaces = {name: value for name, value in self.inputs.items() if name not in given}
+        repeated = map_tensors(lambda tensor: tensor.to(leaves[0].dtype).repeat(copies, 1, 1, 1), surfaces)
+        # The float64 twin always runs on the first backend, the plain one.
+        backend = self.backend if leaves[0].dtype == self.dtype else backends(self.op)[0]
+        chosen = {"backend": backend} if backend else {}
+        results = self.op.function(**given, **repeated, **self.case.settings, **chosen)
+        return [results] if isinstance(results, Tensor) else list(results)
+
+    def gradients(self, leaves: Sequence[Tensor]) -> list[Tensor]:
+        """Of the results with upstream gradients, which are the last of ``leaves``, in the others."""
+        own = [leaf.detach().requires_grad_() for leaf in leaves[: len(self.leaves)]]
+        with torch.enable_grad():
+            results = self.run(own)
+            pairs = [(r, v) for r, v in zip(results, leaves[len(own) :], strict=True) if r.requires_grad]
+            if not pairs:
+                return [torch.zeros_like(leaf) for leaf in own]
+            gradients = torch.autograd.grad(
+                [result for result, _ in pairs], own, [v.to(result.dtype) for result, v in pairs], allow_unused=True
+            )
+        return [torch.zeros_like(x) if g is None else g for x, g in zip(own, gradients, strict=True)]
+
+
+@dataclass(frozen=True)
+class _Exact:
+    """One result in float64, with what its error may be."""
+
+    value: Tensor
+    condition: Tensor
+    bound: Tensor
+
+
+def select(names: Sequence[str] | None = None) -> list[Op]:
+    """Ops by name; all for ``None``.
+
+    Raises:
+        InputError: there is no op of such a name.
+    """
+    known = {op.name: op for op in OPS}
+    unknown = [name for name in names or () if name not in known]
+    if unknown:
+        raise InputError(f"op: expected one of {', '.join(known)}, found {', '.join(unknown)}")
+    return list(OPS) if names is None else [known[name] for name in names]
+
+
+def backends(op: Op) -> tuple[str, ...]:
+    """What the op can be asked to run on, from its signature; ``("",)`` where there is nothing to choose."""
+    if "backend" not in inspect.signature(op.function).parameters:
+        return ("",)
+    hint = get_type_hints(op.function)["backend"]
+    options = [option for part in (hint, *get_args(hint)) for option in get_args(part) if isinstance(option, str)]
+    return tuple(dict.fromkeys(options)) or ("",)
+
+
+def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
+    """Everything that must hold for an op, in each dtype, on each backend that runs here, case by case.
+
+    Args:
+        op: an op of the table.
+        dtypes: the dtypes to try it in.
+    """
+    for dtype in dtypes:
+        for backend in backends(op):
+            for case in op.cases:
+                yield from check_case(op, case, dtype, backend)
+        for pair in ADJOINTS:
+            if op.name == pair[0]:
+                yield from _check_adjoint(op, next(other for other in OPS if other.name == pair[1]), dtype)
+
+
+def check_case(op: Op, case: Case, dtype: torch.dtype, backend: str = "") -> list[Check]:
+    """Everything that must hold for an op on one case.
+
+    Args:
+        op: an op of the table.
+        case: one of its cases.
+        dtype: of the inputs.
+        backend: see :func:`backends`.
+
+    Returns:
+        One check of each kind that applies; a single one, ``"runs"``, where the backend refuses.
+    """
+    trial = _Trial(op, case, dtype, backend, case.inputs(dtype))
+    try:
+        results = trial.run(trial.leaves)
+    except ValueError as error:
+        # A backend that cannot run on this machine says so.
+        passed = bool(backend) and "can run here" in str(error)
+        return [Check(op.name, case.name, name_of(dtype), backend, "runs", 0, 0, 0, passed, str(error))]
+    exact = _exact_results(trial, results)
+    checks = [_compare(trial, "forward", results, exact)]
+    upstream = [_upstream(result) for result in results]
+    leaves = [*trial.leaves, *upstream]
+    try:
+        gradients = trial.gradients(leaves)
+    except ValueError as error:
+        # A backend that has no derivatives says so too.
+        if not backend or "can run here" not in str(error):
+            raise
+    else:
+        checks.append(_compare(trial, "gradient", gradients, _exact_gradients(trial, leaves, exact)))
+    if op.weights(case.settings):
+        checks.append(_check_weights(trial, results[0]))
+    if op.images and case.kind != "extreme":
+        checks += [_check_constant(trial), _check_exposure(trial, results[0])]
+    return checks
+
+
+def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
+    """The op's results by its equation, and how far they may be missed."""
+    inputs = map_tensors(Tensor.double, trial.inputs)
+    references = trial.op.reference(**inputs, **trial.case.settings)
+    references = [references] if isinstance(references, Tensor) else list(references)
+    dtype = accumulator_dtype(trial.dtype)
+    rounding = trial.op.rounding(inputs, trial.case.settings)
+    leaves = [leaf.double() for leaf in trial.leaves]
+    magnitudes = _magnitudes(trial, leaves, rounding, dtype)
+    conditions = _conditions(trial.run, leaves, magnitudes, dtype)
+    return [
+        _bounded(reference, condition + rounding.result, fan_in, dtype, result.dtype)
+        for reference, result, (condition, fan_in) in zip(references, results, conditions, strict=True)
+    ]
+
+
+def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact]) -> list[_Exact]:
+    """The gradients of the float64 op, which gradcheck proves against difference quotients."""
+    rounding = trial.op.rounding(map_tensors(Tensor.double, trial.inputs), trial.case.settings)
+    exact = [leaf.double() for leaf in leaves]
+    magnitudes = _magnitudes(trial, exact[: len(trial.leaves)], rounding, trial.dtype)
+    magnitudes += [leaf.abs() + torch.finfo(trial.dtype).tiny for leaf in exact[len(trial.leaves) :]]
+    conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype)
+    largest = max((leaf.abs().max().item() for leaf in exact[len(trial.leaves) :] if leaf.numel()), default=0.0)
+    cancelling = _by_leaf(trial, [torch.zeros_like(leaf) for leaf in exact[: len(trial.leaves)]], rounding.gradients)
+    # Where a result is infinite by right, so may its derivative be, or be nothing at all; elsewhere nothing excuses it.
+    defined = all(result.value.isfinite().all() for result in results)
+    bounded = []
+    for value, terms, (condition, fan_in) in zip(trial.gradients(exact), cancelling, conditions, strict=True):
+        excused = ~value.isnan() | (not defined)
+        condition = torch.where(excused, condition + largest * terms, 0)
+        bounded.append(_bounded(torch.where(excused, value, 0), condition, fan_in, trial.dtype, trial.dtype))
+    return bounded
+
+
+def _magnitudes(trial: _Trial, leaves: list[Tensor], rounding: Rounding, dtype: torch.dtype) -> list[Tensor]:
+    """How large the numbers are whose rounding each input must absorb."""
+    inner = _by_leaf(trial, [leaf.abs() for leaf in leaves], rounding.arguments)
+    return [magnitude + torch.finfo(dtype).tiny for magnitude in inner]
+
+
+def _by_leaf(trial: _Trial, defaults: list[Tensor], given: Inputs) -> list[Tensor]:
+    """One tensor for each leaf: what is given for its argument, or else its default."""
+    remaining, found = iter(defaults), list[Tensor]()
+    named = map_tensors(lambda _: next(remaining), trial.numbers)
+    map_tensors(lambda tensor: found.append(tensor) or tensor, named | given)  # type: ignore[func-returns-value]
+    return found
+
+
+def _conditions(
+    function: Function, leaves: list[Tensor], magnitudes: list[Tensor], dtype: torch.dtype
+) -> list[tuple[Tensor, Tensor]]:
+    """Of each result ``sum_j s_j |dy / dx_j|``, measured, and the number of inputs that it depends on.
+
+    All ops treat the images of a batch alike and alone, so that many changed inputs are tried in one call.
+    """
+    step = _PROBE * torch.finfo(dtype).eps / 2
+    base = function(leaves)
+    # Infinity is not rounded, and what is never negative is not moved below zero.
+    steps = [torch.where(size.isfinite(), step * size, 0).flatten().tolist() for size in magnitudes]
+    down = [((leaf != 0) | (leaf < 0).any()).flatten().tolist() for leaf in leaves]
+    totals = [torch.zeros_like(result) for result in base]
+    fans = [torch.zeros_like(result) for result in base]
+    places = [(i, j) for i, leaf in enumerate(leaves) for j in range(leaf.numel())]
+    for start in range(0, len(places), _AT_ONCE):
+        chosen = places[start : start + _AT_ONCE]
+        copies = [leaf.repeat(2 * len(chosen), *(1,) * (leaf.ndim - 1)) for leaf in leaves]
+        for k, (i, j) in enumerate(chosen):
+            flat = copies[i].reshape(2 * len(chosen), -1)
+            flat[2 * k, j] += steps[i][j]
+            flat[2 * k + 1, j] -= steps[i][j] * down[i][j]
+        for result, total, fan, changed in zip(base, totals, fans, function(copies), strict=True):
+            both = changed.reshape(len(chosen), 2, *result.shape)
+            change = (both - result).abs()
+            same = (both == result) | (both.isnan() & result.isnan()) | (change <= _NOISE * result.abs())
+            larger = torch.where(same, 0, change.nan_to_num(nan=math.inf)).amax(1)
+            total += larger.sum(0) / step
+            fan += (larger > 0).sum(0)
+    return list(zip(totals, fans, strict=True))
+
+
+def _bounded(value: Tensor, condition: Tensor, fan_in: Tensor, inner: torch.dtype, outer: torch.dtype) -> _Exact:
+    size = torch.where(value.isfinite(), value.abs(), 0)
+    condition = size + condition
+    bound = _unit(outer) * size + torch.finfo(outer).tiny + (fan_in + _DEPTH) * _unit(inner) * condition
+    return _Exact(value, condition, bound)
+
+
+def _compare(trial: _Trial, what: str, results: list[Tensor], exact: list[_Exact]) -> Check:
+    """The result nearest to its bound, or beyond; what cannot be held must be infinite, and all else finite."""
+    worst, highest, condition, message = (0.0, 0.0), 0.0, 0.0, ""
+    for result, truth in zip(results, exact, strict=True):
+        largest = torch.finfo(result.dtype).max
+        # Sums of both signs may leave the range on the way to a result within it.
+        safe = truth.condition < torch.finfo(accumulator_dtype(result.dtype)).max / 2
+        safe &= truth.value.abs() + truth.bound < largest
+        found = result.double()
+        error = (found - truth.value).abs()
+        beyond = truth.value.isfinite() & ~safe
+        error = torch.where(beyond | (found == truth.value), 0, error)
+        error = torch.where(truth.value.isnan(), 0, error)
+        error = torch.where(error.isnan(), math.inf, error)
+        if found[beyond].isnan().any() and truth.condition[beyond].isfinite().all():
+            message = message or "NaN where the result is too large for the dtype"
+        share = torch.where(error == 0, 0, error / truth.bound)
+        if not share.numel():
+            continue
+        magnification = torch.where(truth.value != 0, truth.condition / truth.value.abs(), 0)
+        condition = max(
+            condition, magnification[magnification.isfinite()].max().item() if magnification.isfinite().any() else 0
+        )
+        i = int(share.argmax())
+        if share.reshape(-1)[i] >= highest:
+            highest = share.reshape(-1)[i].item()
+            unit = torch.finfo(result.dtype).eps * truth.condition.reshape(-1)[i].item()
+            worst = (
+                (error.reshape(-1)[i].item() / unit, truth.bound.reshape(-1)[i].item() / unit) if unit else (0.0, 0.0)
+            )
+        if share.max() > 1 and not message:
+            message = f"found {found.reshape(-1)[i].item():.9g}, expected {truth.value.reshape(-1)[i].item():.9g}"
+    return _found(trial, what, *worst, condition, message)
+
+
+def _check_weights(trial: _Trial, weights: Tensor) -> Check:
+    """Non-negative, and of sum one: each is rounded by its share of ``v``, and the sum by one more for each tap."""
+    total = weights.double().sum(1)
+    allowed = _unit(weights.dtype) + (weights.shape[1] + _DEPTH) * _unit(accumulator_dtype(weights.dtype))
+    allowed += weights.shape[1] * torch.finfo(weights.dtype).tiny
+    error = (total - 1).abs().max().item() if total.numel() else 0.0
+    message = "" if bool((weights >= 0).all()) else "a weight is negative or NaN"
+    if not error <= allowed and not message:
+        message = f"weights sum to 1 +- {error:.3g}, expected +- {allowed:.3g}"
+    eps = torch.finfo(weights.dtype).eps
+    return _found(trial, "weights", error / eps, allowed / eps, 1.0, message)
+
+
+def _check_constant(trial: _Trial) -> Check:
+    """The forward check once more, with constant images: a mean of equal numbers is that number."""
+    inputs = dict(trial.inputs)
+    for name in trial.op.images:
+        inputs[name] = torch.full_like(_tensor(inputs[name]), _CONSTANT)
+    constant = replace(trial, inputs=inputs)
+    results = constant.run(constant.leaves)
+    return _compare(constant, "constant", results[:1], _exact_results(constant, results)[:1])
+
+
+def _check_exposure(trial: _Trial, result: Tensor) -> Check:
+    """``f(s x) = s f(x)``, bit by bit while nothing leaves the range of the dtype."""
+    message = ""
+    for exposure in _EXPOSURES:
+        inputs = dict(trial.inputs)
+        for name in trial.op.images:
+            inputs[name] = _tensor(inputs[name]) * exposure
+        scaled = replace(trial, inputs=inputs)
+        if not all(bool(_normal_range(_tensor(inputs[name])).all()) for name in trial.op.images):
+            continue
+        found, expected = scaled.run(scaled.leaves)[0], result * exposure
+        if not torch.equal(found, expected) and bool(_normal_range(expected).all()):
+            message = f"scaled by {exposure:g}, the result is not that of the unscaled image times {exposure:g}"
+    return _found(trial, "exposure", 0, 0, 1.0, message)
+
+
+def _normal_range(tensor: Tensor) -> Tensor:
+    limits = torch.finfo(tensor.dtype)
+    # Terms of a sum may be smaller than the sum.
+    size = tensor.abs()
+    return (size == 0) | ((size >= limits.tiny / limits.eps) & (size <= limits.max / 64))
+
+
+def _check_adjoint(op: Op, transpose: Op, dtype: torch.dtype) -> Iterator[Check]:
+    """``<f(x), y> = <x, f^T(y)>``: both are the same sum, of terms rounded no more than those of a result are."""
+    for case in op.cases:
+        if case.kind == "extreme":
+            continue
+        trial = _Trial(op, case, dtype, "", case.inputs(dtype))
+        (name,) = op.images
+        x, others = _tensor(trial.inputs[name]), {k: v for k, v in trial.inputs.items() if k != name}
+        result = op.function(**{name: x}, **others, **case.settings)
+        y = _upstream(result)
+        back = transpose.function(**{name: y}, **others, **case.settings)
+        left, right = (result.double() * y.double()).sum(), (x.double() * back.double()).sum()
+        absolute = map_tensors(lambda tensor: tensor.double().abs(), others)
+        terms = (op.function(**{name: x.double().abs()}, **absolute, **case.settings) * y.double().abs()).sum().item()
+        count = _tensor(others["kernel"]).shape[1]
+        # Signed weights are not the normalised ones of their absolute values: the terms are larger by that ratio.
+        if case.settings.get("border") == "renormalize":
+            terms *= _cancellation(_tensor(others["kernel"]))
+        allowed = 2 * (_unit(dtype) + 2 * (count + _DEPTH) * _unit(accumulator_dtype(dtype))) * terms
+        error = abs((left - right).item())
+        message = "" if error <= allowed else f"<f(x), y> = {left:.9g}, <x, f^T(y)> = {right:.9g}"
+        unit = torch.finfo(dtype).eps * terms
+        yield _found(trial, "adjoint", error / unit, allowed / unit, 1.0, message)
+
+
+def _cancellation(kernel: Tensor) -> float:
+    kernel = kernel.double()
+    total = kernel.sum(1).abs()
+    return float((kernel.abs().sum(1) / torch.where(total > 0, total, torch.inf)).max().clamp_min(1))
+
+
+def _found(trial: _Trial, what: str, error: float, allowed: float, condition: float, message: str) -> Check:
+    names = (trial.op.name, trial.case.name, name_of(trial.dtype), trial.backend)
+    return Check(*names, what, error, allowed, condition, not message, message)
+
+
+def _upstream(result: Tensor) -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+    return torch.randn(result.shape, generator=generator, dtype=torch.float64).to(result.dtype)
+
+
+def _tensor(value: object) -> Tensor:
+    assert isinstance(value, Tensor)
+    return value
+
+
+def _unit(dtype: torch.dtype) -> float:
+    return torch.finfo(dtype).eps / 2

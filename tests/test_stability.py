@@ -1,0 +1,259 @@
+"""The checks of numerical stability: the ops pass, and what is unstable fails."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mpmath
+import pytest
+import torch
+from torch import Tensor
+
+from mcdenoise import stability
+from mcdenoise.cli import main
+from mcdenoise.errors import InputError
+from mcdenoise.ops import kernel_conv
+from mcdenoise.ops._cases import OPS, Op
+from mcdenoise.stability import Check, check_case, check_denoiser, check_model, check_op, long_runs, summarize
+from mcdenoise.stability import _ops as op_checks
+
+BY_NAME = {op.name: op for op in OPS}
+
+
+def failures(op: Op, dtype: torch.dtype = torch.float32) -> dict[str, set[str]]:
+    """For each kind of check that fails the cases that it fails on."""
+    found: dict[str, set[str]] = {}
+    for check in check_op(op, (dtype,)):
+        if not check.passed:
+            assert check.message
+            found.setdefault(check.what, set()).add(check.case)
+    return found
+
+
+def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
+    """The op of that name with another implementation."""
+    op = replace(BY_NAME[name], function=function, **changes)
+    function.__name__ = name
+    return op
+
+
+# bfloat16 and float16 take the same way through the ops; `mcdenoise stability` tries them all.
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16], ids=str)
+@pytest.mark.parametrize("op", OPS, ids=lambda op: op.name)
+def test_every_op_is_stable(op: Op, dtype: torch.dtype) -> None:
+    checks = list(check_op(op, (dtype,)))
+    assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
+    assert {check.case for check in checks if check.what == "forward"} == {case.name for case in op.cases}
+    assert {check.case for check in checks if check.what == "gradient"} == {case.name for case in op.cases}
+
+
+def test_every_op_has_stiff_or_extreme_cases() -> None:
+    assert all(sum(case.kind != "ordinary" for case in op.cases) >= 5 for op in OPS)
+
+
+def test_sums_in_half_precision_fail() -> None:
+    def halved(image: Tensor, kernel: Tensor, *, border: str) -> Tensor:
+        taps = [
+            kernel_conv(image, kernel * one, border="zeros") for one in torch.eye(kernel.shape[1])[:, :, None, None]
+        ]
+        total = taps[0]
+        for tap in taps[1:]:
+            total = total + tap
+        return total
+
+    cases = tuple(case for case in BY_NAME["kernel_conv"].cases if case.settings["border"] == "zeros")[:2]
+    assert "forward" in failures(like("kernel_conv", halved, cases=cases), torch.bfloat16)
+    # The same sum is good enough in float32.
+    assert not failures(like("kernel_conv", halved, cases=cases), torch.float32).get("forward")
+
+
+def test_a_softmax_that_overflows_fails() -> None:
+    op = BY_NAME["cross_bilateral_weights"]
+
+    def naive(kernel: Tensor, guides: Any, scales: Any, distance_scale: Any, *, normalize: str, border: str) -> Tensor:
+        one = torch.ones_like(kernel)
+        falloff = op.function(one, guides, scales, distance_scale, normalize="none", border=border)
+        weights = falloff * torch.exp(kernel)
+        return weights / weights.sum(1, keepdim=True)
+
+    cases = tuple(case for case in op.cases if case.settings["normalize"] == "softmax")
+    found = failures(like("cross_bilateral_weights", naive, cases=cases))
+    assert {"logits to +-1e4", "logits of -1e4", "logits 1e4 and 1 apart"} <= found["forward"] & found["weights"]
+    assert "softmax" not in found["forward"]
+
+
+def test_a_gradient_that_is_no_number_fails() -> None:
+    def clamped(color: Tensor, albedo: Tensor, *, floor: float = 0.04) -> Tensor:
+        divided = color / albedo
+        return torch.where(albedo.amax(1, keepdim=True) >= 1e-4, color / albedo.clamp_min(floor), color + 0 * divided)
+
+    found = failures(like("demodulate", clamped))
+    assert {"albedo 0"} <= found["gradient"]
+
+
+def test_a_result_that_does_not_scale_or_is_not_constant_fails() -> None:
+    def shifted(image: Tensor) -> Tensor:
+        return BY_NAME["downsample"].function(image) + 1e-6
+
+    found = failures(like("downsample", shifted))
+    assert {"constant", "exposure", "forward"} <= found.keys()
+    assert "gradient" not in found
+
+
+def test_splatting_that_is_not_the_transpose_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = like("kernel_splat", lambda image, kernel, *, border: kernel_conv(image, kernel, border=border))
+    others = tuple(op for op in OPS if op.name != "kernel_splat")
+    monkeypatch.setattr(op_checks, "OPS", (*others, wrong))
+    assert failures(BY_NAME["kernel_conv"]).keys() == {"adjoint"}
+
+
+@pytest.mark.parametrize("scale", [1 + 1e-5, 1 - 1e-5])
+def test_an_error_of_a_hundred_roundings_fails(scale: float) -> None:
+    def scaled(image: Tensor, albedo: Tensor) -> Tensor:
+        return BY_NAME["remodulate"].function(image, albedo) * scale
+
+    ordinary = tuple(case for case in BY_NAME["remodulate"].cases if case.kind == "ordinary" and not case.settings)
+    assert failures(like("remodulate", scaled, cases=ordinary))["forward"] == {case.name for case in ordinary}
+
+
+def test_a_backend_is_tried_and_one_that_cannot_run_is_told() -> None:
+    from typing import Literal
+
+    def doubled(image: Tensor, backend: Literal["plain", "wrong", "absent"] | None = None) -> Tensor:
+        if backend == "absent":
+            raise ValueError("backend: expected one that can run here, found 'absent', which needs another machine")
+        return BY_NAME["downsample"].function(image) * (2 if backend == "wrong" else 1)
+
+    doubled.__annotations__["backend"] = Literal["plain", "wrong", "absent"] | None
+    op = like("downsample", doubled)
+    assert op_checks.backends(op) == ("plain", "wrong", "absent")
+    case = op.cases[0]
+    assert all(check.passed for check in check_case(op, case, torch.float32, "plain"))
+    assert not all(check.passed for check in check_case(op, case, torch.float32, "wrong"))
+    (told,) = check_case(op, case, torch.float32, "absent")
+    assert told.passed
+    assert "another machine" in told.message
+
+
+def test_the_reference_of_an_exponent_that_float64_cannot_hold() -> None:
+    """Against mpmath, with 60 digits."""
+    op = BY_NAME["cross_bilateral_weights"]
+    case = next(case for case in op.cases if case.name == "logits to +-1e4")
+    inputs = case.inputs()
+    weights = op.reference(**inputs, **case.settings)
+    logits, guide, scale, distance = (
+        inputs["kernel"],
+        inputs["guides"][0],
+        inputs["scales"][0],
+        inputs["distance_scale"],
+    )
+    with mpmath.workdps(60):
+        for y, x in ((0, 0), (1, 2), (0, 1)):
+            exact = {}
+            for tap in range(9):
+                row, column = y + tap // 3 - 1, x + tap % 3 - 1
+                if 0 <= row < logits.shape[2] and 0 <= column < logits.shape[3]:
+                    difference = mpmath.mpf(guide[0, 0, row, column].item()) - mpmath.mpf(guide[0, 0, y, x].item())
+                    exponent = mpmath.mpf(logits[0, tap, y, x].item())
+                    exponent -= mpmath.mpf(scale[0, 0, y, x].item()) * difference**2
+                    exponent -= mpmath.mpf(distance[0, 0, y, x].item()) * ((row - y) ** 2 + (column - x) ** 2)
+                    exact[tap] = mpmath.exp(exponent)
+            total = sum(exact.values())
+            for tap in range(9):
+                expected = float(exact.get(tap, mpmath.mpf(0)) / total)
+                assert weights[0, tap, y, x].item() == pytest.approx(expected, rel=1e-11, abs=1e-300)
+
+
+def test_a_model_is_stable() -> None:
+    checks = list(check_model("cascaded_tiny", (torch.float32,)))
+    assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
+    assert {check.what for check in checks} == {"finite", "gradient", "forward", "exposure"}
+
+
+def test_a_denoiser_is_stable() -> None:
+    checks = list(check_denoiser("cascaded_tiny", (torch.float16,)))
+    assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
+    assert {check.what for check in checks} == {"finite", "contained", "refused", "exposure"}
+
+
+def test_long_runs() -> None:
+    runs = {(run.name, run.dtype): run for run in long_runs(frames=300, moving_frames=60)}
+    assert not [run for run in runs.values() if not run.passed]
+    still = runs["still", "bfloat16"]
+    assert still.frames == [1, 3, 10, 30, 100, 300]
+    # Half precision is not float64, and the bound is one that a history can reach.
+    assert 0.01 * still.allowed < max(still.errors) < still.allowed < 0.05
+    assert runs["light off, without anti-lag", "float32"].ghost == 44
+    assert runs["light off, with anti-lag", "float32"].ghost == 1
+
+
+def test_the_worst_check_comes_first() -> None:
+    def check(case: str, error: float, passed: bool = True) -> Check:
+        return Check("op", case, "float32", "", "forward", error, 1.0, 7.0, passed, "" if passed else "wrong")
+
+    (summary,) = summarize([check("a", 0.5), check("b", 0.1, False), check("c", 0.9)])
+    assert (summary.checks, summary.worst.case, summary.condition) == (3, "b", 7.0)
+    assert [failed.case for failed in summary.failed] == ["b"]
+
+
+def test_what_is_checked_by_default_and_by_name() -> None:
+    names = [stage.name for stage in stability.stages()]
+    assert names[: len(OPS)] == [op.name for op in OPS]
+    assert names[len(OPS) :][-2:] == ["Denoiser, cascaded", "long runs"]
+    assert [stage.name for stage in stability.stages(["demodulate"])] == ["demodulate"]
+    named = [stage.name for stage in stability.stages(None, ["cascaded_tiny"])]
+    assert named == ["cascaded_tiny", "Denoiser, cascaded_tiny"]
+    for arguments in ((["sharpen"], None), (None, ["unet"])):
+        with pytest.raises(InputError, match=r"expected .* found (sharpen|unet)"):
+            stability.stages(*arguments)
+    with pytest.raises(InputError, match="found float8"):
+        stability.parse_dtypes(["float32", "float8"])
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as stop:
+        main(["stability", *map(str, arguments)])
+    out, err = capsys.readouterr()
+    return int(stop.value.code or 0), out, err
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "stability.json"
+    status, out, _ = run(capsys, "demodulate", "--dtypes", "float16", "--json", path)
+    assert status == 0
+    assert out.splitlines()[-1].endswith(" checks, 0 failed")
+    content = json.loads(path.read_text())
+    assert content["passed"]
+    assert {check["subject"] for check in content["checks"]} == {"demodulate"}
+    assert {check["dtype"] for check in content["checks"]} == {"float16"}
+    assert content["long_runs"] == []
+
+
+def test_a_broken_bound_exits_with_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(color: Tensor, albedo: Tensor, *, floor: float = 0.04) -> Tensor:
+        return color / albedo
+
+    monkeypatch.setattr(op_checks, "OPS", (like("demodulate", broken),))
+    status, out, _ = run(capsys, "demodulate", "--dtypes", "float32", "--json", tmp_path / "a.json")
+    assert status == 1
+    assert "FAILED" in out
+    assert not json.loads((tmp_path / "a.json").read_text())["passed"]
+
+
+@pytest.mark.parametrize("arguments", [("sharpen",), ("--models", "unet"), ("--dtypes", "float8"), ("--frames", "0")])
+def test_bad_usage_exits_with_2(capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...]) -> None:
+    status, _, err = run(capsys, *arguments)
+    assert status == 2
+    assert err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_the_whole_command(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys)
+    assert status == 0, out
