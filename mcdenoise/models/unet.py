@@ -43,7 +43,8 @@ class UNet(nn.Module):
         Two 3x3 convolutions at each level on the way down and up again, and the rest of a block of the coarsest pixels.
         """
         down, up = range(self.levels), range(scale, self.levels - 1)
-        return sum(2 << level for level in (*down, *up)) + self.multiple - 1
+        convolutions: int = sum(2 << level for level in (*down, *up))
+        return convolutions + self.multiple - 1
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """Features at full, half and quarter resolution.
