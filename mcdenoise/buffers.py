@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -162,16 +162,35 @@ class Frame:
         Raises:
             InputError: another buffer holds NaN, an illegal infinity or a value far outside its range.
         """
+        return self.inspect()[:2]
+
+    def inspect(self) -> Inspected:
+        """As :meth:`validate`, and say what was seen of the features."""
         changes: dict[str, Tensor | None] = {}
+        ranges: dict[str, tuple[float, float]] = {}
         color, replaced = replace_invalid(self.color)
         if replaced:
             changes["color"] = color
         for name, value in self.items():
             if name != "color":
-                clean = _check_values(name, value)
+                clean, ranges[name] = _check_values(name, value)
                 if clean is not value:
                     changes[name] = clean
-        return (self.replace(**changes) if changes else self), replaced
+        return Inspected(self.replace(**changes) if changes else self, replaced, ranges)
+
+
+class Inspected(NamedTuple):
+    """A frame that was looked at.
+
+    Args:
+        frame: with valid values.
+        replaced: number of pixels of ``color`` that were replaced.
+        ranges: smallest and largest value of every buffer but ``color``, by name.
+    """
+
+    frame: Frame
+    replaced: int
+    ranges: dict[str, tuple[float, float]]
 
 
 def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
@@ -212,22 +231,21 @@ def _check_buffer(name: str, value: object) -> None:
         raise InputError(f"buffer '{name}': expected a floating-point dtype, found {value.dtype}")
 
 
-def _check_values(name: str, value: Tensor) -> Tensor:
+def _check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]]:
+    """The values, clamped, and their extremes."""
     spec = BUFFERS.get(name, _MATRIX)
     low, high = (float(extreme) for extreme in torch.aminmax(value))
     # A NaN comes through the extremes and fails the comparison; only then is it worth to look at every value again.
     if not -_UNBOUNDED < low <= high < _UNBOUNDED:
         _refuse_illegal(name, spec, value)
-    if spec.high == _UNBOUNDED and spec.low == -_UNBOUNDED:
-        return value
-    if low >= spec.low and high <= spec.high:
-        return value
+    if (spec.high == _UNBOUNDED and spec.low == -_UNBOUNDED) or (low >= spec.low and high <= spec.high):
+        return value, (low, high)
     if low < spec.low - _ROUNDING or high > spec.high + spec.slack:
         raise InputError(
             f"buffer '{name}': expected values in [{spec.low:g}, {spec.high:g}] ({spec.meaning}), "
             f"found [{low:.4g}, {high:.4g}]"
         )
-    return value.clamp(spec.low, spec.high)
+    return value.clamp(spec.low, spec.high), (max(low, spec.low), min(high, spec.high))
 
 
 def _refuse_illegal(name: str, spec: BufferSpec, value: Tensor) -> None:

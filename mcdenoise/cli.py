@@ -135,9 +135,11 @@ def _denoise() -> Callable[..., int | None]:
     """Denoise a folder of frames."""
     import torch
 
+    from mcdenoise.budget import choose_model
     from mcdenoise.data import open_sequence
     from mcdenoise.denoise import denoise_sequence
     from mcdenoise.denoiser import Denoiser, Precision
+    from mcdenoise.plan import TOLERANCE, Plan
 
     def denoise(
         sequence: tyro.conf.Positional[Path],
@@ -151,6 +153,11 @@ def _denoise() -> Callable[..., int | None]:
         alpha_min: float = 0.1,
         anti_lag: bool = False,
         full_float: bool = False,
+        keep_all: bool = False,
+        tolerance: float = TOLERANCE,
+        budget_ms: float | None = None,
+        max_error: float | None = None,
+        results: Path | None = None,
         json: Json = None,
     ) -> None:
         """Denoise a folder of frames: writes OUT/denoisedN.exr and OUT/denoise.json.
@@ -167,6 +174,13 @@ def _denoise() -> Callable[..., int | None]:
             alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
             anti_lag: give up the accumulated past where the light has changed.
             full_float: write 32-bit instead of half floats.
+            keep_all: leave nothing out, whether the sequence needs it or not.
+            tolerance: noise, or change, relative to its mean, below which a tile of a still shot is not denoised again;
+                0 leaves out only what makes no difference.
+            budget_ms: take the shipped model and precision with the least error (or, where no error is known, the
+                slowest) that needs no more milliseconds a frame on this machine, measured once and without files.
+            max_error: take the fastest one with an SMAPE that is no larger.
+            results: folder of a finished benchmark to take errors from; those of the sequence's references by default.
             json: write the run times to this file too.
         """
         if threads is not None:
@@ -176,8 +190,30 @@ def _denoise() -> Callable[..., int | None]:
         if not 0 < alpha_min <= 1:
             raise InputError(f"--alpha-min: expected in (0, 1], found {alpha_min}")
         opened = open_sequence(sequence, frames)
+        if budget_ms is not None or max_error is not None:
+            if weights is not None:
+                raise InputError("--budget-ms, --max-error: expected no --weights, which are of one model")
+            with _progress() as progress:
+                task = progress.add_task("measure models", total=None)
+                choice = choose_model(
+                    opened,
+                    budget=budget_ms,
+                    max_error=max_error,
+                    results=results,
+                    device=device,
+                    on_step=lambda done, total: progress.update(task, completed=done, total=total),
+                )
+            print(f"picked {choice}")
+            model, precision = choice.model, choice.precision
+        plan = Plan(keep_all=keep_all, tolerance=tolerance)
         denoiser = Denoiser(
-            model, weights=weights, device=device, alpha_min=alpha_min, anti_lag=anti_lag, precision=precision
+            model,
+            weights=weights,
+            device=device,
+            alpha_min=alpha_min,
+            anti_lag=anti_lag,
+            precision=precision,
+            plan=plan,
         )
         height, width = opened.size
         print(f"{opened.name}: {opened.layout} layout, {len(opened)} frames of {width}x{height}")
@@ -191,8 +227,8 @@ def _denoise() -> Callable[..., int | None]:
                 half=not full_float,
                 on_frame=lambda frame, images: progress.advance(task),
             )
-        for stage, plan in report.stages.items():
-            print(f"  {stage}: {'kept' if plan['kept'] else 'left out'} ({plan['reason']})")
+        for row in report.plan:
+            print(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
         if report.replaced_pixels:
             print(f"replaced {report.replaced_pixels} NaN, infinite or negative pixels of the noisy color")
         _print_times(report.milliseconds)
@@ -445,7 +481,7 @@ def _benchmark() -> Callable[..., int | None]:
 
     from mcdenoise.benchmark import Settings, benchmark_ops, choose_candidates, parse_sizes, run_benchmark
     from mcdenoise.benchmark.sizes import SIZES
-    from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows
+    from mcdenoise.benchmark.tables import left_out_rows, op_rows, remarks, scene_rows
     from mcdenoise.data import open_sequence
     from mcdenoise.report import check_packages, write_report
 
@@ -461,6 +497,7 @@ def _benchmark() -> Callable[..., int | None]:
         device: str = "cpu",
         sizes: str = SIZES,
         pictures: int = 4,
+        keep_all: bool = False,
         ops: bool = False,
         size: str = "1280x720",
         json: Json = None,
@@ -483,6 +520,7 @@ def _benchmark() -> Callable[..., int | None]:
             device: cpu or cuda.
             sizes: of images of which only the cost is measured, such as 1280x720,3840x2160, or none.
             pictures: of how many frames of each scene images are kept.
+            keep_all: measure each model a second time, leaving nothing out, to see what leaving out saves and costs.
             ops: measure the operators.
             size: of the images with --ops, WIDTHxHEIGHT.
             json: write what is in results.json, or ops.json, to this file too.
@@ -524,6 +562,7 @@ def _benchmark() -> Callable[..., int | None]:
             command=_command(
                 "benchmark",
                 *sequences,
+                *(["--keep-all"] if keep_all else []),
                 out=out,
                 models=models,
                 peers=peers,
@@ -538,7 +577,9 @@ def _benchmark() -> Callable[..., int | None]:
         )
         check_packages()
         opened = [open_sequence(sequence, frames) for sequence in sequences]
-        candidates = choose_candidates(models, peers, precisions=precisions, threads=threads, device=device)
+        candidates = choose_candidates(
+            models, peers, precisions=precisions, threads=threads, device=device, keep_all=keep_all
+        )
         with _progress() as progress:
             task = progress.add_task("benchmark", total=None)
             results = run_benchmark(
@@ -549,6 +590,7 @@ def _benchmark() -> Callable[..., int | None]:
                 on_step=lambda done, total: progress.update(task, completed=done, total=total),
             )
         _print_rows(scene_rows(results))
+        _print_rows(left_out_rows(results))
         for line in [*remarks(results), f"report: {write_report(out)}"]:
             print(line)
         _write_json(json, asdict(results))
@@ -724,6 +766,11 @@ def _progress() -> Progress:
         TimeRemainingColumn(),
     )
     return Progress(*columns, console=console, disable=not console.is_terminal)
+
+
+def _kept(row: dict[str, Any]) -> str:
+    share = row["left_out"]
+    return "kept" if share == 0 else "left out" if share == 1 else f"{share:.1%} left out"
 
 
 def _show(table: Table) -> None:

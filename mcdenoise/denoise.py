@@ -17,6 +17,7 @@ from mcdenoise.data import Sequence, write_exr
 from mcdenoise.data.files import write_text
 from mcdenoise.denoiser import Denoiser, FrameReport, Images
 from mcdenoise.errors import InputError
+from mcdenoise.plan import Stage, summarize
 
 
 @dataclass
@@ -25,12 +26,12 @@ class SequenceReport:
 
     Args:
         model: name of the model or path of its weights.
-        stages: for each stage whether it was kept, and why.
+        reading: how the sequence stores its color.
         frames: what happened to each frame, by number; its run times include reading and writing.
     """
 
     model: str
-    stages: dict[str, dict[str, Any]]
+    reading: str
     frames: dict[int, FrameReport] = field(default_factory=dict)
 
     @property
@@ -42,6 +43,12 @@ class SequenceReport:
             stage: sorted(report.milliseconds[stage] for report in reports)[len(reports) // 2]
             for stage in reports[0].milliseconds
         }
+
+    @property
+    def plan(self) -> list[dict[str, Any]]:
+        """For each stage whether it was kept, how much of it was left out, and why, see :func:`summarize`."""
+        read = Stage("read", 0.0, self.reading)
+        return summarize([[read, *report.stages] for report in self.frames.values()])
 
     @property
     def replaced_pixels(self) -> int:
@@ -76,7 +83,8 @@ def denoise_sequence(
     make_folder(out)
     # A report stands for a complete result: an old one must not survive a run that fails half-way.
     (out / "denoise.json").unlink(missing_ok=True)
-    report = SequenceReport(model, _stages(sequence))
+    stored = "with albedo" if sequence.color_has_albedo else "without albedo, which the reader multiplies back"
+    report = SequenceReport(model, f"color is stored {stored}")
     for number, (frame, images) in zip(
         sequence.numbers, denoised_frames(sequence, denoiser, reference=references), strict=True
     ):
@@ -106,7 +114,7 @@ def denoised_frames(
     Raises:
         InputError: a file is damaged, or a buffer has invalid values; the message names the frame.
     """
-    denoiser.reset()
+    denoiser.reset(sequence.buffers, len(sequence))
     for number in sequence.numbers:
         start = time.perf_counter()
         frame = sequence.frame(number, reference=reference)
@@ -127,26 +135,6 @@ def make_folder(out: Path) -> None:
         raise InputError(f"{out}: expected a folder that can be written to, found: {error.strerror}") from error
 
 
-def _stages(sequence: Sequence) -> dict[str, dict[str, Any]]:
-    """Which stages run on this sequence, and why."""
-    buffers = sequence.buffers
-    if "motion" in buffers:
-        accumulate = (True, "motion vectors")
-    elif {"position", "view_projection"} <= buffers:
-        accumulate = (True, "positions and cameras")
-    else:
-        accumulate = (False, "no motion, and no positions with cameras: single frames")
-    has_albedo = "albedo" in buffers
-    stored = "with albedo" if sequence.color_has_albedo else "without albedo, which the reader multiplies back"
-    stages = {
-        "read": (True, f"color is stored {stored}"),
-        "demodulate": (has_albedo, "albedo" if has_albedo else "no albedo"),
-        "accumulate": accumulate,
-        "network": (True, "always"),
-    }
-    return {stage: {"kept": kept, "reason": reason} for stage, (kept, reason) in stages.items()}
-
-
 def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> dict[str, Any]:
     return {
         "model": report.model,
@@ -155,7 +143,9 @@ def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> 
         "precision": denoiser.precision,
         "threads": torch.get_num_threads(),
         "sequence": {"name": sequence.name, "layout": sequence.layout, "size": list(sequence.size)},
-        "plan": report.stages,
+        "keep_all": denoiser.plan.keep_all,
+        "tolerance": denoiser.plan.tolerance,
+        "plan": report.plan,
         "milliseconds": report.milliseconds,
         "frames": {
             str(number): {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,11 +12,12 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.buffers import Frame
+from mcdenoise.buffers import Frame, Inspected
 from mcdenoise.errors import InputError
 from mcdenoise.history import Accumulated, History
-from mcdenoise.models import Denoised, create_model
+from mcdenoise.models import Denoised, Known, Region, create_model
 from mcdenoise.ops import Accumulate, HistoryLag, remodulate
+from mcdenoise.plan import Plan, Shortcut, Stage, Steps
 
 Precision = Literal["float32", "bfloat16"]
 PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
@@ -30,13 +31,15 @@ class FrameReport:
         reset: why the history was thrown away, or ``""`` where it was used.
         replaced_pixels: pixels of the noisy color that were NaN, infinite or negative.
         missing: features that the network takes and the frame has not; it sees a constant instead.
-        milliseconds: run time of each stage: validate, accumulate, network, remodulate.
+        milliseconds: run time of each stage: validate, plan, accumulate, network, remodulate.
+        stages: what was left out of them, and why.
     """
 
     reset: str = ""
     replaced_pixels: int = 0
     missing: list[str] = field(default_factory=list)
     milliseconds: dict[str, float] = field(default_factory=dict)
+    stages: list[Stage] = field(default_factory=list)
 
 
 @dataclass
@@ -62,7 +65,8 @@ class Denoiser:
     Args:
         model: a model's name in the zoo (its shipped weights are loaded), or a module that takes demodulated color,
             albedo, normal and depth and returns :class:`mcdenoise.models.Denoised`; with an attribute ``takes_history``
-            that is true, it also gets ``current`` and ``length`` of :class:`mcdenoise.history.Accumulated`. A module of
+            that is true, it also gets ``current`` and ``length`` of :class:`mcdenoise.history.Accumulated`, and with
+            ``takes_plan``, ``guides``, ``known`` and ``parts``, see :class:`mcdenoise.models.Cascade`. A module of
             yours is moved to the device, made channels-last and put into evaluation mode.
         weights: a safetensors file of other weights for a model given by name.
         device: where to run; frames may come from anywhere and images stay here.
@@ -71,6 +75,7 @@ class Denoiser:
             weights were trained without it.
         precision: ``"bfloat16"`` runs the network's convolutions in bfloat16, which is about twice as fast on
             processors that have it; everything else stays in float32.
+        plan: what to leave out of a scene that does not need it; ``Plan(keep_all=True)`` leaves nothing out.
 
     Raises:
         InputError: the model is unknown, has no weights, the device is not there, or the precision is unknown.
@@ -93,6 +98,7 @@ class Denoiser:
         alpha_min: float = 0.1,
         anti_lag: bool = False,
         precision: Precision = "float32",
+        plan: Plan | None = None,
     ) -> None:
         self.device = _device(device)
         if precision not in PRECISIONS:
@@ -104,12 +110,20 @@ class Denoiser:
         model.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.model = model.eval()
         self._takes_history = bool(getattr(model, "takes_history", False))
+        self._takes_plan = bool(getattr(model, "takes_plan", False))
+        self.plan = Plan() if plan is None else plan
         self.history = History(Accumulate(alpha_min), anti_lag=HistoryLag() if anti_lag else None)
         self.report = FrameReport()
 
-    def reset(self) -> None:
-        """Forget the past: the next frame is the first of a shot. A cut and a change of size do so by themselves."""
+    def reset(self, buffers: Collection[str] | None = None, frames: int | None = None) -> None:
+        """Forget the past: the next frame is the first of a shot. A cut and a change of size do so by themselves.
+
+        Args:
+            buffers: names of the buffers that every frame of the shot will have, where that is known.
+            frames: how many frames there will be, where that is known.
+        """
         self.history.reset()
+        self.plan.reset(buffers, frames)
 
     def __call__(self, frame: Frame) -> Tensor:
         """Denoise the next frame of the shot.
@@ -124,38 +138,76 @@ class Denoiser:
         Raises:
             InputError: a feature buffer holds NaN, an illegal infinity or a value far out of range.
         """
-        frame, _, result = self._network(frame)
-        return self._remodulated(frame, result.final)[0]
+        frame, _, steps, result = self._network(frame)
+        return self._remodulated(frame, steps, result.final)[0]
 
     def images(self, frame: Frame) -> Images:
         """As calling the denoiser, with the images on the way to the result."""
-        frame, past, result = self._network(frame)
-        return Images(frame.color, *self._remodulated(frame, past.color, result.initial, result.final))
+        frame, past, steps, result = self._network(frame)
+        return Images(frame.color, *self._remodulated(frame, steps, past.color, result.initial, result.final))
 
     @torch.inference_mode()
-    def _network(self, frame: Frame) -> tuple[Frame, Accumulated, Denoised]:
+    def _network(self, frame: Frame) -> tuple[Frame, Accumulated, Steps, Denoised]:
         """The valid frame, its accumulated color, and what the network makes of it."""
         self.report = report = FrameReport()
         with self._timed("validate"):
-            frame, report.replaced_pixels = frame.to(self.device).to(torch.float32).validate()
-            frame = frame.with_depth()
+            inspected = frame.to(self.device).to(torch.float32).inspect()
+            inspected = inspected._replace(frame=inspected.frame.with_depth())
+        frame, report.replaced_pixels, _ = inspected
+        with self._timed("plan"):
+            steps = self.plan.begin(inspected, self.history.is_still(frame))
         with self._timed("accumulate"):
-            past = self.history.update(frame)
+            past = self.history.update(
+                frame, demodulates=steps.demodulates, reprojects=steps.reprojects, keeps=steps.keeps
+            )
         report.reset = past.reset
-        # A module of your own may do with the paper's four.
-        history = {"current": past.current, "length": past.length} if self._takes_history else {}
+        with self._timed("plan"):
+            known, parts = self._shortcut(inspected, past)
         bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
         with self._timed("network"), bfloat16:
-            result = Denoised(*self.model(*self._inputs(frame, past), **history))
-        return frame, past, result
+            result = self._result(self._inputs(frame, past), past, steps, known, parts)
+        with self._timed("plan"):
+            self.plan.finish(*result, sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1]))
+        report.stages = self.plan.stages
+        return frame, past, steps, result
+
+    def _shortcut(self, inspected: Inspected, past: Accumulated) -> tuple[Shortcut | None, list[Region]]:
+        """What is known of the result, and the parts of the image to run the network on."""
+        alpha_min = self.history.accumulate.alpha_min
+        known = self.plan.known(inspected, past.color, past.current, past.length, past.reset, alpha_min)
+        whole = [Region(0, 0, *inspected.frame.size)]
+        if known is None or self.plan.keep_all:
+            return known, whole
+        if self._takes_plan:
+            return known, self.model.parts(known.mask)  # type: ignore[operator]
+        return known, [] if known.mask.all() else whole
+
+    def _result(
+        self,
+        inputs: tuple[Tensor, Tensor, Tensor, Tensor],
+        past: Accumulated,
+        steps: Steps,
+        known: Shortcut | None,
+        parts: list[Region],
+    ) -> Denoised:
+        # A module of your own may do with the paper's four.
+        history = {"current": past.current, "length": past.length} if self._takes_history else {}
+        if self._takes_plan:
+            given = None if known is None else Known(*known)
+            return Denoised(*self.model(*inputs, **history, guides=steps.guides, known=given, parts=parts))
+        if known is None:
+            return Denoised(*self.model(*inputs, **history))
+        result = Denoised(*self.model(*inputs, **history)) if parts else Denoised(known.initial, known.final)
+        return Denoised(*(torch.where(known.mask, *pair) for pair in zip(known[1:], result, strict=True)))
 
     @torch.inference_mode()
-    def _remodulated(self, frame: Frame, *images: Tensor) -> list[Tensor]:
+    def _remodulated(self, frame: Frame, steps: Steps, *images: Tensor) -> list[Tensor]:
         with self._timed("remodulate"):
             # A network that ends with a convolution hands out its precision.
-            return [
-                image.float() if frame.albedo is None else remodulate(image.float(), frame.albedo) for image in images
-            ]
+            full = [image.float() for image in images]
+            if frame.albedo is None or not steps.demodulates:
+                return full
+            return [remodulate(image, frame.albedo) for image in full]
 
     def _inputs(self, frame: Frame, past: Accumulated) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The network's inputs; a feature that the frame lacks is constant, which guides nothing."""
@@ -174,7 +226,8 @@ class Denoiser:
     def _timed(self, stage: str) -> Iterator[None]:
         start = self._clock()
         yield
-        self.report.milliseconds[stage] = self._clock() - start
+        before = self.report.milliseconds.get(stage, 0.0)
+        self.report.milliseconds[stage] = before + self._clock() - start
 
     def _clock(self) -> float:
         """Milliseconds, after the device has finished."""

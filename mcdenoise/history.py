@@ -23,6 +23,7 @@ _CUT_SHARE = 0.05
 # What a mirror or glass shows does not move as its surface does: a long history would smear it.
 _SPECULAR_LENGTH = 2
 _STILL = 0.05  # pixels
+_NO_WAY = "no motion, and no position with a previous camera"
 # Of the shorter history that the long one is compared with: four frames have half the noise of one.
 _RECENT_ALPHA = 0.25
 
@@ -50,6 +51,17 @@ def motion_to_previous(frame: Frame, previous_view_projection: Tensor | None) ->
     if position is None or previous_view_projection is None:
         return None
     return motion_from_position(position, previous_view_projection)
+
+
+def _thinned(image: Tensor) -> Tensor:
+    """One pixel in 64: enough to see most of what moves."""
+    return image[..., ::8, ::8]
+
+
+def _equal(a: Tensor | None, b: Tensor | None) -> bool:
+    if a is None or b is None or a.device != b.device:
+        return False
+    return a is b or (torch.equal(_thinned(a), _thinned(b)) and torch.equal(a, b))
 
 
 class Accumulated(NamedTuple):
@@ -80,9 +92,11 @@ class History:
     """Demodulates frames and accumulates them, one after the other.
 
     The motion is the frame's own where it has one, else that of its previous positions (its positions, where it has
-    none) seen from the previous camera; with neither there is no past. The consistency test compares the previous
-    frame's positions with the previous positions too, so that what moves keeps its past. It compares the normals as
-    they are: what turns by more than the normal limit from one frame to the next starts anew.
+    none) seen from the previous camera; with neither there is no past. Where positions and cameras say that nothing
+    moved, the motion is zero, not the rounding of a projection, which would blur a still image a little more with every
+    frame. The consistency test compares the previous frame's positions with the previous positions too, so that what
+    moves keeps its past. It compares the normals as they are: what turns by more than the normal limit from one frame
+    to the next starts anew.
 
     Before it is accumulated, a frame loses its fireflies. Where nothing diffuse is seen (no albedo in any channel:
     mirrors, glass) and the image moves by more than 0.05 pixels, the past counts for no more than 2 frames, since
@@ -129,36 +143,64 @@ class History:
         """Forget the past: the next frame is the first of a shot."""
         self._state = None
 
-    def update(self, frame: Frame) -> Accumulated:
+    def is_still(self, frame: Frame) -> bool:
+        """Whether every pixel of the next frame shows what it showed in the frame before, as far as a frame tells.
+
+        Args:
+            frame: the next frame; true where its motion is zero everywhere, or else where the camera is the same and no
+                position differs from its previous position.
+        """
+        if self._state is None:
+            return False
+        if frame.motion is not None:
+            return not (_thinned(frame.motion).any() or frame.motion.any())
+        cameras = (self._state.view_projection, frame.view_projection)
+        if frame.position is None or not _equal(*cameras):
+            return False
+        return frame.previous_position is None or _equal(frame.position, frame.previous_position)
+
+    def update(
+        self, frame: Frame, *, demodulates: bool = True, reprojects: bool = True, keeps: bool = True
+    ) -> Accumulated:
         """Add a frame.
 
         Args:
             frame: the next frame; its values must be valid (:meth:`mcdenoise.buffers.Frame.validate`).
+            demodulates: divide by the albedo; not needed where :func:`mcdenoise.ops.demodulate` would divide by one.
+            reprojects: look for each pixel's past where it was; not needed for a frame that :meth:`is_still`.
+            keeps: remember the frame; not needed for the last one.
         """
         frame = frame.with_depth()
-        color = self.fireflies(frame.color if frame.albedo is None else demodulate(frame.color, frame.albedo))
+        color = frame.color
+        if demodulates and frame.albedo is not None:
+            color = demodulate(color, frame.albedo)
+        color = self.fireflies(color)
         color = color.to(torch.promote_types(color.dtype, torch.float32))
-        result, recent = self._blend(frame, color)
+        result, recent = self._blend(frame, color, reprojects)
         surface = Surface(frame.position, frame.normal, frame.depth)
-        self._state = _State(result.color, recent, result.length, surface, frame.view_projection)
+        self._state = _State(result.color, recent, result.length, surface, frame.view_projection) if keeps else None
         return result
 
-    def _blend(self, frame: Frame, color: Tensor) -> tuple[Accumulated, Tensor | None]:
+    def _blend(self, frame: Frame, color: Tensor, reprojects: bool) -> tuple[Accumulated, Tensor | None]:
         """The frame with its past, and with its recent past alone if that is kept."""
         state, recent = self._state, None if self.anti_lag is None else color
         first = Accumulated(color, color, torch.ones_like(color[:, :1]), "first frame")
         if state is None:
-            return first, recent
+            lost = frame.motion is None and (frame.position is None or frame.view_projection is None)
+            return (first._replace(reset=_NO_WAY) if lost else first), recent
         if state.color.shape != color.shape or state.color.device != color.device:
             return first._replace(reset="size change"), recent
-        motion = motion_to_previous(frame, state.view_projection)
-        if motion is None:
-            return first._replace(reset="no motion, and no position with a previous camera"), recent
+        motion = None
+        if reprojects:
+            still = frame.motion is None and self.is_still(frame)
+            motion = torch.zeros_like(color[:, :2]) if still else motion_to_previous(frame, state.view_projection)
+            if motion is None:
+                return first._replace(reset=_NO_WAY), recent
         surface = surface_before(frame)
         accumulated, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
         if float((length > 1).float().mean()) < _CUT_SHARE:
             return first._replace(reset="cut"), recent
-        if frame.albedo is not None:
+        if frame.albedo is not None and motion is not None:
             accumulated, length = self._shortened(color, accumulated, length, frame.albedo, motion)
         if self.anti_lag is not None and state.recent is not None:
             recent, _ = self._shorter(color, state.recent, state.length, motion, surface, state.surface)

@@ -17,6 +17,8 @@ OPS_FILE = "ops.json"
 IMAGES = "images"
 VERSION = 1
 STAGES = ("read", "accumulate", "network", "filter", "write")
+# Ends the name of a model that leaves nothing out, beside the same model that does.
+KEEP_ALL = ", keep all"
 Kind = Literal["model", "peer", "baseline"]
 
 
@@ -132,6 +134,7 @@ class Cell:
         failure: why the method failed on this scene; nothing else is known then.
         computing: milliseconds a frame of what happens in memory, without reading and writing files; measured around
             all of it, so that the stages may add up to a little less.
+        plan: of a model, what was left out of the scene and why, see :func:`mcdenoise.plan.summarize`.
     """
 
     scene: str
@@ -143,6 +146,27 @@ class Cell:
     memory: float | None = None
     failure: str = ""
     computing: Spread | None = None
+    plan: list[dict[str, Any]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What a model left out of a scene, and what that brought.
+
+    Args:
+        scene: name.
+        method: name.
+        stages: what was left out, and how much of it.
+        saved: milliseconds a frame less than the same model that leaves nothing out, without files; ``None`` where that
+            was not measured.
+        change: by name of a metric, by how much the error differs from that of the other.
+    """
+
+    scene: str
+    method: str
+    stages: str
+    saved: float | None = None
+    change: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -221,6 +245,24 @@ class Results:
     def cell(self, scene: str, method: str) -> Cell | None:
         """What is known of a method on a scene."""
         return next((one for one in self.cells if (one.scene, one.method) == (scene, method)), None)
+
+    def left_out(self) -> list[LeftOut]:
+        """What each model left out of each scene, where it did."""
+        rows = []
+        for cell in self.cells:
+            shares = {row["stage"]: row["left_out"] for row in cell.plan if row["left_out"] > 0}
+            if cell.method.endswith(KEEP_ALL) or not shares:
+                continue
+            whole = self.cell(cell.scene, cell.method + KEEP_ALL)
+            row = LeftOut(cell.scene, cell.method, ", ".join(f"{name} {share:.0%}" for name, share in shares.items()))
+            if whole is not None and whole.computing is not None and cell.computing is not None:
+                saved = whole.computing.median - cell.computing.median
+                change = {
+                    name: value - whole.errors[name] for name, value in cell.errors.items() if name in whole.errors
+                }
+                row = LeftOut(row.scene, row.method, row.stages, saved, change)
+            rows.append(row)
+        return rows
 
     def megapixels_per_second(self, cell: Cell) -> float | None:
         """How many pixels a method denoises, without reading and writing files."""

@@ -29,13 +29,14 @@ from mcdenoise.benchmark.sizes import fit_line, measure_sizes, synthetic_frame
 from mcdenoise.buffers import Frame
 from mcdenoise.cli import main
 from mcdenoise.data import open_sequence, read_exr, write_exr
+from mcdenoise.data.camera_matrices import read_camera_matrices, write_camera_matrices
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import score_sequence
 from mcdenoise.models import Denoised, create_model, pretrained_models, save_weights
 from mcdenoise.ops import downsample
 from mcdenoise.ops._cases import OPS, Op
-from mcdenoise.results import Cost, Method, OpResults, Results, Spread
+from mcdenoise.results import Cell, Cost, LeftOut, Machine, Method, OpResults, Results, Spread
 
 METRICS = {"SMAPE", "relMSE", "PSNR", "SSIM", "tSMAPE", "tRMSE"}
 
@@ -621,3 +622,45 @@ def test_the_command_for_ops(run: Callable[..., Any], out: Path, monkeypatch: py
     assert json.loads(file.read_text()) == asdict(measured[0])
     assert not out.exists()
     assert run("--ops", "--size", "1x1")[0] == 2
+
+
+# What models leave out
+
+
+def test_models_are_shown_beside_themselves_with_nothing_left_out(
+    run: Callable[..., tuple[int, str, str]], small_sequence: Path, out: Path
+) -> None:
+    # A camera at rest: the first matrix for all frames, and the first position.
+    inputs = small_sequence / "inputs"
+    matrices = read_camera_matrices(inputs / "camera_matrices.h")
+    still = replace(matrices, matrices=matrices.matrices[[0, 0, 0, 0]])
+    write_camera_matrices(inputs / "camera_matrices.h", still, "plane")
+    for number in (1, 2, 3):
+        for name in ("world_position", "depth", "shading_normal", "albedo"):
+            shutil.copy(inputs / f"{name}0.exr", inputs / f"{name}{number}.exr")
+    arguments = (small_sequence, "-o", out, "--models", "cascaded_tiny", "--precisions", "float32", "--peers", "none")
+    status, printed, _ = run(*arguments, "--keep-all", "--sizes", "none", "--rounds", "1")
+    assert status == 0
+    results = Results.read(out)
+    assert " --keep-all " in results.command
+    short, whole = (results.cell("plane", name) for name in ("cascaded_tiny", "cascaded_tiny, keep all"))
+    assert short is not None
+    assert whole is not None
+    left_out = {row["stage"]: row["left_out"] for row in short.plan}
+    assert left_out["reproject"] == 0.75
+    assert not any(row["left_out"] for row in whole.plan)
+    (row,) = results.left_out()
+    assert (row.scene, row.method) == ("plane", "cascaded_tiny")
+    assert row.stages.startswith("reproject 75%")
+    assert row.saved == pytest.approx(whole.computing.median - short.computing.median)
+    assert set(row.change) == set(short.errors)
+    assert row.change["SMAPE"] == short.errors["SMAPE"] - whole.errors["SMAPE"] == 0
+    assert "ms saved" in printed
+    assert "What models left out" in (out / "index.html").read_text()
+
+
+def test_without_the_other_nothing_is_known_of_what_was_saved() -> None:
+    plan = [{"stage": "network", "kept": True, "left_out": 0.25, "reason": "", "exact": True}]
+    machine = Machine("", 1, 1.0, "cpu", 1, "")
+    cells = [Cell("a", "x", plan=plan), Cell("a", "y")]
+    assert Results("", "", machine, 1, [], [], cells).left_out() == [LeftOut("a", "x", "network 25%")]

@@ -19,7 +19,7 @@ from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.denoise import denoise_sequence
 from mcdenoise.models import Denoised, save_weights
 
-STAGES = ["validate", "accumulate", "network", "remodulate"]
+STAGES = ["validate", "plan", "accumulate", "network", "remodulate"]
 
 
 def small_model() -> nn.Module:
@@ -304,12 +304,20 @@ def test_the_report_of_a_sequence(small_sequence: Path, tmp_path: Path) -> None:
     assert written["precision"] == "float32"
     assert written["threads"] == torch.get_num_threads()
     assert written["sequence"] == {"name": "plane", "layout": "bmfr", "size": [20, 24]}
-    assert written["plan"] == {
-        "read": {"kept": True, "reason": "color is stored with albedo"},
-        "demodulate": {"kept": True, "reason": "albedo"},
-        "accumulate": {"kept": True, "reason": "positions and cameras"},
-        "network": {"kept": True, "reason": "always"},
-    }
+    assert (written["keep_all"], written["tolerance"]) == (False, 1e-3)
+    assert written["plan"] == report.plan
+    assert [(row["stage"], row["kept"], row["left_out"], row["reason"]) for row in report.plan] == [
+        ("read", True, 0, "color is stored with albedo"),
+        ("accumulate", True, 0, "positions and cameras"),
+        ("reproject", True, 0, "positions and cameras"),
+        ("remember", True, 0.25, "last frame"),
+        ("demodulate", True, 0, "albedo"),
+        ("normal weights", True, 0, "normal"),
+        ("depth weights", True, 0, "depth"),
+        ("noise-free pixels", True, 0, "there are none"),
+        ("network", True, 0, "on 100% of the pixels"),
+    ]
+    assert all(row["exact"] for row in report.plan)
     assert list(written["frames"]) == ["0", "1", "2", "3"]
     for number, frame in written["frames"].items():
         assert list(frame["milliseconds"]) == ["read", *STAGES, "write"]
@@ -326,11 +334,13 @@ def test_the_plan_of_color_alone(small_sequence: Path, tmp_path: Path) -> None:
         if not path.name.startswith("color"):
             path.unlink()
     report = denoise_sequence(open_sequence(small_sequence), tmp_path / "out", Denoiser(small_model()), "small")
-    assert {name: stage["kept"] for name, stage in report.stages.items()} == {
-        "read": True,
-        "demodulate": False,
-        "accumulate": False,
-        "network": True,
+    assert {row["stage"]: row["reason"] for row in report.plan if not row["kept"]} == {
+        "accumulate": "no motion, and no positions with cameras: single frames",
+        "reproject": "no motion, and no positions with cameras: single frames",
+        "remember": "no motion, and no positions with cameras: single frames",
+        "demodulate": "no albedo",
+        "normal weights": "no normal",
+        "depth weights": "no depth",
     }
     assert report.frames[3].missing == ["albedo", "normal", "depth"]
     assert report.frames[3].reset.startswith("no motion")

@@ -279,3 +279,22 @@ def test_paper_tables_of_what_is_there(dataset: Path, tmp_path: Path) -> None:
     assert named["P+K", "meng2020"][0].split()[-1] > named["P+K", "strict"][0].split()[-1]
     assert "not trained: no grouped/kernel/without-hall/kernel.safetensors; run train_folds.py" in third
     assert "| P+K without BWA | 541,184 |" in fourth
+
+
+# What is left out
+
+
+def test_leave_out_shows_five_shots_of_a_scene(small_sequence: Path) -> None:
+    lines = run("leave_out.py", small_sequence, "--model", "cascaded_tiny", "--frames", "4", "--markdown").splitlines()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    assert rows[0][:3] == ["scene", "shot", "left out"]
+    shots = {row[1]: row for row in rows[2:]}
+    assert list(shots) == ["flythrough", "no albedo", "half sky", "static shot", "viewport edit"]
+    assert "demodulate 100%" in shots["no albedo"][2]
+    assert "reproject 75%" in shots["static shot"][2]
+    for row in shots.values():
+        whole, short, change = float(row[6]), float(row[7]), float(row[8])
+        assert 0 < short < 1
+        # The default tolerance moves no third digit.
+        assert abs(change) < 5e-4 * whole
+        assert change == pytest.approx(short - whole, abs=1e-5)

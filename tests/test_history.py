@@ -362,6 +362,90 @@ def test_a_past_of_negative_length_is_refused(length: float) -> None:
         History(specular_length=length)
 
 
+# What a scene does not need
+
+
+def wall(color: Tensor, **buffers: Any) -> Frame:
+    """A wall seen by the same camera in every frame; its positions are those of the pixels, with their rounding."""
+    height, width = color.shape[-2:]
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    camera = torch.diag(torch.tensor([1 / 1.7, 1 / 1.3, 1.0, 0.0]))
+    camera[2, 3] = 1.0
+    position = torch.stack([(2 * columns / width - 1) * 1.7, (2 * rows / height - 1) * 1.3, torch.ones_like(rows)])[
+        None
+    ]
+    return Frame(color=color, **{"position": position * 3, "view_projection": camera[None], **buffers})
+
+
+def test_a_still_frame_is_known_by_its_motion_or_by_camera_and_positions() -> None:
+    history, color = History(), torch.rand(1, 3, 20, 30)
+    assert not history.is_still(wall(color))
+    history.update(wall(color))
+    frame = wall(color)
+    assert frame.position is not None
+    assert history.is_still(frame)
+    assert history.is_still(frame.replace(previous_position=frame.position.clone()))
+    moved = frame.position.clone()
+    moved[0, 2, 13, 17] += 1e-3
+    assert not history.is_still(frame.replace(previous_position=moved))
+    assert frame.view_projection is not None
+    assert not history.is_still(frame.replace(view_projection=frame.view_projection * 1.0001))
+    assert history.is_still(still(color))
+    motion = torch.zeros(1, 2, 20, 30)
+    motion[0, 1, 13, 17] = 1e-6
+    assert not history.is_still(still(color, motion=motion))
+    # The frame's own motion goes before its positions.
+    assert not history.is_still(frame.replace(motion=motion))
+    assert not history.is_still(Frame(color=color))
+
+
+@pytest.mark.parametrize("size", [(20, 30), (96, 110)])
+def test_a_still_frame_needs_no_reprojection_to_the_last_bit(size: tuple[int, int]) -> None:
+    ordinary, short = History(), History()
+    normal = constant(3, 0.6, size)
+    albedo = constant(3, 0.5, size)
+    albedo[..., : size[1] // 3] = 0
+    for number in range(14):
+        # A thing appears where there was a wall, without being told: its past is not the wall's.
+        normal = normal.clone()
+        normal[..., 5:9, number : number + 4] *= -1
+        color = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(number))
+        frame = wall(color, normal=normal, albedo=albedo)
+        assert short.is_still(frame) == (number > 0)
+        past = ordinary.update(frame)
+        again = short.update(frame, reprojects=not short.is_still(frame))
+        assert all(torch.equal(a, b) for a, b in zip(past[:3], again[:3], strict=True))
+        assert past.reset == again.reset
+    assert 1 in past.length
+    assert past.length.max() == 14
+
+
+def test_a_still_wall_is_averaged_pixel_by_pixel() -> None:
+    history, colors = History(), torch.rand(8, 1, 3, 20, 30)
+    for color in colors:
+        past = history.update(wall(color))
+    # To the rounding of the average: no pixel has anything of its neighbours.
+    torch.testing.assert_close(past.color, colors.mean(0), rtol=1e-6, atol=1e-7)
+
+
+def test_an_albedo_of_one_or_of_nothing_needs_no_demodulation() -> None:
+    for albedo in (constant(3), constant(3, 0.0)):
+        ordinary, short = History(), History()
+        for color in torch.rand(3, 1, 3, HEIGHT, WIDTH):
+            frame = still(color, albedo=albedo, motion=constant(2, 0.3))
+            results = ordinary.update(frame), short.update(frame, demodulates=False)
+            assert all(torch.equal(a, b) for a, b in zip(*(result[:3] for result in results), strict=True))
+
+
+def test_a_frame_that_is_not_kept_is_no_past() -> None:
+    history = History()
+    color = torch.rand(1, 3, HEIGHT, WIDTH)
+    history.update(still(color))
+    last = history.update(still(color), keeps=False)
+    assert last.length.unique().tolist() == [2]
+    assert history.update(still(color)).reset == "first frame"
+
+
 # Changes of light
 
 

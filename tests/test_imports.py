@@ -34,7 +34,7 @@ LIBRARY = SIGNAL | {
     "denoiser",
 }
 REPORTS = {"benchmark", "denoise", "evaluate", "ops_overview", "peers", "report", "run_folder"}
-TOOLS = REPORTS | {"demo", "export", "gradcheck", "stability", "train"}
+TOOLS = REPORTS | {"budget", "demo", "export", "gradcheck", "stability", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),

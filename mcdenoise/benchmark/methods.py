@@ -20,7 +20,8 @@ from mcdenoise.history import History
 from mcdenoise.models import FusionModule, UNet, create_model, describe_weights, pretrained_models
 from mcdenoise.ops import remodulate
 from mcdenoise.peers import QUALITIES, JointBilateral, Oidn, OidnPeer, Peer, Quality
-from mcdenoise.results import Kind, Method
+from mcdenoise.plan import Plan, Stage
+from mcdenoise.results import KEEP_ALL, Kind, Method
 
 PEERS = ("oidn", "bilateral")
 
@@ -70,15 +71,16 @@ class Candidate:
 class ModelRunner:
     """A model with everything :class:`mcdenoise.denoiser.Denoiser` does around it.
 
-    Its stages are ``accumulate`` (also looking at every value), ``network`` (U-Nets and convolutions) and ``filter``
-    (all the rest: kernel weights, kernel convolution, fusion, remodulation). The second is told from the third by hooks
-    on the modules, which read a clock.
+    Its stages are ``accumulate`` (also looking at every value, and planning), ``network`` (U-Nets and convolutions) and
+    ``filter`` (all the rest: kernel weights, kernel convolution, fusion, remodulation). The second is told from the
+    third by hooks on the modules, which read a clock.
 
     Args:
         model: see :class:`mcdenoise.denoiser.Denoiser`.
         weights: of a model given by name.
         precision: of the convolutions.
         device: where to run.
+        keep_all: leave nothing out that a scene does not need.
     """
 
     def __init__(
@@ -87,14 +89,22 @@ class ModelRunner:
         weights: Path | None = None,
         precision: Precision = "float32",
         device: str = "cpu",
+        keep_all: bool = False,
     ) -> None:
         self.stages: dict[str, float] = {}
-        self._denoiser = Denoiser(model, weights=weights, precision=precision, device=device)
+        plan = Plan(keep_all=keep_all)
+        self._denoiser = Denoiser(model, weights=weights, precision=precision, device=device, plan=plan)
         self._watch = Stopwatch(device)
         self._marks: list[Moment] = []
-        for module in _networks(self._denoiser.model):
+        self._networks = list(_networks(self._denoiser.model))
+        for module in self._networks:
             module.register_forward_pre_hook(self._mark)
             module.register_forward_hook(self._mark)
+
+    @property
+    def planned(self) -> list[Stage]:
+        """What was left out of the last frame."""
+        return self._denoiser.report.stages
 
     def reset(self) -> None:
         """See :class:`Runner`."""
@@ -106,9 +116,9 @@ class ModelRunner:
         image = self._denoiser(frame)
         times = self._denoiser.report.milliseconds
         pairs = zip(self._marks[::2], self._marks[1::2], strict=True)
-        network = sum(self._watch.between(start, end) for start, end in pairs) if self._marks else times["network"]
+        network = sum(self._watch.between(start, end) for start, end in pairs) if self._networks else times["network"]
         self.stages = {
-            "accumulate": times["validate"] + times["accumulate"],
+            "accumulate": times["validate"] + times["plan"] + times["accumulate"],
             "network": network,
             # On a GPU the two are told by different clocks.
             "filter": max(times["network"] - network, 0.0) + times["remodulate"],
@@ -178,6 +188,7 @@ def choose_candidates(
     precisions: str = ",".join(PRECISIONS),
     threads: int = 1,
     device: str = "cpu",
+    keep_all: bool = False,
 ) -> list[Candidate]:
     """The baselines, and the chosen peers and models.
 
@@ -189,6 +200,7 @@ def choose_candidates(
         precisions: of the models' convolutions, separated by commas: ``float32``, ``bfloat16``.
         threads: of the peers that do not ask torch.
         device: where to run, ``"cpu"`` or ``"cuda"``; Open Image Denoise runs on the CPU.
+        keep_all: have each model twice, the second time leaving nothing out that a scene does not need.
 
     Raises:
         InputError: a model, peer or precision is unknown, or a model has no weights.
@@ -204,7 +216,7 @@ def choose_candidates(
     if "oidn" in wanted:
         candidates += _oidn_candidates(threads, device)
     for model in pretrained_models() if models is None else _list(models, "--models"):
-        candidates += _model_candidates(model, kinds, device)
+        candidates += _model_candidates(model, kinds, device, keep_all)
     return _with_folders(candidates)
 
 
@@ -255,20 +267,22 @@ def _with_folders(candidates: list[Candidate]) -> list[Candidate]:
     return unique
 
 
-def _model_candidates(model: str, precisions: list[Precision], device: str) -> Iterator[Candidate]:
+def _model_candidates(model: str, precisions: list[Precision], device: str, keep_all: bool) -> Iterator[Candidate]:
     path = Path(model) if model.endswith(".safetensors") else None
     name = model if path is None else path.stem
     architecture = model if path is None else str(describe_weights(path)["architecture"])
     made = create_model(architecture, pretrained=path is None, weights=path)
     parameters = sum(parameter.numel() for parameter in made.parameters())
     for precision in precisions:
-        yield _candidate(
-            name if precision == "float32" else f"{name}, {precision}",
-            "model",
-            name,
-            functools.partial(ModelRunner, architecture, path, precision, device),
-            parameters=parameters,
-        )
+        for everything in (False, True) if keep_all else (False,):
+            full_name = name if precision == "float32" else f"{name}, {precision}"
+            yield _candidate(
+                full_name + KEEP_ALL if everything else full_name,
+                "model",
+                name,
+                functools.partial(ModelRunner, architecture, path, precision, device, everything),
+                parameters=parameters,
+            )
 
 
 def _bilateral_candidate(color: float, space: float, device: str) -> Candidate:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mcdenoise.benchmark.machine import Stopwatch, check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.memory import peak_memory
-from mcdenoise.benchmark.methods import Candidate, Runner, one_line
+from mcdenoise.benchmark.methods import Candidate, ModelRunner, Runner, one_line
 from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import Size, measure_sizes
 from mcdenoise.benchmark.tables import write_csv
@@ -25,6 +25,7 @@ from mcdenoise.data import Sequence, open_sequence, write_exr
 from mcdenoise.data.files import new_folder
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import check_references, reference_noise
+from mcdenoise.plan import Stage, summarize
 from mcdenoise.results import IMAGES, STAGES, Cell, Cost, Fit, Results, Scene, Spread
 
 _WHOLE, _COMPUTING = "whole", "computing"
@@ -174,6 +175,7 @@ class _SceneRun:
         self._folder, self._written = folder, folder / ".written.exr"
         self._watch = Stopwatch(settings.device)
         self._times: dict[str, dict[str, list[float]]] = {name: {} for name in self._runners}
+        self._planned: dict[str, list[list[Stage]]] = {name: [] for name in self._runners}
         height, width = sequence.size
         self._scene = Scene(
             name,
@@ -212,6 +214,8 @@ class _SceneRun:
                 image: Tensor | None = None
                 with self._noted(name):
                     image = runner(frame)
+                    if isinstance(runner, ModelRunner):
+                        self._planned[name].append(runner.planned)
                     if not image.isfinite().all():
                         raise ArithmeticError(f"frame {number} has NaN or infinite values")
                     if frame.reference is not None:
@@ -302,6 +306,7 @@ class _SceneRun:
             stages={stage: times[stage] for stage in STAGES if stage in times},
             memory=self._memory[place],
             computing=times[_COMPUTING],
+            plan=summarize(self._planned[name]),
         )
 
 

@@ -72,6 +72,20 @@ def scene_rows(results: Results) -> list[dict[str, str]]:
     return rows
 
 
+def left_out_rows(results: Results) -> list[dict[str, str]]:
+    """What to print of what models left out of the scenes."""
+    return [
+        {
+            "scene": row.scene,
+            "method": row.method,
+            "left out": row.stages,
+            "ms saved": _number(row.saved, ".1f"),
+            **{f"change of {name}": _number(row.change.get(name), "+.1e") for name in _SHOWN if name in row.change},
+        }
+        for row in results.left_out()
+    ]
+
+
 def remarks(results: Results) -> list[str]:
     """What to print below: what failed, what is missing, what is left out, each with its reason."""
     lines = [f"failed: {cell.scene}, {cell.method}: {cell.failure}" for cell in results.cells if cell.failure]

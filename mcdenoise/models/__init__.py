@@ -1,6 +1,7 @@
 """The zoo: denoisers assembled from the operators, by name."""
 
 from mcdenoise.models._overview import ModelOverview, overview
+from mcdenoise.models._regions import Region
 from mcdenoise.models._registry import list_models, register_model
 from mcdenoise.models._weights import create_model, describe_weights, load_weights, pretrained_models, save_weights
 from mcdenoise.models.cascaded import (
@@ -8,6 +9,7 @@ from mcdenoise.models.cascaded import (
     Denoised,
     FusionModule,
     KernelPredictor,
+    Known,
     PixelPredictor,
     auto_exposure,
     normalize_depth,
@@ -19,8 +21,10 @@ __all__ = [
     "Denoised",
     "FusionModule",
     "KernelPredictor",
+    "Known",
     "ModelOverview",
     "PixelPredictor",
+    "Region",
     "UNet",
     "auto_exposure",
     "create_model",

@@ -6,18 +6,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import NamedTuple, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from mcdenoise.models._regions import Region, regions
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.unet import UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample, laplacian_fusion, upsample
+from mcdenoise.ops._backend import choose_backend
 
 FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, its share 1
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of f1, f2, f3
+GUIDES = ("normal", "depth")
 
 
 class Denoised(NamedTuple):
@@ -32,11 +36,41 @@ class Denoised(NamedTuple):
     final: Tensor
 
 
+class Known(NamedTuple):
+    """Pixels whose result is known beforehand.
+
+    Args:
+        mask: ``(B, 1, H, W)`` bool, true where it is.
+        initial: ``(B, 3, H, W)`` the initial image there, demodulated radiance; anything finite elsewhere.
+        final: ``(B, 3, H, W)`` the final image there.
+    """
+
+    mask: Tensor
+    initial: Tensor
+    final: Tensor
+
+
 class Predictor(Protocol):
     """A network that takes an image and guiding features and returns a better image."""
 
-    def __call__(self, image: Tensor, features: Tensor) -> Tensor:
-        """``(B, 3, H, W)`` radiance and ``(B, 11, H, W)`` features to ``(B, 3, H, W)`` radiance."""
+    def __call__(
+        self, image: Tensor, features: Tensor, guides: Collection[str] = GUIDES, top: Tensor | None = None
+    ) -> Tensor:
+        """Better an image, or a part of one.
+
+        Args:
+            image: ``(B, 3, H, W)`` radiance.
+            features: ``(B, 11, H, W)``.
+            guides: which of :data:`GUIDES` differ from pixel to pixel; weights need no others.
+            top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the whole image; that of ``image`` by default.
+
+        Returns:
+            ``(B, 3, H, W)`` radiance.
+        """
+
+    @property
+    def reach(self) -> int:
+        """How far from a pixel its result may depend on the image and the features, in pixels."""
 
 
 class FusionModule(nn.Module):
@@ -73,13 +107,20 @@ class PixelPredictor(nn.Module):
             nn.init.zeros_(head.weight)  # type: ignore[arg-type]
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
 
-    def forward(self, image: Tensor, features: Tensor) -> Tensor:
+    @property
+    def reach(self) -> int:
         """See :class:`Predictor`."""
+        return _reach(self.unet, 0)
+
+    def forward(
+        self, image: Tensor, features: Tensor, guides: Collection[str] = GUIDES, top: Tensor | None = None
+    ) -> Tensor:
+        """See :class:`Predictor`; there are no weights to guide."""
         logs = torch.log1p(image)
         levels = self.unet(torch.cat([logs, features], 1))
         # The heads predict the logarithm of the radiance, on top of the input's: a network at rest is the identity,
         # and errors are relative, as the eye and the loss see them. No pixel grows beyond the brightest of the input.
-        top = logs.amax((1, 2, 3), keepdim=True)
+        top = logs.amax((1, 2, 3), keepdim=True) if top is None else top
         images: list[Tensor] = []
         for head, level in zip(self.heads, levels, strict=True):
             images.append(_at_least_float32(head(level)) + logs)
@@ -103,17 +144,28 @@ class KernelPredictor(nn.Module):
     def __init__(self, width: int, kernel_size: int = 5, bilateral: bool = True) -> None:
         super().__init__()
         self.taps = kernel_size * kernel_size
+        self.radius = kernel_size // 2
         self.bilateral = bilateral
         self.unet = UNet(3 + FEATURES, width)
         channels = self.taps + (3 if bilateral else 0)
         self.heads = nn.ModuleList(nn.Conv2d(width, channels, 3, padding=1) for _ in range(UNet.scales))
         self.fusions = nn.ModuleList(FusionModule() for _ in range(UNet.scales - 1))
 
-    def forward(self, image: Tensor, features: Tensor) -> Tensor:
+    @property
+    def reach(self) -> int:
+        """See :class:`Predictor`."""
+        return _reach(self.unet, self.radius)
+
+    def forward(
+        self, image: Tensor, features: Tensor, guides: Collection[str] = GUIDES, top: Tensor | None = None
+    ) -> Tensor:
         """See :class:`Predictor`."""
         levels = self.unet(torch.cat([torch.log1p(image), features], 1))
-        normal, depth = features[:, 3:6], features[:, 6:7]
-        top = torch.log1p(image).amax((1, 2, 3), keepdim=True)
+        guiding = {"normal": features[:, 3:6], "depth": features[:, 6:7]}
+        guiding = {name: guide for name, guide in guiding.items() if name in guides}
+        top = torch.log1p(image).amax((1, 2, 3), keepdim=True) if top is None else top
+        # One for all scales: a part of an image must not be filtered otherwise than the whole.
+        backend = choose_backend(None, image, *levels)
         images: list[Tensor] = []
         for head, level in zip(self.heads, levels, strict=True):
             prediction = head(level)
@@ -121,12 +173,16 @@ class KernelPredictor(nn.Module):
             # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
             if self.bilateral:
                 f1_f2_f3 = F.softplus(_at_least_float32(prediction[:, self.taps :]).contiguous()).split(1, 1)
-                f1, f2, f3 = (f * unit for f, unit in zip(f1_f2_f3, SCALE_UNITS, strict=True))
-                filtered = cross_bilateral_filter(image, logits, [normal, depth], [f1, f2], f3, border="renormalize")
+                *scales, f3 = (f * unit for f, unit in zip(f1_f2_f3, SCALE_UNITS, strict=True))
+                scales = [scale for scale, name in zip(scales, GUIDES, strict=True) if name in guiding]
+                filtered = cross_bilateral_filter(
+                    image, logits, list(guiding.values()), scales, f3, border="renormalize", backend=backend
+                )
             else:
-                filtered = cross_bilateral_filter(image, logits, border="renormalize")
+                filtered = cross_bilateral_filter(image, logits, border="renormalize", backend=backend)
             images.append(torch.log1p(filtered))
-            image, normal, depth = downsample(image), downsample(normal), downsample(depth)
+            image = downsample(image)
+            guiding = {name: downsample(guide) for name, guide in guiding.items()}
         # Each scale is a weighted mean; their fusion could leave the range of the input.
         return torch.expm1(torch.minimum(_fuse(images, self.fusions).clamp_min(0), top))
 
@@ -143,6 +199,7 @@ class Cascade(nn.Module):
     """
 
     takes_history = True
+    takes_plan = True
 
     def __init__(self, first: nn.Module, second: nn.Module | None = None) -> None:
         super().__init__()
@@ -157,8 +214,17 @@ class Cascade(nn.Module):
         depth: Tensor,
         current: Tensor | None = None,
         length: Tensor | None = None,
+        *,
+        guides: Collection[str] = GUIDES,
+        known: Known | None = None,
+        parts: list[Region] | None = None,
     ) -> Denoised:
         """Denoise one frame of any size.
+
+        What is ``known`` is taken as it is, also by the second network, and only ``parts`` of the image are computed,
+        each with as much around it as its pixels depend on. What depends on the whole image (exposure, depth, the
+        brightest pixel) is computed on the whole image. So a result does not depend on which parts are computed, up to
+        the rounding of convolutions, whose order of summation may depend on the size of the image.
 
         Args:
             color: ``(B, 3, H, W)`` demodulated accumulated radiance, scene-linear, finite, non-negative.
@@ -167,6 +233,9 @@ class Cascade(nn.Module):
             depth: ``(B, 1, H, W)`` distance along the view axis, scene units, ``inf`` where nothing was hit.
             current: ``(B, 3, H, W)`` demodulated radiance of the current frame alone; ``color`` by default.
             length: ``(B, 1, H, W)`` history length of ``color`` in frames, at least 1; 1 by default.
+            guides: which of :data:`GUIDES` differ from pixel to pixel. Without the others the result is the same.
+            known: pixels that need not be computed.
+            parts: those of :meth:`parts`; the whole image by default.
 
         Returns:
             The initial and the final image, demodulated as ``color`` is.
@@ -175,9 +244,56 @@ class Cascade(nn.Module):
         alone = torch.log1p((color if current is None else current) * exposure)
         share = torch.ones_like(depth) if length is None else 1 / length
         features = torch.cat([albedo, normal * 0.5 + 0.5, normalize_depth(depth), alone, share], 1)
-        initial = self.first(color * exposure, features)
-        final = initial if self.second is None else self.second(initial, features)
-        return Denoised(initial / exposure, final / exposure)
+        image = color * exposure
+        if known is None:
+            initial = self.first(image, features, guides)
+            final = initial if self.second is None else self.second(initial, features, guides)
+            return Denoised(initial / exposure, final / exposure)
+        if parts is None:
+            parts = [Region(0, 0, color.shape[-2], color.shape[-1])]
+        initial = self._completed(self.first, image, features, guides, known.mask, known.initial * exposure, parts)
+        final = initial
+        if self.second is not None:
+            final = self._completed(self.second, initial, features, guides, known.mask, known.final * exposure, parts)
+        images = zip((known.initial, known.final), (initial, final), strict=True)
+        return Denoised(*(torch.where(known.mask, given, image / exposure) for given, image in images))
+
+    def parts(self, known: Tensor) -> list[Region]:
+        """The rectangles to compute; the whole image where less would hardly pay, none where everything is known.
+
+        Args:
+            known: ``(B, 1, H, W)`` bool.
+        """
+        return regions(~known, self.halo)
+
+    @property
+    def halo(self) -> int:
+        """Margin around a rectangle without which its pixels would not be the same, in pixels."""
+        multiple = max((module.multiple for module in self.modules() if isinstance(module, UNet)), default=1)
+        reach = max(int(part.reach) for part in (self.first, self.second) if part is not None)  # type: ignore[arg-type]
+        return -(-reach // multiple) * multiple
+
+    def _completed(
+        self,
+        predictor: nn.Module,
+        image: Tensor,
+        features: Tensor,
+        guides: Collection[str],
+        known: Tensor,
+        result: Tensor,
+        parts: list[Region],
+    ) -> Tensor:
+        """``result``, with the pixels that are not known computed."""
+        top = torch.log1p(image).amax((1, 2, 3), keepdim=True)
+        size = (image.shape[-2], image.shape[-1])
+        result = result.clone()
+        for part in parts:
+            around = part.grown(self.halo, size)
+            better = predictor(around.of(image), around.of(features), guides, top)
+            inner = Region(*(side - start for side, start in zip(part, (around.top, around.left) * 2, strict=True)))
+            there = part.of(result)
+            there.copy_(torch.where(part.of(known), there, inner.of(better)))
+        return result
 
 
 def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
@@ -224,6 +340,12 @@ def normalize_depth(depth: Tensor) -> Tensor:
 def _at_least_float32(tensor: Tensor) -> Tensor:
     """Half precision as float32, float64 as it is: the shipped weights also run in float64, to measure what rounds."""
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+
+
+def _reach(unet: UNet, radius: int) -> int:
+    """Of a head, a filter and the fusions behind a U-Net: a pixel each, and the filter's radius, at their scales."""
+    fusions = sum(1 << scale for scale in range(UNet.scales - 1))
+    return max(unet.reach(scale) + ((1 + radius) << scale) for scale in range(UNet.scales)) + fusions
 
 
 def _fuse(images: list[Tensor], fusions: nn.ModuleList) -> Tensor:

@@ -31,10 +31,20 @@ class UNet(nn.Module):
         # The coarsest level is the encoder's alone.
         if levels <= self.scales:
             raise ValueError(f"levels: expected at least {self.scales + 1}, found {levels}")
-        self.multiple = 2 ** (levels - 1)
+        self.levels = levels
+        self.multiple: int = 2 ** (levels - 1)
         self.encoder = nn.ModuleList(_block(in_channels if level == 0 else width, width) for level in range(levels))
         self.up = nn.ModuleList(nn.ConvTranspose2d(width, width, 2, stride=2) for _ in range(levels - 1))
         self.decoder = nn.ModuleList(_block(2 * width, width) for _ in range(levels - 1))
+
+    def reach(self, scale: int) -> int:
+        """How far from a pixel of the input a feature of scale ``2 ** scale`` may depend on it, in pixels of the input.
+
+        Two 3x3 convolutions at each level on the way down and up again, and the rest of a block of the coarsest pixels.
+        """
+        down, up = range(self.levels), range(scale, self.levels - 1)
+        convolutions: int = sum(2 << level for level in (*down, *up))
+        return convolutions + self.multiple - 1
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """Features at full, half and quarter resolution.

@@ -80,7 +80,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
 
 def reproject(
     previous: Tensor,
-    motion: Tensor,
+    motion: Tensor | None,
     surface: Surface | None = None,
     previous_surface: Surface | None = None,
     *,
@@ -106,7 +106,8 @@ def reproject(
     Args:
         previous: ``(B, C, H, W)`` anything of the previous frame.
         motion: ``(B, 2, H, W)`` pixels, ``previous position = current position + motion``; a non-finite value means
-            that there is no previous position.
+            that there is no previous position. ``None`` means that nothing moves in the image: each pixel is tested
+            against itself, and the result is, bit by bit, that of a motion of zeros.
         surface: the current frame's surface; ``None`` tests only for the image border.
         previous_surface: the previous frame's surface.
         rule: ``"relative"`` or ``"bmfr"``.
@@ -134,11 +135,15 @@ def reproject(
         >>> value.flatten().tolist(), weight.flatten().tolist()
         ([1.5, 2.5, 3.0], [1.0, 1.0, 0.5])
     """
-    sizes = check_shapes(previous=(previous, "B C H W"), motion=(motion, "B 2 H W"))
+    sizes = _check_images(motion, previous=(previous, "B C H W"))
     _check_known(rule)
     here, there = _comparable(surface, previous_surface, previous)
     if surface is not None and previous_surface is not None:
         _check_rule(rule, here, position_limit, normal_limit)
+    test = _bmfr_test if rule == "bmfr" else _relative_test
+    if motion is None:
+        kept = torch.ones_like(previous[:, :1], dtype=torch.bool) & test(here, there, position_limit, normal_limit)
+        return torch.where(kept, previous, 0), kept.to(previous.dtype)
     height, width = sizes["H"], sizes["W"]
     dtype = torch.promote_types(previous.dtype, torch.float32)
 
@@ -168,10 +173,7 @@ def reproject(
             parts = iter(torch.split(tap, [previous.shape[1], *(t.shape[1] for t in tested)], 1))
             value = next(parts)
             tap_surface = Surface(*(None if x is None else next(parts) for x in there))
-            if rule == "bmfr":
-                kept = kept & _bmfr_test(here, tap_surface, position_limit, normal_limit)
-            else:
-                kept = kept & _relative_test(here, tap_surface, position_limit, normal_limit)
+            kept = kept & test(here, tap_surface, position_limit, normal_limit)
             bilinear = (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
             bilinear = torch.where(kept, bilinear, 0)
             # A tap that is left out may hold anything, NaN too.
@@ -186,7 +188,7 @@ def accumulate(
     color: Tensor,
     previous: Tensor,
     previous_length: Tensor,
-    motion: Tensor,
+    motion: Tensor | None,
     surface: Surface | None = None,
     previous_surface: Surface | None = None,
     *,
@@ -207,7 +209,8 @@ def accumulate(
         color: ``(B, C, H, W)`` noisy radiance of the current frame, usually demodulated.
         previous: ``(B, C, H, W)`` accumulated radiance of the previous frame.
         previous_length: ``(B, 1, H, W)`` history length of the previous frame, in frames, at least 1.
-        motion: ``(B, 2, H, W)`` pixels, ``previous position = current position + motion``.
+        motion: ``(B, 2, H, W)`` pixels, ``previous position = current position + motion``; ``None`` where nothing moves
+            in the image, which gives, bit by bit, what a motion of zeros gives, without looking for it.
         surface: see :func:`reproject`.
         previous_surface: see :func:`reproject`.
         alpha_min: smallest weight of the current frame, in (0, 1].
@@ -239,18 +242,20 @@ def accumulate(
         >>> accumulated.unique().tolist(), length.unique().tolist()
         ([1.0], [4.0])
     """
-    check_shapes(
+    _check_images(
+        motion,
         color=(color, "B C H W"),
         previous=(previous, "B C H W"),
         previous_length=(previous_length, "B 1 H W"),
-        motion=(motion, "B 2 H W"),
     )
     if not 0 < alpha_min <= 1:
         raise ValueError(f"alpha_min: expected in (0, 1], found {alpha_min}")
-    images = (color, previous, previous_length, motion)
+    images = (color, previous, previous_length)
     surfaces = (*(surface or ()), *(previous_surface or ()))
-    if choose_backend(backend, *images, *surfaces, differentiable=False) == "numba":
-        return _accumulate_numba(*images, surface, previous_surface, alpha_min, rule, position_limit, normal_limit)
+    if choose_backend(backend, *images, motion, *surfaces, differentiable=False) == "numba":
+        return _accumulate_numba(
+            *images, motion, surface, previous_surface, alpha_min, rule, position_limit, normal_limit
+        )
     dtype = torch.promote_types(color.dtype, torch.float32)
     channels = color.shape[1]
     both, weight = reproject(
@@ -276,7 +281,7 @@ def _accumulate_numba(
     color: Tensor,
     previous: Tensor,
     previous_length: Tensor,
-    motion: Tensor,
+    motion: Tensor | None,
     surface: Surface | None,
     previous_surface: Surface | None,
     alpha_min: float,
@@ -333,7 +338,7 @@ class Accumulate(nn.Module):
         color: Tensor,
         previous: Tensor,
         previous_length: Tensor,
-        motion: Tensor,
+        motion: Tensor | None,
         surface: Surface | None = None,
         previous_surface: Surface | None = None,
     ) -> tuple[Tensor, Tensor]:
@@ -351,6 +356,10 @@ class Accumulate(nn.Module):
             normal_limit=self.normal_limit,
             backend=self.backend,
         )
+
+
+def _check_images(motion: Tensor | None, **images: tuple[Tensor, str]) -> dict[str, int]:
+    return check_shapes(**images) if motion is None else check_shapes(**images, motion=(motion, "B 2 H W"))
 
 
 def _pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtype) -> Tensor:

@@ -63,6 +63,7 @@ def write_report(folder: Path) -> Path:
         "stages": STAGES,
         "number": _number,
         "plots": _write_plots(folder, results, shown, names),
+        "left_out": results.left_out(),
         "sizes": sorted({(cost.width, cost.height) for cost in results.costs}, key=lambda size: size[0] * size[1]),
         "costs": {(cost.method, cost.width, cost.height): cost for cost in results.costs},
         "fits": {fit.method: fit for fit in results.fits},

@@ -18,7 +18,9 @@ from mcdenoise.errors import InputError
 from mcdenoise.models import (
     Cascade,
     KernelPredictor,
+    Known,
     PixelPredictor,
+    Region,
     UNet,
     cascaded,
     create_model,
@@ -30,6 +32,7 @@ from mcdenoise.models import (
     register_model,
     save_weights,
 )
+from mcdenoise.models._regions import regions
 from mcdenoise.models.cascaded import FEATURES, auto_exposure, normalize_depth
 from mcdenoise.ops import cross_bilateral_weights, kernel_conv
 
@@ -128,7 +131,7 @@ def test_weights_and_filter_in_one_give_the_same_image(
     with torch.no_grad(), bfloat16:
         image = model(*inputs(97, 131)).final
 
-        def in_two_steps(image: Tensor, logits: Tensor, *arguments: Any, border: Any) -> Tensor:
+        def in_two_steps(image: Tensor, logits: Tensor, *arguments: Any, border: Any, backend: Any) -> Tensor:
             weights = cross_bilateral_weights(logits.float(), *arguments, border=border)
             return kernel_conv(image, weights, border="zeros", backend="torch")
 
@@ -305,6 +308,87 @@ def test_unet_gives_three_scales_of_any_size(levels: int) -> None:
 def test_unet_needs_a_decoder_level_for_each_scale(levels: int) -> None:
     with pytest.raises(ValueError, match=f"levels: expected at least 4, found {levels}"):
         UNet(5, 4, levels)
+
+
+# Parts of an image
+
+
+def half_known(name: str, top: int, left: int) -> tuple[Cascade, tuple[Tensor, ...], Known]:
+    """A cascade, its inputs, and a result that is known but for 60 x 70 pixels."""
+    model = build(name).to(memory_format=torch.channels_last)
+    assert isinstance(model, Cascade)
+    frame = inputs(237, 331)
+    mask = torch.ones(1, 1, 237, 331, dtype=torch.bool)
+    mask[..., top : top + 60, left : left + 70] = False
+    return model, frame, Known(mask, frame[0] * 0.7, frame[0] * 0.6)
+
+
+@pytest.mark.parametrize("name", ["cascaded", "cascaded_tiny", "kernel_pixel", "kernel", "pixel"])
+@pytest.mark.parametrize(("top", "left"), [(0, 0), (100, 131), (170, 250)])
+@torch.inference_mode()
+def test_a_part_of_an_image_is_that_of_the_whole(name: str, top: int, left: int) -> None:
+    model, frame, known = half_known(name, top, left)
+    parts = model.parts(known.mask)
+    assert sum(part.grown(model.halo, (237, 331)).pixels for part in parts) < 0.8 * 237 * 331
+    whole, part = model(*frame, known=known), model(*frame, known=known, parts=parts)
+    for a, b, given in zip(whole, part, (known.initial, known.final), strict=True):
+        assert torch.equal(a, b)
+        assert torch.equal(torch.where(known.mask, b, given), given)
+    assert not torch.equal(whole.initial, known.initial)
+
+
+@torch.inference_mode()
+def test_a_part_needs_all_around_it_that_the_network_sees(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, frame, known = half_known("cascaded", 100, 131)
+    parts, whole = model.parts(known.mask), model(*frame, known=known)
+    monkeypatch.setattr(Cascade, "halo", 24)
+    assert not torch.equal(model(*frame, known=known, parts=parts).final, whole.final)
+
+
+@torch.inference_mode()
+def test_what_is_known_is_not_computed() -> None:
+    model, frame, known = half_known("cascaded", 0, 0)
+    everything = known._replace(mask=torch.ones_like(known.mask))
+    assert model.parts(everything.mask) == []
+    model.first.register_forward_hook(lambda *_: pytest.fail("the network ran"))
+    results = model(*frame, known=everything, parts=[])
+    assert torch.equal(results.initial, known.initial)
+    assert torch.equal(results.final, known.final)
+
+
+def test_rectangles_hold_what_is_needed_once_and_reach_no_other() -> None:
+    needed = torch.zeros(2, 1, 1000, 1400, dtype=torch.bool)
+    for image, top, left in ((0, 3, 5), (0, 40, 70), (1, 500, 900), (0, 999, 1399)):
+        needed[image, 0, top, left] = True
+    boxes = regions(needed, 64)
+    assert boxes == [Region(0, 0, 64, 96), Region(480, 896, 512, 928), Region(992, 1376, 1000, 1400)]
+    covered = sum(box.of(needed).sum() for box in boxes)
+    assert covered == needed.sum()
+
+
+def test_where_a_part_costs_as_much_as_the_whole_it_is_the_whole() -> None:
+    needed = torch.zeros(1, 1, 90, 160, dtype=torch.bool)
+    assert regions(needed, 64) == []
+    needed[..., 40, 80] = True
+    assert regions(needed, 64) == [Region(0, 0, 90, 160)]
+    assert regions(needed, 8) == [Region(32, 64, 64, 96)]
+
+
+@pytest.mark.parametrize("name", ["cascaded", "kernel_kernel"])
+@pytest.mark.parametrize("size", [(33, 47), (96, 110)])
+@torch.inference_mode()
+def test_a_constant_guide_guides_nothing(name: str, size: tuple[int, int]) -> None:
+    color, albedo, normal, _ = inputs(*size)
+    for constant, guides in (
+        ((normal[..., :1, :1].expand_as(normal), torch.full((1, 1, *size), 3.7)), ()),
+        ((normal, torch.full((1, 1, *size), torch.inf)), ("normal",)),
+        ((torch.zeros_like(normal), 1 + inputs(*size)[3]), ("depth",)),
+    ):
+        model = build(name)
+        expected, result = model(color, albedo, *constant), model(color, albedo, *constant, guides=guides)
+        assert all(torch.equal(a, b) for a, b in zip(expected, result, strict=True))
+    other = model(color, albedo, normal, constant[1], guides=())
+    assert not torch.equal(other.final, model(color, albedo, normal, constant[1]).final)
 
 
 def test_golden() -> None:

@@ -328,3 +328,44 @@ def test_settings_reach_the_test_of_the_surface() -> None:
     surfaces = (Surface(depth=image([[5.0, 5.0]])), Surface(depth=image([[5.4, 5.6]])))
     assert accumulate(*arguments, *surfaces)[1].flatten().tolist() == [4.0, 1.0]
     assert accumulate(*arguments, *surfaces, position_limit=0.2)[1].flatten().tolist() == [4.0, 4.0]
+
+
+class TestNothingMoves:
+    """A motion of ``None`` is a motion of zeros, to the last bit."""
+
+    def surfaces(self, seed: int) -> Surface:
+        position, depth = draw(2, 3, 96, 110, seed=seed), draw(2, 1, 96, 110, seed=seed) + 1
+        normal = torch.nn.functional.normalize(draw(2, 3, 96, 110, seed=seed + 1) - 0.5)
+        depth[..., :9, :] = INF
+        return Surface(position.float(), normal.float(), depth.float())
+
+    @pytest.mark.parametrize("backend", ["torch", "numba"])
+    @pytest.mark.parametrize("rule", ["relative", "bmfr"])
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+    def test_bit_by_bit(self, backend: Any, rule: Any, dtype: torch.dtype) -> None:
+        if backend == "numba":
+            pytest.importorskip("numba", reason="the fast form is in the extra mcdenoise[fast]")
+        color, previous = (draw(2, 3, 96, 110, seed=seed).to(dtype) for seed in (1, 2))
+        length = (draw(2, 1, 96, 110, seed=3) * 40).round() + 1
+        here, there = self.surfaces(4), self.surfaces(4)
+        assert there.normal is not None
+        # Half of the pixels show another surface than before.
+        changed = draw(2, 1, 96, 110, seed=5) < 0.5
+        there = there._replace(normal=torch.where(changed, -there.normal, there.normal))
+        limits = {"position_limit": 0.1, "normal_limit": 0.3} if rule == "bmfr" else {}
+        arguments, settings = (color, previous, length.to(dtype)), {"rule": rule, "backend": backend, **limits}
+        zeros = still(96, 110, 2).to(dtype)
+        expected = accumulate(*arguments, zeros, here, there, **settings)
+        for result, known in zip(accumulate(*arguments, None, here, there, **settings), expected, strict=True):
+            assert torch.equal(result, known)
+        assert 0.4 < (expected[1] == 1).float().mean() < 0.6
+
+    def test_reprojection_and_its_derivatives(self) -> None:
+        previous, here = draw(1, 3, 5, 6).requires_grad_(), draw(1, 1, 5, 6, seed=1) + 1
+        surfaces = Surface(depth=here), Surface(depth=here * torch.tensor([1.0, 1.5]).repeat(3))
+        expected = reproject(previous, still(5, 6), *surfaces)
+        results = reproject(previous, None, *surfaces)
+        assert all(torch.equal(result, known) for result, known in zip(results, expected, strict=True))
+        slopes = [torch.autograd.grad(value.square().sum(), previous)[0] for value, _ in (results, expected)]
+        assert torch.equal(*slopes)
+        assert results[1].unique().tolist() == [0, 1]

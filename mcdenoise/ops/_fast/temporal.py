@@ -20,7 +20,7 @@ from mcdenoise.ops._fast._filter import compiled, share_rows, source
     "mcdenoise::accumulate",
     mutates_args=(),
     device_types="cpu",
-    schema="(Tensor color, Tensor previous, Tensor previous_length, Tensor motion, Tensor?[] surface, "
+    schema="(Tensor color, Tensor previous, Tensor previous_length, Tensor? motion, Tensor?[] surface, "
     "Tensor?[] previous_surface, float alpha_min, bool bmfr, float position_limit, float normal_limit) "
     "-> (Tensor, Tensor)",
 )
@@ -28,7 +28,7 @@ def accumulate(
     color: Tensor,
     previous: Tensor,
     previous_length: Tensor,
-    motion: Tensor,
+    motion: Tensor | None,
     surface: list[Tensor | None],
     previous_surface: list[Tensor | None],
     alpha_min: float,
@@ -46,7 +46,10 @@ def accumulate(
             tuple(source((nothing if buffer is None else buffer).to(dtype)) for buffer in buffers)
             for buffers in (surface, previous_surface)
         )
-        images = (source(image.to(dtype)) for image in (color, previous, previous_length, motion))
+        images = (
+            source((nothing if image is None else image).to(dtype))
+            for image in (color, previous, previous_length, motion)
+        )
         limits = tuple(accumulated.new_tensor([alpha_min, position_limit, normal_limit]).tolist())
         arguments = (accumulated.numpy(), length.numpy(), *images, *surfaces, *limits, bmfr)
         share_rows(color, lambda *rows: _accumulate(*arguments, *rows))
@@ -83,27 +86,30 @@ def _accumulate(
     """
     _, channels, height, width = accumulated.shape
     (new, new_strides, _), (old, old_strides, _), (old_length, length_strides, _) = color, previous, previous_length
-    moved, motion_strides, _ = motion
+    moved, motion_strides, moves = motion
     (p, p_strides, positions), (n, n_strides, normals), (d, d_strides, depths) = here
     (tap_p, tap_p_strides, _), (tap_n, tap_n_strides, _), (tap_d, tap_d_strides, _) = there
+    taps = 4 if moves else 1
     sums, one, zero = np.empty(channels, accumulated.dtype), accumulated.dtype.type(1), accumulated.dtype.type(0)
     for y in range(first, last):
         for x in range(width):
             at_new = b * new_strides[0] + y * new_strides[2] + x * new_strides[3]
             at_p = b * p_strides[0] + y * p_strides[2] + x * p_strides[3]
             at_n = b * n_strides[0] + y * n_strides[2] + x * n_strides[3]
-            at_motion = b * motion_strides[0] + y * motion_strides[2] + x * motion_strides[3]
             depth = d[b * d_strides[0] + y * d_strides[2] + x * d_strides[3]] if depths else zero
             hit = math.isfinite(depth)
-            qx = accumulated.dtype.type(x) + moved[at_motion]
-            qy = accumulated.dtype.type(y) + moved[at_motion + motion_strides[1]]
+            qx, qy = accumulated.dtype.type(x), accumulated.dtype.type(y)
+            if moves:
+                at_motion = b * motion_strides[0] + y * motion_strides[2] + x * motion_strides[3]
+                qx += moved[at_motion]
+                qy += moved[at_motion + motion_strides[1]]
             # Not so for a NaN either.
             reachable = -1 < qx < width and -1 < qy < height
             left, top = (math.floor(qx), math.floor(qy)) if reachable else (0, 0)
             fx, fy = qx - accumulated.dtype.type(left), qy - accumulated.dtype.type(top)
             sums[:] = 0
             weight = length = zero
-            for tap in range(4 if reachable else 0):
+            for tap in range(taps if reachable else 0):
                 row, column = top + tap // 2, left + tap % 2
                 if row < 0 or row >= height or column < 0 or column >= width:
                     continue

@@ -1,0 +1,186 @@
+"""Which model to take, so that a frame takes no longer, or is no worse, than was asked for on this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import statistics
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+
+from mcdenoise.benchmark.sizes import synthetic_frame
+from mcdenoise.data import Sequence
+from mcdenoise.data.files import write_text
+from mcdenoise.denoiser import PRECISIONS, Denoiser, Precision
+from mcdenoise.errors import InputError
+from mcdenoise.metrics import smape_linear
+from mcdenoise.models import pretrained_models
+from mcdenoise.plan import Plan
+from mcdenoise.results import Results
+
+_ROUNDS = 3
+# Frames with a reference that errors are measured on, and frames before the first of them.
+_SCORED = 4
+_HISTORY = 8
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A model that could be taken.
+
+    Args:
+        model: its name.
+        precision: of its convolutions.
+        milliseconds: of a frame in memory on this machine, measured with everything kept.
+        error: SMAPE of scene-linear radiance, where it is known.
+    """
+
+    model: str
+    precision: Precision
+    milliseconds: float
+    error: float | None = None
+
+    @property
+    def name(self) -> str:
+        """As a benchmark calls it."""
+        return self.model if self.precision == "float32" else f"{self.model}, {self.precision}"
+
+    def __str__(self) -> str:
+        error = "" if self.error is None else f", SMAPE {self.error:.4g}"
+        return f"{self.name}: {self.milliseconds:.1f} ms a frame{error}"
+
+
+def choose_model(
+    sequence: Sequence,
+    *,
+    budget: float | None = None,
+    max_error: float | None = None,
+    results: Path | None = None,
+    device: str = "cpu",
+    cache: Path | None = None,
+    on_step: Callable[[int, int], None] = lambda done, total: None,
+) -> Choice:
+    """The cheapest shipped model and precision with an error no larger than ``max_error``, if that is given.
+
+    With a budget alone it is the model with the least error of those that keep to it; where no errors are known, the
+    slowest of them, which does most.
+
+    Args:
+        sequence: what is to be denoised.
+        budget: milliseconds a frame, without reading and writing files.
+        max_error: SMAPE of scene-linear radiance.
+        results: folder of a finished benchmark, whose errors (mean over its scenes) are taken; without it they are
+            measured on the last frames of the sequence that have a reference.
+        device: where to run.
+        cache: file of run times that were measured earlier, :func:`cache_file` by default.
+        on_step: called with the number of models that were measured, and that of all of them.
+
+    Raises:
+        InputError: no model meets what is asked for, or no errors are known and ``max_error`` is given.
+    """
+    for name, value in (("--budget-ms", budget), ("--max-error", max_error)):
+        if value is not None and not value > 0:
+            raise InputError(f"{name}: expected more than 0, found {value:g}")
+    if results is None and max_error is not None and not sequence.reference_numbers:
+        raise InputError(
+            f"--max-error: expected references in {sequence.root}, or --results of a finished benchmark, found neither"
+        )
+    choices = _timed(sequence.size, device, cache_file() if cache is None else cache, on_step)
+    affordable = [choice for choice in choices if budget is None or choice.milliseconds <= budget]
+    if not affordable:
+        raise InputError(f"--budget-ms: expected a model that takes at most {budget:g} ms, found at best {choices[0]}")
+    if max_error is None:
+        known = _with_errors(affordable, sequence, results, device)
+        return min(known, key=lambda choice: (choice.error or 0.0, -choice.milliseconds))
+    best: Choice | None = None
+    for choice in affordable:
+        (scored,) = _with_errors([choice], sequence, results, device)
+        if scored.error is None:
+            continue
+        if scored.error <= max_error:
+            return scored
+        if best is None or best.error is None or scored.error < best.error:
+            best = scored
+    within = "" if budget is None else f" in {budget:g} ms"
+    found = "no error of any" if best is None else f"at best {best}"
+    raise InputError(f"--max-error: expected a model with SMAPE of at most {max_error:g}{within}, found {found}")
+
+
+def cache_file() -> Path:
+    """Where run times are kept: in the user's cache folder."""
+    folder = os.environ.get("XDG_CACHE_HOME")
+    return (Path(folder) if folder else Path.home() / ".cache") / "mcdenoise" / "run_times.json"
+
+
+def _timed(size: tuple[int, int], device: str, cache: Path, on_step: Callable[[int, int], None]) -> list[Choice]:
+    """All shipped models in all precisions, the fastest first."""
+    height, width = size
+    machine = f"{platform.node()}, {platform.machine()}, {device}, {torch.get_num_threads()} threads"
+    key = f"{machine}, mcdenoise {version('mcdenoise')}, torch {torch.__version__}, {width}x{height}"
+    known = _read(cache)
+    own = known.setdefault(key, {})
+    choices = [Choice(model, precision, 0.0) for model in pretrained_models() for precision in PRECISIONS]
+    measured = []
+    for done, choice in enumerate(choices, start=1):
+        if choice.name not in own:
+            own[choice.name] = _measure(choice, size, device)
+        measured.append(replace(choice, milliseconds=own[choice.name]))
+        on_step(done, len(choices))
+    # Without a place to keep them, they are measured again.
+    with suppress(OSError, InputError):
+        cache.parent.mkdir(parents=True, exist_ok=True)
+        write_text(cache, json.dumps(known, indent=1) + "\n")
+    return sorted(measured, key=lambda choice: choice.milliseconds)
+
+
+def _read(cache: Path) -> dict[str, dict[str, float]]:
+    try:
+        known = json.loads(cache.read_text())
+        return {key: {name: float(value) for name, value in own.items()} for key, own in known.items()}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}
+
+
+def _measure(choice: Choice, size: tuple[int, int], device: str) -> float:
+    denoiser = Denoiser(choice.model, precision=choice.precision, device=device, plan=Plan(keep_all=True))
+    frame = synthetic_frame(size[1], size[0]).to(device)
+    times = []
+    for _ in range(_ROUNDS + 2):
+        denoiser(frame)
+        times.append(sum(denoiser.report.milliseconds.values()))
+    return statistics.median(times[2:])
+
+
+def _with_errors(choices: list[Choice], sequence: Sequence, results: Path | None, device: str) -> list[Choice]:
+    if results is not None:
+        benchmark = Results.read(results)
+        means = {}
+        for choice in choices:
+            cells = [cell for cell in benchmark.cells if cell.method == choice.name and "SMAPE" in cell.errors]
+            if cells:
+                means[choice.name] = statistics.mean(cell.errors["SMAPE"] for cell in cells)
+        scored = [replace(choice, error=means.get(choice.name)) for choice in choices]
+        return [choice for choice in scored if choice.error is not None] or scored
+    if not sequence.reference_numbers:
+        return choices
+    return [replace(choice, error=_error(choice, sequence, device)) for choice in choices]
+
+
+def _error(choice: Choice, sequence: Sequence, device: str) -> float:
+    """On the last frames that have a reference, with a history."""
+    scored = sequence.reference_numbers[-_SCORED:]
+    numbers = [number for number in sequence.numbers if scored[0] - _HISTORY <= number <= scored[-1]]
+    denoiser = Denoiser(choice.model, precision=choice.precision, device=device)
+    errors = []
+    for number in numbers:
+        frame = sequence.frame(number).to(device)
+        image = denoiser(frame)
+        if number in scored and frame.reference is not None:
+            errors.append(float(smape_linear(image, frame.reference)))
+    return statistics.mean(errors)

@@ -1,0 +1,91 @@
+"""Which rectangles of an image to compute, where not all of it is asked for."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch.nn.functional as F
+from torch import Tensor
+
+# Rectangles begin and end at multiples of this.
+_TILE = 32
+# A network on more than this share of the image costs as much as on all of it.
+_WORTHWHILE = 0.9
+
+
+class Region(NamedTuple):
+    """A rectangle of an image, in pixels; ``bottom`` and ``right`` are outside."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    def of(self, image: Tensor) -> Tensor:
+        """That part of ``(..., H, W)``."""
+        return image[..., self.top : self.bottom, self.left : self.right]
+
+    def grown(self, margin: int, size: tuple[int, int]) -> Region:
+        """With a margin on all sides, as far as the image goes."""
+        height, width = size
+        return Region(
+            max(self.top - margin, 0),
+            max(self.left - margin, 0),
+            min(self.bottom + margin, height),
+            min(self.right + margin, width),
+        )
+
+    @property
+    def pixels(self) -> int:
+        """How many there are."""
+        return (self.bottom - self.top) * (self.right - self.left)
+
+
+def regions(needed: Tensor, halo: int) -> list[Region]:
+    """Rectangles that hold all pixels that are needed; the whole image where computing less would hardly pay.
+
+    Args:
+        needed: ``(B, 1, H, W)`` true where a result is asked for, in any image of the batch.
+        halo: how far around a rectangle the network has to look, in pixels.
+
+    Returns:
+        Rectangles that do not overlap, without the halo; none where nothing is needed.
+    """
+    size = height, width = needed.shape[-2], needed.shape[-1]
+    padded = F.pad(
+        needed.any(0, keepdim=True).float().reshape(1, 1, height, width), (0, -width % _TILE, 0, -height % _TILE)
+    )
+    tiles = F.max_pool2d(padded, _TILE)[0, 0] > 0
+    boxes = [
+        Region(top * _TILE, left * _TILE, min(bottom * _TILE, height), min(right * _TILE, width))
+        for top, left, bottom, right in _boxes(tiles, -(-2 * halo // _TILE))
+    ]
+    cost = sum(box.grown(halo, size).pixels for box in boxes)
+    return [Region(0, 0, height, width)] if cost > _WORTHWHILE * height * width else boxes
+
+
+def _boxes(tiles: Tensor, gap: int) -> list[Region]:
+    """Boxes around groups of tiles; groups whose halos touch are one."""
+    boxes = [Region(y, x, y + 1, x + 1) for y, x in tiles.nonzero().tolist()]
+    merged = True
+    while merged:
+        merged, left = False, boxes
+        boxes = []
+        for box in left:
+            near = next((i for i, other in enumerate(boxes) if _near(box, other, gap)), None)
+            if near is None:
+                boxes.append(box)
+                continue
+            other, merged = boxes[near], True
+            boxes[near] = Region(
+                min(box.top, other.top),
+                min(box.left, other.left),
+                max(box.bottom, other.bottom),
+                max(box.right, other.right),
+            )
+    return boxes
+
+
+def _near(a: Region, b: Region, gap: int) -> bool:
+    rows = a.top <= b.bottom + gap and b.top <= a.bottom + gap
+    return rows and a.left <= b.right + gap and b.left <= a.right + gap

@@ -1,0 +1,152 @@
+"""The model that keeps to a budget, or to an error."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mcdenoise.budget
+from mcdenoise.budget import Choice, choose_model
+from mcdenoise.cli import main
+from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.errors import InputError
+from mcdenoise.models import pretrained_models
+from mcdenoise.results import Cell, Machine, Results
+
+TIMES = {"cascaded": 300.0, "cascaded_small": 170.0, "cascaded_tiny": 80.0}
+
+
+@pytest.fixture(autouse=True)
+def measured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
+    """Times that are told, and no cache but the test's; the names of what was measured."""
+    names: list[str] = []
+
+    def measure(choice: Choice, *_: Any) -> float:
+        names.append(choice.name)
+        return TIMES[choice.model] * (1.0 if choice.precision == "float32" else 0.6)
+
+    monkeypatch.setattr(mcdenoise.budget, "_measure", measure)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return names
+
+
+@pytest.fixture
+def sequence(small_sequence: Path) -> Sequence:
+    return open_sequence(small_sequence)
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """A benchmark over two scenes."""
+    errors = {"cascaded": 0.05, "cascaded, bfloat16": 0.052, "cascaded_small": 0.06, "cascaded_tiny": 0.08}
+    cells = [
+        Cell(scene, name, {"SMAPE": error + shift})
+        for name, error in errors.items()
+        for scene, shift in (("a", -0.01), ("b", 0.01))
+    ]
+    folder = tmp_path / "results"
+    folder.mkdir()
+    Results("", "", Machine("", 1, 1.0, "cpu", 1, ""), 1, [], [], cells).write(folder)
+    return folder
+
+
+def refused(action: Callable[[], object]) -> str:
+    with pytest.raises(InputError) as error:
+        action()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [
+        ({"max_error": 0.09}, "cascaded_tiny"),
+        ({"max_error": 0.055}, "cascaded, bfloat16"),
+        ({"max_error": 0.051}, "cascaded"),
+        ({"budget": 1000}, "cascaded"),
+        ({"budget": 200}, "cascaded, bfloat16"),
+        ({"budget": 175, "max_error": 0.07}, "cascaded_small"),
+        ({"budget": 100}, "cascaded_tiny"),
+    ],
+)
+def test_the_choice(sequence: Sequence, results: Path, limits: dict[str, float], expected: str) -> None:
+    choice = choose_model(sequence, results=results, **limits)
+    assert choice.name == expected
+    assert choice.error is not None
+    assert choice.milliseconds <= limits.get("budget", 1000)
+    assert choice.error <= limits.get("max_error", 1)
+
+
+def test_what_nothing_meets_is_told_in_one_line(sequence: Sequence, results: Path) -> None:
+    message = refused(lambda: choose_model(sequence, budget=10))
+    assert message == (
+        "--budget-ms: expected a model that takes at most 10 ms, found at best cascaded_tiny, bfloat16: 48.0 ms a frame"
+    )
+    message = refused(lambda: choose_model(sequence, budget=100, max_error=0.01, results=results))
+    assert message.endswith("at most 0.01 in 100 ms, found at best cascaded_tiny: 80.0 ms a frame, SMAPE 0.08")
+    assert "--max-error: expected more than 0" in refused(lambda: choose_model(sequence, max_error=-1))
+    for path in (sequence.root / "inputs").glob("reference*.exr"):
+        path.unlink()
+    bare = open_sequence(sequence.root)
+    assert "expected references in" in refused(lambda: choose_model(bare, max_error=0.1))
+    # Without any error, the slowest that keeps to the budget.
+    assert choose_model(bare, budget=150).name == "cascaded_small, bfloat16"
+
+
+def test_errors_come_from_the_references(sequence: Sequence) -> None:
+    choice = choose_model(sequence, max_error=0.9)
+    assert choice.name == "cascaded_tiny, bfloat16"
+    assert choice.error is not None
+    assert 0.01 < choice.error < 0.9
+    stricter = choose_model(sequence, budget=1000)
+    assert stricter.error is not None
+    assert stricter.error <= choice.error
+
+
+def test_times_are_measured_once_for_each_size_and_number_of_threads(
+    sequence: Sequence, measured: list[str], tmp_path: Path
+) -> None:
+    cache = tmp_path / "times.json"
+    bare = {"budget": 1000.0, "cache": cache}
+    for path in (sequence.root / "inputs").glob("reference*.exr"):
+        path.unlink()
+    sequence = open_sequence(sequence.root)
+    first = choose_model(sequence, **bare)
+    assert len(measured) == 2 * len(pretrained_models())
+    assert choose_model(sequence, **bare) == first
+    assert len(measured) == 2 * len(pretrained_models())
+    ((key, times),) = json.loads(cache.read_text()).items()
+    assert "24x20" in key
+    assert "threads" in key
+    assert times["cascaded_tiny, bfloat16"] == 48
+    cache.write_text("{ damaged")
+    assert choose_model(sequence, **bare) == first
+    assert len(measured) == 4 * len(pretrained_models())
+
+
+def test_the_command_line(small_sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["denoise", str(small_sequence), "-o", str(tmp_path / "out"), "--frames", "3"]
+    with pytest.raises(SystemExit) as stop:
+        main([*command, "--max-error", "0.9"])
+    assert stop.value.code == 0
+    assert "picked cascaded_tiny, bfloat16: 48.0 ms a frame, SMAPE 0." in capsys.readouterr().out
+    report = json.loads((tmp_path / "out" / "denoise.json").read_text())
+    assert (report["model"], report["precision"]) == ("cascaded_tiny", "bfloat16")
+    with pytest.raises(SystemExit) as stop:
+        main([*command, "--budget-ms", "1"])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.startswith(
+        "mcdenoise denoise: --budget-ms: expected a model that takes at most 1 ms"
+    )
+
+
+def test_a_measurement_is_that_of_frames_with_a_history(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    taken = mcdenoise.budget._measure(Choice("cascaded_tiny", "float32", 0.0), (36, 64), "cpu")
+    assert 0.5 < taken < 60_000
+    assert asdict(Choice("a", "float32", 1.0))["error"] is None
