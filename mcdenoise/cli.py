@@ -151,7 +151,7 @@ def _denoise() -> Callable[..., int | None]:
         threads: int | None = None,
         precision: Precision = "float32",
         alpha_min: float = 0.1,
-        anti_lag: bool = False,
+        anti_lag: bool = True,
         full_float: bool = False,
         keep_all: bool = False,
         tolerance: float = TOLERANCE,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -71,8 +72,7 @@ class Denoiser:
         weights: a safetensors file of other weights for a model given by name.
         device: where to run; frames may come from anywhere and images stay here.
         alpha_min: smallest weight of the current frame in the accumulation, see :func:`mcdenoise.ops.accumulate`.
-        anti_lag: give up the past where the light has changed, see :class:`mcdenoise.history.History`. The shipped
-            weights were trained without it.
+        anti_lag: give up the past where the light has changed, see :class:`mcdenoise.history.History`.
         precision: ``"bfloat16"`` runs the network's convolutions in bfloat16, which is about twice as fast on
             processors that have it; everything else stays in float32.
         plan: what to leave out of a scene that does not need it; ``Plan(keep_all=True)`` leaves nothing out.
@@ -96,7 +96,7 @@ class Denoiser:
         weights: Path | str | None = None,
         device: torch.device | str = "cpu",
         alpha_min: float = 0.1,
-        anti_lag: bool = False,
+        anti_lag: bool = True,
         precision: Precision = "float32",
         plan: Plan | None = None,
     ) -> None:
@@ -112,7 +112,7 @@ class Denoiser:
         self._takes_history = bool(getattr(model, "takes_history", False))
         self._takes_plan = bool(getattr(model, "takes_plan", False))
         self.plan = Plan() if plan is None else plan
-        self.history = History(Accumulate(alpha_min), anti_lag=HistoryLag() if anti_lag else None)
+        self.history = History(Accumulate(alpha_min), anti_lag=None if anti_lag else HistoryLag(math.inf))
         self.report = FrameReport()
 
     def reset(self, buffers: Collection[str] | None = None, frames: int | None = None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -26,6 +27,8 @@ _STILL = 0.05  # pixels
 _NO_WAY = "no motion, and no position with a previous camera"
 # Of the shorter history that the long one is compared with: four frames have half the noise of one.
 _RECENT_ALPHA = 0.25
+# As many equally weighted frames have the noise of that history, once it is full: (2 - alpha) / alpha.
+_RECENT_FRAMES = 7
 
 
 def surface_before(frame: Frame) -> Surface:
@@ -58,6 +61,14 @@ def _thinned(image: Tensor) -> Tensor:
     return image[..., ::8, ::8]
 
 
+def _compressed(color: Tensor) -> Tensor:
+    """What the test for lag compares means of: the fourth root of the radiance, in which a firefly hides little.
+
+    Any power keeps the ratio of a difference to its noise at any exposure; a logarithm would need a unit.
+    """
+    return color.detach().mean(1, keepdim=True).clamp_min(0).sqrt().sqrt()
+
+
 def _equal(a: Tensor | None, b: Tensor | None) -> bool:
     if a is None or b is None or a.device != b.device:
         return False
@@ -81,11 +92,28 @@ class Accumulated(NamedTuple):
 
 
 class _State(NamedTuple):
+    """The past of a shot.
+
+    Args:
+        color: ``(B, 3, H, W)``; where lag is looked for ``(B, 5, H, W)``, also the means of compressed radiance and of
+            its square.
+        recent: ``(B, 4, H, W)`` color and compressed radiance of a shorter past, where lag is looked for.
+    """
+
     color: Tensor
     recent: Tensor | None
     length: Tensor
     surface: Surface
     view_projection: Tensor | None
+
+
+class _Past(NamedTuple):
+    """A frame with its past: the first three of the next :class:`_State`, and why there is no more past, or ``""``."""
+
+    color: Tensor
+    recent: Tensor | None
+    length: Tensor
+    reset: str
 
 
 class History:
@@ -103,9 +131,12 @@ class History:
     reflections do not move with the surface. Emitters and background have no albedo either and are treated alike; they
     have little noise to lose. A frame without an albedo buffer says nothing of mirrors, and its past is kept.
 
-    Where a light is switched or moves, the past is wrong although every surface is still there, and fades in some 40
-    frames. With ``anti_lag`` it is given up where local means say so (:func:`mcdenoise.ops.history_lag`), in two steps:
-    a second history of about four frames is compared with the current frame, and the long one with that.
+    Where a light is switched or moves, or a reflection moves over a glossy surface, the past is wrong although every
+    surface is still there, and would fade in some 40 frames. It is given up where local means say so
+    (:func:`mcdenoise.ops.history_lag`), in two steps: a second history of about four frames is compared with the
+    current frame, and the long one with that. Compared are means of the fourth root of the radiance (channel mean,
+    demodulated, without fireflies); their noise is what the same root varied by over the past. The decision has no
+    derivative.
 
     Half-precision frames are accumulated in float32, which holds 10,000 frames as well as ten.
 
@@ -118,7 +149,7 @@ class History:
         fireflies: how fireflies are clamped; ``ClampFireflies(math.inf)`` leaves them.
         specular_length: the longest history of what is seen in mirrors and through glass while the image moves, in
             frames, at least 0; infinity treats them as everything else.
-        anti_lag: the test for changes of light; ``None`` makes none. It doubles the time that accumulating takes.
+        anti_lag: the test for changes of light; ``HistoryLag(math.inf)`` makes none, in a third of the time.
 
     Raises:
         ValueError: ``specular_length`` is negative.
@@ -136,7 +167,8 @@ class History:
         self.accumulate = Accumulate() if accumulate is None else accumulate
         self.fireflies = ClampFireflies() if fireflies is None else fireflies
         self.specular_length = specular_length
-        self.anti_lag = anti_lag
+        anti_lag = HistoryLag() if anti_lag is None else anti_lag
+        self.anti_lag = None if math.isinf(anti_lag.threshold) else anti_lag
         self._state: _State | None = None
 
     def reset(self) -> None:
@@ -176,39 +208,53 @@ class History:
             color = demodulate(color, frame.albedo)
         color = self.fireflies(color)
         color = color.to(torch.promote_types(color.dtype, torch.float32))
-        result, recent = self._blend(frame, color, reprojects)
+        entering = color
+        if self.anti_lag is not None:
+            compressed = _compressed(color)
+            entering = torch.cat([color, compressed, compressed.square()], 1)
+        past = self._blend(frame, entering, reprojects)
         surface = Surface(frame.position, frame.normal, frame.depth)
-        self._state = _State(result.color, recent, result.length, surface, frame.view_projection) if keeps else None
-        return result
+        self._state = _State(past.color, past.recent, past.length, surface, frame.view_projection) if keeps else None
+        return Accumulated(past.color[:, :3], color, past.length, past.reset)
 
-    def _blend(self, frame: Frame, color: Tensor, reprojects: bool) -> tuple[Accumulated, Tensor | None]:
-        """The frame with its past, and with its recent past alone if that is kept."""
-        state, recent = self._state, None if self.anti_lag is None else color
-        first = Accumulated(color, color, torch.ones_like(color[:, :1]), "first frame")
+    def _blend(self, frame: Frame, color: Tensor, reprojects: bool) -> _Past:
+        """The frame with its past."""
+        state = self._state
+        first = _Past(
+            color, None if self.anti_lag is None else color[:, :4], torch.ones_like(color[:, :1]), "first frame"
+        )
         if state is None:
             lost = frame.motion is None and (frame.position is None or frame.view_projection is None)
-            return (first._replace(reset=_NO_WAY) if lost else first), recent
+            return first._replace(reset=_NO_WAY) if lost else first
         if state.color.shape != color.shape or state.color.device != color.device:
-            return first._replace(reset="size change"), recent
+            return first._replace(reset="size change")
         motion = None
         if reprojects:
             still = frame.motion is None and self.is_still(frame)
             motion = torch.zeros_like(color[:, :2]) if still else motion_to_previous(frame, state.view_projection)
             if motion is None:
-                return first._replace(reset=_NO_WAY), recent
+                return first._replace(reset=_NO_WAY)
         surface = surface_before(frame)
-        accumulated, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
+        past, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
         if float((length > 1).float().mean()) < _CUT_SHARE:
-            return first._replace(reset="cut"), recent
+            return first._replace(reset="cut")
         if frame.albedo is not None and motion is not None:
-            accumulated, length = self._shortened(color, accumulated, length, frame.albedo, motion)
-        if self.anti_lag is not None and state.recent is not None:
-            recent, _ = self._shorter(color, state.recent, state.length, motion, surface, state.surface)
-            recent = torch.lerp(recent, color, self.anti_lag(recent, color))
-            lag = self.anti_lag(accumulated, recent)
-            accumulated = torch.lerp(accumulated, recent, lag)
-            length = torch.lerp(length, length.clamp_max(1 / self._shorter.alpha_min), lag)
-        return Accumulated(accumulated, color, length, ""), recent
+            past, length = self._shortened(color, past, length, frame.albedo, motion)
+        if self.anti_lag is None or state.recent is None:
+            return _Past(past, None, length, "")
+        recent, _ = self._shorter(color[:, :4], state.recent, state.length, motion, surface, state.surface)
+        return self._without_lag(self.anti_lag, color, past, recent, length)
+
+    def _without_lag(self, lag: HistoryLag, color: Tensor, past: Tensor, recent: Tensor, length: Tensor) -> _Past:
+        """What of the past still holds: first of the recent one, by the frame; then of the long one, by the recent."""
+        mean, square = past[:, 3:4], past[:, 4:]
+        counted = length.clamp_min(2)
+        variance = (square - mean.square()).clamp_min(0) * (counted / (counted - 1))
+        recent = torch.lerp(recent, color[:, :4], lag(recent[:, 3:], color[:, 3:4], variance))
+        share = lag(mean, recent[:, 3:], variance / length.clamp_max(_RECENT_FRAMES))
+        shorter = torch.cat([recent, recent[:, 3:].square() + variance], 1)
+        length = torch.lerp(length, length.clamp_max(1 / self._shorter.alpha_min), share)
+        return _Past(torch.lerp(past, shorter, share), recent, length, "")
 
     @property
     def _shorter(self) -> Accumulate:

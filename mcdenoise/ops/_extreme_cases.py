@@ -393,9 +393,13 @@ def firefly_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 def lags() -> tuple[Case, ...]:
     """Of ``history_lag``."""
 
-    def case(name: str, size: tuple[int, int, int, int], history: Draw, recent: Draw | None = None) -> Case:
+    def case(
+        name: str, size: tuple[int, int, int, int], history: Draw, recent: Draw | None = None, noise: float = 0.3
+    ) -> Case:
         def tensors(g: Generator) -> Inputs:
-            return {"history": history(g, *size), "recent": (recent or history)(g, *size)}
+            images = {"history": history(g, *size), "recent": (recent or history)(g, *size)}
+            variance = (noise * images["history"].mean(1, keepdim=True)).square()
+            return {**images, "variance": variance}
 
         return Case(name, "extreme", tensors, ())
 
@@ -406,6 +410,8 @@ def lags() -> tuple[Case, ...]:
         case("the light goes on", size, _constant(0.0), lambda g, *shape: uniform(g, *shape, low=0.5)),
         case("the light goes on at 1e30", size, _constant(0.0), _constant(1e30)),
         case("1e30 and 1e-30", size, _constant(1e30), _constant(1e-30)),
+        case("no noise", size, radiance, noise=0.0),
+        case("noise of 1e15 times the light", size, _constant(1.0), noise=1e15),
     )
 
 

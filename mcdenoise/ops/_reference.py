@@ -196,7 +196,9 @@ def clamp_fireflies(image: Tensor, *, limit: float = 30.0, kernel_size: int = 7)
     return _tensor(out, image.shape)
 
 
-def history_lag(history: Tensor, recent: Tensor, *, threshold: float = 3.0, kernel_size: int = 7) -> Tensor:
+def history_lag(
+    history: Tensor, recent: Tensor, variance: Tensor, *, threshold: float = 2.0, kernel_size: int = 11
+) -> Tensor:
     """``clamp((z^2 / threshold^2 - 1) / 3, 0, 1)`` of the difference of local means in standard errors ``z``."""
     batch, channels, height, width = history.shape
     shape = (batch, 1, height, width)
@@ -221,13 +223,11 @@ def history_lag(history: Tensor, recent: Tensor, *, threshold: float = 3.0, kern
         pixels = window(b, y, x)
         return math.fsum(image[b][row][column] for row, column in pixels) / len(pixels)
 
-    out = _zeros(shape)
+    out, noises = _zeros(shape), [image[0] for image in variance.tolist()]
     for b, _, y, x in _indices(shape):
-        pixels = window(b, y, x)
-        deviations = [short[b][row][column] - mean(short, b, row, column) for row, column in pixels]
-        variance = math.fsum(deviation**2 for deviation in deviations) / len(pixels)
         long_mean, short_mean = mean(long, b, y, x), mean(short, b, y, x)
-        noise = variance / len(pixels) + (1e-3 * (abs(long_mean) + abs(short_mean)) / 2) ** 2
+        smallest = 1e-3 * (abs(long_mean) + abs(short_mean)) / 2
+        noise = mean(noises, b, y, x) / len(window(b, y, x)) + smallest**2
         z2 = (short_mean - long_mean) ** 2 / noise if noise > 0 else 0.0
         out[b][0][y][x] = min(max((z2 / threshold**2 - 1) / 3, 0.0), 1.0)
     return _tensor(out, shape)

@@ -9,30 +9,39 @@ from torch import Tensor, nn
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._window import accumulator_dtype
 
-THRESHOLD = 3.0
-KERNEL_SIZE = 7
+THRESHOLD = 2.0
+KERNEL_SIZE = 11
 # Of the local mean: a difference that no eye sees is no lag, however little noise there is.
 SMALLEST = 1e-3
 
 
 def history_lag(
-    history: Tensor, recent: Tensor, *, threshold: float = THRESHOLD, kernel_size: int = KERNEL_SIZE
+    history: Tensor,
+    recent: Tensor,
+    variance: Tensor,
+    *,
+    threshold: float = THRESHOLD,
+    kernel_size: int = KERNEL_SIZE,
 ) -> Tensor:
     """How much of a long history to give up for a shorter one, because the light has changed.
 
     Noise hides a change of the light in a pixel, but not in the mean of a window. With ``y`` the mean over channels,
     ``m_h`` and ``m_r`` its means over the ``n`` pixels of the window that lie in the image, of ``history`` and of
-    ``recent``, and the standard error of the latter ``s^2 = mean((y_r - m_r)^2) / n``,
+    ``recent``, and ``m_v`` that of ``variance``,
 
-    ``z^2 = (m_r - m_h)^2 / (s^2 + (0.001 (|m_h| + |m_r|) / 2)^2)``,
+    ``z^2 = (m_r - m_h)^2 / (m_v / n + (0.001 (|m_h| + |m_r|) / 2)^2)``,
     ``lag = clamp((z^2 / threshold^2 - 1) / 3, 0, 1)``:
 
-    0 up to ``threshold`` standard errors, 1 from twice as many. One outlier in the window raises ``m_r`` and ``s``
-    alike, and is no lag. Detail is none either: both means contain it.
+    0 up to ``threshold`` standard errors, 1 from twice as many. Detail is no lag: both means contain it.
+
+    The variance must come from more than the window of ``recent``: where light arrives in few, large samples, a window
+    that none has hit looks dark and free of noise. And radiance itself is a poor ``y``, since one firefly hides all
+    else: :class:`mcdenoise.history.History` compares means of its fourth root, with the variance over the past.
 
     Args:
-        history: ``(B, C, H, W)`` radiance of a long history, finite, any unit; usually demodulated.
-        recent: ``(B, C, H, W)`` the same of a shorter history or of the current frame, with more noise and less lag.
+        history: ``(B, C, H, W)`` mean over a long past, finite, any unit.
+        recent: ``(B, C, H, W)`` the same of a shorter past or of the current frame, with more noise and less lag.
+        variance: ``(B, 1, H, W)`` of the noise of ``recent``'s channel mean, at least 0, in its unit squared.
         threshold: standard errors up to which a difference is taken for noise, above 0.
         kernel_size: side of the window in pixels, odd, at least 3.
 
@@ -45,20 +54,20 @@ def history_lag(
         TypeError: an argument is no floating-point tensor.
         ValueError: a shape or a setting does not fit.
 
-    Differentiable in ``history`` and ``recent``, to any order, where the share is not exactly at its limits.
+    Differentiable in all three images, to any order, where the share is not exactly at its limits.
 
     Source: the idea of Schied et al. 2018, "Gradient estimation for real-time adaptive temporal filtering" (A-SVGF),
     and of the fast history of NVIDIA's ReLAX; with a test of means in place of re-shaded samples and of color boxes.
 
     Example:
-        >>> history = torch.ones(1, 3, 9, 9)
-        >>> history_lag(history, torch.zeros(1, 3, 9, 9)).unique().tolist()  # the light went out
+        >>> history, variance = torch.ones(1, 3, 9, 9), torch.full((1, 1, 9, 9), 0.1)
+        >>> history_lag(history, torch.zeros(1, 3, 9, 9), variance).unique().tolist()  # the light went out
         [1.0]
         >>> noise = torch.rand(1, 3, 9, 9, generator=torch.Generator().manual_seed(0)) * 2
-        >>> history_lag(history, noise).unique().tolist()
-        [0.0]
+        >>> history_lag(history, noise, variance).mean() < 0.01
+        tensor(True)
     """
-    check_shapes(history=(history, "B C H W"), recent=(recent, "B C H W"))
+    check_shapes(history=(history, "B C H W"), recent=(recent, "B C H W"), variance=(variance, "B 1 H W"))
     _check_settings(threshold, kernel_size)
     if history.numel() == 0:
         return history[:, :1]
@@ -69,11 +78,11 @@ def history_lag(
     long, short = ((image.to(dtype) / largest).mean(1, keepdim=True) for image in (history, recent))
     # Not the difference of the means, which cancels.
     mean, difference = _box(short, kernel_size), _box(short - long, kernel_size)
-    count = _box(torch.ones_like(short), kernel_size, divide=False)
-    # Nor is this the mean of squares less the square of the mean.
-    variance = _box((short - mean).square(), kernel_size) / count
+    height, width = history.shape[-2:]
+    count = _count(height, kernel_size, mean)[:, None] * _count(width, kernel_size, mean)
+    error = _box(variance.to(dtype) / largest / largest, kernel_size) / count
     smallest = SMALLEST * ((mean - difference).abs() + mean.abs()) / 2
-    noise = threshold**2 * (variance + smallest.square())
+    noise = threshold**2 * (error + smallest.square())
     some = noise > 0
     ratio = torch.where(some, difference.square() / torch.where(some, noise, 1), 0)
     return ((ratio - 1) / 3).clamp(0, 1).to(history.dtype)
@@ -93,9 +102,9 @@ class HistoryLag(nn.Module):
         self.threshold = threshold
         self.kernel_size = kernel_size
 
-    def forward(self, history: Tensor, recent: Tensor) -> Tensor:
+    def forward(self, history: Tensor, recent: Tensor, variance: Tensor) -> Tensor:
         """See :func:`history_lag`."""
-        return history_lag(history, recent, threshold=self.threshold, kernel_size=self.kernel_size)
+        return history_lag(history, recent, variance, threshold=self.threshold, kernel_size=self.kernel_size)
 
 
 def _check_settings(threshold: float, kernel_size: int) -> None:
@@ -105,9 +114,14 @@ def _check_settings(threshold: float, kernel_size: int) -> None:
         raise ValueError(f"kernel_size: expected odd and at least 3, found {kernel_size}")
 
 
-def _box(image: Tensor, kernel_size: int, divide: bool = True) -> Tensor:
-    """Mean over the pixels of each window that exist, or with ``divide=False`` the sum, along one axis at a time."""
-    for size, padding in (((1, kernel_size), (0, kernel_size // 2)), ((kernel_size, 1), (kernel_size // 2, 0))):
-        override = None if divide else 1
-        image = F.avg_pool2d(image, size, 1, padding, count_include_pad=False, divisor_override=override)
-    return image
+def _box(image: Tensor, kernel_size: int) -> Tensor:
+    """Mean over the pixels of each window that exist, along one axis at a time."""
+    radius = kernel_size // 2
+    image = F.avg_pool2d(image, (1, kernel_size), 1, (0, radius), count_include_pad=False)
+    return F.avg_pool2d(image, (kernel_size, 1), 1, (radius, 0), count_include_pad=False)
+
+
+def _count(length: int, kernel_size: int, like: Tensor) -> Tensor:
+    """How many pixels of each window exist, along an axis of that length."""
+    place, radius = torch.arange(length, dtype=like.dtype, device=like.device), kernel_size // 2
+    return 1 + place.clamp_max(radius) + place.flip(0).clamp_max(radius)
