@@ -115,7 +115,7 @@ def test_a_frame_without_camera_is_no_past_for_positions() -> None:
 
 
 def test_the_motion_of_the_renderer_is_followed() -> None:
-    history = History()
+    history = History(anti_lag=HistoryLag(math.inf))
     columns = torch.arange(float(WIDTH)).expand(1, 3, HEIGHT, WIDTH)
     motion = torch.tensor([1.0, 0.0]).reshape(1, 2, 1, 1).expand(1, 2, HEIGHT, WIDTH)
     history.update(Frame(color=columns, motion=motion))
@@ -460,7 +460,7 @@ def switched(off_at: int, count: int, level: float = 0.0) -> list[Frame]:
 
 @pytest.mark.parametrize("level", [0.0, 0.1])
 def test_the_past_is_given_up_where_the_light_changes(level: float) -> None:
-    lagging, history = History(), History(anti_lag=HistoryLag())
+    lagging, history = History(anti_lag=HistoryLag(math.inf)), History()
     for frame in switched(20, 21, level):
         ghost, past = lagging.update(frame), history.update(frame)
     # A tenth of the new light, nine of the old; and nothing but the new one.
@@ -472,7 +472,7 @@ def test_the_past_is_given_up_where_the_light_changes(level: float) -> None:
 
 def test_brighter_light_comes_sooner() -> None:
     """The brighter it is, the more noise there is to hide the change: some frames are needed."""
-    lagging, history = History(), History(anti_lag=HistoryLag())
+    lagging, history = History(anti_lag=HistoryLag(math.inf)), History()
     for frame in switched(20, 24, 5.0):
         expected, past = lagging.update(frame), history.update(frame)
     assert expected.color.mean() < 2.5
@@ -480,7 +480,7 @@ def test_brighter_light_comes_sooner() -> None:
 
 
 def test_steady_light_keeps_its_past() -> None:
-    lagging, history = History(), History(anti_lag=HistoryLag())
+    lagging, history = History(anti_lag=HistoryLag(math.inf)), History()
     for frame in switched(20, 20):
         expected, past = lagging.update(frame), history.update(frame)
     torch.testing.assert_close(past.color, expected.color)
@@ -488,7 +488,7 @@ def test_steady_light_keeps_its_past() -> None:
 
 
 def test_after_a_change_a_new_past_grows() -> None:
-    history = History(anti_lag=HistoryLag())
+    history = History()
     for frame in switched(20, 30, 0.2):
         past = history.update(frame)
     assert past.length.min() > 9
@@ -496,7 +496,7 @@ def test_after_a_change_a_new_past_grows() -> None:
 
 
 def test_a_first_frame_a_cut_and_another_size_begin_a_recent_past_too() -> None:
-    history, fresh = History(anti_lag=HistoryLag()), History(anti_lag=HistoryLag())
+    history, fresh = History(), History()
     floor = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
     for frame in (still(constant(3, 9.0, (4, 4))), still(constant(3, 5.0), normal=floor.roll(1, 1))):
         history.update(frame)
@@ -508,7 +508,7 @@ def test_a_first_frame_a_cut_and_another_size_begin_a_recent_past_too() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_precision_frames_are_accumulated_in_float32(dtype: torch.dtype) -> None:
-    history, twin = History(Accumulate(1e-6)), History(Accumulate(1e-6))
+    history, twin = (History(Accumulate(1e-6), anti_lag=HistoryLag(math.inf)) for _ in range(2))
     for color in torch.rand(300, 1, 3, 4, 4, generator=torch.Generator().manual_seed(0)).to(dtype):
         past, expected = history.update(still(color)), twin.update(still(color.float()))
     assert past.color.dtype == past.length.dtype == torch.float32

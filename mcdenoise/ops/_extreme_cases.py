@@ -410,7 +410,7 @@ def lags() -> tuple[Case, ...]:
         case("the light goes on", size, _constant(0.0), lambda g, *shape: uniform(g, *shape, low=0.5)),
         case("the light goes on at 1e30", size, _constant(0.0), _constant(1e30)),
         case("1e30 and 1e-30", size, _constant(1e30), _constant(1e-30)),
-        case("no noise", size, radiance, noise=0.0),
+        case("radiance without noise", size, radiance, noise=0.0),
         case("noise of 1e15 times the light", size, _constant(1.0), noise=1e15),
     )
 

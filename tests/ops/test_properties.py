@@ -178,9 +178,10 @@ def test_an_unknown_place_has_no_motion_but_no_nan(data: st.DataObject, size: Si
 @given(st.data(), sizes, dtypes, st.sampled_from([3, 7]))
 def test_lag_is_a_share(data: st.DataObject, size: Size, dtype: Any, side: int) -> None:
     history, recent = data.draw(images(size, dtype)), data.draw(images(size, dtype))
-    share = ops.history_lag(history, recent, kernel_size=side)
+    variance = data.draw(images(size, dtype, st.floats(0, float(torch.finfo(dtype).max)), 1))
+    share = ops.history_lag(history, recent, variance, kernel_size=side)
     assert bool(((share >= 0) & (share <= 1)).all())
-    assert not ops.history_lag(history, history, kernel_size=side).any()
+    assert not ops.history_lag(history, history, variance, kernel_size=side).any()
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
@@ -197,7 +198,7 @@ def test_gradients_of_a_denoiser_are_finite(data: st.DataObject, dtype: torch.dt
     weights = ops.cross_bilateral_weights(logits, [albedo], [scale], border="renormalize")
     image = ops.kernel_conv(light, weights, border="zeros")
     image = ops.laplacian_fusion(image, ops.downsample(light), torch.full_like(scale, 0.5))
-    image = torch.lerp(image, light, ops.history_lag(image, light))
+    image = torch.lerp(image, light, ops.history_lag(image, light, scale))
     total = ops.remodulate(image, albedo).float().mean() if image.numel() else image.sum()
     for gradient in torch.autograd.grad(total, (color, previous, albedo, logits, scale), allow_unused=True):
         assert gradient is None or bool(gradient.isfinite().all())
