@@ -614,7 +614,7 @@ def test_the_command_for_ops(run: Callable[..., Any], out: Path, monkeypatch: py
         measured.append(benchmark_ops(ops=first, **arguments))
         return measured[0]
 
-    monkeypatch.setattr(mcdenoise.benchmark, "benchmark_ops", some_ops)
+    monkeypatch.setattr("mcdenoise.cli.benchmark.benchmark_ops", some_ops)
     file = out.parent / "ops.json"
     status, printed, _ = run("--ops", "--size", "16x12", "--rounds", "2", "--json", file)
     assert status == 0
