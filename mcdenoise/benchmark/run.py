@@ -15,7 +15,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from mcdenoise.benchmark.machine import Stopwatch, check_device, describe_machine, fix_threads
-from mcdenoise.benchmark.memory import peak_memory
+from mcdenoise.benchmark.memory import Peaks
 from mcdenoise.benchmark.methods import Candidate, ModelRunner, Runner, one_line
 from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import Size, measure_sizes
@@ -109,7 +109,7 @@ def run_benchmark(
     with new_folder(out) as folder:
         left_out: dict[str, str] = {}
         present = [candidate for candidate in candidates if not candidate.method.missing]
-        made = _Made(present)
+        made = _Made(present, Peaks(settings.threads, settings.device))
         scenes: list[Scene] = []
         cells: list[Cell] = []
         for name, sequence in zip(_unique_names(sequences), sequences, strict=True):
@@ -137,12 +137,12 @@ def run_benchmark(
 
 
 class _Made:
-    """The methods that could be made, why the others could not, and what memory they took at each size of image."""
+    """The methods that could be made, why the others could not, and what memory they take."""
 
-    def __init__(self, candidates: list[Candidate]) -> None:
+    def __init__(self, candidates: list[Candidate], peaks: Peaks) -> None:
         self.runners: dict[str, Runner] = {}
         self.failures: dict[str, str] = {}
-        self.memory: dict[tuple[str, tuple[int, int]], float | None] = {}
+        self.peaks = peaks
         for candidate in candidates:
             try:
                 self.runners[candidate.method.name] = candidate.make()
@@ -170,7 +170,7 @@ class _SceneRun:
     ) -> None:
         self.errors = Errors()
         self._sequence, self._candidates, self._settings = sequence, candidates, settings
-        self._runners, self._memory = made.runners, made.memory
+        self._runners, self._peaks = made.runners, made.peaks
         self._failures = dict(made.failures)
         self._folder, self._written = folder, folder / ".written.exr"
         self._watch = Stopwatch(settings.device)
@@ -292,11 +292,7 @@ class _SceneRun:
             shutil.rmtree(self._folder / IMAGES / self._scene.name / candidate.method.folder, ignore_errors=True)
             return Cell(self._scene.name, name, failure=self._failures[name])
         times = {stage: Spread.of(values) for stage, values in self._times[name].items()}
-        place = name, self._sequence.size
-        if place not in self._memory:
-            frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
-            threads, device = self._settings.threads, self._settings.device
-            self._memory[place] = peak_memory(candidate.make, frames, threads=threads, device=device)
+        frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
         return Cell(
             self._scene.name,
             name,
@@ -304,7 +300,7 @@ class _SceneRun:
             self.errors.spreads(name),
             whole=times[_WHOLE],
             stages={stage: times[stage] for stage in STAGES if stage in times},
-            memory=self._memory[place],
+            memory=self._peaks.of(candidate, self._sequence.size, frames),
             computing=times[_COMPUTING],
             plan=summarize(self._planned[name]),
         )
