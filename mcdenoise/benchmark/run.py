@@ -23,6 +23,7 @@ from mcdenoise.benchmark.tables import write_csv
 from mcdenoise.buffers import Frame
 from mcdenoise.data import Sequence, open_sequence, write_exr
 from mcdenoise.data.files import new_folder
+from mcdenoise.data.sequences import with_unique_names
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import check_references, reference_noise
 from mcdenoise.plan import Stage, summarize
@@ -112,8 +113,8 @@ def run_benchmark(
         made = _Made(present, Peaks(settings.threads, settings.device))
         scenes: list[Scene] = []
         cells: list[Cell] = []
-        for name, sequence in zip(_unique_names(sequences), sequences, strict=True):
-            run = _SceneRun(name, sequence, present, made, folder, settings)
+        for sequence in with_unique_names(sequences):
+            run = _SceneRun(sequence, present, made, folder, settings)
             scene, own = run.measure(step)
             left_out |= run.errors.left_out
             scenes.append(scene)
@@ -161,7 +162,6 @@ class _SceneRun:
 
     def __init__(
         self,
-        name: str,
         sequence: Sequence,
         candidates: list[Candidate],
         made: _Made,
@@ -178,7 +178,7 @@ class _SceneRun:
         self._planned: dict[str, list[list[Stage]]] = {name: [] for name in self._runners}
         height, width = sequence.size
         self._scene = Scene(
-            name,
+            sequence.name,
             width,
             height,
             sequence.numbers,
@@ -337,13 +337,3 @@ def _costs(
 def _first_two_frames(root: Path, numbers: tuple[int, ...]) -> list[Frame]:
     sequence = open_sequence(root, ",".join(map(str, numbers)))
     return [sequence.frame(number, reference=False).validate()[0] for number in numbers]
-
-
-def _unique_names(sequences: list[Sequence]) -> list[str]:
-    names: list[str] = []
-    for sequence in sequences:
-        name, number = sequence.name, 2
-        while name in names:
-            name, number = f"{sequence.name} ({number})", number + 1
-        names.append(name)
-    return names

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
@@ -152,6 +152,19 @@ def open_sequence(path: Path, frames: str | None = None) -> Sequence:
     raise InputError(
         f"{path}: expected frames in a known layout ({_KNOWN_LAYOUTS}), found no color file; check the path"
     )
+
+
+def with_unique_names(sequences: list[Sequence]) -> list[Sequence]:
+    """The same sequences; the second of a name gets a number, so that tables and folders keep them apart."""
+    unique: list[Sequence] = []
+    names: set[str] = set()
+    for sequence in sequences:
+        name, number = sequence.name, 2
+        while name in names:
+            name, number = f"{sequence.name} ({number})", number + 1
+        names.add(name)
+        unique.append(replace(sequence, name=name))
+    return unique
 
 
 def parse_frames(text: str, name: str = "frames") -> list[int]:
