@@ -9,6 +9,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
+from torch import Tensor
+
 from mcdenoise.buffers import Frame
 from mcdenoise.data.bmfr import find_frames, open_bmfr
 from mcdenoise.data.exr import Metadata
@@ -53,6 +55,10 @@ class Layout(Protocol):
 
     def frame(self, number: int, *, reference: bool = True, realisation: int = 0) -> Frame:
         """Read one frame."""
+        ...
+
+    def reference(self, number: int) -> Tensor:
+        """Read the reference of one frame that has one."""
         ...
 
     def metadata(self, number: int) -> Metadata:
@@ -112,6 +118,23 @@ class Sequence:
                 f"found {realisation}; render more of them"
             )
         return self._source.frame(number, reference=reference, realisation=realisation)
+
+    def reference(self, number: int) -> Tensor:
+        """Read the reference of one frame, and nothing else.
+
+        Args:
+            number: one of ``reference_numbers``.
+
+        Returns:
+            ``(1, 3, H, W)`` radiance, float32, on the CPU; as :meth:`frame` gives it.
+
+        Raises:
+            InputError: there is no such frame, it has no reference, or the file is damaged.
+        """
+        self._check(number)
+        if number not in self.reference_numbers:
+            raise InputError(f"{self.root}: expected the reference of frame {number}, found none; render it")
+        return self._source.reference(number)
 
     def metadata(self, number: int) -> Metadata:
         """Attributes of the color file of one frame: texts, numbers and tuples of numbers.

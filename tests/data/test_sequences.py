@@ -472,3 +472,19 @@ def test_sequences_of_one_name_are_told_apart(small_sequence: Path, tmp_path: Pa
     unique = with_unique_names(opened)
     assert [sequence.name for sequence in unique] == ["room", "room (2)", "room (3)"]
     assert [sequence.root for sequence in unique] == [sequence.root for sequence in opened]
+
+
+def test_a_reference_is_read_alone(small_sequence: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    expected = sequence.frame(2).reference
+    for name in ("color2", "albedo2"):
+        (small_sequence / "inputs" / f"{name}.exr").unlink()
+    assert expected is not None
+    assert torch.equal(sequence.reference(2), expected)
+    assert "expected a frame of the sequence" in refused(lambda: sequence.reference(99))
+
+
+def test_a_reference_that_is_not_there(small_sequence: Path) -> None:
+    (small_sequence / "inputs" / "reference2.exr").unlink()
+    message = refused(lambda: open_sequence(small_sequence).reference(2))
+    assert message.endswith("expected the reference of frame 2, found none; render it")
