@@ -137,6 +137,10 @@ class History:
         self.fireflies = ClampFireflies() if fireflies is None else fireflies
         self.specular_length = specular_length
         self.anti_lag = anti_lag
+        # The same rule with a shorter memory.
+        rule = self.accumulate
+        alpha_min = max(rule.alpha_min, _RECENT_ALPHA)
+        self._shorter = Accumulate(alpha_min, rule.rule, rule.position_limit, rule.normal_limit)
         self._state: _State | None = None
 
     def reset(self) -> None:
@@ -209,13 +213,6 @@ class History:
             accumulated = torch.lerp(accumulated, recent, lag)
             length = torch.lerp(length, length.clamp_max(1 / self._shorter.alpha_min), lag)
         return Accumulated(accumulated, color, length, ""), recent
-
-    @property
-    def _shorter(self) -> Accumulate:
-        """As ``accumulate``, with a shorter memory."""
-        rule = self.accumulate
-        alpha = max(rule.alpha_min, _RECENT_ALPHA)
-        return Accumulate(alpha, rule.rule, rule.position_limit, rule.normal_limit)
 
     def _shortened(
         self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor
