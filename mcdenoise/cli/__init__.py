@@ -14,7 +14,6 @@ from typing import Any
 import tyro
 
 from mcdenoise.errors import InputError
-from mcdenoise.heap import keep_heap
 
 Command = Callable[..., int | None]
 
@@ -56,7 +55,6 @@ def main(arguments: list[str] | None = None) -> None:
         print(version("mcdenoise"))
         return
     name, rest = arguments[0], arguments[1:]
-    keep_heap()
     if name not in COMMANDS:
         print(f"mcdenoise: unknown command '{name}'; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(2)

@@ -17,6 +17,7 @@ from mcdenoise.cli._options import Json, check_threads, parse_size
 from mcdenoise.cli._output import print_rows, progress_bar, write_json
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
+from mcdenoise.heap import keep_heap
 from mcdenoise.report import check_packages, write_report
 
 
@@ -60,6 +61,7 @@ def benchmark(
         size: of the images with --ops, WIDTHxHEIGHT.
         json: write what is in results.json, or ops.json, to this file too.
     """
+    keep_heap()
     threads = torch.get_num_threads() if threads is None else threads
     check_threads(threads)
     if ops == bool(sequences):

@@ -11,6 +11,7 @@ from rich.table import Table
 from mcdenoise.cli._options import Json, Out
 from mcdenoise.cli._output import print_times, progress_bar, show, write_json
 from mcdenoise.demo import FRAMES, run_demo
+from mcdenoise.heap import keep_heap
 
 
 def demo(out: Out = Path("demo"), model: str = "cascaded", json: Json = None) -> None:
@@ -23,6 +24,7 @@ def demo(out: Out = Path("demo"), model: str = "cascaded", json: Json = None) ->
         model: name of a model with shipped weights.
         json: write the printed figures to this file too.
     """
+    keep_heap()
     with progress_bar() as progress:
         rendering = progress.add_task("render", total=None)
         denoising = progress.add_task("denoise", total=FRAMES)

@@ -15,6 +15,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.denoise import denoise_sequence
 from mcdenoise.denoiser import Denoiser, Precision
 from mcdenoise.errors import InputError
+from mcdenoise.heap import keep_heap
 from mcdenoise.plan import TOLERANCE, Plan
 
 
@@ -60,6 +61,7 @@ def denoise(
         results: folder of a finished benchmark to take errors from; those of the sequence's references by default.
         json: write the run times to this file too.
     """
+    keep_heap()
     if threads is not None:
         check_threads(threads)
         torch.set_num_threads(threads)

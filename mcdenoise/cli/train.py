@@ -8,6 +8,7 @@ import tyro
 from rich.console import Console
 
 from mcdenoise.cli._options import Out
+from mcdenoise.heap import keep_heap
 from mcdenoise.train import Progress, TrainConfig, is_first_process
 from mcdenoise.train import train as run
 
@@ -36,6 +37,7 @@ def train(
         checkpoint_every: steps between checkpoints.
         credits: authors and licences of the training scenes, stored with the weights.
     """
+    keep_heap()
     console = Console(stderr=True)
 
     def report(progress: Progress) -> None:
