@@ -20,15 +20,15 @@ import argparse
 import json
 import sys
 import time
-from collections import Counter
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
 
 from mcdenoise import Denoiser
-from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.data import open_sequence
 from mcdenoise.data.files import write_text
+from mcdenoise.data.sequences import with_unique_names
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import (
     METRICS,
@@ -58,19 +58,6 @@ def table(scores: list[Score], markdown: bool) -> str:
         return "\n".join(f"| {' | '.join(row)} |" for row in [header, rule, *rows])
     widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
     return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in [header, *rows])
-
-
-def open_all(paths: list[Path], frames: str | None) -> list[Sequence]:
-    """Open sequences; the second of a name gets a number, so that the tables keep them apart."""
-    sequences: list[Sequence] = []
-    names: Counter[str] = Counter()
-    for path in paths:
-        sequence = open_sequence(path, frames)
-        check_references(sequence)
-        names[sequence.name] += 1
-        count = names[sequence.name]
-        sequences.append(sequence if count == 1 else replace(sequence, name=f"{sequence.name} ({count})"))
-    return sequences
 
 
 def parse() -> argparse.Namespace:
@@ -106,7 +93,9 @@ def main() -> None:
         raise InputError(f"--weights: expected one model to load them into, found --models {options.models}")
     if options.flip_every < 1:
         raise InputError(f"--flip-every: expected at least 1, found {options.flip_every}")
-    sequences = open_all(options.sequences, options.frames)
+    sequences = with_unique_names([open_sequence(path, options.frames) for path in options.sequences])
+    for sequence in sequences:
+        check_references(sequence)
     denoisers = {name: Denoiser(name, weights=options.weights) for name in names}
     peers: list[Peer] = [] if options.no_bilateral else joint_bilateral_peers()
     if "oidn" in options.peers:

@@ -13,7 +13,7 @@ def keep_heap() -> None:
 
     A frame's large tensors come and go. By default glibc gives each back to the system, which hands out pages of zeros
     for the next one: on a CPU a fifth of a fast network's time. It is a setting of the whole process and so a decision
-    of whoever owns it: the commands make it, the library does not. Does nothing where there is no glibc.
+    of whoever owns it: commands that run networks make it, the library does not. Does nothing where there is no glibc.
     """
     if platform.libc_ver()[0] != "glibc":
         return

@@ -169,6 +169,10 @@ class History:
         self.specular_length = specular_length
         anti_lag = HistoryLag() if anti_lag is None else anti_lag
         self.anti_lag = None if math.isinf(anti_lag.threshold) else anti_lag
+        # The same rule with a shorter memory.
+        rule = self.accumulate
+        alpha_min = max(rule.alpha_min, _RECENT_ALPHA)
+        self._shorter = Accumulate(alpha_min, rule.rule, rule.position_limit, rule.normal_limit)
         self._state: _State | None = None
 
     def reset(self) -> None:
@@ -255,13 +259,6 @@ class History:
         shorter = torch.cat([recent, recent[:, 3:].square() + variance], 1)
         length = torch.lerp(length, length.clamp_max(1 / self._shorter.alpha_min), share)
         return _Past(torch.lerp(past, shorter, share), recent, length, "")
-
-    @property
-    def _shorter(self) -> Accumulate:
-        """As ``accumulate``, with a shorter memory."""
-        rule = self.accumulate
-        alpha = max(rule.alpha_min, _RECENT_ALPHA)
-        return Accumulate(alpha, rule.rule, rule.position_limit, rule.normal_limit)
 
     def _shortened(
         self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor

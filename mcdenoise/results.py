@@ -276,7 +276,7 @@ class Results:
             InputError: it cannot be written.
             ValueError: a number is NaN or infinite, which is no JSON.
         """
-        write_text(folder / FILE, json.dumps(asdict(self), indent=1, allow_nan=False) + "\n")
+        _write(folder / FILE, self)
 
     @classmethod
     def read(cls, folder: Path) -> Results:
@@ -365,7 +365,11 @@ class OpResults:
             InputError: it cannot be written.
             ValueError: a number is NaN or infinite, which is no JSON.
         """
-        write_text(folder / OPS_FILE, json.dumps(asdict(self), indent=1, allow_nan=False) + "\n")
+        _write(folder / OPS_FILE, self)
+
+
+def _write(path: Path, results: Results | OpResults) -> None:
+    write_text(path, json.dumps(asdict(results), indent=1, allow_nan=False) + "\n")
 
 
 def _results(data: dict[str, Any]) -> Results:

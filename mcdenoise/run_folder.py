@@ -133,6 +133,28 @@ def _json(content: Any) -> str:
     return json.dumps(content, indent=2) + "\n"
 
 
+def about_weights(
+    config: dict[str, Any], identity: dict[str, Any], steps: int, provenance: Provenance
+) -> dict[str, str]:
+    """What weights say of the run that they come from, for :func:`mcdenoise.models.save_weights`.
+
+    Args:
+        config: what ``config.json`` holds.
+        identity: what ``data.json`` holds.
+        steps: optimiser steps done.
+        provenance: of the steps.
+    """
+    return {
+        "config": json.dumps(config),
+        "data": json.dumps(identity["sequences"]),
+        "credits": identity["credits"],
+        "initial_weights": identity["initial_weights"],
+        "steps": str(steps),
+        "commits": json.dumps(provenance),
+        "licence": "Apache-2.0",
+    }
+
+
 def source_commit() -> str:
     """The commit of the source tree, with ``-dirty`` where files differ from it; ``"unknown"`` outside a checkout."""
     source = Path(__file__)

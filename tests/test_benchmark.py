@@ -5,8 +5,11 @@ from __future__ import annotations
 import csv
 import functools
 import json
+import os
 import shutil
+import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -17,6 +20,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+import mcdenoise.benchmark.memory
 import mcdenoise.benchmark.methods
 import mcdenoise.benchmark.sizes
 from mcdenoise.benchmark import Candidate, Settings, benchmark_ops, choose_candidates, parse_sizes, run_benchmark
@@ -53,8 +57,7 @@ def _one_thread() -> Iterator[None]:
 def _no_other_process(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory is measured in one test only: each process that is started takes a while."""
     if "measures_memory" not in request.fixturenames:
-        for module in (mcdenoise.benchmark.run, mcdenoise.benchmark.sizes):
-            monkeypatch.setattr(module, "peak_memory", lambda *_, **__: None)
+        monkeypatch.setattr(mcdenoise.benchmark.memory, "peak_memory", lambda *_, **__: None)
 
 
 @pytest.fixture
@@ -478,6 +481,45 @@ def test_peak_memory_is_what_a_method_adds() -> None:
     assert peak_memory(Greedy, functools.partial(synthetic_frame, -1, -1), threads=1, device="cpu") is None
 
 
+class Stuck(Greedy):
+    """Writes the number of its process to a file and comes to no end."""
+
+    def __init__(self, file: Path) -> None:
+        file.write_text(str(os.getpid()))
+        time.sleep(600)
+
+
+def wait_for_end(process: int) -> None:
+    while Path(f"/proc/{process}").exists():
+        time.sleep(0.05)
+
+
+@pytest.mark.usefixtures("measures_memory")
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="memory is not measured here")
+def test_a_method_that_hangs_is_given_up(tmp_path: Path) -> None:
+    stuck = functools.partial(Stuck, tmp_path / "process")
+    assert peak_memory(stuck, two_frames, threads=1, device="cpu", seconds=10) is None
+    wait_for_end(int((tmp_path / "process").read_text()))
+
+
+@pytest.mark.usefixtures("measures_memory")
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="memory is not measured here")
+def test_a_method_that_hangs_ends_with_the_benchmark(tmp_path: Path) -> None:
+    file = tmp_path / "process"
+    code = (
+        "import functools, pathlib, test_benchmark as t\n"
+        f"stuck = functools.partial(t.Stuck, pathlib.Path({str(file)!r}))\n"
+        "t.peak_memory(stuck, t.two_frames, threads=1, device='cpu')"
+    )
+    benchmark = subprocess.Popen([sys.executable, "-c", code], cwd=Path(__file__).parent)
+    while not (file.exists() and file.read_text()):
+        assert benchmark.poll() is None
+        time.sleep(0.05)
+    benchmark.kill()
+    benchmark.wait()
+    wait_for_end(int(file.read_text()))
+
+
 # Sizes
 
 
@@ -522,7 +564,7 @@ def test_too_large_an_image_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> Non
         width, height = frames.args
         return 10 + width * height * 1e-3
 
-    monkeypatch.setattr(mcdenoise.benchmark.sizes, "peak_memory", peak)
+    monkeypatch.setattr(mcdenoise.benchmark.memory, "peak_memory", peak)
     monkeypatch.setattr(mcdenoise.benchmark.sizes, "available_memory", lambda device: 2 * 1013 * 2**20)
     large = scripted("A", log)
     sizes = [(1003, 1000), (1004, 1000)]
@@ -614,7 +656,7 @@ def test_the_command_for_ops(run: Callable[..., Any], out: Path, monkeypatch: py
         measured.append(benchmark_ops(ops=first, **arguments))
         return measured[0]
 
-    monkeypatch.setattr(mcdenoise.benchmark, "benchmark_ops", some_ops)
+    monkeypatch.setattr("mcdenoise.cli.benchmark.benchmark_ops", some_ops)
     file = out.parent / "ops.json"
     status, printed, _ = run("--ops", "--size", "16x12", "--rounds", "2", "--json", file)
     assert status == 0

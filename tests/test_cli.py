@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 import torch
 
-from mcdenoise.cli import COMMANDS, RenderOptions, main
+from mcdenoise.cli import COMMANDS, load_command, main
+from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.models import create_model, list_models, pretrained_models, save_weights
 from mcdenoise.train import TrainConfig
@@ -111,7 +112,7 @@ def whole_images(folder: Path) -> list[str]:
 def test_help_names_every_option(run: Callable[..., tuple[int, str, str]], command: str) -> None:
     status, text, errors = run(command, "--help")
     assert (status, errors) == (0, "")
-    parameters = inspect.signature(COMMANDS[command]()).parameters
+    parameters = inspect.signature(load_command(command)).parameters
     names = set(parameters) - POSITIONAL
     for group, settings in (("config", TrainConfig), ("rendering", RenderOptions)):
         if group in names:

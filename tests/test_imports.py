@@ -181,6 +181,15 @@ def test_importing_is_silent_and_loads_nothing_optional() -> None:
     assert python(code).strip() == ""
 
 
+def test_the_command_line_loads_the_chosen_command_alone() -> None:
+    code = (
+        "import sys\nfrom mcdenoise.cli import COMMANDS, load_command\nload_command('models')\n"
+        "print(*(name for name in COMMANDS if f'mcdenoise.cli.{name}' in sys.modules))\n"
+        f"print(*sorted({LAZY - {'tyro'}!r} & set(sys.modules)))"
+    )
+    assert python(code).split("\n") == ["models", "", ""]
+
+
 def test_importing_is_quick() -> None:
     # Processor time, because others may use the machine; torch and kornia are not ours to shorten.
     code = (

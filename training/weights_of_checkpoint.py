@@ -11,6 +11,7 @@ import torch
 
 from mcdenoise.data.files import atomic_path
 from mcdenoise.models import create_model, save_weights
+from mcdenoise.run_folder import about_weights
 
 
 def main() -> None:
@@ -27,15 +28,7 @@ def main() -> None:
     settings = {"width": config["width"]} if config["width"] else {}
     model = create_model(config["model"], **settings)
     model.load_state_dict(averages if config["ema"] else network)
-    about = {
-        "config": json.dumps(config),
-        "data": json.dumps(data["sequences"]),
-        "credits": data["credits"],
-        "initial_weights": data["initial_weights"],
-        "steps": str(checkpoint["step"]),
-        "commits": json.dumps(checkpoint["provenance"]),
-        "licence": "Apache-2.0",
-    }
+    about = about_weights(config, data, checkpoint["step"], checkpoint["provenance"])
     with atomic_path(options.out) as temporary:
         temporary.write_bytes(save_weights(model, config["model"], settings, about))
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from mcdenoise.benchmark.machine import Stopwatch, check_device, describe_machine, fix_threads
-from mcdenoise.benchmark.memory import peak_memory
+from mcdenoise.benchmark.memory import Peaks
 from mcdenoise.benchmark.methods import Candidate, ModelRunner, Runner, one_line
 from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import Size, measure_sizes
@@ -23,6 +23,7 @@ from mcdenoise.benchmark.tables import write_csv
 from mcdenoise.buffers import Frame
 from mcdenoise.data import Sequence, open_sequence, write_exr
 from mcdenoise.data.files import new_folder
+from mcdenoise.data.sequences import with_unique_names
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import check_references, reference_noise
 from mcdenoise.plan import Stage, summarize
@@ -109,11 +110,11 @@ def run_benchmark(
     with new_folder(out) as folder:
         left_out: dict[str, str] = {}
         present = [candidate for candidate in candidates if not candidate.method.missing]
-        made = _Made(present)
+        made = _Made(present, Peaks(settings.threads, settings.device))
         scenes: list[Scene] = []
         cells: list[Cell] = []
-        for name, sequence in zip(_unique_names(sequences), sequences, strict=True):
-            run = _SceneRun(name, sequence, present, made, folder, settings)
+        for sequence in with_unique_names(sequences):
+            run = _SceneRun(sequence, present, made, folder, settings)
             scene, own = run.measure(step)
             left_out |= run.errors.left_out
             scenes.append(scene)
@@ -137,12 +138,12 @@ def run_benchmark(
 
 
 class _Made:
-    """The methods that could be made, why the others could not, and what memory they took at each size of image."""
+    """The methods that could be made, why the others could not, and what memory they take."""
 
-    def __init__(self, candidates: list[Candidate]) -> None:
+    def __init__(self, candidates: list[Candidate], peaks: Peaks) -> None:
         self.runners: dict[str, Runner] = {}
         self.failures: dict[str, str] = {}
-        self.memory: dict[tuple[str, tuple[int, int]], float | None] = {}
+        self.peaks = peaks
         for candidate in candidates:
             try:
                 self.runners[candidate.method.name] = candidate.make()
@@ -161,7 +162,6 @@ class _SceneRun:
 
     def __init__(
         self,
-        name: str,
         sequence: Sequence,
         candidates: list[Candidate],
         made: _Made,
@@ -170,7 +170,7 @@ class _SceneRun:
     ) -> None:
         self.errors = Errors()
         self._sequence, self._candidates, self._settings = sequence, candidates, settings
-        self._runners, self._memory = made.runners, made.memory
+        self._runners, self._peaks = made.runners, made.peaks
         self._failures = dict(made.failures)
         self._folder, self._written = folder, folder / ".written.exr"
         self._watch = Stopwatch(settings.device)
@@ -178,7 +178,7 @@ class _SceneRun:
         self._planned: dict[str, list[list[Stage]]] = {name: [] for name in self._runners}
         height, width = sequence.size
         self._scene = Scene(
-            name,
+            sequence.name,
             width,
             height,
             sequence.numbers,
@@ -292,11 +292,7 @@ class _SceneRun:
             shutil.rmtree(self._folder / IMAGES / self._scene.name / candidate.method.folder, ignore_errors=True)
             return Cell(self._scene.name, name, failure=self._failures[name])
         times = {stage: Spread.of(values) for stage, values in self._times[name].items()}
-        place = name, self._sequence.size
-        if place not in self._memory:
-            frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
-            threads, device = self._settings.threads, self._settings.device
-            self._memory[place] = peak_memory(candidate.make, frames, threads=threads, device=device)
+        frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
         return Cell(
             self._scene.name,
             name,
@@ -304,7 +300,7 @@ class _SceneRun:
             self.errors.spreads(name),
             whole=times[_WHOLE],
             stages={stage: times[stage] for stage in STAGES if stage in times},
-            memory=self._memory[place],
+            memory=self._peaks.of(candidate, self._sequence.size, frames),
             computing=times[_COMPUTING],
             plan=summarize(self._planned[name]),
         )
@@ -341,13 +337,3 @@ def _costs(
 def _first_two_frames(root: Path, numbers: tuple[int, ...]) -> list[Frame]:
     sequence = open_sequence(root, ",".join(map(str, numbers)))
     return [sequence.frame(number, reference=False).validate()[0] for number in numbers]
-
-
-def _unique_names(sequences: list[Sequence]) -> list[str]:
-    names: list[str] = []
-    for sequence in sequences:
-        name, number = sequence.name, 2
-        while name in names:
-            name, number = f"{sequence.name} ({number})", number + 1
-        names.append(name)
-    return names

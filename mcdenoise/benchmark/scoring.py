@@ -8,8 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mcdenoise.errors import InputError
-from mcdenoise.evaluate import METRICS
+from mcdenoise.evaluate import METRICS, measure
 from mcdenoise.results import Spread
 
 
@@ -45,20 +44,10 @@ class Errors:
         past = self._past.get(method)
         if past is not None and past.number != number - 1:
             past = None
+        before = None if past is None else (past.image, past.reference)
         values = self._values.setdefault(method, {})
-        for name, metric in METRICS.items():
-            try:
-                if not metric.temporal:
-                    value = metric.function(image, reference)
-                elif past is not None:
-                    clips = torch.stack([past.image, image], 1), torch.stack([past.reference, reference], 1)
-                    value = metric.function(*clips)
-                else:
-                    continue
-            except InputError as error:
-                self.left_out[name] = str(error)
-                continue
-            values.setdefault(name, []).append(float(value))
+        for name, value in measure(METRICS, image, reference, before, self.left_out).items():
+            values.setdefault(name, []).append(value)
         self._past[method] = _Past(number, image, reference)
 
     def means(self, method: str) -> dict[str, float]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from mcdenoise.benchmark.machine import Stopwatch, available_memory
-from mcdenoise.benchmark.memory import peak_memory
+from mcdenoise.benchmark.memory import Peaks
 from mcdenoise.benchmark.methods import Candidate, Runner, one_line
 from mcdenoise.buffers import Frame
 from mcdenoise.errors import InputError
@@ -164,8 +164,7 @@ class _Memory:
     """Foretells the memory a method takes."""
 
     def __init__(self, threads: int, device: str) -> None:
-        self._threads, self._device = threads, device
-        self._known: dict[tuple[str, Size], float | None] = {}
+        self._device, self._peaks = device, Peaks(threads, device)
 
     def lack(self, candidate: Candidate, width: int, height: int) -> str:
         """Why there is too little memory for an image, or ``""`` where there is enough, or nothing is known."""
@@ -186,11 +185,7 @@ class _Memory:
         )
 
     def _peak(self, candidate: Candidate, size: Size) -> float | None:
-        key = candidate.method.name, size
-        if key not in self._known:
-            frames = functools.partial(_two_frames, *size)
-            self._known[key] = peak_memory(candidate.make, frames, threads=self._threads, device=self._device)
-        return self._known[key]
+        return self._peaks.of(candidate, size, functools.partial(_two_frames, *size))
 
 
 def _two_frames(width: int, height: int) -> list[Frame]:

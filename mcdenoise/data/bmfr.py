@@ -105,6 +105,10 @@ class BmfrFolder:
             buffers["depth"] = _normalise_depth(buffers["depth"], buffers.get("albedo"), buffers.get("normal"))
         return Frame(**buffers)
 
+    def reference(self, number: int) -> Tensor:
+        """Read the reference of one frame that has one."""
+        return self._read("reference", self.files["reference"][number])
+
     def _read(self, name: str, path: Path) -> Tensor:
         image, channels, _ = read_exr(path)
         _check_file(name, path, image.shape[:2], channels, self.size)

@@ -41,13 +41,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
         raise InputError(f"{path}: expected a file to write, found a folder or a device; choose another path")
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp{target.suffix}")
     try:
-        yield temporary
-        os.replace(temporary, target)
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise InputError(
-            f"{path}: cannot be written ({reason}); check the folder, its permissions and free space"
-        ) from error
+        with _writing(path):
+            yield temporary
+            os.replace(temporary, target)
     finally:
         # Gone already after a successful rename; a folder that refuses this refused the file too.
         with suppress(OSError):
@@ -73,15 +69,11 @@ def new_folder(path: Path) -> Iterator[Path]:
         raise InputError(f"{path}: expected nothing there yet, found something; choose a new folder, or remove it")
     temporary = path.absolute().with_name(f".{path.absolute().name}.{os.getpid()}.tmp")
     try:
-        temporary.mkdir(parents=True)
-        yield temporary
-        # Over a folder that has come meanwhile, unless it is empty, this fails.
-        os.rename(temporary, path)
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise InputError(
-            f"{path}: cannot be written ({reason}); check the folder, its permissions and free space"
-        ) from error
+        with _writing(path):
+            temporary.mkdir(parents=True)
+            yield temporary
+            # Over a folder that has come meanwhile, unless it is empty, this fails.
+            os.rename(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -98,3 +90,15 @@ def write_text(path: Path, text: str) -> None:
     """
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """One line for what the operating system refuses."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise InputError(
+            f"{path}: cannot be written ({reason}); check the folder, its permissions and free space"
+        ) from error

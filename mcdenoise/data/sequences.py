@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
+
+from torch import Tensor
 
 from mcdenoise.buffers import Frame
 from mcdenoise.data.bmfr import find_frames, open_bmfr
@@ -53,6 +55,10 @@ class Layout(Protocol):
 
     def frame(self, number: int, *, reference: bool = True, realisation: int = 0) -> Frame:
         """Read one frame."""
+        ...
+
+    def reference(self, number: int) -> Tensor:
+        """Read the reference of one frame that has one."""
         ...
 
     def metadata(self, number: int) -> Metadata:
@@ -113,6 +119,23 @@ class Sequence:
             )
         return self._source.frame(number, reference=reference, realisation=realisation)
 
+    def reference(self, number: int) -> Tensor:
+        """Read the reference of one frame, and nothing else.
+
+        Args:
+            number: one of ``reference_numbers``.
+
+        Returns:
+            ``(1, 3, H, W)`` radiance, float32, on the CPU; as :meth:`frame` gives it.
+
+        Raises:
+            InputError: there is no such frame, it has no reference, or the file is damaged.
+        """
+        self._check(number)
+        if number not in self.reference_numbers:
+            raise InputError(f"{self.root}: expected the reference of frame {number}, found none; render it")
+        return self._source.reference(number)
+
     def metadata(self, number: int) -> Metadata:
         """Attributes of the color file of one frame: texts, numbers and tuples of numbers.
 
@@ -152,6 +175,19 @@ def open_sequence(path: Path, frames: str | None = None) -> Sequence:
     raise InputError(
         f"{path}: expected frames in a known layout ({_KNOWN_LAYOUTS}), found no color file; check the path"
     )
+
+
+def with_unique_names(sequences: list[Sequence]) -> list[Sequence]:
+    """The same sequences; the second of a name gets a number, so that tables and folders keep them apart."""
+    unique: list[Sequence] = []
+    names: set[str] = set()
+    for sequence in sequences:
+        name, number = sequence.name, 2
+        while name in names:
+            name, number = f"{sequence.name} ({number})", number + 1
+        names.add(name)
+        unique.append(replace(sequence, name=name))
+    return unique
 
 
 def parse_frames(text: str, name: str = "frames") -> list[int]:

@@ -47,9 +47,7 @@ def noise_floor(sequence: Sequence, *, metrics: Collection[str] = ("SMAPE", "tSM
     past = None
     noise = _noted(sequence)
     for number, smape in noise.items():
-        truth = sequence.frame(number).reference
-        if truth is None:
-            continue
+        truth = sequence.reference(number)
         generator = torch.Generator().manual_seed(number)
         deviation = smape * math.sqrt(math.pi / 2) * (2 * truth + _NOISE_EPSILON)
         noisy = (truth + deviation * torch.randn(truth.shape, generator=generator)).clamp_min(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -22,7 +21,7 @@ from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
 from mcdenoise.losses import cascade_loss
 from mcdenoise.models import create_model, describe_weights, save_weights
-from mcdenoise.run_folder import Provenance, RunFolder, source_commit
+from mcdenoise.run_folder import Provenance, RunFolder, about_weights, source_commit
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.data import DataFolders, TrainingData
 from mcdenoise.train.devices import open_fabric
@@ -124,15 +123,7 @@ def train(
     with _writing(out):
         _run(trainer, data, run, first, provenance, checkpoint_every, report)
         if fabric.is_global_zero:
-            about = {
-                "config": json.dumps(settled),
-                "data": json.dumps(data.description["sequences"]),
-                "credits": credits,
-                "initial_weights": start["sha256"],
-                "steps": str(config.steps),
-                "commits": json.dumps(provenance),
-                "licence": "Apache-2.0",
-            }
+            about = about_weights(settled, identity, config.steps, provenance)
             with atomic_path(weights) as temporary:
                 temporary.write_bytes(save_weights(trainer.result, config.model, settings, about))
     fabric.barrier()

@@ -14,7 +14,7 @@ from mcdenoise.buffers import Frame
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.bmfr import realisation_folder, write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, read_camera_matrices, write_camera_matrices
-from mcdenoise.data.sequences import parse_frames
+from mcdenoise.data.sequences import parse_frames, with_unique_names
 from mcdenoise.errors import InputError
 
 SHARED_DATA = Path(__file__).parents[3] / "shared" / "data" / "train"
@@ -463,3 +463,28 @@ def test_rendered_sequences() -> None:
             ..., 3
         ]
         torch.testing.assert_close(w[hit], frame.depth[0, 0][hit], rtol=5e-3, atol=1e-2)
+
+
+def test_sequences_of_one_name_are_told_apart(small_sequence: Path, tmp_path: Path) -> None:
+    for folder in ("a/room", "b/room (2)", "c/room"):
+        shutil.copytree(small_sequence, tmp_path / folder)
+    opened = [open_sequence(tmp_path / folder) for folder in ("a/room", "b/room (2)", "c/room")]
+    unique = with_unique_names(opened)
+    assert [sequence.name for sequence in unique] == ["room", "room (2)", "room (3)"]
+    assert [sequence.root for sequence in unique] == [sequence.root for sequence in opened]
+
+
+def test_a_reference_is_read_alone(small_sequence: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    expected = sequence.frame(2).reference
+    for name in ("color2", "albedo2"):
+        (small_sequence / "inputs" / f"{name}.exr").unlink()
+    assert expected is not None
+    assert torch.equal(sequence.reference(2), expected)
+    assert "expected a frame of the sequence" in refused(lambda: sequence.reference(99))
+
+
+def test_a_reference_that_is_not_there(small_sequence: Path) -> None:
+    (small_sequence / "inputs" / "reference2.exr").unlink()
+    message = refused(lambda: open_sequence(small_sequence).reference(2))
+    assert message.endswith("expected the reference of frame 2, found none; render it")

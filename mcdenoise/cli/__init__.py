@@ -1,0 +1,103 @@
+"""The command line: parses, calls, prints."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import io
+import itertools
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import tyro
+
+from mcdenoise.errors import InputError
+
+Command = Callable[..., int | None]
+
+# What each command does; it is the function of its name in the module of its name here.
+COMMANDS = {
+    "demo": "Render a short animation at one sample a pixel, denoise it, and show the result.",
+    "denoise": "Denoise a folder of frames.",
+    "render": "Render a Mitsuba 3 scene along a camera path to a noisy sequence with references.",
+    "generate": "Render random scenes to train on.",
+    "train": "Train a model on sequences with references.",
+    "evaluate": "Compare a folder of denoised images with references.",
+    "benchmark": "Measure error against run time of models and other denoisers.",
+    "report": "Write the page and the plots of a finished benchmark.",
+    "gradcheck": "Check first and second derivatives of the operators in float64.",
+    "stability": "Check operators, models and the denoiser on stiff and extreme inputs, in every precision.",
+    "models": "List the models with their size and cost.",
+    "ops": "List the operators with their error against the equations written out.",
+}
+
+_SUMMARY = """usage: mcdenoise COMMAND [OPTIONS]
+
+Interactive Monte Carlo denoising you can open up.
+
+commands:
+{commands}
+
+`mcdenoise COMMAND --help` says everything about a command."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run a command; exit status 0, 1 where a check failed, 2 for bad usage or bad input."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_summary())
+        sys.exit(0 if arguments else 2)
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(version("mcdenoise"))
+        return
+    name, rest = arguments[0], arguments[1:]
+    if name not in COMMANDS:
+        print(f"mcdenoise: unknown command '{name}'; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
+        sys.exit(2)
+    try:
+        status = _parse(load_command(name), rest, f"mcdenoise {name}")()
+    except InputError as error:
+        print(f"mcdenoise {name}: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print(f"mcdenoise {name}: interrupted; finished files are kept", file=sys.stderr)
+        sys.exit(130)
+    sys.exit(status or 0)
+
+
+def load_command(name: str) -> Command:
+    """The function that runs a command; only now are its imports paid for.
+
+    Args:
+        name: one of :data:`COMMANDS`.
+    """
+    command: Command = getattr(importlib.import_module(f"{__name__}.{name}"), name)
+    return command
+
+
+def _parse(command: Command, arguments: list[str], prog: str) -> Callable[[], int | None]:
+    """A command with its arguments, ready to be called."""
+
+    @functools.wraps(command)
+    def bind(*args: Any, **kwargs: Any) -> Callable[[], int | None]:
+        return functools.partial(command, *args, **kwargs)
+
+    messages = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(messages):
+            return tyro.cli(bind, args=arguments, prog=prog)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        # tyro frames its messages: a title, what is wrong, a rule, and more help.
+        lines = [line.strip("│╭╮╰╯ ") for line in messages.getvalue().splitlines()]
+        wrong = itertools.takewhile(lambda line: line.strip("─"), lines[1:])
+        raise InputError(f"{' '.join(wrong).rstrip('.')}; see `{prog} --help`") from stop
+
+
+def _summary() -> str:
+    return _SUMMARY.format(commands="\n".join(f"  {name:<10} {what}" for name, what in COMMANDS.items()))

@@ -1,0 +1,38 @@
+"""What the options of several commands have in common."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from mcdenoise.errors import InputError
+
+Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+Json = Path | None
+
+# With very many threads torch does not fail but crashes.
+_MOST_THREADS = 1024
+
+
+def check_threads(threads: int) -> None:
+    """See that torch can have so many threads.
+
+    Raises:
+        InputError: it cannot.
+    """
+    if not 1 <= threads <= _MOST_THREADS:
+        raise InputError(f"--threads: expected 1 to {_MOST_THREADS}, found {threads}")
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height of a ``--size``.
+
+    Raises:
+        InputError: the text is something else.
+    """
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{text}'")
+    return int(width), int(height)

@@ -1,0 +1,54 @@
+"""What commands show, and where they show it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+
+def progress_bar() -> Progress:
+    """A progress bar on stderr; silent when that is no terminal."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeRemainingColumn(),
+    )
+    return Progress(*columns, console=console, disable=not console.is_terminal)
+
+
+def show(table: Table) -> None:
+    """Print a table to stdout."""
+    # A pipe has no width: never fold what a script may read.
+    console = Console()
+    Console(width=None if console.is_terminal else 200).print(table)
+
+
+def print_rows(rows: list[dict[str, str]]) -> None:
+    """Print rows with the same columns; nothing where there are none."""
+    if rows:
+        table = Table(*rows[0])
+        for row in rows:
+            table.add_row(*row.values())
+        show(table)
+
+
+def print_times(milliseconds: dict[str, float]) -> None:
+    """Print the run time of each stage, and of all."""
+    stages = ", ".join(f"{stage} {value:.1f}" for stage, value in milliseconds.items())
+    print(f"milliseconds a frame (median): {stages}; together {sum(milliseconds.values()):.1f}")
+
+
+def write_json(path: Path | None, content: Any) -> None:
+    """Write what was printed to the file of ``--json``, if there is one."""
+    if path is not None:
+        # Here because it brings the reader of images, which not every command needs.
+        from mcdenoise.data.files import write_text
+
+        write_text(path, json.dumps(content, indent=2) + "\n")

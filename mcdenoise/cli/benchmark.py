@@ -1,0 +1,137 @@
+"""`mcdenoise benchmark`."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+
+from mcdenoise.benchmark import Settings, benchmark_ops, choose_candidates, parse_sizes, run_benchmark
+from mcdenoise.benchmark.sizes import SIZES
+from mcdenoise.benchmark.tables import left_out_rows, op_rows, remarks, scene_rows
+from mcdenoise.cli._options import Json, check_threads, parse_size
+from mcdenoise.cli._output import print_rows, progress_bar, write_json
+from mcdenoise.data import open_sequence
+from mcdenoise.errors import InputError
+from mcdenoise.heap import keep_heap
+from mcdenoise.report import check_packages, write_report
+
+
+def benchmark(
+    sequences: tyro.conf.Positional[list[Path]] = [],  # noqa: B006 - tyro reads it
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None,
+    models: str | None = None,
+    peers: str = "all",
+    precisions: str = "float32,bfloat16",
+    frames: str | None = None,
+    rounds: int | None = None,
+    threads: int | None = None,
+    device: str = "cpu",
+    sizes: str = SIZES,
+    pictures: int = 4,
+    keep_all: bool = False,
+    ops: bool = False,
+    size: str = "1280x720",
+    json: Json = None,
+) -> int:
+    """Measure error against run time: models, other denoisers and doing nothing, on the same frames, taking turns.
+
+    Writes OUT/index.html, the report, with its plots, results.json, results.csv and images; OUT must not exist.
+    Exit status 1 if a method failed on a scene. With --ops, measures the operators instead: time, error, and how
+    near they come to a copy.
+
+    Args:
+        sequences: folders of sequences with references.
+        out: folder to make; needed except with --ops.
+        models: names separated by commas, or safetensors files; by default all with shipped weights; or none.
+        peers: oidn, bilateral, or all, or none. Doing nothing and accumulation alone are always there.
+        precisions: of the models' convolutions: float32, bfloat16, or both.
+        frames: which frames of each sequence, such as 0-59,70; all by default.
+        rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.
+        threads: CPU threads of all methods; torch's choice by default.
+        device: cpu or cuda.
+        sizes: of images of which only the cost is measured, such as 1280x720,3840x2160, or none.
+        pictures: of how many frames of each scene images are kept.
+        keep_all: measure each model a second time, leaving nothing out, to see what leaving out saves and costs.
+        ops: measure the operators.
+        size: of the images with --ops, WIDTHxHEIGHT.
+        json: write what is in results.json, or ops.json, to this file too.
+    """
+    keep_heap()
+    threads = torch.get_num_threads() if threads is None else threads
+    check_threads(threads)
+    if ops == bool(sequences):
+        raise InputError("expected the folders of sequences, or --ops, and not both; see `mcdenoise benchmark --help`")
+    rounds = rounds if rounds is not None else 5 if ops else 3
+    if ops:
+        with progress_bar() as progress:
+            task = progress.add_task("ops", total=None)
+            costs = benchmark_ops(
+                size=parse_size(size),
+                rounds=rounds,
+                threads=threads,
+                device=device,
+                out=out,
+                command=_command_line(
+                    "benchmark", "--ops", out=out, size=size, rounds=rounds, threads=threads, device=device
+                ),
+                on_step=lambda done, total: progress.update(task, completed=done, total=total),
+            )
+        print_rows(op_rows(costs))
+        print(f"a copy moves {costs.bandwidth:.1f} GB/s, read and written")
+        write_json(json, asdict(costs))
+        return 0
+    if out is None:
+        raise InputError("--out: expected a folder to write to, found none; give one with -o")
+    settings = Settings(
+        rounds=rounds,
+        threads=threads,
+        device=device,
+        sizes=tuple(parse_sizes(sizes)),
+        pictures=pictures,
+        command=_command_line(
+            "benchmark",
+            *sequences,
+            *(["--keep-all"] if keep_all else []),
+            out=out,
+            models=models,
+            peers=peers,
+            precisions=precisions,
+            frames=frames,
+            rounds=rounds,
+            threads=threads,
+            device=device,
+            sizes=sizes,
+            pictures=pictures,
+        ),
+    )
+    check_packages()
+    opened = [open_sequence(sequence, frames) for sequence in sequences]
+    candidates = choose_candidates(
+        models, peers, precisions=precisions, threads=threads, device=device, keep_all=keep_all
+    )
+    with progress_bar() as progress:
+        task = progress.add_task("benchmark", total=None)
+        results = run_benchmark(
+            opened,
+            candidates,
+            out,
+            settings,
+            on_step=lambda done, total: progress.update(task, completed=done, total=total),
+        )
+    print_rows(scene_rows(results))
+    print_rows(left_out_rows(results))
+    for line in [*remarks(results), f"report: {write_report(out)}"]:
+        print(line)
+    write_json(json, asdict(results))
+    return 1 if results.failed else 0
+
+
+def _command_line(*arguments: object, **options: object) -> str:
+    """A command line with every choice in it, also those that were made by default."""
+    chosen = [f"--{name}={value}" for name, value in options.items() if value is not None]
+    return shlex.join(["mcdenoise", *map(str, arguments), *chosen])

@@ -1,0 +1,50 @@
+"""`mcdenoise demo`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from mcdenoise.cli._options import Json, Out
+from mcdenoise.cli._output import print_times, progress_bar, show, write_json
+from mcdenoise.demo import FRAMES, run_demo
+from mcdenoise.heap import keep_heap
+
+
+def demo(out: Out = Path("demo"), model: str = "cascaded", json: Json = None) -> None:
+    """Render 16 frames of a small scene at one sample a pixel, denoise them, print errors and times.
+
+    Ends with a report of error against run time: all models, and what other denoisers are installed.
+
+    Args:
+        out: folder to write to; what an earlier run rendered there is used again.
+        model: name of a model with shipped weights.
+        json: write the printed figures to this file too.
+    """
+    keep_heap()
+    with progress_bar() as progress:
+        rendering = progress.add_task("render", total=None)
+        denoising = progress.add_task("denoise", total=FRAMES)
+        comparing = progress.add_task("compare", total=None)
+        result = run_demo(
+            out,
+            model=model,
+            on_render=lambda done, total: progress.update(rendering, completed=done, total=total),
+            on_frame=lambda: progress.advance(denoising),
+            on_compare=lambda done, total: progress.update(comparing, completed=done, total=total),
+        )
+    scores = [asdict(score) for score in result.scores]
+    _print_scores(scores)
+    print_times(result.report.milliseconds)
+    print(f"clean frames: {result.denoised}\npicture: {result.picture}\nreport: {result.page}")
+    write_json(json, {"scores": scores, "milliseconds": result.report.milliseconds})
+
+
+def _print_scores(rows: list[dict[str, Any]]) -> None:
+    table = Table("image", *rows[0]["values"], "frames")
+    for row in rows:
+        table.add_row(row["method"], *(f"{value:.4g}" for value in row["values"].values()), str(row["frames"]))
+    show(table)

@@ -1,0 +1,74 @@
+"""`mcdenoise evaluate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tyro
+from rich.table import Table
+
+from mcdenoise.cli._options import Json
+from mcdenoise.cli._output import progress_bar, show, write_json
+from mcdenoise.data import open_sequence
+from mcdenoise.evaluate import Evaluation, evaluate_folder
+from mcdenoise.metrics.protocols import ProtocolName
+
+
+def evaluate(
+    sequence: tyro.conf.Positional[Path],
+    images: tyro.conf.Positional[Path],
+    protocol: ProtocolName = "strict",
+    frames: str | None = None,
+    json: Json = None,
+) -> None:
+    """Compare a folder of denoised images, ours or not, with the references of a sequence.
+
+    Args:
+        sequence: folder of a sequence with references.
+        images: folder of one EXR a frame, such as denoised12.exr or frame.0012.exr, scene-linear RGB.
+        protocol: how a publication computed its numbers; they are printed beside the strict ones.
+        frames: which frames, such as 0-59,70; all that have a reference by default.
+        json: write the printed figures to this file too.
+    """
+    opened = open_sequence(sequence, frames)
+    with progress_bar() as progress:
+        task = progress.add_task("evaluate", total=len(opened.reference_numbers))
+        result = evaluate_folder(opened, images, protocol=protocol, on_frame=lambda number: progress.advance(task))
+    _print_evaluation(result)
+    write_json(json, result.as_json())
+
+
+def _print_evaluation(result: Evaluation) -> None:
+    strict = result.tables["strict"]
+    for name, own in result.tables.items():
+        columns = []
+        for metric in own.mean:
+            columns.append((metric, own, "" if own is strict else name))
+            # Only these are the same quantity; a protocol's SMAPE may be one of displayed values.
+            if own is not strict and metric in ("PSNR", "SSIM") and metric in strict.mean:
+                columns.append((metric, strict, "strict"))
+        table = Table("frame", *(f"{metric} {of}".strip() for metric, _, of in columns))
+        for number in own.frames:
+            table.add_row(str(number), *(_figure(of.frames[number].get(metric)) for metric, of, _ in columns))
+        table.add_section()
+        table.add_row("mean", *(_figure(of.mean[metric]) for metric, of, _ in columns))
+        if own is strict and result.floor:
+            table.add_row("perfect", *(_figure(result.floor.get(metric)) for metric, _, _ in columns))
+        if columns:
+            show(table)
+        print(f"{name}: {own.description}")
+        for reason in dict.fromkeys(own.left_out.values()):
+            without = [metric for metric, why in own.left_out.items() if why == reason]
+            print(f"{name}: no {', '.join(without)}: {reason}")
+    if result.warping_error:
+        ours, theirs = result.warping_error
+        print(f"warping error (Lai et al. 2018): {ours:.4g}; of the references {theirs:.4g}")
+    if result.reference_noise is not None:
+        print(
+            f"perfect: estimate of what the truth would score, since the references' own SMAPE against it is about "
+            f"{result.reference_noise:.4g}"
+        )
+
+
+def _figure(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"

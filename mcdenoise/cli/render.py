@@ -1,0 +1,100 @@
+"""`mcdenoise render`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from mcdenoise.cli._options import Out, parse_size
+from mcdenoise.cli._output import progress_bar
+from mcdenoise.data.sequences import parse_frames
+from mcdenoise.errors import InputError
+from mcdenoise.render import load_shot, render_sequence
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How a sequence is rendered, whatever the scene.
+
+    Args:
+        spp: samples a pixel of the noisy color.
+        realisations: noisy colors of each frame, with independent noise.
+        reference_spp: samples a pixel of the references; 0 renders none. With --noise-level the most.
+        noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
+        reference_frames: which frames get a reference, such as 8-11; all by default.
+        size: WIDTHxHEIGHT in pixels.
+        workers: processes that render frames side by side; of use with scalar_rgb.
+        variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
+    """
+
+    spp: int = 1
+    realisations: int = 1
+    reference_spp: int = 512
+    noise_level: float | None = None
+    reference_frames: str | None = None
+    size: str = "640x360"
+    workers: int = 1
+    variant: str | None = None
+
+    def arguments(self) -> dict[str, Any]:
+        """Those of :func:`mcdenoise.render.render_sequence`."""
+        if self.reference_spp < 0:
+            raise InputError(f"--reference-spp: expected at least 0, found {self.reference_spp}")
+        frames = self.reference_frames
+        referenced = None if frames is None else parse_frames(frames, name="--reference-frames")
+        return {
+            "spp": self.spp,
+            "realisations": self.realisations,
+            "reference_spp": max(self.reference_spp, 1),
+            "noise_level": self.noise_level,
+            "reference_frames": referenced if self.reference_spp > 0 else [],
+            "size": parse_size(self.size),
+            "workers": self.workers,
+            "variant": self.variant,
+        }
+
+
+def render(
+    scene: tyro.conf.Positional[Path],
+    camera_path: Path,
+    out: Out,
+    rendering: tyro.conf.OmitArgPrefixes[RenderOptions],
+    frames: int | None = None,
+    every: int = 1,
+    seed: int = 0,
+) -> None:
+    """Render a Mitsuba 3 scene along a camera path to a sequence in the BMFR layout.
+
+    The same command again resumes a run that was stopped; with more samples or less noise it refines references.
+
+    Args:
+        scene: Mitsuba 3 scene.xml.
+        camera_path: JSON with 'fov' in degrees, and a list 'to_world' of 4x4 camera-to-world matrices or a list
+            'frames' of cameras with 'position' and 'look_at'; or a folder of Tungsten scenes, one per frame.
+            Objects of the scene move with 'objects': for each id a list of 4x4 matrices, one per frame.
+        out: folder of the sequence; finished frames in it are kept.
+        rendering: samples, references, size and processors.
+        frames: render the first so many cameras; all by default.
+        every: take only every n-th camera of the path.
+        seed: of the noise.
+    """
+    if every < 1:
+        raise InputError(f"--every: expected at least 1, found {every}")
+    arguments = rendering.arguments()
+    shot = load_shot(camera_path)
+    with progress_bar() as progress:
+        task = progress.add_task("render", total=None)
+        written = render_sequence(
+            scene,
+            shot.cameras[::every],
+            out,
+            frames=frames,
+            moves={name: path[::every] for name, path in shot.moves.items()},
+            seed=seed,
+            progress=lambda done, total: progress.update(task, completed=done, total=total),
+            **arguments,
+        )
+    print(written)

@@ -1,0 +1,18 @@
+"""`mcdenoise report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tyro
+
+from mcdenoise.report import write_report
+
+
+def report(folder: tyro.conf.Positional[Path]) -> None:
+    """Write FOLDER/index.html and FOLDER/plots/ from the results and pictures of a finished benchmark.
+
+    Args:
+        folder: what `mcdenoise benchmark` wrote: results.json and images/.
+    """
+    print(write_report(folder))

@@ -1,0 +1,82 @@
+"""`mcdenoise stability`."""
+
+from __future__ import annotations
+
+import tyro
+from rich.table import Table
+
+from mcdenoise.cli._options import Json
+from mcdenoise.cli._output import progress_bar, show, write_json
+from mcdenoise.errors import InputError
+from mcdenoise.stability import FRAMES, Check, LongRun, Summary, as_json, parse_dtypes, stages, summarize
+
+
+def stability(
+    ops: tyro.conf.Positional[list[str]] = [],  # noqa: B006 - tyro reads it
+    models: list[str] = [],  # noqa: B006
+    dtypes: list[str] = ["float32", "bfloat16", "float16"],  # noqa: B006
+    frames: int = FRAMES,
+    json: Json = None,
+) -> int:
+    """Check operators, models and the denoiser on ordinary, stiff and extreme inputs, and over thousands of frames.
+
+    Errors are in units of the dtype's epsilon times the condition number of the case; bounds come from analysis.
+
+    Args:
+        ops: names of operators; all by default.
+        models: names of models with shipped weights; all by default, none where operators are named.
+        dtypes: precisions to try.
+        frames: length of the long runs.
+        json: write every check to this file too, and the errors of the long runs over time.
+    """
+    if frames < 1:
+        raise InputError(f"--frames: expected at least 1, found {frames}")
+    chosen = stages(ops or None, models or None, parse_dtypes(dtypes), frames)
+    checks: list[Check] = []
+    runs: list[LongRun] = []
+    with progress_bar() as progress:
+        for stage in progress.track(chosen, description="stability"):
+            for result in stage.run():
+                checks.append(result) if isinstance(result, Check) else runs.append(result)
+    _print_checks(checks)
+    _print_long_runs(runs)
+    write_json(json, as_json(checks, runs))
+    failed = sum(not check.passed for check in checks) + sum(not run.passed for run in runs)
+    print(f"{len(checks) + len(runs)} checks, {failed} failed")
+    return 1 if failed else 0
+
+
+def _print_checks(checks: list[Check]) -> None:
+    """One row for each subject, dtype and backend: error and bound of what was nearest to its bound."""
+    if not checks:
+        return
+    rows: dict[tuple[str, str, str], list[Summary]] = {}
+    for summary in summarize(checks):
+        rows.setdefault((summary.subject, summary.dtype, summary.backend), []).append(summary)
+    table = Table("what", "dtype", "backend", "checks", "condition", "forward", "gradient", "holds", "result")
+    for key, summaries in rows.items():
+        found = {summary.what: summary for summary in summaries}
+        errors = []
+        for what in ("forward", "gradient"):
+            worst = found[what].worst if what in found else None
+            errors.append(f"{worst.error:.2g} of {worst.allowed:.2g}" if worst and worst.allowed else "-")
+        holds = ", ".join(what for what, summary in found.items() if not summary.failed)
+        failed = [check for summary in summaries for check in summary.failed]
+        result = (
+            "ok" if not failed else f"{len(failed)} FAILED: {failed[0].what}, {failed[0].case}: {failed[0].message}"
+        )
+        condition = max(summary.condition for summary in summaries)
+        table.add_row(*key, str(sum(s.checks for s in summaries)), f"{condition:.1g}", *errors, holds, result)
+    show(table)
+
+
+def _print_long_runs(runs: list[LongRun]) -> None:
+    if not runs:
+        return
+    table = Table("long run", "dtype", "error after frames", "at most", "ghost", "result")
+    for run in runs:
+        over_time = ", ".join(f"{number}: {error:.1g}" for number, error in zip(run.frames, run.errors, strict=True))
+        ghost = "-" if run.ghost is None else f"{run.ghost} frames"
+        allowed = f"{run.allowed:.2g}" if run.allowed else "-"
+        table.add_row(run.name, run.dtype, over_time or "-", allowed, ghost, "ok" if run.passed else run.message)
+    show(table)
