@@ -155,6 +155,8 @@ def _denoise() -> Callable[..., int | None]:
         full_float: bool = False,
         keep_all: bool = False,
         tolerance: float = TOLERANCE,
+        tile: int | None = None,
+        max_memory: float | None = None,
         budget_ms: float | None = None,
         max_error: float | None = None,
         results: Path | None = None,
@@ -177,6 +179,10 @@ def _denoise() -> Callable[..., int | None]:
             keep_all: leave nothing out, whether the sequence needs it or not.
             tolerance: noise, or change, relative to its mean, below which a tile of a still shot is not denoised again;
                 0 leaves out only what makes no difference.
+            tile: run the network on tiles of at most so many pixels a side, a multiple of 32 from 64 on; the result is
+                that of whole frames, to rounding. By default, frames are tiled where the network's features would take
+                more than 2 GB.
+            max_memory: of this process, in GB; chooses the tiles, and whether the next frame is read meanwhile.
             budget_ms: take the shipped model and precision with the least error (or, where no error is known, the
                 slowest) that needs no more milliseconds a frame on this machine, measured once and without files.
             max_error: take the fastest one with an SMAPE that is no larger.
@@ -214,6 +220,8 @@ def _denoise() -> Callable[..., int | None]:
             anti_lag=anti_lag,
             precision=precision,
             plan=plan,
+            tile=tile,
+            max_memory=max_memory,
         )
         height, width = opened.size
         print(f"{opened.name}: {opened.layout} layout, {len(opened)} frames of {width}x{height}")
@@ -225,14 +233,16 @@ def _denoise() -> Callable[..., int | None]:
                 denoiser,
                 str(weights or model),
                 half=not full_float,
-                on_frame=lambda frame, images: progress.advance(task),
+                on_frame=lambda: progress.advance(task),
             )
         for row in report.plan:
             print(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
         if report.replaced_pixels:
             print(f"replaced {report.replaced_pixels} NaN, infinite or negative pixels of the noisy color")
+        print(f"  tiles: {report.tiles}")
         _print_times(report.milliseconds)
-        _write_json(json, {"model": report.model, "milliseconds": report.milliseconds})
+        print(f"{'beside that' if denoiser.has_room_ahead else 'of the waiting'}: {_stages(report.beside)}")
+        _write_json(json, {"model": report.model, "milliseconds": report.milliseconds, "beside": report.beside})
 
     return denoise
 
@@ -869,8 +879,12 @@ def _figure(value: float | None) -> str:
 
 
 def _print_times(milliseconds: dict[str, float]) -> None:
-    stages = ", ".join(f"{stage} {value:.1f}" for stage, value in milliseconds.items())
-    print(f"milliseconds a frame (median): {stages}; together {sum(milliseconds.values()):.1f}")
+    together = sum(milliseconds.values())
+    print(f"milliseconds a frame (median): {_stages(milliseconds)}; together {together:.1f}")
+
+
+def _stages(milliseconds: dict[str, float]) -> str:
+    return ", ".join(f"{stage} {value:.1f}" for stage, value in milliseconds.items())
 
 
 def _write_json(path: Path | None, content: Any) -> None:

@@ -17,6 +17,7 @@ from mcdenoise.ops import (
     demodulate,
     motion_from_position,
 )
+from mcdenoise.ops._rows import by_rows
 
 # A cut leaves a few accidental matches; a fast pan keeps far more than this share of the image.
 _CUT_SHARE = 0.05
@@ -171,10 +172,11 @@ class History:
             keeps: remember the frame; not needed for the last one.
         """
         frame = frame.with_depth()
-        color = frame.color
+        reach = self.fireflies.kernel_size // 2
         if demodulates and frame.albedo is not None:
-            color = demodulate(color, frame.albedo)
-        color = self.fireflies(color)
+            color = by_rows(lambda *rows: self.fireflies(demodulate(*rows)), frame.color, frame.albedo, reach=reach)
+        else:
+            color = by_rows(self.fireflies, frame.color, reach=reach)
         color = color.to(torch.promote_types(color.dtype, torch.float32))
         result, recent = self._blend(frame, color, reprojects)
         surface = Surface(frame.position, frame.normal, frame.depth)
@@ -198,10 +200,11 @@ class History:
                 return first._replace(reset=_NO_WAY), recent
         surface = surface_before(frame)
         accumulated, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
-        if float((length > 1).float().mean()) < _CUT_SHARE:
+        if int((length > 1).sum()) < _CUT_SHARE * length.numel():
             return first._replace(reset="cut"), recent
         if frame.albedo is not None and motion is not None:
-            accumulated, length = self._shortened(color, accumulated, length, frame.albedo, motion)
+            both = by_rows(self._shortened, color, accumulated, length, frame.albedo, motion)
+            accumulated, length = both[:, :-1], both[:, -1:]
         if self.anti_lag is not None and state.recent is not None:
             recent, _ = self._shorter(color, state.recent, state.length, motion, surface, state.surface)
             recent = torch.lerp(recent, color, self.anti_lag(recent, color))
@@ -219,8 +222,8 @@ class History:
 
     def _shortened(
         self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """What accumulating gives if the past of mirrors and glass that move is no longer than ``specular_length``.
+    ) -> Tensor:
+        """Color and length that accumulating gives if the past of mirrors and glass that move is no longer than ``specular_length``.
 
         Which pixels those are is known in this frame, the past's length in the previous one. So the past is shortened
         after it was blended in: ``lerp(color, past, p)`` with a smaller ``p`` lies on the way back to ``color``.
@@ -232,7 +235,9 @@ class History:
         too_long = moves & specular & (length > longest)
         share = self._share_of_past(length.clamp_max(longest)) / self._share_of_past(length).clamp_min(1e-6)
         shortened = torch.lerp(color, accumulated, share.to(color.dtype))
-        return torch.where(too_long, shortened, accumulated), torch.where(too_long, longest, length)
+        return torch.cat(
+            [torch.where(too_long, shortened, accumulated), torch.where(too_long, longest, length)], 1
+        )
 
     def _share_of_past(self, length: Tensor) -> Tensor:
         """The weight of the past in a result of history length ``length``, see :func:`mcdenoise.ops.accumulate`."""

@@ -270,7 +270,7 @@ def test_a_sequence_is_written_with_its_numbers_and_metadata(small_sequence: Pat
         out,
         Denoiser(small_model()),
         "small",
-        on_frame=lambda frame, images: seen.append((frame.reference is None, images.noisy.equal(frame.color))),
+        on_images=lambda frame, images: seen.append((frame.reference is None, images.noisy.equal(frame.color))),
     )
     assert seen == [(True, True)] * 2
     assert sorted(path.name for path in out.iterdir()) == ["denoise.json", "denoised1.exr", "denoised2.exr"]
@@ -320,8 +320,9 @@ def test_the_report_of_a_sequence(small_sequence: Path, tmp_path: Path) -> None:
     assert all(row["exact"] for row in report.plan)
     assert list(written["frames"]) == ["0", "1", "2", "3"]
     for number, frame in written["frames"].items():
-        assert list(frame["milliseconds"]) == ["read", *STAGES, "write"]
-        assert all(value >= 0 for value in frame["milliseconds"].values())
+        assert list(frame["milliseconds"]) == ["waiting", *STAGES]
+        assert list(frame["beside"]) == ["read", "write"]
+        assert all(value >= 0 for times in (frame["milliseconds"], frame["beside"]) for value in times.values())
         assert frame["reset"] == ("first frame" if number == "0" else "")
         assert (frame["replaced_pixels"], frame["missing"]) == (0, [])
     assert written["milliseconds"] == report.milliseconds

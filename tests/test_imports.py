@@ -31,6 +31,7 @@ LIBRARY = SIGNAL | {
     "demo_scene",
     "random_scene",
     "render",
+    "tiling",
     "denoiser",
 }
 REPORTS = {"benchmark", "denoise", "evaluate", "ops_overview", "peers", "report", "run_folder"}
@@ -39,7 +40,7 @@ ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),
     "ops": set(),
-    "buffers": {"errors"},
+    "buffers": {"errors", "ops"},
     "metrics": SIGNAL,
     "losses": SIGNAL | {"metrics"},
     "models": SIGNAL,
@@ -49,7 +50,8 @@ ALLOWED: dict[str, set[str]] = {
     "demo_scene": SIGNAL | {"data"},
     "random_scene": SIGNAL | {"data"},
     "render": SIGNAL | {"data"},
-    "denoiser": SIGNAL | {"models", "history", "plan"},
+    "tiling": SIGNAL | {"models"},
+    "denoiser": SIGNAL | {"models", "history", "plan", "tiling"},
     "denoise": LIBRARY,
     "run_folder": SIGNAL | {"data"},
     "ops_overview": {"ops"},

@@ -24,6 +24,9 @@ from mcdenoise.ops._rows import by_rows
 FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, its share 1
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of f1, f2, f3
 GUIDES = ("normal", "depth")
+# Numbers that are alive at once for each pixel of a part, measured: of a U-Net, in widths (what is concatenated, and the
+# convolutions of it; then a third of the resolution); and images, features and inputs, which are never rounded.
+_UNET_WIDTHS, _IMAGES = 4.5, 54
 
 
 class Denoised(NamedTuple):
@@ -250,7 +253,7 @@ class Cascade(nn.Module):
         features = functools.lru_cache(maxsize=1)(
             _Features(albedo, normal, depth, _depth_scale(depth), alone, exposure, length).of
         )
-        if known is None and parts is None:
+        if known is None and (parts is None or parts == [whole]):
             initial = self.first(color * exposure, features(whole), guides, _top(color, exposure))
             final = initial if self.second is None else self.second(initial, features(whole), guides, _top(initial))
             return Denoised(initial / exposure, final / exposure)
@@ -258,10 +261,11 @@ class Cascade(nn.Module):
             known = Known(torch.zeros_like(depth[..., :1, :1], dtype=torch.bool).expand_as(depth), color, color)
         better = functools.partial(self._completed, features, guides, known.mask, [whole] if parts is None else parts)
         exposed = better(self.first, color, known.initial * exposure, exposure)
+        final = None
+        if self.second is not None:
+            final = better(self.second, exposed, known.final.clone(), divisor=exposure)
         initial = by_rows(lambda mask, given, image: torch.where(mask, given, image / exposure), *known[:2], exposed)
-        if self.second is None:
-            return Denoised(initial, by_rows(torch.where, known.mask, known.final, initial))
-        return Denoised(initial, better(self.second, exposed, known.final.clone(), divisor=exposure))
+        return Denoised(initial, by_rows(torch.where, known.mask, known.final, initial) if final is None else final)
 
     def parts(self, known: Tensor) -> list[Region]:
         """The rectangles to compute; the whole image where less would hardly pay, none where everything is known.
@@ -277,6 +281,15 @@ class Cascade(nn.Module):
         multiple = max((module.multiple for module in self.modules() if isinstance(module, UNet)), default=1)
         reach = max(int(part.reach) for part in (self.first, self.second) if part is not None)  # type: ignore[arg-type]
         return -(-reach // multiple) * multiple
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a part takes while it is computed, for each of its pixels with those around it.
+
+        Args:
+            bfloat16: whether convolutions are in bfloat16, else in float32.
+        """
+        width = max((module.width for module in self.modules() if isinstance(module, UNet)), default=0)
+        return _UNET_WIDTHS * width * (2 if bfloat16 else 4) + _IMAGES * 4
 
     def _completed(
         self,

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.models import (
+    Denoised,
     Cascade,
     KernelPredictor,
     Known,
