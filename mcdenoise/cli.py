@@ -21,7 +21,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from rich.table import Table
 
 from mcdenoise.errors import InputError
-from mcdenoise.heap import keep_heap
+from mcdenoise.heap import keep_heap, return_heap
 
 if TYPE_CHECKING:
     from mcdenoise.evaluate import Evaluation
@@ -212,6 +212,8 @@ def _denoise() -> Callable[..., int | None]:
             print(f"picked {choice}")
             model, precision = choice.model, choice.precision
         plan = Plan(keep_all=keep_all, tolerance=tolerance)
+        if max_memory is not None:
+            return_heap()
         denoiser = Denoiser(
             model,
             weights=weights,
