@@ -135,7 +135,6 @@ def _denoise() -> Callable[..., int | None]:
     """Denoise a folder of frames."""
     import torch
 
-    from mcdenoise.budget import choose_model
     from mcdenoise.data import open_sequence
     from mcdenoise.denoise import denoise_sequence
     from mcdenoise.denoiser import Denoiser, Precision
@@ -199,6 +198,8 @@ def _denoise() -> Callable[..., int | None]:
         if budget_ms is not None or max_error is not None:
             if weights is not None:
                 raise InputError("--budget-ms, --max-error: expected no --weights, which are of one model")
+            from mcdenoise.budget import choose_model
+
             with _progress() as progress:
                 task = progress.add_task("measure models", total=None)
                 choice = choose_model(

@@ -162,7 +162,7 @@ class Denoiser:
         """
         self.history.reset()
         self.plan.reset(buffers, frames)
-        self.has_room_ahead = False
+        self.has_room_ahead = size is not None
         if buffers is not None and size is not None and self._takes_plan:
             shot = Frames(size, frozenset(buffers), self.plan.has_past(buffers))
             self._tiling(shot)

@@ -19,12 +19,13 @@ def keep_heap() -> None:
 
 
 def return_heap() -> None:
-    """Let this process give freed memory back at once: for one that must hold as little as it can.
+    """Let this process give back large pieces of memory when they are freed: for one that must hold as little as it can.
 
     What is kept lies between what is in use, and cannot always be had again for something larger: a network then takes
     up to 1.4 times the memory.
     """
-    _set({_MMAP_MAX: 65536, _MMAP_THRESHOLD: 1 << 20, _TRIM_THRESHOLD: 1 << 20, _TOP_PAD: 0})
+    # What is smaller than the largest threshold that there is may stay, 128 MiB of it.
+    _set({_MMAP_MAX: 65536, _MMAP_THRESHOLD: 32 << 20, _TRIM_THRESHOLD: 128 << 20, _TOP_PAD: 16 << 20})
 
 
 def _set(options: dict[int, int]) -> None:
