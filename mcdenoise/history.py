@@ -220,9 +220,7 @@ class History:
         alpha = max(rule.alpha_min, _RECENT_ALPHA)
         return Accumulate(alpha, rule.rule, rule.position_limit, rule.normal_limit)
 
-    def _shortened(
-        self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor
-    ) -> Tensor:
+    def _shortened(self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor) -> Tensor:
         """Color and length that accumulating gives if the past of mirrors and glass that move is no longer than ``specular_length``.
 
         Which pixels those are is known in this frame, the past's length in the previous one. So the past is shortened
@@ -235,9 +233,7 @@ class History:
         too_long = moves & specular & (length > longest)
         share = self._share_of_past(length.clamp_max(longest)) / self._share_of_past(length).clamp_min(1e-6)
         shortened = torch.lerp(color, accumulated, share.to(color.dtype))
-        return torch.cat(
-            [torch.where(too_long, shortened, accumulated), torch.where(too_long, longest, length)], 1
-        )
+        return torch.cat([torch.where(too_long, shortened, accumulated), torch.where(too_long, longest, length)], 1)
 
     def _share_of_past(self, length: Tensor) -> Tensor:
         """The weight of the past in a result of history length ``length``, see :func:`mcdenoise.ops.accumulate`."""

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.models import (
-    Denoised,
     Cascade,
+    Denoised,
     KernelPredictor,
     Known,
     PixelPredictor,
@@ -369,7 +369,7 @@ def distance(results: Denoised, expected: Denoised) -> float:
 def test_tiles_are_the_whole_image(name: str, side: int, monkeypatch: pytest.MonkeyPatch) -> None:
     model, frame, known = half_known(name, 100, 131)
     tiles = Region(0, 0, 237, 331).split(side)
-    # Measured at most 1.1e-6: convolutions of small images are summed in another order. With 128 pixels nothing differs.
+    # Measured at most 1.1e-6: convolutions of small images are summed in another order.
     assert distance(model(*frame, parts=tiles), model(*frame)) < 3e-6
     tiles = [tile for part in model.parts(known.mask) for tile in part.split(side)]
     assert distance(model(*frame, known=known, parts=tiles), model(*frame, known=known)) < 3e-6
