@@ -19,7 +19,7 @@ def keep_heap() -> None:
 
 
 def return_heap() -> None:
-    """Let this process give back large pieces of memory when they are freed: for one that must hold as little as it can.
+    """Let this process give large pieces of memory back when they are freed, to hold as little as it can.
 
     What is kept lies between what is in use, and cannot always be had again for something larger: a network then takes
     up to 1.4 times the memory.

@@ -221,7 +221,7 @@ class History:
         return Accumulate(alpha, rule.rule, rule.position_limit, rule.normal_limit)
 
     def _shortened(self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor) -> Tensor:
-        """Color and length that accumulating gives if the past of mirrors and glass that move is no longer than ``specular_length``.
+        """Color and length if the past of mirrors and glass that move is no longer than ``specular_length``.
 
         Which pixels those are is known in this frame, the past's length in the previous one. So the past is shortened
         after it was blended in: ``lerp(color, past, p)`` with a smaller ``p`` lies on the way back to ``color``.

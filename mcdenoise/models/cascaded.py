@@ -24,8 +24,8 @@ from mcdenoise.ops._rows import by_rows
 FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, its share 1
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of f1, f2, f3
 GUIDES = ("normal", "depth")
-# Numbers that are alive at once for each pixel of a part, measured: of a U-Net, in widths (what is concatenated, and the
-# convolutions of it; then a third of the resolution); and images, features and inputs, which are never rounded.
+# Numbers that are alive at once for each pixel of a part, measured: of a U-Net, in widths (what is concatenated, its
+# convolutions, and a third for the coarser levels); and of images and features, which are never rounded.
 _UNET_WIDTHS, _IMAGES = 4.5, 54
 
 

@@ -1,4 +1,4 @@
-"""A local function of large images, a few rows at a time: the same result, without temporaries as large as the image."""
+"""A local function of large images, a few rows at a time: the same result, without temporaries of their size."""
 
 from __future__ import annotations
 
