@@ -162,11 +162,12 @@ class Denoiser:
         """
         self.history.reset()
         self.plan.reset(buffers, frames)
-        self.has_room_ahead = size is not None
+        # Of one frame there is nothing ahead.
+        self.has_room_ahead = size is not None and frames != 1
         if buffers is not None and size is not None and self._takes_plan:
             shot = Frames(size, frozenset(buffers), self.plan.has_past(buffers))
             self._tiling(shot)
-            self.has_room_ahead = self._memory.has_room_ahead(shot, self._needs())
+            self.has_room_ahead = self.has_room_ahead and self._memory.has_room_ahead(shot, self._needs())
 
     def __call__(self, frame: Frame) -> Tensor:
         """Denoise the next frame of the shot.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +16,8 @@ from mcdenoise.models import Region
 GB = 1e9
 LEAST_SIDE = 64
 MULTIPLE = 32
+# Smaller tiles cost more time, for what they share, than reading meanwhile can save.
+_WORTHWHILE_SIDE = 512
 # Features of a network, by default: a frame of 1920x1080 is one piece for every model of the package, and the margins
 # of larger ones cost no more than a seventh. Not what happens to be free: the same frames give the same images.
 _FEATURES = 2 * GB
@@ -50,15 +53,15 @@ class Memory:
     """
 
     def __init__(self, cap: float | None, device: torch.device) -> None:
-        if cap is not None and not 0 < cap < torch.inf:
+        if cap is not None and not 0 < cap < math.inf:
             raise InputError(f"max_memory: expected a number of GB above 0, found {cap / GB:g}")
         self.cap = cap
         self._device = device
         self._loaded = _memory_in_use(device)
 
     def has_room_ahead(self, frames: Frames, network: Network) -> bool:
-        """Whether the next frame can be read, and the last one be written, while a network runs on small tiles."""
-        return self.cap is None or self._least(frames._replace(ahead=True), network) <= self.cap
+        """Whether the next frame can be read, and the last one be written, beside tiles that are not too small."""
+        return self.cap is None or self._least(frames._replace(ahead=True), network, _WORTHWHILE_SIDE) <= self.cap
 
     def choose(self, frames: Frames, network: Network) -> Tiling:
         """The largest tiles that fit.
@@ -94,9 +97,9 @@ class Memory:
             side -= MULTIPLE
         return Tiling(side, f"{describe(frames.size, side)}: {why}")
 
-    def _least(self, frames: Frames, network: Network) -> float:
-        """Bytes that are needed with the smallest tiles."""
-        part = _largest_part(frames.size, LEAST_SIDE, network.halo)
+    def _least(self, frames: Frames, network: Network, side: int = LEAST_SIDE) -> float:
+        """Bytes that are needed with small tiles."""
+        part = _largest_part(frames.size, side, network.halo)
         features = frames.batch * network.bytes_per_pixel * part
         return self._loaded + max(frames.held + features, frames.held_elsewhere)
 
