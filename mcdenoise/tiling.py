@@ -24,7 +24,7 @@ _FEATURES = 2 * GB
 # Of a GPU's memory, in which the largest pieces are the fastest.
 _SHARE_OF_GPU = 0.4
 # What is loaded with the first frame: compiled kernels, the library of convolutions, its buffers.
-_LOADED_LATER = 0.3 * GB
+_LOADED_LATER = 0.35 * GB
 _BYTES = 4
 _STATM = Path("/proc/self/statm")
 
