@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.errors import InputError
+from mcdenoise.ops._rows import by_rows
 
 # How far half floats and a renderer's own arithmetic may lead out of a range.
 _ROUNDING = 1e-2
@@ -213,15 +214,17 @@ def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
     low, high = torch.aminmax(color)
     if low >= 0 and high < torch.inf:
         return color, 0
-    usable = (torch.isfinite(color) & (color >= 0)).all(dim=1, keepdim=True)
-    replaced = int((~usable).sum())
+    usable = by_rows(lambda rows: (torch.isfinite(rows) & (rows >= 0)).all(dim=1, keepdim=True), color)
+    return by_rows(_mended, color, usable, reach=1), int((~usable).sum())
+
+
+def _mended(color: Tensor, usable: Tensor) -> Tensor:
     zeroed = torch.where(usable, color, 0)
     # Divided before they are summed, and never in half precision: bright neighbours must not add up to infinity.
     dtype = torch.promote_types(color.dtype, torch.float32)
     total = torch.nn.functional.avg_pool2d(zeroed.to(dtype) / 9, 3, stride=1, padding=1, divisor_override=1)
     count = torch.nn.functional.avg_pool2d(usable.to(dtype), 3, stride=1, padding=1, divisor_override=1)
-    mean = (total * (9 / count.clamp_min(1))).to(color.dtype)
-    return torch.where(usable, color, mean), replaced
+    return torch.where(usable, color, (total * (9 / count.clamp_min(1))).to(color.dtype))
 
 
 def _check_buffer(name: str, value: object) -> None:

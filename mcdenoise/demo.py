@@ -99,7 +99,7 @@ def run_demo(
         last[:] = [(frame, images)]
         on_frame()
 
-    report = denoise_sequence(sequence, out / "denoised", denoiser, model, references=True, on_frame=show)
+    report = denoise_sequence(sequence, out / "denoised", denoiser, model, references=True, on_images=show)
     picture = out / "demo.png"
     write_png(picture, _sheet(*last[0]))
     page = write_report(_compare(out, on_compare))

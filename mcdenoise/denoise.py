@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from importlib.metadata import version
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import torch
+from torch import Tensor
 
 from mcdenoise.buffers import Frame
 from mcdenoise.data import Sequence, write_exr
@@ -27,7 +31,7 @@ class SequenceReport:
     Args:
         model: name of the model or path of its weights.
         reading: how the sequence stores its color.
-        frames: what happened to each frame, by number; its run times include reading and writing.
+        frames: what happened to each frame, by number; its run times include waiting for the disk.
     """
 
     model: str
@@ -37,12 +41,17 @@ class SequenceReport:
     @property
     def milliseconds(self) -> dict[str, float]:
         """Median run time of each stage over the frames after the first, which pays for warming up."""
-        reports = list(self.frames.values())
-        reports = reports[1:] or reports
-        return {
-            stage: sorted(report.milliseconds[stage] for report in reports)[len(reports) // 2]
-            for stage in reports[0].milliseconds
-        }
+        return _medians([report.milliseconds for report in self.frames.values()])
+
+    @property
+    def beside(self) -> dict[str, float]:
+        """The same of reading and writing, which go on while another frame is denoised."""
+        return _medians([report.beside for report in self.frames.values()])
+
+    @property
+    def tiles(self) -> str:
+        """The parts of the image on which the network ran, and why those."""
+        return next((report.tiles for report in self.frames.values()), "")
 
     @property
     def plan(self) -> list[dict[str, Any]]:
@@ -64,9 +73,13 @@ def denoise_sequence(
     *,
     half: bool = True,
     references: bool = False,
-    on_frame: Callable[[Frame, Images], None] = lambda frame, images: None,
+    on_frame: Callable[[], None] = lambda: None,
+    on_images: Callable[[Frame, Images], None] | None = None,
 ) -> SequenceReport:
     """Denoise a sequence and write ``OUT/denoisedN.exr`` and ``OUT/denoise.json``.
+
+    While a frame is denoised, the next one is read and the one before is written, unless memory is too short for that
+    (``Denoiser(max_memory=...)``).
 
     Args:
         sequence: the frames.
@@ -74,26 +87,49 @@ def denoise_sequence(
         denoiser: is reset first.
         model: what to call the model in the report.
         half: write half floats, else 32-bit floats.
-        references: read references too, for ``on_frame``.
-        on_frame: called with each finished frame and its images.
+        references: read references too, for ``on_images``.
+        on_frame: called after each denoised frame.
+        on_images: called with each denoised frame and its images, which take memory of their own.
 
     Raises:
-        InputError: a file is damaged, a buffer has invalid values, or the folder cannot be written to.
+        InputError: a file is damaged, a buffer has invalid values, the folder cannot be written to, or memory is too
+            short. Frames before the one that the message names are written.
     """
     make_folder(out)
     # A report stands for a complete result: an old one must not survive a run that fails half-way.
     (out / "denoise.json").unlink(missing_ok=True)
     stored = "with albedo" if sequence.color_has_albedo else "without albedo, which the reader multiplies back"
     report = SequenceReport(model, f"color is stored {stored}")
-    for number, (frame, images) in zip(
-        sequence.numbers, denoised_frames(sequence, denoiser, reference=references), strict=True
-    ):
+
+    def write(number: int, image: Tensor, done: FrameReport) -> None:
         start = time.perf_counter()
-        pixels = images.denoised[0].permute(1, 2, 0).cpu().numpy()
+        pixels = image[0].permute(1, 2, 0).cpu().numpy()
         write_exr(out / f"denoised{number}.exr", pixels, ["R", "G", "B"], half=half, metadata=sequence.metadata(number))
-        report.frames[number] = denoiser.report
-        denoiser.report.milliseconds["write"] = (time.perf_counter() - start) * 1e3
-        on_frame(frame, images)
+        done.beside["write"] = _since(start)
+
+    with ThreadPoolExecutor(1) as writer:
+        writing: Future[None] | None = None
+        for number, frame, times in _read_frames(sequence, denoiser, reference=references):
+            if on_images is None:
+                image = _denoised(denoiser, sequence, number, denoiser, frame, times)
+            else:
+                images = _denoised(denoiser.images, sequence, number, denoiser, frame, times)
+                on_images(frame, images)
+                image = images.denoised
+                del images
+            del frame
+            start = time.perf_counter()
+            if writing is not None:
+                writing.result()
+            report.frames[number] = denoiser.report
+            writing = writer.submit(write, number, image, denoiser.report)
+            del image
+            if not denoiser.has_room_ahead:
+                writing.result()
+            denoiser.report.milliseconds["waiting"] += _since(start)
+            on_frame()
+        if writing is not None:
+            writing.result()
     write_text(out / "denoise.json", json.dumps(_as_json(sequence, denoiser, report), indent=2) + "\n")
     return report
 
@@ -101,7 +137,7 @@ def denoise_sequence(
 def denoised_frames(
     sequence: Sequence, denoiser: Denoiser, *, reference: bool = True
 ) -> Iterator[tuple[Frame, Images]]:
-    """Read and denoise frame after frame.
+    """Denoise frame after frame, each while the next one is read.
 
     Args:
         sequence: the frames.
@@ -112,19 +148,72 @@ def denoised_frames(
         Each frame with its images; the denoiser's report includes the time to read.
 
     Raises:
-        InputError: a file is damaged, or a buffer has invalid values; the message names the frame.
+        InputError: a file is damaged, a buffer has invalid values, or memory is too short; the message names the frame.
     """
-    denoiser.reset(sequence.buffers, len(sequence))
-    for number in sequence.numbers:
+    for number, frame, times in _read_frames(sequence, denoiser, reference=reference):
+        yield frame, _denoised(denoiser.images, sequence, number, denoiser, frame, times)
+
+
+class _Times(NamedTuple):
+    """Milliseconds that reading a frame took, and those of them that were waited for."""
+
+    read: float
+    waiting: float
+
+
+def _read_frames(sequence: Sequence, denoiser: Denoiser, *, reference: bool) -> Iterator[tuple[int, Frame, _Times]]:
+    """Each frame, and meanwhile the next one is read, if there is room for it. Resets the denoiser."""
+    denoiser.reset(sequence.buffers - (set() if reference else {"reference"}), len(sequence), sequence.size)
+
+    def read(number: int) -> tuple[Frame, float]:
         start = time.perf_counter()
-        frame = sequence.frame(number, reference=reference)
-        read = (time.perf_counter() - start) * 1e3
-        try:
-            images = denoiser.images(frame)
-        except InputError as error:
-            raise InputError(f"{sequence.root}, frame {number}: {error}") from error
-        denoiser.report.milliseconds = {"read": read, **denoiser.report.milliseconds}
-        yield frame, images
+        return sequence.frame(number, reference=reference), _since(start)
+
+    with ThreadPoolExecutor(1) as reader:
+        # No frame has a name here: whoever gets it decides when it goes.
+        coming: deque[Future[tuple[Frame, float]]] = deque()
+        for number, following in zip_longest(sequence.numbers, sequence.numbers[1:]):
+            start = time.perf_counter()
+            if not coming:
+                coming.append(reader.submit(read, number))
+            wait(coming)
+            waiting = _since(start)
+            if following is not None and denoiser.has_room_ahead and coming[0].exception() is None:
+                coming.append(reader.submit(read, following))
+            yield _numbered(number, waiting, *coming.popleft().result())
+
+
+def _numbered(number: int, waiting: float, frame: Frame, read: float) -> tuple[int, Frame, _Times]:
+    return number, frame, _Times(read, waiting)
+
+
+_Result = TypeVar("_Result")
+
+
+def _denoised(
+    denoise: Callable[[Frame], _Result],
+    sequence: Sequence,
+    number: int,
+    denoiser: Denoiser,
+    frame: Frame,
+    times: _Times,
+) -> _Result:
+    try:
+        result = denoise(frame)
+    except InputError as error:
+        raise InputError(f"{sequence.root}, frame {number}: {error}") from error
+    denoiser.report.milliseconds = {"waiting": times.waiting, **denoiser.report.milliseconds}
+    denoiser.report.beside["read"] = times.read
+    return result
+
+
+def _since(start: float) -> float:
+    return (time.perf_counter() - start) * 1e3
+
+
+def _medians(frames: list[dict[str, float]]) -> dict[str, float]:
+    frames = frames[1:] or frames
+    return {stage: sorted(times[stage] for times in frames)[len(frames) // 2] for stage in frames[0]}
 
 
 def make_folder(out: Path) -> None:
@@ -146,10 +235,14 @@ def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> 
         "keep_all": denoiser.plan.keep_all,
         "tolerance": denoiser.plan.tolerance,
         "plan": report.plan,
+        "tiles": report.tiles,
+        "reads_ahead": denoiser.has_room_ahead,
         "milliseconds": report.milliseconds,
+        "beside": report.beside,
         "frames": {
             str(number): {
                 "milliseconds": done.milliseconds,
+                "beside": done.beside,
                 "reset": done.reset,
                 "replaced_pixels": done.replaced_pixels,
                 "missing": done.missing,

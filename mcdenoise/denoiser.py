@@ -18,7 +18,9 @@ from mcdenoise.errors import InputError
 from mcdenoise.history import Accumulated, History
 from mcdenoise.models import Denoised, Known, Region, create_model
 from mcdenoise.ops import Accumulate, HistoryLag, remodulate
+from mcdenoise.ops._rows import by_rows
 from mcdenoise.plan import Plan, Shortcut, Stage, Steps
+from mcdenoise.tiling import GB, Frames, Memory, Network, Tiling, check_side, describe
 
 Precision = Literal["float32", "bfloat16"]
 PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
@@ -32,15 +34,20 @@ class FrameReport:
         reset: why the history was thrown away, or ``""`` where it was used.
         replaced_pixels: pixels of the noisy color that were NaN, infinite or negative.
         missing: features that the network takes and the frame has not; it sees a constant instead.
-        milliseconds: run time of each stage: validate, plan, accumulate, network, remodulate.
+        milliseconds: run time of each stage: validate, plan, accumulate, network, remodulate; of a sequence also of
+            waiting for the disk, to have read this frame and to have written the last one.
+        beside: milliseconds of what is done while another frame is denoised: read, write.
         stages: what was left out of them, and why.
+        tiles: the parts of the image on which the network ran, and why those.
     """
 
     reset: str = ""
     replaced_pixels: int = 0
     missing: list[str] = field(default_factory=list)
     milliseconds: dict[str, float] = field(default_factory=dict)
+    beside: dict[str, float] = field(default_factory=dict)
     stages: list[Stage] = field(default_factory=list)
+    tiles: str = ""
 
 
 @dataclass
@@ -67,8 +74,9 @@ class Denoiser:
         model: a model's name in the zoo (its shipped weights are loaded), or a module that takes demodulated color,
             albedo, normal and depth and returns :class:`mcdenoise.models.Denoised`; with an attribute ``takes_history``
             that is true, it also gets ``current`` and ``length`` of :class:`mcdenoise.history.Accumulated`, and with
-            ``takes_plan``, ``guides``, ``known`` and ``parts``, see :class:`mcdenoise.models.Cascade`. A module of
-            yours is moved to the device, made channels-last and put into evaluation mode.
+            ``takes_plan``, ``guides``, ``known`` and ``parts``, see :class:`mcdenoise.models.Cascade`, whose ``halo``,
+            ``parts`` and ``bytes_per_pixel`` it has, too. A module of yours is moved to the device, made channels-last
+            and put into evaluation mode.
         weights: a safetensors file of other weights for a model given by name.
         device: where to run; frames may come from anywhere and images stay here.
         alpha_min: smallest weight of the current frame in the accumulation, see :func:`mcdenoise.ops.accumulate`.
@@ -76,9 +84,17 @@ class Denoiser:
         precision: ``"bfloat16"`` runs the network's convolutions in bfloat16, which is about twice as fast on
             processors that have it; everything else stays in float32.
         plan: what to leave out of a scene that does not need it; ``Plan(keep_all=True)`` leaves nothing out.
+        tile: run the network on tiles of at most so many pixels a side, a multiple of 32 from 64 on. The result is that
+            of the whole image, up to the rounding of convolutions; the margins that tiles share cost time. By default
+            they are as large as memory allows, and an image is in one piece where that takes no more than 2 GB (on a
+            GPU: 0.4 of its memory) for the network's features, whatever is free: the same frames give the same images.
+        max_memory: of the process on a CPU, or else of what torch holds on the device, in GB of 1e9 bytes. Tiles are
+            so small that all keeps below it: what is there when the denoiser is made, the images of a frame and those
+            of the past. Frames that you keep, beside the one that is denoised, are your own.
 
     Raises:
-        InputError: the model is unknown, has no weights, the device is not there, or the precision is unknown.
+        InputError: the model is unknown, has no weights, the device is not there, the precision is unknown, the tiles
+            or the memory are no such number, or the model computes no parts.
 
     Example:
         >>> denoiser = Denoiser("cascaded")
@@ -99,6 +115,8 @@ class Denoiser:
         anti_lag: bool = True,
         precision: Precision = "float32",
         plan: Plan | None = None,
+        tile: int | None = None,
+        max_memory: float | None = None,
     ) -> None:
         self.device = _device(device)
         if precision not in PRECISIONS:
@@ -114,16 +132,42 @@ class Denoiser:
         self.plan = Plan() if plan is None else plan
         self.history = History(Accumulate(alpha_min), anti_lag=None if anti_lag else HistoryLag(math.inf))
         self.report = FrameReport()
+        if tile is not None:
+            check_side(tile)
+            if max_memory is not None:
+                raise InputError("tile, max_memory: expected one of them, found both; max_memory chooses the tiles")
+        if not self._takes_plan and (tile, max_memory) != (None, None):
+            raise InputError("tile, max_memory: expected a model that computes parts of an image, found one without")
+        self.tile = tile
+        self._memory = Memory(None if max_memory is None else max_memory * GB, self.device)
+        self._tilings: dict[Frames, Tiling] = {}
+        self.has_room_ahead = False
 
-    def reset(self, buffers: Collection[str] | None = None, frames: int | None = None) -> None:
+    def reset(
+        self,
+        buffers: Collection[str] | None = None,
+        frames: int | None = None,
+        size: tuple[int, int] | None = None,
+    ) -> None:
         """Forget the past: the next frame is the first of a shot. A cut and a change of size do so by themselves.
 
         Args:
             buffers: names of the buffers that every frame of the shot will have, where that is known.
             frames: how many frames there will be, where that is known.
+            size: their height and width, where that and the buffers are known. Then ``has_room_ahead`` says whether
+                there is memory to read the next frame while one is denoised.
+
+        Raises:
+            InputError: frames of this size cannot be denoised within ``max_memory``; the message says with what.
         """
         self.history.reset()
         self.plan.reset(buffers, frames)
+        # Of one frame there is nothing ahead.
+        self.has_room_ahead = size is not None and frames != 1
+        if buffers is not None and size is not None and self._takes_plan:
+            shot = Frames(size, frozenset(buffers), self.plan.has_past(buffers))
+            self._tiling(shot)
+            self.has_room_ahead = self.has_room_ahead and self._memory.has_room_ahead(shot, self._needs())
 
     def __call__(self, frame: Frame) -> Tensor:
         """Denoise the next frame of the shot.
@@ -136,7 +180,8 @@ class Denoiser:
             ``(B, 3, H, W)`` float32 scene-linear radiance on the denoiser's device; ``report`` says what was done.
 
         Raises:
-            InputError: a feature buffer holds NaN, an illegal infinity or a value far out of range.
+            InputError: a feature buffer holds NaN, an illegal infinity or a value far out of range; or there is too
+                little memory, see :meth:`reset`.
         """
         frame, _, steps, result = self._network(frame)
         return self._remodulated(frame, steps, result.final)[0]
@@ -163,6 +208,10 @@ class Denoiser:
         report.reset = past.reset
         with self._timed("plan"):
             known, parts = self._shortcut(inspected, past)
+            tiling = self._tiling(self._shot(frame))
+            if tiling.side is not None:
+                parts = [tile for part in parts for tile in part.split(tiling.side)]
+            report.tiles = tiling.reason
         bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
         with self._timed("network"), bfloat16:
             result = self._result(self._inputs(frame, past), past, steps, known, parts)
@@ -170,6 +219,26 @@ class Denoiser:
             self.plan.finish(*result, sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1]))
         report.stages = self.plan.stages
         return frame, past, steps, result
+
+    def _shot(self, frame: Frame) -> Frames:
+        """What matters of a frame and those after it."""
+        buffers = frozenset(name for name, _ in frame.items())
+        return Frames(frame.size, buffers, self.plan.has_past(buffers), self.has_room_ahead, frame.color.shape[0])
+
+    def _needs(self) -> Network:
+        return Network(self.model.halo, self.model.bytes_per_pixel(bfloat16=self.precision == "bfloat16"))  # type: ignore
+
+    def _tiling(self, frames: Frames) -> Tiling:
+        """The parts of these frames on which the network runs."""
+        if frames not in self._tilings:
+            if not self._takes_plan:
+                tiling = Tiling(None, "whole frames: the model computes no parts")
+            elif self.tile is not None:
+                tiling = Tiling(self.tile, f"{describe(frames.size, self.tile)}: as asked for")
+            else:
+                tiling = self._memory.choose(frames, self._needs())
+            self._tilings[frames] = tiling
+        return self._tilings[frames]
 
     def _shortcut(self, inspected: Inspected, past: Accumulated) -> tuple[Shortcut | None, list[Region]]:
         """What is known of the result, and the parts of the image to run the network on."""
@@ -207,7 +276,7 @@ class Denoiser:
             full = [image.float() for image in images]
             if frame.albedo is None or not steps.demodulates:
                 return full
-            return [remodulate(image, frame.albedo) for image in full]
+            return [by_rows(remodulate, image, frame.albedo) for image in full]
 
     def _inputs(self, frame: Frame, past: Accumulated) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The network's inputs; a feature that the frame lacks is constant, which guides nothing."""

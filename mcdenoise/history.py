@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ from mcdenoise.ops import (
     demodulate,
     motion_from_position,
 )
+from mcdenoise.ops._rows import by_rows
 
 # A cut leaves a few accidental matches; a fast pan keeps far more than this share of the image.
 _CUT_SHARE = 0.05
@@ -207,13 +209,15 @@ class History:
             keeps: remember the frame; not needed for the last one.
         """
         frame = frame.with_depth()
-        color = frame.color
+        reach = self.fireflies.kernel_size // 2
         if demodulates and frame.albedo is not None:
-            color = demodulate(color, frame.albedo)
-        color = self.fireflies(color)
+            color = by_rows(lambda *rows: self.fireflies(demodulate(*rows)), frame.color, frame.albedo, reach=reach)
+        else:
+            color = by_rows(self.fireflies, frame.color, reach=reach)
         color = color.to(torch.promote_types(color.dtype, torch.float32))
         entering = color
-        if self.anti_lag is not None:
+        # What has no past and will be none is compared with nothing.
+        if self.anti_lag is not None and (keeps or self._state is not None):
             compressed = _compressed(color)
             entering = torch.cat([color, compressed, compressed.square()], 1)
         past = self._blend(frame, entering, reprojects)
@@ -224,9 +228,7 @@ class History:
     def _blend(self, frame: Frame, color: Tensor, reprojects: bool) -> _Past:
         """The frame with its past."""
         state = self._state
-        first = _Past(
-            color, None if self.anti_lag is None else color[:, :4], torch.ones_like(color[:, :1]), "first frame"
-        )
+        first = _Past(color, color[:, :4] if color.shape[1] > 3 else None, torch.ones_like(color[:, :1]), "first frame")
         if state is None:
             lost = frame.motion is None and (frame.position is None or frame.view_projection is None)
             return first._replace(reset=_NO_WAY) if lost else first
@@ -240,17 +242,20 @@ class History:
                 return first._replace(reset=_NO_WAY)
         surface = surface_before(frame)
         past, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
-        if float((length > 1).float().mean()) < _CUT_SHARE:
+        if int((length > 1).sum()) < _CUT_SHARE * length.numel():
             return first._replace(reset="cut")
         if frame.albedo is not None and motion is not None:
-            past, length = self._shortened(color, past, length, frame.albedo, motion)
+            both = by_rows(self._shortened, color, past, length, frame.albedo, motion)
+            past, length = both[:, :-1], both[:, -1:]
         if self.anti_lag is None or state.recent is None:
             return _Past(past, None, length, "")
         recent, _ = self._shorter(color[:, :4], state.recent, state.length, motion, surface, state.surface)
-        return self._without_lag(self.anti_lag, color, past, recent, length)
+        reach = self.anti_lag.kernel_size // 2
+        every = by_rows(partial(self._without_lag, self.anti_lag), color, past, recent, length, reach=reach)
+        return _Past(every[:, :5], every[:, 5:9], every[:, 9:], "")
 
-    def _without_lag(self, lag: HistoryLag, color: Tensor, past: Tensor, recent: Tensor, length: Tensor) -> _Past:
-        """What of the past still holds: first of the recent one, by the frame; then of the long one, by the recent."""
+    def _without_lag(self, lag: HistoryLag, color: Tensor, past: Tensor, recent: Tensor, length: Tensor) -> Tensor:
+        """Past, recent past and length of what still holds: of the recent one by the frame, of the long one by that."""
         mean, square = past[:, 3:4], past[:, 4:]
         counted = length.clamp_min(2)
         variance = (square - mean.square()).clamp_min(0) * (counted / (counted - 1))
@@ -258,12 +263,10 @@ class History:
         share = lag(mean, recent[:, 3:], variance / length.clamp_max(_RECENT_FRAMES))
         shorter = torch.cat([recent, recent[:, 3:].square() + variance], 1)
         length = torch.lerp(length, length.clamp_max(1 / self._shorter.alpha_min), share)
-        return _Past(torch.lerp(past, shorter, share), recent, length, "")
+        return torch.cat([torch.lerp(past, shorter, share), recent, length], 1)
 
-    def _shortened(
-        self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """What accumulating gives if the past of mirrors and glass that move is no longer than ``specular_length``.
+    def _shortened(self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor) -> Tensor:
+        """Color and length if the past of mirrors and glass that move is no longer than ``specular_length``.
 
         Which pixels those are is known in this frame, the past's length in the previous one. So the past is shortened
         after it was blended in: ``lerp(color, past, p)`` with a smaller ``p`` lies on the way back to ``color``.
@@ -275,7 +278,7 @@ class History:
         too_long = moves & specular & (length > longest)
         share = self._share_of_past(length.clamp_max(longest)) / self._share_of_past(length).clamp_min(1e-6)
         shortened = torch.lerp(color, accumulated, share.to(color.dtype))
-        return torch.where(too_long, shortened, accumulated), torch.where(too_long, longest, length)
+        return torch.cat([torch.where(too_long, shortened, accumulated), torch.where(too_long, longest, length)], 1)
 
     def _share_of_past(self, length: Tensor) -> Tensor:
         """The weight of the past in a result of history length ``length``, see :func:`mcdenoise.ops.accumulate`."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,9 +15,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+import mcdenoise.denoise
 from mcdenoise import Denoiser, Frame, InputError, create_model
 from mcdenoise.cli import main
-from mcdenoise.data import open_sequence, read_exr, write_exr
+from mcdenoise.data import Sequence, open_sequence, read_exr, write_exr
 from mcdenoise.denoise import denoise_sequence
 from mcdenoise.models import Denoised, save_weights
 
@@ -270,7 +273,7 @@ def test_a_sequence_is_written_with_its_numbers_and_metadata(small_sequence: Pat
         out,
         Denoiser(small_model()),
         "small",
-        on_frame=lambda frame, images: seen.append((frame.reference is None, images.noisy.equal(frame.color))),
+        on_images=lambda frame, images: seen.append((frame.reference is None, images.noisy.equal(frame.color))),
     )
     assert seen == [(True, True)] * 2
     assert sorted(path.name for path in out.iterdir()) == ["denoise.json", "denoised1.exr", "denoised2.exr"]
@@ -320,8 +323,9 @@ def test_the_report_of_a_sequence(small_sequence: Path, tmp_path: Path) -> None:
     assert all(row["exact"] for row in report.plan)
     assert list(written["frames"]) == ["0", "1", "2", "3"]
     for number, frame in written["frames"].items():
-        assert list(frame["milliseconds"]) == ["read", *STAGES, "write"]
-        assert all(value >= 0 for value in frame["milliseconds"].values())
+        assert list(frame["milliseconds"]) == ["waiting", *STAGES]
+        assert list(frame["beside"]) == ["read", "write"]
+        assert all(value >= 0 for times in (frame["milliseconds"], frame["beside"]) for value in times.values())
         assert frame["reset"] == ("first frame" if number == "0" else "")
         assert (frame["replaced_pixels"], frame["missing"]) == (0, [])
     assert written["milliseconds"] == report.milliseconds
@@ -355,6 +359,121 @@ def test_a_bad_frame_is_named_and_leaves_only_whole_files(small_sequence: Path, 
     message = refused(lambda: denoise_sequence(sequence, out, Denoiser(small_model()), "small"))
     assert f"{small_sequence}, frame 2: buffer 'normal'" in message
     assert sorted(path.name for path in out.iterdir()) == ["denoised0.exr", "denoised1.exr"]
+
+
+# Reading and writing beside the network
+
+
+class Slow(nn.Module):
+    """A network that changes nothing, and takes its time."""
+
+    def forward(self, color: Tensor, *_: Tensor) -> Denoised:
+        time.sleep(DELAY)
+        return Denoised(color, color)
+
+
+DELAY = 0.15
+
+
+def slowly(monkeypatch: pytest.MonkeyPatch, *, read: float = 0.0, write: float = 0.0) -> None:
+    """Let reading a frame and writing one take so many seconds more."""
+    frame, write_exr = Sequence.frame, mcdenoise.denoise.write_exr
+
+    def slow_frame(*arguments: Any, **options: Any) -> Frame:
+        time.sleep(read)
+        return frame(*arguments, **options)
+
+    def slow_write(*arguments: Any, **options: Any) -> None:
+        time.sleep(write)
+        write_exr(*arguments, **options)
+
+    monkeypatch.setattr(Sequence, "frame", slow_frame)
+    monkeypatch.setattr("mcdenoise.denoise.write_exr", slow_write)
+
+
+def test_reading_and_writing_go_on_while_a_frame_is_denoised(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slowly(monkeypatch, read=DELAY, write=DELAY)
+    sequence, times = open_sequence(small_sequence), []
+    for ahead in (True, False):
+        denoiser = Denoiser(Slow())
+        monkeypatch.setattr(denoiser, "reset", lambda *_, room=ahead, of=denoiser: setattr(of, "has_room_ahead", room))
+        start = time.perf_counter()
+        report = denoise_sequence(sequence, tmp_path / "out", denoiser, "slow")
+        times.append(time.perf_counter() - start)
+        written = json.loads((tmp_path / "out" / "denoise.json").read_text())
+        assert written["reads_ahead"] is ahead
+        for number, done in report.frames.items():
+            assert min(done.beside["read"], done.beside["write"]) >= DELAY * 1e3
+            assert written["frames"][str(number)]["milliseconds"]["waiting"] == done.milliseconds["waiting"]
+        waiting = [done.milliseconds["waiting"] for done in report.frames.values()]
+        # All of reading and writing, or else reading the first frame and what a busy machine adds.
+        assert (sum(waiting[1:]) < 3 * DELAY * 1e3) is ahead
+        assert waiting[0] >= DELAY * 1e3
+    # One after the other, four frames take twelve delays; side by side, six.
+    assert times[1] >= 12 * DELAY
+    assert times[0] < 0.8 * times[1]
+
+
+def test_reading_ahead_does_not_change_an_image(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = open_sequence(small_sequence)
+    for name, ahead in (("ahead", True), ("alone", False)):
+        denoiser = Denoiser(small_model())
+        monkeypatch.setattr(type(denoiser._memory), "has_room_ahead", lambda *_, room=ahead: room)
+        denoise_sequence(sequence, tmp_path / name, denoiser, "small", half=False)
+        assert denoiser.has_room_ahead is ahead
+    for number in sequence.numbers:
+        images = [read_exr(tmp_path / name / f"denoised{number}.exr")[0] for name in ("ahead", "alone")]
+        assert np.array_equal(*images)
+
+
+def test_no_more_than_one_frame_is_read_ahead(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[int] = []
+    frame = Sequence.frame
+    monkeypatch.setattr(Sequence, "frame", lambda self, number, **_: read.append(number) or frame(self, number))
+    model = Slow()
+    seen: list[int] = []
+    model.register_forward_hook(lambda *_: seen.append(len(read)))
+    denoise_sequence(open_sequence(small_sequence), tmp_path / "out", Denoiser(model), "slow")
+    assert seen == [2, 3, 4, 4]
+
+
+@pytest.mark.parametrize("failing", [0, 1, 3])
+def test_a_frame_that_cannot_be_written_ends_the_run(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int
+) -> None:
+    out = tmp_path / "out"
+    (out / f"denoised{failing}.exr").mkdir(parents=True)
+    sequence = open_sequence(small_sequence)
+    message = refused(lambda: denoise_sequence(sequence, out, Denoiser(small_model()), "small"))
+    assert f"denoised{failing}.exr: expected a file to write" in message
+    whole = sorted(path.name for path in out.iterdir() if path.is_file())
+    assert whole == [f"denoised{number}.exr" for number in range(failing)]
+
+
+def test_an_interrupt_leaves_only_whole_files(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slowly(monkeypatch, write=DELAY)
+    out, done = tmp_path / "out", []
+
+    def interrupt() -> None:
+        done.append(len(done))
+        if len(done) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        denoise_sequence(open_sequence(small_sequence), out, Denoiser(small_model()), "small", on_frame=interrupt)
+    # What was being written is finished.
+    assert sorted(path.name for path in out.iterdir()) == ["denoised0.exr", "denoised1.exr"]
+    for number in range(2):
+        assert read_exr(out / f"denoised{number}.exr")[0].shape == (20, 24, 3)
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("ThreadPoolExecutor")]
 
 
 def test_an_output_folder_that_cannot_be(small_sequence: Path, tmp_path: Path) -> None:

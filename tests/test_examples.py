@@ -298,3 +298,18 @@ def test_leave_out_shows_five_shots_of_a_scene(small_sequence: Path) -> None:
         # The default tolerance moves no third digit.
         assert abs(change) < 5e-4 * whole
         assert change == pytest.approx(short - whole, abs=1e-5)
+
+
+def test_start_up_times_whole_processes(tmp_path: Path) -> None:
+    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    file = tmp_path / "times.json"
+    arguments = ("--size", "64x48", "--rounds", "2", "--threads", "1", "--quality", "fast", "--json", file)
+    lines = run("start_up.py", *arguments).splitlines()
+    assert lines[0] == "64x48, one frame, whole process, 1 threads, 2 rounds"
+    times = json.loads(file.read_text())
+    own, torch_alone = times["mcdenoise denoise, cascaded_tiny, float32"], times["import torch"]
+    assert list(times)[:2] == ["pyoidn, fast", "pyoidn, fast, without torch"]
+    assert all(len(values) == 2 for values in times.values())
+    assert min(own) > min(torch_alone) > min(times["pyoidn, fast, without torch"])
+    for line, (name, values) in zip(lines[2:], times.items(), strict=True):
+        assert re.fullmatch(rf"{re.escape(name)} +{sum(values) / 2:.2f} +.*", line)

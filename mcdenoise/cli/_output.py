@@ -41,8 +41,12 @@ def print_rows(rows: list[dict[str, str]]) -> None:
 
 def print_times(milliseconds: dict[str, float]) -> None:
     """Print the run time of each stage, and of all."""
-    stages = ", ".join(f"{stage} {value:.1f}" for stage, value in milliseconds.items())
-    print(f"milliseconds a frame (median): {stages}; together {sum(milliseconds.values()):.1f}")
+    print(f"milliseconds a frame (median): {stages(milliseconds)}; together {sum(milliseconds.values()):.1f}")
+
+
+def stages(milliseconds: dict[str, float]) -> str:
+    """The run time of each stage in words."""
+    return ", ".join(f"{stage} {value:.1f}" for stage, value in milliseconds.items())
 
 
 def write_json(path: Path | None, content: Any) -> None:

@@ -8,14 +8,13 @@ from typing import Any
 import torch
 import tyro
 
-from mcdenoise.budget import choose_model
 from mcdenoise.cli._options import Json, Out, check_threads
-from mcdenoise.cli._output import print_times, progress_bar, write_json
+from mcdenoise.cli._output import print_times, progress_bar, stages, write_json
 from mcdenoise.data import open_sequence
 from mcdenoise.denoise import denoise_sequence
 from mcdenoise.denoiser import Denoiser, Precision
 from mcdenoise.errors import InputError
-from mcdenoise.heap import keep_heap
+from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.plan import TOLERANCE, Plan
 
 
@@ -33,6 +32,8 @@ def denoise(
     full_float: bool = False,
     keep_all: bool = False,
     tolerance: float = TOLERANCE,
+    tile: int | None = None,
+    max_memory: float | None = None,
     budget_ms: float | None = None,
     max_error: float | None = None,
     results: Path | None = None,
@@ -55,6 +56,10 @@ def denoise(
         keep_all: leave nothing out, whether the sequence needs it or not.
         tolerance: noise, or change, relative to its mean, below which a tile of a still shot is not denoised again;
             0 leaves out only what makes no difference.
+        tile: run the network on tiles of at most so many pixels a side, a multiple of 32 from 64 on; the result is that
+            of whole frames, to rounding. By default, frames are tiled where the network's features would take more than
+            2 GB.
+        max_memory: of this process, in GB; chooses the tiles, and whether the next frame is read meanwhile.
         budget_ms: take the shipped model and precision with the least error (or, where no error is known, the
             slowest) that needs no more milliseconds a frame on this machine, measured once and without files.
         max_error: take the fastest one with an SMAPE that is no larger.
@@ -71,6 +76,9 @@ def denoise(
     if budget_ms is not None or max_error is not None:
         if weights is not None:
             raise InputError("--budget-ms, --max-error: expected no --weights, which are of one model")
+        # Here because it brings the benchmark, which takes its time to load.
+        from mcdenoise.budget import choose_model
+
         with progress_bar() as progress:
             task = progress.add_task("measure models", total=None)
             choice = choose_model(
@@ -84,6 +92,8 @@ def denoise(
         print(f"picked {choice}")
         model, precision = choice.model, choice.precision
     plan = Plan(keep_all=keep_all, tolerance=tolerance)
+    if max_memory is not None:
+        return_heap()
     denoiser = Denoiser(
         model,
         weights=weights,
@@ -92,6 +102,8 @@ def denoise(
         anti_lag=anti_lag,
         precision=precision,
         plan=plan,
+        tile=tile,
+        max_memory=max_memory,
     )
     height, width = opened.size
     print(f"{opened.name}: {opened.layout} layout, {len(opened)} frames of {width}x{height}")
@@ -103,14 +115,16 @@ def denoise(
             denoiser,
             str(weights or model),
             half=not full_float,
-            on_frame=lambda frame, images: progress.advance(task),
+            on_frame=lambda: progress.advance(task),
         )
     for row in report.plan:
         print(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
     if report.replaced_pixels:
         print(f"replaced {report.replaced_pixels} NaN, infinite or negative pixels of the noisy color")
+    print(f"  tiles: {report.tiles}")
     print_times(report.milliseconds)
-    write_json(json, {"model": report.model, "milliseconds": report.milliseconds})
+    print(f"{'beside that' if denoiser.has_room_ahead else 'of the waiting'}: {stages(report.beside)}")
+    write_json(json, {"model": report.model, "milliseconds": report.milliseconds, "beside": report.beside})
 
 
 def _kept(row: dict[str, Any]) -> str:

@@ -21,6 +21,8 @@ Metadata: TypeAlias = dict[str, MetadataValue]
 
 LARGEST_HALF = 65504.0
 _LARGEST_PIXEL_COUNT = 2**28
+# Converted and compressed at a time: enough for all cores, and little beside a large image.
+_ROWS = 256
 # Black pixels in a byte of file: zlib's limit is 1032, and PXR24 drops a quarter before; DWA leaves one number of 64.
 _LARGEST_RATIO, _LARGEST_DWA_RATIO = 2_000, 200_000
 # These describe how one file stores its pixels, not what they show; the next file has its own.
@@ -109,11 +111,7 @@ def write_exr(
         raise ValueError(
             f"image: expected shape (H, W, {len(channels)}) for channels {list(channels)}, found {image.shape}"
         )
-    pixels = np.ascontiguousarray(image, dtype=np.float32)
-    if half:
-        # Rounding would turn a firefly into infinity, which spreads through every filter downstream; NaN stays NaN.
-        pixels = np.clip(pixels, -LARGEST_HALF, LARGEST_HALF)
-    height, width, count = pixels.shape
+    height, width, count = image.shape
     spec = oiio.ImageSpec(width, height, count, "half" if half else "float")
     spec.channelnames = tuple(channels)
     for name, value in (metadata or {}).items():
@@ -121,7 +119,7 @@ def write_exr(
             _set_attribute(spec, name, value)
     spec.attribute("compression", "zip")
     with atomic_path(path) as temporary:
-        reason = _write(temporary, spec, pixels).replace(str(temporary), path.name)
+        reason = _write(temporary, spec, image, half).replace(str(temporary), path.name)
         if reason:
             raise InputError(f"{path}: cannot be written ({reason}); check the folder, its permissions and free space")
 
@@ -178,14 +176,20 @@ def _set_attribute(spec: oiio.ImageSpec, name: str, value: MetadataValue) -> Non
         spec.attribute(name, value)
 
 
-def _write(path: Path, spec: oiio.ImageSpec, pixels: Image) -> str:
+def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], half: bool) -> str:
     """Write the file and return why that failed, or an empty text."""
     file = oiio.ImageOutput.create("openexr")
     if file is None:
         return _reason(oiio)
     if not file.open(str(path), spec):
         return _reason(file)
-    written = file.write_image(pixels)
+    written = True
+    for top in range(0, spec.height, _ROWS):
+        pixels = np.ascontiguousarray(image[top : top + _ROWS], dtype=np.float32)
+        if half:
+            # Rounding would turn a firefly into infinity, which spreads through every filter downstream; NaN stays NaN.
+            pixels = np.clip(pixels, -LARGEST_HALF, LARGEST_HALF)
+        written = written and file.write_scanlines(top, top + len(pixels), 0, pixels)
     reason = _reason(file)
     if not file.close() or not written:
         return reason or "writing failed"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch.nn.functional as F
 from torch import Tensor
 
 # Rectangles begin and end at multiples of this.
-_TILE = 32
+TILE = 32
 # A network on more than this share of the image costs as much as on all of it.
 _WORTHWHILE = 0.9
 
@@ -35,10 +36,25 @@ class Region(NamedTuple):
             min(self.right + margin, width),
         )
 
+    def split(self, side: int) -> list[Region]:
+        """In tiles of about the same size, whose sides are multiples of 32 pixels, and no longer than ``side``.
+
+        Args:
+            side: a multiple of 32 pixels.
+        """
+        rows, columns = _steps(self.top, self.bottom, side), _steps(self.left, self.right, side)
+        return [Region(top, left, bottom, right) for top, bottom in pairwise(rows) for left, right in pairwise(columns)]
+
     @property
     def pixels(self) -> int:
         """How many there are."""
         return (self.bottom - self.top) * (self.right - self.left)
+
+
+def _steps(start: int, end: int, longest: int) -> list[int]:
+    count = -(-(end - start) // longest)
+    step = -(-(end - start) // (count * TILE)) * TILE
+    return [*range(start, end, step), end]
 
 
 def regions(needed: Tensor, halo: int) -> list[Region]:
@@ -53,12 +69,12 @@ def regions(needed: Tensor, halo: int) -> list[Region]:
     """
     size = height, width = needed.shape[-2], needed.shape[-1]
     padded = F.pad(
-        needed.any(0, keepdim=True).float().reshape(1, 1, height, width), (0, -width % _TILE, 0, -height % _TILE)
+        needed.any(0, keepdim=True).float().reshape(1, 1, height, width), (0, -width % TILE, 0, -height % TILE)
     )
-    tiles = F.max_pool2d(padded, _TILE)[0, 0] > 0
+    tiles = F.max_pool2d(padded, TILE)[0, 0] > 0
     boxes = [
-        Region(top * _TILE, left * _TILE, min(bottom * _TILE, height), min(right * _TILE, width))
-        for top, left, bottom, right in _boxes(tiles, -(-2 * halo // _TILE))
+        Region(top * TILE, left * TILE, min(bottom * TILE, height), min(right * TILE, width))
+        for top, left, bottom, right in _boxes(tiles, -(-2 * halo // TILE))
     ]
     cost = sum(box.grown(halo, size).pixels for box in boxes)
     return [Region(0, 0, height, width)] if cost > _WORTHWHILE * height * width else boxes

@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import functools
+from collections.abc import Callable, Collection
 from typing import NamedTuple, Protocol
 
 import torch
@@ -18,10 +19,14 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.unet import UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample, laplacian_fusion, upsample
 from mcdenoise.ops._backend import choose_backend
+from mcdenoise.ops._rows import by_rows
 
 FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, its share 1
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of f1, f2, f3
 GUIDES = ("normal", "depth")
+# Numbers that are alive at once for each pixel of a part, measured: of a U-Net, in widths (what is concatenated, its
+# convolutions, and a third for the coarser levels); and of images and features, which are never rounded.
+_UNET_WIDTHS, _IMAGES = 4.5, 54
 
 
 class Denoised(NamedTuple):
@@ -224,7 +229,8 @@ class Cascade(nn.Module):
         What is ``known`` is taken as it is, also by the second network, and only ``parts`` of the image are computed,
         each with as much around it as its pixels depend on. What depends on the whole image (exposure, depth, the
         brightest pixel) is computed on the whole image. So a result does not depend on which parts are computed, up to
-        the rounding of convolutions, whose order of summation may depend on the size of the image.
+        the rounding of convolutions, whose order of summation may depend on the size of the image. In small parts, a
+        large image takes little more memory than its inputs and results.
 
         Args:
             color: ``(B, 3, H, W)`` demodulated accumulated radiance, scene-linear, finite, non-negative.
@@ -235,28 +241,31 @@ class Cascade(nn.Module):
             length: ``(B, 1, H, W)`` history length of ``color`` in frames, at least 1; 1 by default.
             guides: which of :data:`GUIDES` differ from pixel to pixel. Without the others the result is the same.
             known: pixels that need not be computed.
-            parts: those of :meth:`parts`; the whole image by default.
+            parts: those of :meth:`parts`, or smaller ones (:meth:`Region.split`); the whole image by default.
 
         Returns:
             The initial and the final image, demodulated as ``color`` is.
         """
+        whole = Region(0, 0, color.shape[-2], color.shape[-1])
         exposure = auto_exposure(color)
-        alone = torch.log1p((color if current is None else current) * exposure)
-        share = torch.ones_like(depth) if length is None else 1 / length
-        features = torch.cat([albedo, normal * 0.5 + 0.5, normalize_depth(depth), alone, share], 1)
-        image = color * exposure
-        if known is None:
-            initial = self.first(image, features, guides)
-            final = initial if self.second is None else self.second(initial, features, guides)
+        alone = color if current is None else current
+        # Both networks see the same, and often all of it at once.
+        features = functools.lru_cache(maxsize=1)(
+            _Features(albedo, normal, depth, _depth_scale(depth), alone, exposure, length).of
+        )
+        if known is None and (parts is None or parts == [whole]):
+            initial = self.first(color * exposure, features(whole), guides, _top(color, exposure))
+            final = initial if self.second is None else self.second(initial, features(whole), guides, _top(initial))
             return Denoised(initial / exposure, final / exposure)
-        if parts is None:
-            parts = [Region(0, 0, color.shape[-2], color.shape[-1])]
-        initial = self._completed(self.first, image, features, guides, known.mask, known.initial * exposure, parts)
-        final = initial
+        if known is None:
+            known = Known(torch.zeros_like(depth[..., :1, :1], dtype=torch.bool).expand_as(depth), color, color)
+        better = functools.partial(self._completed, features, guides, known.mask, [whole] if parts is None else parts)
+        exposed = better(self.first, color, known.initial * exposure, exposure)
+        final = None
         if self.second is not None:
-            final = self._completed(self.second, initial, features, guides, known.mask, known.final * exposure, parts)
-        images = zip((known.initial, known.final), (initial, final), strict=True)
-        return Denoised(*(torch.where(known.mask, given, image / exposure) for given, image in images))
+            final = better(self.second, exposed, known.final.clone(), divisor=exposure)
+        initial = by_rows(lambda mask, given, image: torch.where(mask, given, image / exposure), *known[:2], exposed)
+        return Denoised(initial, by_rows(torch.where, known.mask, known.final, initial) if final is None else final)
 
     def parts(self, known: Tensor) -> list[Region]:
         """The rectangles to compute; the whole image where less would hardly pay, none where everything is known.
@@ -273,27 +282,56 @@ class Cascade(nn.Module):
         reach = max(int(part.reach) for part in (self.first, self.second) if part is not None)  # type: ignore[arg-type]
         return -(-reach // multiple) * multiple
 
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a part takes while it is computed, for each of its pixels with those around it.
+
+        Args:
+            bfloat16: whether convolutions are in bfloat16, else in float32.
+        """
+        width = max((module.width for module in self.modules() if isinstance(module, UNet)), default=0)
+        return _UNET_WIDTHS * width * (2 if bfloat16 else 4) + _IMAGES * 4
+
     def _completed(
         self,
-        predictor: nn.Module,
-        image: Tensor,
-        features: Tensor,
+        features: Callable[[Region], Tensor],
         guides: Collection[str],
         known: Tensor,
-        result: Tensor,
         parts: list[Region],
+        predictor: nn.Module,
+        image: Tensor,
+        result: Tensor,
+        factor: Tensor | float = 1.0,
+        divisor: Tensor | float = 1.0,
     ) -> Tensor:
-        """``result``, with the pixels that are not known computed."""
-        top = torch.log1p(image).amax((1, 2, 3), keepdim=True)
-        size = (image.shape[-2], image.shape[-1])
-        result = result.clone()
+        """``result``, with the pixels that are not known computed: ``predictor(image * factor) / divisor``."""
+        top = _top(image, factor)
         for part in parts:
-            around = part.grown(self.halo, size)
-            better = predictor(around.of(image), around.of(features), guides, top)
+            around = part.grown(self.halo, (image.shape[-2], image.shape[-1]))
+            better = predictor(around.of(image) * factor, features(around), guides, top)
             inner = Region(*(side - start for side, start in zip(part, (around.top, around.left) * 2, strict=True)))
             there = part.of(result)
-            there.copy_(torch.where(part.of(known), there, inner.of(better)))
+            there.copy_(torch.where(part.of(known), there, inner.of(better) / divisor))
         return result
+
+
+class _Features(NamedTuple):
+    """The buffers of an image, and what the features of its parts have in common."""
+
+    albedo: Tensor
+    normal: Tensor
+    depth: Tensor
+    depth_scale: tuple[Tensor, Tensor]
+    current: Tensor
+    exposure: Tensor
+    length: Tensor | None
+
+    def of(self, part: Region) -> Tensor:
+        """The features of a part, ``(B, 11, h, w)``."""
+        alone = torch.log1p(part.of(self.current) * self.exposure)
+        depth = part.of(self.depth)
+        share = torch.ones_like(depth) if self.length is None else 1 / part.of(self.length)
+        near = _normalized(depth, *self.depth_scale)
+        return torch.cat([part.of(self.albedo), part.of(self.normal) * 0.5 + 0.5, near, alone, share], 1)
 
 
 def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
@@ -328,13 +366,33 @@ def normalize_depth(depth: Tensor) -> Tensor:
     Returns:
         ``(B, 1, H, W)`` in [0, 1]. The typical depth is the image's geometric mean over what was hit.
     """
-    hit = torch.isfinite(depth)
-    finite = _at_least_float32(torch.where(hit, depth, 0)).clamp_min(1e-30)
+    return _normalized(depth, *_depth_scale(depth))
+
+
+def _depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
+    """The largest depth of what was hit, and the typical one as a share of it, ``(B, 1, 1, 1)``."""
+
+    def finite(rows: Tensor) -> Tensor:
+        return _at_least_float32(torch.where(torch.isfinite(rows), rows, 0)).clamp_min(1e-30)
+
+    def logs(rows: Tensor) -> Tensor:
+        return (torch.log(finite(rows) / largest) * torch.isfinite(rows)).sum(-1, keepdim=True)
+
     # Of the largest, so that the logarithms are small numbers in any unit.
-    shares = finite / finite.amax((1, 2, 3), keepdim=True)
-    count = hit.sum((1, 2, 3), keepdim=True).clamp_min(1)
-    typical = torch.exp((torch.log(shares) * hit).sum((1, 2, 3), keepdim=True) / count)
+    largest = by_rows(lambda rows: finite(rows).amax(-1, keepdim=True), depth).amax((1, 2, 3), keepdim=True)
+    count = torch.isfinite(depth).sum((1, 2, 3), keepdim=True).clamp_min(1)
+    return largest, torch.exp(by_rows(logs, depth).sum((1, 2, 3), keepdim=True) / count)
+
+
+def _normalized(depth: Tensor, largest: Tensor, typical: Tensor) -> Tensor:
+    hit = torch.isfinite(depth)
+    shares = _at_least_float32(torch.where(hit, depth, 0)).clamp_min(1e-30) / largest
     return torch.where(hit, shares / (shares + typical), 1).to(depth.dtype)
+
+
+def _top(image: Tensor, factor: Tensor | float = 1.0) -> Tensor:
+    """The logarithm of the brightest of ``image * factor``, ``(B, 1, 1, 1)``."""
+    return torch.log1p(image.amax((1, 2, 3), keepdim=True) * factor)
 
 
 def _at_least_float32(tensor: Tensor) -> Tensor:

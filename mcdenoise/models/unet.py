@@ -31,7 +31,7 @@ class UNet(nn.Module):
         # The coarsest level is the encoder's alone.
         if levels <= self.scales:
             raise ValueError(f"levels: expected at least {self.scales + 1}, found {levels}")
-        self.levels = levels
+        self.levels, self.width = levels, width
         self.multiple: int = 2 ** (levels - 1)
         self.encoder = nn.ModuleList(_block(in_channels if level == 0 else width, width) for level in range(levels))
         self.up = nn.ModuleList(nn.ConvTranspose2d(width, width, 2, stride=2) for _ in range(levels - 1))

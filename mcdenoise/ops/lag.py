@@ -47,8 +47,7 @@ def history_lag(
 
     Returns:
         ``(B, 1, H, W)`` share in [0, 1] in the dtype of ``history``: ``lerp(history, recent, lag)`` has no lag. Half
-        precision is computed in float32. Values are compared in units of the image's largest one; below 1e-15 of it
-        nothing counts as lag.
+        precision is computed in float32. Below 1e-15 of the image's largest value nothing counts as lag.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -74,7 +73,8 @@ def history_lag(
     dtype = accumulator_dtype(history.dtype)
     # Squares keep within range of numbers up to 1. Divided before they are summed, which could overflow.
     largest = torch.maximum(history.detach().abs(), recent.detach().abs()).to(dtype).amax((1, 2, 3), keepdim=True)
-    largest = torch.where(largest > 0, largest, 1)
+    # A power of two, which rounds nothing.
+    largest = torch.where(largest > 0, largest / (2 * torch.frexp(largest).mantissa), 1)
     long, short = ((image.to(dtype) / largest).mean(1, keepdim=True) for image in (history, recent))
     # Not the difference of the means, which cancels.
     mean, difference = _box(short, kernel_size), _box(short - long, kernel_size)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import torch
-from kornia.geometry.grid import create_meshgrid
 from torch import Tensor, nn
 
 from mcdenoise.ops._backend import Backend, check_backend, choose_backend
@@ -364,6 +363,9 @@ def _check_images(motion: Tensor | None, **images: tuple[Tensor, str]) -> dict[s
 
 def _pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """``(1, 2, H, W)`` integer pixel indices, x first."""
+    # All of kornia comes with it, which takes as long to import as a single frame to denoise.
+    from kornia.geometry.grid import create_meshgrid
+
     return create_meshgrid(height, width, normalized_coordinates=False, device=device, dtype=dtype).permute(0, 3, 1, 2)
 
 

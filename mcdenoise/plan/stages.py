@@ -113,6 +113,10 @@ class Plan:
         self._still = False
         self._tiles: Tiles | None = None
 
+    def has_past(self, buffers: Collection[str]) -> bool:
+        """Whether frames with these buffers may be accumulated."""
+        return self.keep_all or (self._frames != 1 and _can_reproject(buffers))
+
     def begin(self, inspected: Inspected, still: bool) -> Steps:
         """Decide on what comes before the network.
 

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.models import (
     Cascade,
+    Denoised,
     KernelPredictor,
     Known,
     PixelPredictor,
@@ -354,6 +355,40 @@ def test_what_is_known_is_not_computed() -> None:
     results = model(*frame, known=everything, parts=[])
     assert torch.equal(results.initial, known.initial)
     assert torch.equal(results.final, known.final)
+
+
+def distance(results: Denoised, expected: Denoised) -> float:
+    """Of the largest difference, in means of the image."""
+    pairs = zip(results, expected, strict=True)
+    return max(float((result - image).abs().max() / image.mean()) for result, image in pairs)
+
+
+@pytest.mark.parametrize("side", [32, 96, 128])
+@pytest.mark.parametrize("name", ["cascaded", "cascaded_tiny", "kernel"])
+@torch.inference_mode()
+def test_tiles_are_the_whole_image(name: str, side: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, frame, known = half_known(name, 100, 131)
+    tiles = Region(0, 0, 237, 331).split(side)
+    # Measured at most 1.1e-6: convolutions of small images are summed in another order.
+    assert distance(model(*frame, parts=tiles), model(*frame)) < 3e-6
+    tiles = [tile for part in model.parts(known.mask) for tile in part.split(side)]
+    assert distance(model(*frame, known=known, parts=tiles), model(*frame, known=known)) < 3e-6
+    monkeypatch.setattr(Cascade, "halo", 24)
+    assert distance(model(*frame, parts=Region(0, 0, 237, 331).split(side)), model(*frame)) > 1e-3
+
+
+def test_tiles_hold_every_pixel_once() -> None:
+    for region, side in ((Region(0, 0, 237, 331), 96), (Region(64, 32, 65, 4000), 1024), (Region(0, 0, 64, 64), 64)):
+        count = torch.zeros(region.bottom, region.right)
+        tiles = region.split(side)
+        for tile in tiles:
+            assert max(tile.bottom - tile.top, tile.right - tile.left) <= side
+            assert all(start % 32 == 0 for start in tile[:2])
+            tile.of(count).add_(1)
+        assert region.of(count).min() == count.max() == 1
+        assert count.sum() == region.pixels
+    # No sliver is left over.
+    assert [tile.right - tile.left for tile in Region(0, 0, 32, 1056).split(1024)] == [544, 512]
 
 
 def test_rectangles_hold_what_is_needed_once_and_reach_no_other() -> None:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops._fast._filter import derivatives, filtered
+from mcdenoise.ops._fast._operator import custom_op
 from mcdenoise.ops._fast._plain import plain_gradients
 from mcdenoise.ops.bilateral_filter import cross_bilateral_filter_torch
 
@@ -16,9 +17,7 @@ _ARGUMENTS = (
 )
 
 
-@torch.library.custom_op(
-    "mcdenoise::cross_bilateral_filter", mutates_args=(), device_types="cpu", schema=f"({_ARGUMENTS}) -> Tensor"
-)
+@custom_op("mcdenoise::cross_bilateral_filter", device_types="cpu", schema=f"({_ARGUMENTS}) -> Tensor")
 def cross_bilateral_filter(
     image: Tensor,
     kernel: Tensor,
@@ -37,9 +36,8 @@ def _(image: Tensor, *_: Any) -> Tensor:
     return image.new_empty(image.shape)
 
 
-@torch.library.custom_op(
+@custom_op(
     "mcdenoise::cross_bilateral_filter_backward",
-    mutates_args=(),
     device_types="cpu",
     schema=f"(Tensor gradient, {_ARGUMENTS}, bool of_guides) -> Tensor[]",
 )

@@ -9,23 +9,20 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops._fast._filter import derivatives, filtered
+from mcdenoise.ops._fast._operator import custom_op
 from mcdenoise.ops._fast._plain import plain_gradients
 from mcdenoise.ops.kernel_conv import kernel_conv_torch, kernel_splat_torch
 
 _ARGUMENTS = "Tensor image, Tensor kernel, str border"
 
 
-@torch.library.custom_op(
-    "mcdenoise::kernel_conv", mutates_args=(), device_types="cpu", schema=f"({_ARGUMENTS}) -> Tensor"
-)
+@custom_op("mcdenoise::kernel_conv", device_types="cpu", schema=f"({_ARGUMENTS}) -> Tensor")
 def kernel_conv(image: Tensor, kernel: Tensor, border: Any) -> Tensor:
     """See :func:`mcdenoise.ops.kernel_conv`."""
     return filtered(image, kernel, (), (), None, False, border)
 
 
-@torch.library.custom_op(
-    "mcdenoise::kernel_splat", mutates_args=(), device_types="cpu", schema=f"({_ARGUMENTS}) -> Tensor"
-)
+@custom_op("mcdenoise::kernel_splat", device_types="cpu", schema=f"({_ARGUMENTS}) -> Tensor")
 def kernel_splat(image: Tensor, kernel: Tensor, border: Any) -> Tensor:
     """See :func:`mcdenoise.ops.kernel_splat`: what a convolution's derivative spreads over its image."""
     return derivatives(image, image, kernel, (), (), None, False, border)[0]
@@ -33,9 +30,8 @@ def kernel_splat(image: Tensor, kernel: Tensor, border: Any) -> Tensor:
 
 # Both are bilinear maps of one trilinear form, <y, kernel_conv(x, k)> = <kernel_splat(y, k), x>, and its derivative in
 # the kernel is the same whichever of the two images is called the gradient.
-@torch.library.custom_op(
+@custom_op(
     "mcdenoise::kernel_conv_backward",
-    mutates_args=(),
     device_types="cpu",
     schema=f"(Tensor gradient, {_ARGUMENTS}) -> (Tensor, Tensor)",
 )

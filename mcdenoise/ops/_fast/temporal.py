@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops._fast._filter import compiled, share_rows, source
+from mcdenoise.ops._fast._operator import custom_op
 
 
-@torch.library.custom_op(
+@custom_op(
     "mcdenoise::accumulate",
-    mutates_args=(),
     device_types="cpu",
     schema="(Tensor color, Tensor previous, Tensor previous_length, Tensor? motion, Tensor?[] surface, "
     "Tensor?[] previous_surface, float alpha_min, bool bmfr, float position_limit, float normal_limit) "

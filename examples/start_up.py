@@ -1,0 +1,131 @@
+"""Time whole processes side by side: one frame from EXR to EXR, with this package and with Open Image Denoise.
+
+    python examples/start_up.py
+    python examples/start_up.py --size 640x360 --rounds 9 --model cascaded_tiny --precision float32
+
+Every round starts each process once, one after the other, so that whatever else the machine does hits all alike; the
+first round, in which files come from the disk and kernels are compiled, is not counted. Prints the median and the
+quartiles in seconds, and how far behind the first. The peer is what a script of one's own would be: it reads color,
+albedo and normal with OpenImageIO, runs `pyoidn`, and writes the result. `pyoidn` itself imports torch where that is
+installed, as it is beside this package; the second row keeps torch from it, and the last one is torch alone.
+"""
+
+import argparse
+import json
+import re
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from mcdenoise.benchmark.sizes import synthetic_frame
+from mcdenoise.data.bmfr import write_bmfr_frame
+from mcdenoise.data.files import write_text
+from mcdenoise.errors import InputError
+
+PEER = """
+import sys
+
+folder, out, quality, threads, torch = sys.argv[1:]
+if torch == "without torch":
+    sys.modules["torch"] = None
+
+import numpy as np
+import OpenImageIO as oiio
+import pyoidn
+
+images = {}
+for name, stem in (("color", "color"), ("albedo", "albedo"), ("normal", "shading_normal")):
+    image = oiio.ImageInput.open(f"{folder}/{stem}0.exr")
+    images[name] = np.ascontiguousarray(image.read_image(0, 0, 0, 3, oiio.FLOAT))
+    image.close()
+images["output"] = np.zeros_like(images["color"])
+device = pyoidn.Device()
+device.set_int("numThreads", int(threads))
+device.commit()
+run = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT)
+for name, image in images.items():
+    run.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
+run.set_bool("hdr", True)
+run.set_quality(getattr(pyoidn, f"OIDN_QUALITY_{quality.upper()}"))
+run.commit()
+run.execute()
+assert not device.get_error()
+height, width, _ = images["output"].shape
+spec = oiio.ImageSpec(width, height, 3, "half")
+spec.attribute("compression", "zip")
+file = oiio.ImageOutput.create("openexr")
+assert file.open(out, spec) and file.write_image(images["output"]) and file.close()
+run.release()
+device.release()
+"""
+
+
+def seconds(command: list[str]) -> float:
+    """That a process takes; it must succeed."""
+    start = time.perf_counter()
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise InputError(f"{' '.join(command[:4])}: expected to succeed, found: {done.stderr.strip()[-300:]}")
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--model", default="cascaded_tiny")
+    parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
+    parser.add_argument("--quality", default="balanced", choices=["fast", "balanced", "high"], help="of the peer")
+    parser.add_argument("--size", default="1280x720", metavar="WxH")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every time to this file too")
+    options = parser.parse_args()
+
+    for name, lowest in (("threads", 1), ("rounds", 2)):
+        if getattr(options, name) < lowest:
+            raise InputError(f"--{name}: expected at least {lowest}, found {getattr(options, name)}")
+    match = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", options.size)
+    if not match:
+        raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{options.size}'")
+    folder = Path(tempfile.mkdtemp(prefix="start-up-"))
+    try:
+        write_bmfr_frame(folder / "frame", 0, synthetic_frame(int(match[1]), int(match[2])))
+        threads = str(options.threads)
+        peer = [str(folder / "frame"), str(folder / "oidn.exr"), options.quality, threads]
+        own = ["denoise", str(folder / "frame"), "-o", str(folder / "out"), "--model", options.model]
+        commands = {
+            f"pyoidn, {options.quality}": [sys.executable, "-c", PEER, *peer, "as it is"],
+            f"pyoidn, {options.quality}, without torch": [sys.executable, "-c", PEER, *peer, "without torch"],
+            f"mcdenoise denoise, {options.model}, {options.precision}": [
+                *(sys.executable, "-m", "mcdenoise", *own),
+                *("--precision", options.precision, "--threads", threads),
+            ],
+            "import torch": [sys.executable, "-c", "import torch"],
+        }
+        times: dict[str, list[float]] = {name: [] for name in commands}
+        for _ in range(options.rounds + 1):
+            for name, command in commands.items():
+                times[name].append(seconds(command))
+    finally:
+        shutil.rmtree(folder)
+
+    times = {name: values[1:] for name, values in times.items()}
+    first = statistics.median(next(iter(times.values())))
+    print(f"{options.size}, one frame, whole process, {threads} threads, {options.rounds} rounds")
+    print(f"{'seconds':<46}{'median':>8}{'quartiles':>16}{'behind':>9}")
+    for name, values in times.items():
+        low, median, high = statistics.quantiles(values, n=4)
+        print(f"{name:<46}{median:>8.2f}{f'{low:.2f} .. {high:.2f}':>16}{median - first:>+9.2f}")
+    if options.json:
+        write_text(options.json, json.dumps(times, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,192 @@
+"""How large the parts of an image are on which a network runs, so that a frame keeps within memory."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from mcdenoise.buffers import BUFFERS
+from mcdenoise.errors import InputError
+from mcdenoise.models import Region
+
+GB = 1e9
+LEAST_SIDE = 64
+MULTIPLE = 32
+# Smaller tiles cost more time, for what they share, than reading meanwhile can save.
+_WORTHWHILE_SIDE = 512
+# Features of a network, by default: a frame of 1920x1080 is one piece for every model of the package, and the margins
+# of larger ones cost no more than a seventh. Not what happens to be free: the same frames give the same images.
+_FEATURES = 2 * GB
+# Of a GPU's memory, in which the largest pieces are the fastest.
+_SHARE_OF_GPU = 0.4
+# What is loaded with the first frame: compiled kernels, the library of convolutions, its buffers.
+_LOADED_LATER = 0.35 * GB
+_BYTES = 4
+# Channels of a history: a long and a recent past, what they are compared by, and the length.
+_KEPT = 10
+_STATM = Path("/proc/self/statm")
+
+
+class Tiling(NamedTuple):
+    """The parts of an image on which a network runs.
+
+    Args:
+        side: longest side in pixels; ``None`` for the whole image at once.
+        reason: why, in words.
+    """
+
+    side: int | None
+    reason: str
+
+
+class Memory:
+    """What a denoiser may hold, and what it does.
+
+    Args:
+        cap: bytes of the whole process (of the device, where that is no CPU), at most; ``None`` for no promise.
+        device: where the network runs.
+
+    Raises:
+        InputError: the cap is not a positive number.
+    """
+
+    def __init__(self, cap: float | None, device: torch.device) -> None:
+        if cap is not None and not 0 < cap < math.inf:
+            raise InputError(f"max_memory: expected a number of GB above 0, found {cap / GB:g}")
+        self.cap = cap
+        self._device = device
+        self._loaded = _memory_in_use(device)
+
+    def has_room_ahead(self, frames: Frames, network: Network) -> bool:
+        """Whether the next frame can be read, and the last one be written, beside tiles that are not too small."""
+        return self.cap is None or self._least(frames._replace(ahead=True), network, _WORTHWHILE_SIDE) <= self.cap
+
+    def choose(self, frames: Frames, network: Network) -> Tiling:
+        """The largest tiles that fit.
+
+        Without a cap, the features of a network are kept below 2 GB on a CPU, and 0.4 of the memory of a GPU.
+
+        Raises:
+            InputError: not even the smallest tiles fit.
+        """
+        height, width = frames.size
+        if self.cap is None:
+            limit = _FEATURES
+            if self._device.type == "cuda":
+                limit = _SHARE_OF_GPU * torch.cuda.get_device_properties(self._device).total_memory
+            why = f"features of the network within {limit / GB:.3g} GB"
+        else:
+            least = self._least(frames, network)
+            if least > self.cap:
+                raise InputError(
+                    f"max_memory: expected at least {least / GB + 0.005:.2f} GB for frames of {width}x{height}, found "
+                    f"{self.cap / GB:g}; allow that much, or take a smaller model, bfloat16 or fewer buffers"
+                )
+            limit = self.cap - self._loaded - frames.held
+            why = f"all within {self.cap / GB:g} GB"
+
+        def fits(side: int) -> bool:
+            return frames.batch * network.bytes_per_pixel * _largest_part(frames.size, side, network.halo) <= limit
+
+        side = -(-max(frames.size) // MULTIPLE) * MULTIPLE
+        if fits(side):
+            return Tiling(None, f"whole frames: {why}")
+        while side > LEAST_SIDE and not fits(side):
+            side -= MULTIPLE
+        return Tiling(side, f"{describe(frames.size, side)}: {why}")
+
+    def _least(self, frames: Frames, network: Network, side: int = LEAST_SIDE) -> float:
+        """Bytes that are needed with small tiles."""
+        part = _largest_part(frames.size, side, network.halo)
+        features = frames.batch * network.bytes_per_pixel * part
+        return self._loaded + max(frames.held + features, frames.held_elsewhere)
+
+
+class Network(NamedTuple):
+    """What matters of a network.
+
+    Args:
+        halo: what a tile has around it, in pixels.
+        bytes_per_pixel: that it takes for each of them.
+    """
+
+    halo: int
+    bytes_per_pixel: float
+
+
+class Frames(NamedTuple):
+    """What matters of frames.
+
+    Args:
+        size: height and width in pixels.
+        buffers: their names.
+        streaming: a frame has a past, or will be one.
+        ahead: the next frame is read, and the last one written, at the same time.
+        batch: number of images.
+    """
+
+    size: tuple[int, int]
+    buffers: frozenset[str]
+    streaming: bool
+    ahead: bool = False
+    batch: int = 1
+
+    @property
+    def held(self) -> int:
+        """Bytes of whole images while a network runs."""
+        # Color, demodulated, and what is kept of it; the results of both networks.
+        return self._bytes(self._channels() + 3 + (_KEPT if self.streaming else 1) + 6)
+
+    @property
+    def held_elsewhere(self) -> int:
+        """Bytes of whole images, at most, while none runs."""
+        # One of the results also in other units.
+        after = self._channels() + 3 + (_KEPT if self.streaming else 1) + 9
+        if not self.streaming:
+            return self._bytes(after)
+        # Color as it is and as it enters; the old past with the features it belongs to; the new one, long and short, as
+        # accumulated and without lag.
+        past = 8 + _KEPT + 11 + _KEPT
+        return self._bytes(max(after, self._channels() + self._channels("position", "normal", "depth") + past))
+
+    def _channels(self, *names: str) -> int:
+        return sum(BUFFERS[name].channels for name in names or BUFFERS if name in self.buffers)
+
+    def _bytes(self, channels: int) -> int:
+        # The next frame, and the last result.
+        channels += self._channels() + 3 if self.ahead else 0
+        return self.batch * self.size[0] * self.size[1] * channels * _BYTES
+
+
+def describe(size: tuple[int, int], side: int) -> str:
+    """Such as ``"6 x 4 tiles of up to 1280x1088 pixels"``."""
+    tiles = Region(0, 0, *size).split(side)
+    columns = sum(tile.top == 0 for tile in tiles)
+    return f"{columns} x {len(tiles) // columns} tiles of up to {tiles[0].right}x{tiles[0].bottom} pixels"
+
+
+def check_side(side: int) -> None:
+    """``InputError`` for a side that tiles cannot have."""
+    if side < LEAST_SIDE or side % MULTIPLE:
+        raise InputError(f"tile: expected a multiple of {MULTIPLE} of at least {LEAST_SIDE} pixels, found {side}")
+
+
+def _memory_in_use(device: torch.device) -> float:
+    """Bytes that this process will hold on the device besides its images."""
+    if device.type == "cuda":
+        return float(torch.cuda.memory_allocated(device))
+    try:
+        resident = int(_STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        # The system does not tell: as much as torch takes.
+        resident = int(0.4 * GB)
+    return resident + _LOADED_LATER
+
+
+def _largest_part(size: tuple[int, int], side: int, halo: int) -> int:
+    whole = Region(0, 0, *size)
+    return max(tile.grown(halo, size).pixels for tile in whole.split(side))
