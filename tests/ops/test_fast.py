@@ -12,7 +12,7 @@ from torch import Tensor
 from mcdenoise import ops
 from mcdenoise.ops import _backend
 from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
-from mcdenoise.ops._fast import _filter
+from mcdenoise.ops._fast import _numba_filter
 
 FAST = [op for op in OPS if op.name in ("kernel_conv", "kernel_splat", "cross_bilateral_filter")]
 # Of the largest number in the case. Half precision is rounded once, after a sum in float32; a derivative in float32
@@ -101,7 +101,7 @@ def test_sizes(op: Op, border: str, size: tuple[int, int, int, int, int]) -> Non
 @pytest.mark.parametrize("border", ["replicate", "zeros", "renormalize"])
 @every_op
 def test_threads_change_nothing(op: Op, border: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_filter, "_PIXELS_A_THREAD", 1)
+    monkeypatch.setattr(_numba_filter, "_PIXELS_A_THREAD", 1)
     case = drawn(2, 3, 9, 6, 5, op, border=border)
     threads, results = torch.get_num_threads(), []
     try:
@@ -273,7 +273,7 @@ def test_accumulation_is_that_of_the_plain_form(case: Case, dtype: torch.dtype) 
 def test_accumulation_of_any_layout_and_by_any_number_of_threads(
     layout: Callable[[Tensor], Tensor], rule: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_filter, "_PIXELS_A_THREAD", 1)
+    monkeypatch.setattr(_numba_filter, "_PIXELS_A_THREAD", 1)
     case = next(case for case in ACCUMULATE.cases if "all buffers" in case.name)
     inputs = case.inputs()
     limits: dict[str, Any] = {"rule": rule, "position_limit": 0.05, "normal_limit": 0.3}
