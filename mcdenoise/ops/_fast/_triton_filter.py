@@ -23,7 +23,7 @@ from mcdenoise.ops.bilateral import guide_gradient
 
 # A pixel for each thread of four warps, a warp for each row: neighbours are near, and rows are read at once.
 _COLUMNS, _ROWS = 32, 4
-# Offsets within an image are 32 bits wide where they fit.
+# Offsets within a plane have 32 bits where that is enough; those of planes always 64.
 _NARROW = 2**31
 
 _REPLICATE = tl.constexpr(BORDERS.index("replicate"))
@@ -104,9 +104,7 @@ def derivatives(
     if of_guides:
         # The slope of an exponent is that of its logit, or its weight's times that weight.
         slopes = of_kernel if log_domain else of_kernel * kernel
-        of_guide = [
-            guide_gradient(slopes, guide, scale, border) for guide, scale in zip(guides, scales, strict=True)
-        ]
+        of_guide = [guide_gradient(slopes, guide, scale, border) for guide, scale in zip(guides, scales, strict=True)]
     return _spread(gradient, inputs, sums), of_kernel.to(kernel.dtype), of_guide, of_scales, of_distance
 
 
@@ -144,8 +142,8 @@ def _source(tensor: Tensor) -> Source:
 
 
 def _is_wide(tensor: Tensor) -> bool:
-    """Whether offsets within one image need more than 32 bits."""
-    sizes, strides = tensor.shape[1:], tensor.stride()[1:]
+    """Whether offsets of pixels within one plane need more than 32 bits."""
+    sizes, strides = tensor.shape[2:], tensor.stride()[2:]
     return sum((size - 1) * stride for size, stride in zip(sizes, strides, strict=True)) >= _NARROW
 
 
@@ -377,7 +375,16 @@ def _gather(
             value = _read_plane(kernel, b, row * KERNEL_SIZE + column, y, x, counted, SUM)
             square_offset = tl.cast(dy * dy + dx * dx, SUM)
             exponent = _exponent(
-                value, squares, falloff, square_offset, falloff_with_distance, inside, DISTANCE, LOG_DOMAIN, BORDER, LARGEST
+                value,
+                squares,
+                falloff,
+                square_offset,
+                falloff_with_distance,
+                inside,
+                DISTANCE,
+                LOG_DOMAIN,
+                BORDER,
+                LARGEST,
             )
             neighbours = _read(image, b, there_y, there_x, inside, CHANNELS, SUM)
             if LOG_DOMAIN:
@@ -453,7 +460,16 @@ def _correlate(
             value = _read_plane(kernel, b, tap, y, x, counted, SUM)
             square_offset = tl.cast(dy * dy + dx * dx, SUM)
             exponent = _exponent(
-                value, squares, falloff, square_offset, falloff_with_distance, inside, DISTANCE, LOG_DOMAIN, BORDER, LARGEST
+                value,
+                squares,
+                falloff,
+                square_offset,
+                falloff_with_distance,
+                inside,
+                DISTANCE,
+                LOG_DOMAIN,
+                BORDER,
+                LARGEST,
             )
             factor = tl.exp(exponent - top)
             neighbours = _read(image, b, there_y, there_x, inside, CHANNELS, SUM)
@@ -511,7 +527,16 @@ def _scatter(
             value = _read_plane(kernel, b, row * KERNEL_SIZE + column, from_y, from_x, inside, SUM)
             square_offset = tl.cast(dy * dy + dx * dx, SUM)
             exponent = _exponent(
-                value, squares, falloff, square_offset, falloff_with_distance, inside, DISTANCE, LOG_DOMAIN, BORDER, LARGEST
+                value,
+                squares,
+                falloff,
+                square_offset,
+                falloff_with_distance,
+                inside,
+                DISTANCE,
+                LOG_DOMAIN,
+                BORDER,
+                LARGEST,
             )
             if NORMALISED:
                 exponent -= _read_plane(sums, b, 0, from_y, from_x, inside, SUM)
@@ -524,7 +549,9 @@ def _scatter(
 
 
 @triton.jit
-def _neighbour(y: tl.tensor, x: tl.tensor, mine: tl.tensor, height: tl.tensor, width: tl.tensor, BORDER: tl.constexpr) -> tl.tensor:
+def _neighbour(
+    y: tl.tensor, x: tl.tensor, mine: tl.tensor, height: tl.tensor, width: tl.tensor, BORDER: tl.constexpr
+) -> tl.tensor:
     """Where a tap reads, and whether it reads anything."""
     if BORDER == _REPLICATE:
         y, x = tl.minimum(tl.maximum(y, 0), height - 1), tl.minimum(tl.maximum(x, 0), width - 1)
