@@ -1,10 +1,11 @@
 """The filter of :mod:`mcdenoise.ops._fast._numba_filter` and its derivatives, in Triton, for NVIDIA GPUs.
 
-Checked with Triton's interpreter and compiled for several generations of GPUs; not yet timed on one.
+Checked with Triton's interpreter, and compiled for several generations of GPUs; not yet timed on a GPU.
 
-Every program has a tile of pixels, and goes through the taps of the window: neighbours of a tile lie in the cache, and
-kernels are read once, in whatever layout and precision they have. Only sums are held, so that the ``K*K`` weights exist
-for one tap at a time; the derivatives compute them once more. What is spread over a window is gathered instead, by the
+Every program has a tile of pixels, one for each thread, and goes through the taps of the window: neighbours of a tile
+lie in the cache, and kernels are read once, in whatever layout and precision they have. Only sums are held, so that the
+``K*K`` weights exist for one tap at a time; the derivatives compute them once more. Channels and guides are tuples, not
+an axis of a tensor: nothing moves between threads. What is spread over a window is gathered instead, by the
 pixel that it arrives at: no two programs add to the same number, and results are the same bit by bit in every run.
 """
 
