@@ -68,9 +68,9 @@ ALLOWED: dict[str, set[str]] = {
 }
 OPS_KNOW = {"torch", "kornia"}
 # Fast forms are imported when one is chosen; `_backend` looks whether that is possible.
-FAST_OPS_KNOW = OPS_KNOW | {"numba", "numpy"}
+FAST_OPS_KNOW = OPS_KNOW | {"numba", "numpy", "triton"}
 # `import mcdenoise` leaves these alone: optional, slow to load, or of use to the command line only.
-LAZY = {"OpenImageIO", "PIL", "colour", "jinja2", "matplotlib", "numba", "tyro"}
+LAZY = {"OpenImageIO", "PIL", "colour", "jinja2", "matplotlib", "numba", "triton", "tyro"}
 LAZY |= {"drjit", "mitsuba", "pyoidn", "flip_evaluator", "lightning", "lightning_fabric", "tensorboard"}
 SECONDS = 0.5
 
@@ -137,8 +137,10 @@ def test_no_import_goes_up(module: str) -> None:
         ("mcdenoise.ops._check", "import numpy", True),
         ("mcdenoise.ops._check", "import OpenImageIO as oiio", True),
         ("mcdenoise.ops._check", "import numba", True),
-        ("mcdenoise.ops._fast._filter", "import numba", False),
-        ("mcdenoise.ops._fast._filter", "import OpenImageIO", True),
+        ("mcdenoise.ops._check", "import triton", True),
+        ("mcdenoise.ops._fast._numba_filter", "import numba", False),
+        ("mcdenoise.ops._fast._triton_filter", "import triton.language as tl", False),
+        ("mcdenoise.ops._fast._numba_filter", "import OpenImageIO", True),
         ("mcdenoise.ops._check", "from mcdenoise.buffers import Frame", True),
         ("mcdenoise.ops._check", "from ..buffers import Frame", True),
         ("mcdenoise.ops._check", "def f():\n    from mcdenoise import buffers", True),

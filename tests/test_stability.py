@@ -233,6 +233,16 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert content["long_runs"] == []
 
 
+def test_the_command_says_which_backend_is_not_run(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = replace(BY_NAME["kernel_conv"], cases=BY_NAME["kernel_conv"].cases[:1])
+    monkeypatch.setattr(op_checks, "select", lambda names: [small])
+    status, out, _ = run(capsys, "kernel_conv", "--dtypes", "float32")
+    assert status == 0
+    assert "not run: backend: expected one that can run here, found 'triton'" in out
+
+
 def test_a_broken_bound_exits_with_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

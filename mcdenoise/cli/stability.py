@@ -62,9 +62,11 @@ def _print_checks(checks: list[Check]) -> None:
             errors.append(f"{worst.error:.2g} of {worst.allowed:.2g}" if worst and worst.allowed else "-")
         holds = ", ".join(what for what, summary in found.items() if not summary.failed)
         failed = [check for summary in summaries for check in summary.failed]
-        result = (
-            "ok" if not failed else f"{len(failed)} FAILED: {failed[0].what}, {failed[0].case}: {failed[0].message}"
-        )
+        result = "ok"
+        if failed:
+            result = f"{len(failed)} FAILED: {failed[0].what}, {failed[0].case}: {failed[0].message}"
+        elif list(found) == ["runs"]:
+            holds, result = "-", f"not run: {found['runs'].worst.message}"
         condition = max(summary.condition for summary in summaries)
         table.add_row(*key, str(sum(s.checks for s in summaries)), f"{condition:.1g}", *errors, holds, result)
     show(table)

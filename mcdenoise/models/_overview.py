@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
 from mcdenoise.models._registry import describe_model, list_models
 from mcdenoise.models._weights import create_model, pretrained_models
@@ -34,6 +33,9 @@ class ModelOverview:
 
 def overview() -> list[ModelOverview]:
     """An entry for every registered model, sorted by name."""
+    # Imports Triton where it is installed, which takes a fifth of a second.
+    from torch.utils.flop_counter import FlopCounterMode
+
     shipped = pretrained_models()
     inputs = [torch.rand(1, channels, _SIDE, _SIDE) for channels in (3, 3, 3, 1)]
     entries = []

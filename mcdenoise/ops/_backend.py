@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import importlib.util
+import os
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-Backend = Literal["torch", "numba"]
+Backend = Literal["torch", "numba", "triton"]
 BACKENDS: tuple[Backend, ...] = get_args(Backend)
 
-_FOUND = importlib.util.find_spec("numba") is not None
+_FOUND = {name: importlib.util.find_spec(name) is not None for name in ("numba", "triton")}
+_EXTRAS = {"numba": "fast", "triton": "gpu"}
 # Pixels of a batch below which importing numba and calling it takes longer than the plain form does.
 _FEW_PIXELS = 8192
+# Triton's interpreter computes with the memory of any device, slowly: for tests.
+_INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
 
 def check_backend(backend: str | None) -> None:
@@ -23,59 +28,79 @@ def check_backend(backend: str | None) -> None:
         raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, found {backend!r}")
 
 
-def choose_backend(backend: str | None, *tensors: Tensor | None, differentiable: bool = True) -> Backend:
+def choose_backend(
+    backend: str | None, *tensors: Tensor | None, differentiable: bool = True, forms: tuple[Backend, ...] = BACKENDS
+) -> Backend:
     """The backend to run an op on ``tensors`` with.
 
     Args:
         backend: ``"torch"`` runs everywhere and has derivatives of any order. ``"numba"`` is compiled for the
-            processor when it is first called (seconds; later processes load it from numba's cache). ``None`` takes
-            numba where it is installed and pays, and torch elsewhere, also while a model is exported, so that what is
-            exported needs neither.
+            processor when it is first called (seconds; later processes load it from numba's cache), ``"triton"``
+            likewise for an NVIDIA GPU. ``None`` takes the one of the tensors' device where it is installed and pays,
+            and torch elsewhere, also while a model is exported, so that what is exported needs neither.
         tensors: the arguments of the op, the first of them ``(B, C, H, W)``.
-        differentiable: whether the fast form has derivatives.
+        differentiable: whether the fast forms have derivatives.
+        forms: what the op has been written in.
 
     Raises:
         ValueError: the backend is unknown, or cannot run; the message says why.
     """
     check_backend(backend)
-    if backend == "torch":
-        return "torch"
     if backend is None:
-        first = tensors[0]
-        few = first is None or first.shape[0] * first.shape[-2] * first.shape[-1] < _FEW_PIXELS
-        if few or torch.compiler.is_exporting():
-            return "torch"
-        return "torch" if _obstacle(tensors, differentiable) else "numba"
-    obstacle = _obstacle(tensors, differentiable)
-    if obstacle:
-        raise ValueError(f"backend: expected one that can run here, found 'numba', which {obstacle}")
-    return "numba"
+        backend = _fastest(tensors[0])
+        return "torch" if _obstacle(backend, tensors, differentiable, forms) else backend
+    for known in BACKENDS:
+        if backend == known:
+            obstacle = _obstacle(known, tensors, differentiable, forms)
+            if obstacle:
+                raise ValueError(f"backend: expected one that can run here, found {backend!r}, which {obstacle}")
+            return known
+    raise AssertionError(backend)
 
 
-def _obstacle(tensors: tuple[Tensor | None, ...], differentiable: bool) -> str:
-    """Why numba cannot run on these tensors; empty if it can."""
-    for tensor in tensors:
-        if tensor is None:
-            continue
-        if tensor.device.type != "cpu":
-            return f"runs on the CPU, not on {tensor.device}"
+def _fastest(image: Tensor | None) -> Backend:
+    """What to take for an image if nothing is in its way."""
+    if image is None or torch.compiler.is_exporting():
+        return "torch"
+    if image.device.type == "cuda":
+        return "triton"
+    return "torch" if image.shape[0] * image.shape[-2] * image.shape[-1] < _FEW_PIXELS else "numba"
+
+
+def _obstacle(
+    backend: Backend, tensors: tuple[Tensor | None, ...], differentiable: bool, forms: tuple[Backend, ...]
+) -> str:
+    """Why a backend cannot run on these tensors; empty if it can."""
+    if backend == "torch":
+        return ""
+    if backend not in forms:
+        return "has no form of this op"
+    given = [tensor for tensor in tensors if tensor is not None]
+    for tensor in given:
+        device = tensor.device
+        if backend == "numba" and device.type != "cpu":
+            return f"runs on the CPU, not on {device}"
+        if backend == "triton" and device.type != "cuda" and not (_INTERPRETED and device.type == "cpu"):
+            return f"runs on an NVIDIA GPU, not on {device}"
+        if device != given[0].device:
+            return f"needs all tensors on one device, and they are on {given[0].device} and {device}"
         if not differentiable and tensor.requires_grad and torch.is_grad_enabled():
             return "has no derivatives of this op"
-    return _no_numba()
+    return _missing(backend)
 
 
-def _no_numba() -> str:
-    """Why numba cannot be imported; empty if it can."""
+def _missing(backend: Backend) -> str:
+    """Why the package of a backend cannot be imported; empty if it can."""
     # The compiler traces neither a cache nor an attempt to import.
-    if torch.compiler.is_compiling() and _FOUND:
+    if torch.compiler.is_compiling() and _FOUND[backend]:
         return ""
-    return _tried_import()
+    return _tried_import(backend)
 
 
 @functools.cache
-def _tried_import() -> str:
+def _tried_import(backend: Backend) -> str:
     try:
-        import numba  # noqa: F401
+        importlib.import_module(backend)
     except ImportError as error:
-        return f"cannot be imported ({error}); install mcdenoise[fast]"
+        return f"cannot be imported ({error}); install mcdenoise[{_EXTRAS[backend]}]"
     return ""

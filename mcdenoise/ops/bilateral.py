@@ -19,6 +19,7 @@ from mcdenoise.ops._window import (
     offsets,
     pad,
     shifted,
+    unpad,
 )
 
 Normalize = Literal["softmax", "none"]
@@ -231,6 +232,13 @@ def _squared_distance(padded: Tensor, radius: int, dy: int, dx: int, height: int
     centre = shifted(padded, radius, 0, 0, height, width)
     difference = shifted(padded, radius, dy, dx, height, width) - centre
     return difference.square().sum(1, keepdim=True)
+
+
+def guide_gradient(gradient: Tensor, guide: Tensor, scale: Tensor, border: Border) -> Tensor:
+    """Of one guide, times the gradient of each tap's exponent, in the dtype of ``guide``."""
+    radius = kernel_size_of(gradient.shape[1], "kernel") // 2
+    padded = pad(guide.to(gradient.dtype), radius, border)
+    return unpad(_guide_gradient(gradient, padded, scale.to(gradient.dtype), radius), radius, border).to(guide.dtype)
 
 
 def _guide_gradient(gradient: Tensor, padded: Tensor, scale: Tensor, radius: int) -> Tensor:

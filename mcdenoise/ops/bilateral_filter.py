@@ -40,8 +40,8 @@ def cross_bilateral_filter(
         border: what a tap outside the image sees: ``"replicate"`` the nearest edge pixel of image and guides,
             ``"zeros"`` zeros; ``"renormalize"`` leaves such taps out and divides by the sum of the weights that are
             left (0 where that sum is 0), so that the result is a weighted mean everywhere.
-        backend: ``"torch"``, ``"numba"`` (CPU only; about five times as fast), or ``None`` for the faster of those
-            that can run.
+        backend: ``"torch"``, ``"numba"`` (CPU; about five times as fast), ``"triton"`` (NVIDIA GPU), or ``None`` for
+            the fastest that can run.
 
     Returns:
         ``(B, C, H, W)`` in the dtype of ``image``. Half precision is computed in float32.
@@ -67,11 +67,12 @@ def cross_bilateral_filter(
     """
     check_shapes(image=(image, "B C H W"), kernel=(kernel, "B T H W"))
     check_weights(kernel, guides, scales, distance_scale, normalize, border)
-    if choose_backend(backend, image, kernel, *guides, *scales, distance_scale) == "numba":
+    chosen = choose_backend(backend, image, kernel, *guides, *scales, distance_scale)
+    if chosen != "torch":
         from mcdenoise.ops._fast import bilateral_filter as fast
 
         result: Tensor = fast.cross_bilateral_filter(
-            image, kernel, list(guides), list(scales), distance_scale, normalize, border
+            image, kernel, list(guides), list(scales), distance_scale, normalize, border, chosen
         )
         return result
     return cross_bilateral_filter_torch(image, kernel, guides, scales, distance_scale, normalize, border)

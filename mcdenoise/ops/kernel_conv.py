@@ -36,7 +36,7 @@ def kernel_conv(
         border: what a tap outside the image reads: ``"replicate"`` the nearest edge pixel, ``"zeros"`` zero;
             ``"renormalize"`` leaves such taps out and divides by the sum of the weights that are left
             (0 where that sum is 0), so that the result is a weighted mean everywhere.
-        backend: ``"torch"``, ``"numba"`` (CPU only), or ``None`` for the faster of those that can run.
+        backend: ``"torch"``, ``"numba"`` (CPU), ``"triton"`` (NVIDIA GPU), or ``None`` for the fastest that can run.
 
     Returns:
         ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32. Holds while the sum of
@@ -60,10 +60,11 @@ def kernel_conv(
         5.0
     """
     _check(image, kernel, border)
-    if choose_backend(backend, image, kernel) == "numba":
+    chosen = choose_backend(backend, image, kernel)
+    if chosen != "torch":
         from mcdenoise.ops._fast import kernel_conv as fast
 
-        result: Tensor = fast.kernel_conv(image, kernel, border)
+        result: Tensor = fast.kernel_conv(image, kernel, border, chosen)
         return result
     return kernel_conv_torch(image, kernel, border)
 
@@ -104,10 +105,11 @@ def kernel_splat(
         [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
     """
     _check(image, kernel, border)
-    if choose_backend(backend, image, kernel) == "numba":
+    chosen = choose_backend(backend, image, kernel)
+    if chosen != "torch":
         from mcdenoise.ops._fast import kernel_conv as fast
 
-        result: Tensor = fast.kernel_splat(image, kernel, border)
+        result: Tensor = fast.kernel_splat(image, kernel, border, chosen)
         return result
     return kernel_splat_torch(image, kernel, border)
 

@@ -251,7 +251,7 @@ def accumulate(
         raise ValueError(f"alpha_min: expected in (0, 1], found {alpha_min}")
     images = (color, previous, previous_length)
     surfaces = (*(surface or ()), *(previous_surface or ()))
-    if choose_backend(backend, *images, motion, *surfaces, differentiable=False) == "numba":
+    if choose_backend(backend, *images, motion, *surfaces, differentiable=False, forms=("torch", "numba")) == "numba":
         return _accumulate_numba(
             *images, motion, surface, previous_surface, alpha_min, rule, position_limit, normal_limit
         )

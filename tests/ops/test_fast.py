@@ -7,22 +7,25 @@ from typing import Any
 
 import pytest
 import torch
+from plain_form import (
+    FAST,
+    TOLERANCE,
+    assert_same,
+    channels_last,
+    drawn,
+    every_other_column,
+    leaves_of,
+    outcomes,
+    slice_of_pixels,
+    transposed,
+)
 from torch import Tensor
 
 from mcdenoise import ops
 from mcdenoise.ops import _backend
 from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
-from mcdenoise.ops._fast import _filter
+from mcdenoise.ops._fast import _numba_filter
 
-FAST = [op for op in OPS if op.name in ("kernel_conv", "kernel_splat", "cross_bilateral_filter")]
-# Of the largest number in the case. Half precision is rounded once, after a sum in float32; a derivative in float32
-# is a sum over up to 49 taps of products of sums.
-TOLERANCE = {
-    torch.float64: 1e-13,
-    torch.float32: 32 * torch.finfo(torch.float32).eps,
-    torch.bfloat16: torch.finfo(torch.bfloat16).eps,
-    torch.float16: torch.finfo(torch.float16).eps,
-}
 every_op = pytest.mark.parametrize("op", FAST, ids=lambda op: op.name)
 every_dtype = pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
 
@@ -33,30 +36,6 @@ def nan_in_fresh_memory() -> Iterator[None]:
     torch.use_deterministic_algorithms(True)
     yield
     torch.use_deterministic_algorithms(False)
-
-
-def leaves_of(inputs: Inputs, case: Case) -> list[Tensor]:
-    leaves: list[Tensor] = []
-    map_tensors(
-        lambda tensor: leaves.append(tensor.requires_grad_()) or tensor,
-        {name: inputs[name] for name in case.differentiable},
-    )
-    return leaves
-
-
-def outcomes(op: Op, case: Case, inputs: Inputs, backend: str) -> list[Tensor]:
-    """The result and, times a random upstream gradient, each derivative."""
-    leaves = leaves_of(inputs, case)
-    result = op.function(**inputs, **case.settings, backend=backend)
-    upstream = torch.randn(result.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    return [result.detach(), *torch.autograd.grad(result, leaves, upstream.to(result.dtype))]
-
-
-def assert_same(actual: list[Tensor], exact: list[Tensor], tolerance: float) -> None:
-    largest = max(1.0, *(tensor.abs().max().item() for tensor in exact))
-    for a, e in zip(actual, exact, strict=True):
-        assert a.shape == e.shape
-        assert (a.double() - e).abs().max().item() <= tolerance * largest
 
 
 @every_dtype
@@ -73,20 +52,6 @@ def test_result_and_derivatives_are_those_of_the_plain_form(op: Op, case: Case, 
     assert_same(actual, exact, TOLERANCE[dtype])
 
 
-def drawn(batch: int, channels: int, height: int, width: int, kernel_size: int, op: Op, **settings: Any) -> Case:
-    def tensors(g: torch.Generator) -> Inputs:
-        def draw(count: int) -> Tensor:
-            return torch.rand(batch, count, height, width, generator=g, dtype=torch.float64)
-
-        inputs: Inputs = {"image": draw(channels), "kernel": draw(kernel_size**2) + 0.1}
-        if op.name == "cross_bilateral_filter":
-            inputs |= {"guides": [draw(3), draw(1)], "scales": [draw(1), 3 * draw(1)], "distance_scale": draw(1)}
-        return inputs
-
-    names = ("image", "kernel", "guides", "scales", "distance_scale")
-    return Case("drawn", "ordinary", tensors, names if op.name == "cross_bilateral_filter" else names[:2], settings)
-
-
 # Wider than a run of pixels, taller than a share, smaller than the kernel.
 @pytest.mark.parametrize("size", [(1, 3, 3, 300, 5), (1, 4, 40, 2, 7), (2, 3, 7, 9, 3), (1, 1, 1, 1, 5)], ids=str)
 @pytest.mark.parametrize("border", ["replicate", "zeros", "renormalize"])
@@ -101,7 +66,7 @@ def test_sizes(op: Op, border: str, size: tuple[int, int, int, int, int]) -> Non
 @pytest.mark.parametrize("border", ["replicate", "zeros", "renormalize"])
 @every_op
 def test_threads_change_nothing(op: Op, border: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_filter, "_PIXELS_A_THREAD", 1)
+    monkeypatch.setattr(_numba_filter, "_PIXELS_A_THREAD", 1)
     case = drawn(2, 3, 9, 6, 5, op, border=border)
     threads, results = torch.get_num_threads(), []
     try:
@@ -112,23 +77,6 @@ def test_threads_change_nothing(op: Op, border: str, monkeypatch: pytest.MonkeyP
         torch.set_num_threads(threads)
     for result in results[1:]:
         assert all(map(torch.equal, result, results[0]))
-
-
-def channels_last(tensor: Tensor) -> Tensor:
-    return tensor.contiguous(memory_format=torch.channels_last)
-
-
-def slice_of_pixels(tensor: Tensor) -> Tensor:
-    """Channels-last with other channels beside its own, as a network's prediction holds its logits."""
-    return channels_last(torch.cat([torch.full_like(tensor, torch.nan), tensor], 1))[:, tensor.shape[1] :]
-
-
-def every_other_column(tensor: Tensor) -> Tensor:
-    return torch.stack([tensor, torch.full_like(tensor, torch.nan)], -1).flatten(-2)[..., ::2]
-
-
-def transposed(tensor: Tensor) -> Tensor:
-    return tensor.transpose(-1, -2).contiguous().transpose(-1, -2)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
@@ -235,22 +183,30 @@ def test_what_runs_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
     assert _backend.choose_backend("torch", large) == "torch"
     assert _backend.choose_backend(None, large.to("meta")) == "torch"
     assert _backend.choose_backend("numba", small) == "numba"
-    monkeypatch.setattr(_backend, "_no_numba", lambda: "cannot be imported")
+    monkeypatch.setattr(_backend, "_missing", lambda backend: "cannot be imported")
     assert _backend.choose_backend(None, large) == "torch"
 
 
 def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
     image, kernel = torch.rand(1, 3, 4, 5), torch.rand(1, 9, 4, 5)
-    with pytest.raises(ValueError, match="backend: expected one of torch, numba, found 'cuda'"):
+    with pytest.raises(ValueError, match="backend: expected one of torch, numba, triton, found 'cuda'"):
         ops.kernel_conv(image, kernel, backend="cuda")  # type: ignore[arg-type]
     for module in (ops.KernelConv, ops.KernelSplat, ops.CrossBilateralFilter, ops.Accumulate):
-        with pytest.raises(ValueError, match="backend: expected one of torch, numba, found 'c'"):
+        with pytest.raises(ValueError, match="backend: expected one of torch, numba, triton, found 'c'"):
             module(backend="c")
     with pytest.raises(ValueError, match="found 'numba', which runs on the CPU, not on meta"):
         ops.kernel_conv(image.to("meta"), kernel.to("meta"), backend="numba")
-    monkeypatch.setattr(_backend, "_no_numba", lambda: "cannot be imported (gone); install mcdenoise[fast]")
-    with pytest.raises(ValueError, match=r"found 'numba', which cannot be imported \(gone\); install mcdenoise\[fast"):
+
+    def gone(name: str) -> None:
+        raise ImportError("gone")
+
+    monkeypatch.setattr(_backend.importlib, "import_module", gone)
+    _backend._tried_import.cache_clear()
+    with pytest.raises(
+        ValueError, match=r"found 'numba', which cannot be imported \(gone\); install mcdenoise\[fast\]"
+    ):
         ops.cross_bilateral_filter(image, kernel, backend="numba")
+    _backend._tried_import.cache_clear()
 
 
 ACCUMULATE = next(op for op in OPS if op.name == "accumulate")
@@ -273,7 +229,7 @@ def test_accumulation_is_that_of_the_plain_form(case: Case, dtype: torch.dtype) 
 def test_accumulation_of_any_layout_and_by_any_number_of_threads(
     layout: Callable[[Tensor], Tensor], rule: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_filter, "_PIXELS_A_THREAD", 1)
+    monkeypatch.setattr(_numba_filter, "_PIXELS_A_THREAD", 1)
     case = next(case for case in ACCUMULATE.cases if "all buffers" in case.name)
     inputs = case.inputs()
     limits: dict[str, Any] = {"rule": rule, "position_limit": 0.05, "normal_limit": 0.3}

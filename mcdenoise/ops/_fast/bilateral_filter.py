@@ -7,17 +7,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._fast._filter import derivatives, filtered
+from mcdenoise.ops._fast._filter import filter_of
 from mcdenoise.ops._fast._operator import custom_op
 from mcdenoise.ops._fast._plain import plain_gradients
 from mcdenoise.ops.bilateral_filter import cross_bilateral_filter_torch
 
 _ARGUMENTS = (
-    "Tensor image, Tensor kernel, Tensor[] guides, Tensor[] scales, Tensor? distance_scale, str normalize, str border"
+    "Tensor image, Tensor kernel, Tensor[] guides, Tensor[] scales, Tensor? distance_scale, str normalize, str border, "
+    "str backend"
 )
 
 
-@custom_op("mcdenoise::cross_bilateral_filter", device_types="cpu", schema=f"({_ARGUMENTS}) -> Tensor")
+@custom_op("mcdenoise::cross_bilateral_filter", schema=f"({_ARGUMENTS}) -> Tensor")
 def cross_bilateral_filter(
     image: Tensor,
     kernel: Tensor,
@@ -25,10 +26,14 @@ def cross_bilateral_filter(
     scales: list[Tensor],
     distance_scale: Tensor | None,
     normalize: str,
-    border: Any,
+    border: str,
+    backend: str,
 ) -> Tensor:
     """See :func:`mcdenoise.ops.cross_bilateral_filter`."""
-    return filtered(image, kernel, guides, scales, distance_scale, normalize == "softmax", border)
+    result: Tensor = filter_of(backend).filtered(
+        image, kernel, guides, scales, distance_scale, normalize == "softmax", border
+    )
+    return result
 
 
 @cross_bilateral_filter.register_fake
@@ -38,7 +43,6 @@ def _(image: Tensor, *_: Any) -> Tensor:
 
 @custom_op(
     "mcdenoise::cross_bilateral_filter_backward",
-    device_types="cpu",
     schema=f"(Tensor gradient, {_ARGUMENTS}, bool of_guides) -> Tensor[]",
 )
 def _backward(
@@ -49,10 +53,11 @@ def _backward(
     scales: list[Tensor],
     distance_scale: Tensor | None,
     normalize: str,
-    border: Any,
+    border: str,
+    backend: str,
     of_guides: bool,
 ) -> list[Tensor]:
-    of_image, of_kernel, of_guide, of_scale, of_distance = derivatives(
+    of_image, of_kernel, of_guide, of_scale, of_distance = filter_of(backend).derivatives(
         gradient, image, kernel, guides, scales, distance_scale, normalize == "softmax", border, of_guides
     )
     return [of_image, of_kernel, *of_scale, of_distance, *of_guide]
@@ -68,6 +73,7 @@ def _(
     distance_scale: Tensor | None,
     normalize: str,
     border: str,
+    backend: str,
     of_guides: bool,
 ) -> list[Tensor]:
     batch, _, height, width = image.shape
@@ -83,7 +89,7 @@ def _(
 
 
 def _setup_context(ctx: Any, inputs: Any, output: Tensor) -> None:
-    image, kernel, guides, scales, distance_scale, ctx.normalize, ctx.border = inputs
+    image, kernel, guides, scales, distance_scale, ctx.normalize, ctx.border, ctx.backend = inputs
     ctx.count = len(guides)
     ctx.save_for_backward(image, kernel, distance_scale, *guides, *scales)
 
@@ -104,13 +110,23 @@ def _gradients(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
         of_image, of_kernel, of_distance, *rest = plain_gradients(
             plain, [image, kernel, distance_scale, *others], needed, gradient
         )
-        return of_image, of_kernel, rest[:count], rest[count:], of_distance, None, None
+        return of_image, of_kernel, rest[:count], rest[count:], of_distance, None, None, None
     results = _backward(
-        gradient, image, kernel, guides, scales, distance_scale, ctx.normalize, ctx.border, any(need_guides)
+        gradient,
+        image,
+        kernel,
+        guides,
+        scales,
+        distance_scale,
+        ctx.normalize,
+        ctx.border,
+        ctx.backend,
+        any(need_guides),
     )
     of_image, of_kernel, of_scales, of_distance = results[0], results[1], results[2 : 2 + count], results[2 + count]
     of_guides = results[3 + count :] or [None] * count
-    return of_image, of_kernel, of_guides, of_scales, None if distance_scale is None else of_distance, None, None
+    to_distance = None if distance_scale is None else of_distance
+    return of_image, of_kernel, of_guides, of_scales, to_distance, None, None, None
 
 
 cross_bilateral_filter.register_autograd(_gradients, setup_context=_setup_context)

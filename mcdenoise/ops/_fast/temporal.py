@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._fast._filter import compiled, share_rows, source
+from mcdenoise.ops._fast._numba_filter import compiled, share_rows, source
 from mcdenoise.ops._fast._operator import custom_op
 
 

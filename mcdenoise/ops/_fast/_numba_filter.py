@@ -1,0 +1,708 @@
+"""One compiled filter for every op that weighs the taps of a window, and its derivatives.
+
+``out[p] = sum_t w[t, p] image[p + o_t] / total[p]`` with weights as in
+:func:`mcdenoise.ops.cross_bilateral_filter`; with neither guides nor a distance scale and with ``"none"`` that is
+:func:`mcdenoise.ops.kernel_conv`.
+
+Rows of all images wait in a ring as long as a window needs them, with their borders filled in and in the dtype of the
+sums; kernels are read once, in whatever layout and precision they have. So no argument is copied as a whole, and the
+``K*K`` weights exist for ``_CHUNK`` pixels at a time; the derivatives compute them once more. Rows are shared out among
+threads of our own, as many as torch uses: numba's would be a second OpenMP beside torch's.
+
+All its kernels are in this file: numba compiles them again when their own file changes, but not when another does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import torch
+from numba import types
+from numba.extending import overload
+from torch import Tensor
+
+from mcdenoise.ops._window import BORDERS, Border, accumulator_dtype, kernel_size_of
+
+# Pixels whose weights are held at a time: 25 taps of 256 floats stay in the first-level cache.
+_CHUNK = 256
+# A thread of its own for fewer pixels costs more than it saves.
+_PIXELS_A_THREAD = 4096
+
+# Guides come in tuples of this length or a multiple of it, filled up with empty ones: each length is compiled anew.
+_GUIDES = 4
+
+_REPLICATE, _ZEROS, _RENORMALIZE = range(len(BORDERS))
+
+# A tensor as numba sees it: its memory from the first element on, strides in elements, and number of channels.
+Source = tuple[Any, tuple[int, ...], int]
+
+
+class _Inputs(NamedTuple):
+    """What a filter reads; a guide or a scale that is not there has no channels."""
+
+    kernel: Source
+    image: Source
+    guides: tuple[Source, ...]
+    scales: tuple[Source, ...]
+    distance: Source
+    height: int
+    width: int
+    kernel_size: int
+    log_domain: bool
+    border: int
+
+
+compiled = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+
+
+def filtered(
+    image: Tensor,
+    kernel: Tensor,
+    guides: Sequence[Tensor],
+    scales: Sequence[Tensor],
+    distance_scale: Tensor | None,
+    log_domain: bool,
+    border: Border,
+) -> Tensor:
+    """The filtered image, contiguous and in the dtype of ``image``."""
+    dtype = _compute_dtype(image, kernel)
+    out = torch.empty(image.shape, dtype=dtype)
+    if out.numel():
+        inputs = _inputs(dtype, image, kernel, guides, scales, distance_scale, log_domain, border)
+        share_rows(image, lambda *rows: _forward(out.numpy(), inputs, *rows))
+    return out.to(image.dtype)
+
+
+def splatted(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
+    """The transpose of the filter without guides: what its derivative spreads over an image."""
+    return derivatives(image, image, kernel, (), (), None, False, border)[0]
+
+
+def derivatives(
+    gradient: Tensor,
+    image: Tensor,
+    kernel: Tensor,
+    guides: Sequence[Tensor],
+    scales: Sequence[Tensor],
+    distance_scale: Tensor | None,
+    log_domain: bool,
+    border: Border,
+    of_guides: bool = False,
+) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], Tensor]:
+    """Of the image, kernel, guides, scales and distance scale, times ``gradient``; those of guides only if asked for.
+
+    Each has the dtype and shape of what it is the derivative of; what is absent or not asked for is empty.
+    """
+    dtype = _compute_dtype(image, kernel)
+    batch, _, height, width = image.shape
+    of_scales = [torch.empty((batch, 1, height, width), dtype=dtype) for _ in scales]
+    of_distance = torch.empty((batch, 0 if distance_scale is None else 1, height, width), dtype=dtype)
+    planes = [image, *(guides if of_guides else ())]
+    scattered = torch.empty((batch, sum(plane.shape[1] for plane in planes), height, width), dtype=dtype)
+    of_kernel = torch.empty_like(kernel, dtype=_readable(kernel, dtype).dtype)
+    if scattered.numel():
+        inputs = _inputs(dtype, image, kernel, guides, scales, distance_scale, log_domain, border)
+        upstream = source(gradient.to(dtype))
+        results = (
+            scattered.numpy(),
+            source(of_kernel),
+            _filled_up([scale.numpy() for scale in of_scales], of_distance.numpy()),
+            of_distance.numpy(),
+        )
+        share_rows(image, lambda *rows: _backward(results, upstream, inputs, *rows))
+    of_planes = torch.split(scattered, [plane.shape[1] for plane in planes], 1)
+    # Custom ops hand out tensors of their own, and no views.
+    of_image, *guide_gradients = (
+        part.to(plane.dtype, copy=len(planes) > 1) for part, plane in zip(of_planes, planes, strict=True)
+    )
+    return (
+        of_image,
+        of_kernel.to(kernel.dtype),
+        guide_gradients,
+        [part.to(scale.dtype) for part, scale in zip(of_scales, scales, strict=True)],
+        of_distance if distance_scale is None else of_distance.to(distance_scale.dtype),
+    )
+
+
+def _compute_dtype(image: Tensor, kernel: Tensor) -> torch.dtype:
+    return accumulator_dtype(torch.promote_types(image.dtype, kernel.dtype))
+
+
+def _readable(tensor: Tensor, dtype: torch.dtype) -> Tensor:
+    """``tensor`` in a dtype that the kernels read: bfloat16 as it is, where sums are float32; else that of the sums."""
+    return tensor if tensor.dtype == torch.bfloat16 and dtype == torch.float32 else tensor.to(dtype)
+
+
+def source(tensor: Tensor) -> Source:
+    """Any layout is fine: strides go with the memory."""
+    strides = tensor.stride()
+    extent = 1 + sum((size - 1) * stride for size, stride in zip(tensor.shape, strides, strict=True))
+    memory = tensor.detach().as_strided((extent if tensor.numel() else 0,), (1,))
+    if memory.dtype == torch.bfloat16:
+        memory = memory.view(torch.uint16)
+    return memory.numpy(), strides, tensor.shape[1]
+
+
+def _inputs(
+    dtype: torch.dtype,
+    image: Tensor,
+    kernel: Tensor,
+    guides: Sequence[Tensor],
+    scales: Sequence[Tensor],
+    distance_scale: Tensor | None,
+    log_domain: bool,
+    border: Border,
+) -> _Inputs:
+    nothing = source(torch.empty((0, 0, 0, 0), dtype=dtype))
+    return _Inputs(
+        source(_readable(kernel, dtype)),
+        source(image.to(dtype)),
+        _filled_up([source(guide.to(dtype)) for guide in guides], nothing),
+        _filled_up([source(scale.to(dtype)) for scale in scales], nothing),
+        nothing if distance_scale is None else source(distance_scale.to(dtype)),
+        image.shape[2],
+        image.shape[3],
+        kernel_size_of(kernel.shape[1], "kernel"),
+        log_domain,
+        BORDERS.index(border),
+    )
+
+
+def _filled_up(values: list[Any], nothing: Any) -> tuple[Any, ...]:
+    return (*values, *[nothing] * (-len(values) % _GUIDES or (0 if values else _GUIDES)))
+
+
+def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
+    """``run(b, first, last)`` for all rows of all images of the batch, on as many threads as torch uses."""
+    batch, _, height, width = image.shape
+    rows = batch * height
+    threads = max(1, min(torch.get_num_threads(), rows, rows * width // _PIXELS_A_THREAD))
+
+    def share(number: int) -> None:
+        row, end = rows * number // threads, rows * (number + 1) // threads
+        while row < end:
+            b, first = divmod(row, height)
+            last = min(height, first + end - row)
+            run(b, first, last)
+            row += last - first
+
+    if threads == 1:
+        share(0)
+        return
+    with ThreadPoolExecutor(threads - 1) as pool:
+        others = [pool.submit(share, number) for number in range(1, threads)]
+        share(0)
+        for other in others:
+            other.result()
+
+
+def _load(value: Any) -> Any:
+    """A number of a source, in the dtype of the sums."""
+
+
+def _unchanged(value: Any) -> Any:
+    return value
+
+
+@overload(_load)
+def _load_overload(value: Any) -> Any:
+    if value != types.uint16:
+        return _unchanged
+
+    def from_bfloat16(value: Any) -> Any:
+        return np.uint32(np.uint32(value) << np.uint32(16)).view(np.float32)
+
+    return from_bfloat16
+
+
+def _rounded(value: Any, memory: Any) -> Any:
+    """A number as ``memory`` stores it."""
+
+
+@overload(_rounded)
+def _rounded_overload(value: Any, memory: Any) -> Any:
+    def unchanged(value: Any, memory: Any) -> Any:
+        return value
+
+    def to_bfloat16(value: Any, memory: Any) -> Any:
+        # To the nearest, of two equally near to the even one; a NaN must not carry over into an infinity.
+        bits = np.float32(value).view(np.uint32)
+        odd = np.uint32(np.uint32(bits >> np.uint32(16)) & np.uint32(1))
+        up = np.uint32(np.uint32(bits + np.uint32(0x7FFF)) + odd)
+        return np.uint16(np.uint32(up >> np.uint32(16))) if value == value else np.uint16(0x7FC0)
+
+    return to_bfloat16 if memory.dtype == types.uint16 else unchanged
+
+
+def _exp(value: Any) -> Any:
+    """``exp``, which LLVM vectorises for float32 in this form only."""
+
+
+def _math_exp(value: Any) -> Any:
+    return math.exp(value)
+
+
+@overload(_exp)
+def _exp_overload(value: Any) -> Any:
+    if value != types.float32:
+        return _math_exp
+    # Cephes' expf: exp(x) = 2^n exp(r) with r = x - n log(2) in two parts and a polynomial for exp(r). Adding and
+    # subtracting 1.5 * 2^23 rounds to the nearest whole number. Results below the smallest normal number are 0.
+    log2_e, high, low = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
+    magic, one, zero = np.float32(12582912.0), np.float32(1), np.float32(0)
+    least, most, infinity = np.float32(-87.0), np.float32(88.3), np.float32(np.inf)
+    c0, c1, c2 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
+    c3, c4, c5 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1), np.float32(5.0000001201e-1)
+    bias, mantissa = np.int32(127), np.int32(23)
+
+    def exp(value: Any) -> Any:
+        x = max(min(value, most), least)
+        n = (x * log2_e + magic) - magic
+        r = (x - n * high) - n * low
+        p = ((((c0 * r + c1) * r + c2) * r + c3) * r + c4) * r + c5
+        power = np.int32(np.int32(np.int32(n) + bias) << mantissa).view(np.float32)
+        result = (p * r * r + r + one) * power
+        # A comparison with a NaN is false, and the NaN stays.
+        return zero if value < least else infinity if value > most else result + (value - value)
+
+    return exp
+
+
+@compiled
+def _copy_row(row: Any, source: Any, start: int, stride: int) -> None:
+    memory = source[0]
+    if stride == 1:
+        values = memory[start : start + row.size]
+        for x in range(row.size):
+            row[x] = _load(values[x])
+    else:
+        for x in range(row.size):
+            row[x] = _load(memory[start + x * stride])
+
+
+@compiled
+def _fetch(rows: Any, source: Any, b: int, y: int, height: int, radius: int, border: int) -> None:
+    """Row ``y`` of each channel, which may lie beyond the image, with ``radius`` more pixels at both ends."""
+    _, strides, channels = source
+    width = rows.shape[1] - 2 * radius
+    for c in range(channels):
+        row = rows[c]
+        if border != _REPLICATE and (y < 0 or y >= height):
+            row[:] = 0
+            continue
+        nearest = min(max(y, 0), height - 1)
+        inner = row[radius : radius + width]
+        _copy_row(inner, source, b * strides[0] + c * strides[1] + nearest * strides[2], strides[3])
+        if border == _REPLICATE:
+            row[:radius] = inner[0]
+            row[radius + width :] = inner[width - 1]
+
+
+@compiled
+def _fetch_all(ring: Any, inputs: Any, b: int, y: int) -> None:
+    """The image and behind it the guides."""
+    rows, radius, border = ring[y % inputs.kernel_size], inputs.kernel_size // 2, inputs.border
+    _fetch(rows, inputs.image, b, y, inputs.height, radius, border)
+    channel = inputs.image[2]
+    for guide in inputs.guides:
+        _fetch(rows[channel:], guide, b, y, inputs.height, radius, border)
+        channel += guide[2]
+
+
+@compiled
+def _read_taps(taps: Any, kernel: Any, b: int, y: int, x0: int, n: int) -> None:
+    """The kernels of a run of pixels, one row a tap, from planes or from pixels with their taps side by side."""
+    memory, strides, count = kernel
+    start = b * strides[0] + y * strides[2] + x0 * strides[3]
+    if strides[1] == 1 and strides[3] != 1:
+        for x in range(n):
+            values = memory[start + x * strides[3] : start + x * strides[3] + count]
+            for t in range(count):
+                taps[t, x] = _load(values[t])
+    else:
+        for t in range(count):
+            _copy_row(taps[t, :n], kernel, start + t * strides[1], strides[3])
+
+
+@compiled
+def _write_taps(kernel: Any, taps: Any, b: int, y: int, x0: int, n: int) -> None:
+    """The opposite of :func:`_read_taps`."""
+    memory, strides, count = kernel
+    start = b * strides[0] + y * strides[2] + x0 * strides[3]
+    if strides[1] == 1 and strides[3] != 1:
+        for x in range(n):
+            values = memory[start + x * strides[3] : start + x * strides[3] + count]
+            for t in range(count):
+                values[t] = _rounded(taps[t, x], memory)
+    else:
+        for t in range(count):
+            for x in range(n):
+                memory[start + t * strides[1] + x * strides[3]] = _rounded(taps[t, x], memory)
+
+
+@compiled
+def _subtract_differences(total: Any, factor: Any, neighbours: Any, centres: Any, dx: int, begin: int) -> None:
+    """``factor`` times the squared difference of a run of pixels and those ``dx`` to the right, over all channels."""
+    n = total.size
+    for c in range(centres.shape[0]):
+        centre, neighbour = centres[c, begin : begin + n], neighbours[c, begin + dx : begin + dx + n]
+        for x in range(n):
+            difference = neighbour[x] - centre[x]
+            total[x] -= factor[x] * difference * difference
+
+
+@compiled
+def _subtract_multiple(total: Any, values: Any, factor: int) -> None:
+    # A whole number would make the products float64.
+    scale = total.dtype.type(factor)
+    for x in range(total.size):
+        total[x] -= scale * values[x]
+
+
+@compiled
+def _weigh(
+    weights: Any,
+    factors: Any,
+    inverse: Any,
+    ring: Any,
+    falloff: Any,
+    top: Any,
+    inputs: Any,
+    b: int,
+    y: int,
+    x0: int,
+    n: int,
+) -> None:
+    """Weights of a run of pixels, not yet normalised; what each was multiplied with; one over what to divide by.
+
+    Where the weights are the kernel, nothing is multiplied, and ``factors`` may have no rows.
+    """
+    kernel, image, guides, scales, distance, height, width, kernel_size, log_domain, border = inputs
+    radius = kernel_size // 2
+    taps = weights.shape[0]
+    guided = _is_guided(inputs)
+    adjusted = guided or border == _RENORMALIZE
+    _read_taps(weights, kernel, b, y, x0, n)
+    exponents = weights if log_domain else factors
+    if log_domain:
+        for t in range(taps):
+            _make_finite(weights[t, :n])
+    else:
+        factors[:, :n] = 0 if adjusted else 1
+    if guided:
+        _read_scales(falloff, scales, distance, b, y, x0, n)
+        centres = ring[y % kernel_size]
+        for t in range(taps):
+            dy, dx = t // kernel_size - radius, t % kernel_size - radius
+            exponent = exponents[t, :n]
+            neighbours = ring[(y + dy) % kernel_size]
+            channel = image[2]
+            for g in range(len(guides)):
+                end = channel + guides[g][2]
+                if dy != 0 or dx != 0:
+                    _subtract_differences(
+                        exponent, falloff[g, :n], neighbours[channel:end], centres[channel:end], dx, x0 + radius
+                    )
+                channel = end
+            if distance[2] > 0:
+                _subtract_multiple(exponent, falloff[len(guides), :n], dy * dy + dx * dx)
+    if border == _RENORMALIZE:
+        for t in range(taps):
+            row, dx = y + t // kernel_size - radius, t % kernel_size - radius
+            outside = row < 0 or row >= height
+            first = n if outside else min(max(-dx - x0, 0), n)
+            last = n if outside else min(max(width - dx - x0, 0), n)
+            for start, stop in ((0, first), (last, n)):
+                exponents[t, start:stop] = -np.inf
+                if not log_domain:
+                    # An infinite weight times nothing is NaN.
+                    weights[t, start:stop] = 0
+    if log_domain:
+        top[:] = weights[0, :n]
+        for t in range(1, taps):
+            _maximum(top, weights[t, :n])
+        inverse[:] = 0
+        for t in range(taps):
+            _exponential(weights[t, :n], top)
+            _add(inverse, weights[t, :n])
+    else:
+        top[:] = 0
+        inverse[:] = 0 if border == _RENORMALIZE else 1
+        for t in range(taps if adjusted else 0):
+            _exponential(factors[t, :n], top)
+            _multiply(weights[t, :n], factors[t, :n])
+            if border == _RENORMALIZE:
+                _add(inverse, weights[t, :n])
+    # A plain 1 would make this a division in float64.
+    one, zero = inverse.dtype.type(1), inverse.dtype.type(0)
+    for x in range(n):
+        inverse[x] = one / inverse[x] if inverse[x] != zero else zero
+
+
+@compiled
+def _read_scales(falloff: Any, scales: Any, distance: Any, b: int, y: int, x0: int, n: int) -> None:
+    for g in range(len(scales)):
+        if scales[g][2] > 0:
+            strides = scales[g][1]
+            _copy_row(falloff[g, :n], scales[g], b * strides[0] + y * strides[2] + x0 * strides[3], strides[3])
+    if distance[2] > 0:
+        strides = distance[1]
+        start = b * strides[0] + y * strides[2] + x0 * strides[3]
+        _copy_row(falloff[len(scales), :n], distance, start, strides[3])
+
+
+@compiled
+def _exponential(values: Any, offset: Any) -> None:
+    for x in range(values.size):
+        values[x] = _exp(values[x] - offset[x])
+
+
+@compiled
+def _make_finite(values: Any) -> None:
+    """Infinity as the largest number: the weight of each of two infinite logits is not NaN, but half."""
+    largest = np.finfo(values.dtype).max
+    for x in range(values.size):
+        values[x] = min(max(values[x], -largest), largest)
+
+
+@compiled
+def _maximum(total: Any, values: Any) -> None:
+    for x in range(total.size):
+        total[x] = max(total[x], values[x])
+
+
+@compiled
+def _add(total: Any, values: Any) -> None:
+    for x in range(total.size):
+        total[x] += values[x]
+
+
+@compiled
+def _multiply(values: Any, factors: Any) -> None:
+    for x in range(values.size):
+        values[x] *= factors[x]
+
+
+@compiled
+def _add_product(total: Any, a: Any, b: Any) -> None:
+    for x in range(total.size):
+        total[x] += a[x] * b[x]
+
+
+@compiled
+def _is_guided(inputs: Any) -> bool:
+    return bool(_channels_of(inputs) > inputs.image[2] or inputs.distance[2] > 0)
+
+
+@compiled
+def _channels_of(inputs: Any) -> int:
+    """Of the image and all guides."""
+    count: int = inputs.image[2]
+    for guide in inputs.guides:
+        count += guide[2]
+    return count
+
+
+@compiled
+def _forward(out: Any, inputs: Any, b: int, first: int, last: int) -> None:
+    """Rows ``first`` to ``last`` of the result."""
+    width, kernel_size, channels, log_domain = inputs.width, inputs.kernel_size, inputs.image[2], inputs.log_domain
+    radius, taps, chunk = kernel_size // 2, kernel_size**2, min(_CHUNK, width)
+    ring = np.zeros((kernel_size, _channels_of(inputs), width + 2 * radius), out.dtype)
+    weights = np.empty((taps, chunk), out.dtype)
+    adjusted = _is_guided(inputs) or inputs.border == _RENORMALIZE
+    factors = np.empty((taps if adjusted and not log_domain else 0, chunk), out.dtype)
+    falloff = np.empty((len(inputs.scales) + 1, chunk), out.dtype)
+    inverse, top = np.empty(chunk, out.dtype), np.empty(chunk, out.dtype)
+    for row in range(first - radius, last + radius):
+        _fetch_all(ring, inputs, b, row)
+        y = row - radius
+        if y < first:
+            continue
+        for x0 in range(0, width, chunk):
+            n = min(chunk, width - x0)
+            _weigh(weights, factors, inverse[:n], ring, falloff, top[:n], inputs, b, y, x0, n)
+            out[b, :, y, x0 : x0 + n] = 0
+            for t in range(taps):
+                start = x0 + t % kernel_size
+                neighbours = ring[(y + t // kernel_size - radius) % kernel_size]
+                for c in range(channels):
+                    _add_product(out[b, c, y, x0 : x0 + n], weights[t, :n], neighbours[c, start : start + n])
+            for c in range(channels):
+                _multiply(out[b, c, y, x0 : x0 + n], inverse[:n])
+
+
+@compiled
+def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last: int) -> None:
+    """Rows ``first`` to ``last`` of the derivatives.
+
+    What is spread over a window comes from the rows around too: their weights are computed here once more, which
+    leaves nothing to add up between threads.
+    """
+    scattered, of_kernel, of_scales, of_distance = results
+    height, width, kernel_size, channels = inputs.height, inputs.width, inputs.kernel_size, inputs.image[2]
+    log_domain, border = inputs.log_domain, inputs.border
+    radius, taps, chunk = kernel_size // 2, kernel_size**2, min(_CHUNK, width)
+    dtype = scattered.dtype
+    of_guides = scattered.shape[1] > channels
+    ring = np.zeros((kernel_size, _channels_of(inputs), width + 2 * radius), dtype)
+    sums = np.zeros((kernel_size, scattered.shape[1], width + 2 * radius), dtype)
+    weights, slopes = np.empty((taps, chunk), dtype), np.empty((taps, chunk), dtype)
+    factors = np.empty((0 if log_domain else taps, chunk), dtype)
+    falloff = np.empty((len(inputs.scales) + 1, chunk), dtype)
+    upstream = np.empty((channels, chunk), dtype)
+    inverse, top, total = np.empty(chunk, dtype), np.empty(chunk, dtype), np.empty(chunk, dtype)
+    start_row, end_row = max(first - radius, 0), min(last + radius, height)
+    normalised = log_domain or border == _RENORMALIZE
+    for row in range(start_row - radius, end_row + radius):
+        _fetch_all(ring, inputs, b, row)
+        y = row - radius
+        if y < start_row:
+            continue
+        mine = first <= y < last
+        for x0 in range(0, width, chunk):
+            n = min(chunk, width - x0)
+            scale, shared = inverse[:n], total[:n]
+            _weigh(weights, factors, scale, ring, falloff, top[:n], inputs, b, y, x0, n)
+            strides = gradient[1]
+            for c in range(channels):
+                start = b * strides[0] + c * strides[1] + y * strides[2] + x0 * strides[3]
+                _copy_row(upstream[c, :n], gradient, start, strides[3])
+                _multiply(upstream[c, :n], scale)
+            # The slope of each weight; where weights are normalised, less what all of them share.
+            shared[:] = 0
+            for t in range(taps):
+                start = x0 + t % kernel_size
+                neighbours = ring[(y + t // kernel_size - radius) % kernel_size]
+                slopes[t, :n] = 0
+                for c in range(channels):
+                    _add_product(slopes[t, :n], upstream[c, :n], neighbours[c, start : start + n])
+                if normalised:
+                    _add_product(shared, weights[t, :n], slopes[t, :n])
+            if normalised:
+                _multiply(shared, scale)
+            for t in range(taps):
+                target = y + t // kernel_size - radius
+                if border == _REPLICATE:
+                    target = min(max(target, 0), height - 1)
+                start = x0 + t % kernel_size
+                # No row but ours, and none beyond the image.
+                if first <= target < last:
+                    for c in range(channels):
+                        _add_product(sums[target % kernel_size, c, start : start + n], weights[t, :n], upstream[c, :n])
+                slope, weight = slopes[t, :n], weights[t, :n]
+                if normalised:
+                    for x in range(n):
+                        slope[x] -= shared[x]
+                if log_domain:
+                    _multiply(slope, weight)
+                else:
+                    # The exponent's slope takes the weight's place.
+                    _multiply(weight, slope)
+                    _multiply(slope, factors[t, :n])
+            if mine:
+                _write_taps(of_kernel, slopes, b, y, x0, n)
+            exponents = slopes if log_domain else weights
+            if mine:
+                _scale_slopes(of_scales, of_distance, exponents, ring, inputs, b, y, x0, n)
+            if of_guides:
+                _guide_slopes(sums, exponents, falloff, top[:n], ring, inputs, y, x0, n, first, last)
+        done = y - radius
+        if first <= done < last:
+            _finish(scattered, sums, b, done, radius, border)
+    for done in range(max(end_row - radius, first), last):
+        _finish(scattered, sums, b, done, radius, border)
+
+
+@compiled
+def _scale_slopes(
+    of_scales: Any,
+    of_distance: Any,
+    slopes: Any,
+    ring: Any,
+    inputs: Any,
+    b: int,
+    y: int,
+    x0: int,
+    n: int,
+) -> None:
+    """``-sum_t slope_t |difference_t|^2`` for each guide, and with the offsets for the distance."""
+    taps = slopes.shape[0]
+    guides, scales, kernel_size = inputs.guides, inputs.scales, inputs.kernel_size
+    radius, channel = kernel_size // 2, inputs.image[2]
+    for g in range(len(guides)):
+        end = channel + guides[g][2]
+        if scales[g][2] > 0:
+            result = of_scales[g][b, 0, y, x0 : x0 + n]
+            result[:] = 0
+            centres = ring[y % kernel_size, channel:end]
+            for t in range(taps):
+                neighbours = ring[(y + t // kernel_size - radius) % kernel_size, channel:end]
+                _subtract_differences(result, slopes[t, :n], neighbours, centres, t % kernel_size - radius, x0 + radius)
+        channel = end
+    if of_distance.shape[1] > 0:
+        result = of_distance[b, 0, y, x0 : x0 + n]
+        result[:] = 0
+        for t in range(taps):
+            dy, dx = t // kernel_size - radius, t % kernel_size - radius
+            _subtract_multiple(result, slopes[t, :n], dy * dy + dx * dx)
+
+
+@compiled
+def _guide_slopes(
+    sums: Any,
+    slopes: Any,
+    falloff: Any,
+    pull: Any,
+    ring: Any,
+    inputs: Any,
+    y: int,
+    x0: int,
+    n: int,
+    first: int,
+    last: int,
+) -> None:
+    """Each tap pulls the neighbour one way and the centre the other."""
+    taps = slopes.shape[0]
+    guides, kernel_size = inputs.guides, inputs.kernel_size
+    radius = kernel_size // 2
+    begin = x0 + radius
+    for t in range(taps):
+        row, dx = y + t // kernel_size - radius, t % kernel_size - radius
+        target = min(max(row, 0), inputs.height - 1) if inputs.border == _REPLICATE else row
+        channel = inputs.image[2]
+        for g in range(len(guides)):
+            for c in range(channel, channel + guides[g][2]):
+                slope, factor = slopes[t, :n], falloff[g, :n]
+                neighbour = ring[row % kernel_size, c, begin + dx : begin + dx + n]
+                centre = ring[y % kernel_size, c, begin : begin + n]
+                for x in range(n):
+                    half = slope[x] * factor[x] * (neighbour[x] - centre[x])
+                    pull[x] = half + half
+                if first <= target < last:
+                    there = sums[target % kernel_size, c, begin + dx : begin + dx + n]
+                    for x in range(n):
+                        there[x] -= pull[x]
+                if first <= y < last:
+                    _add(sums[y % kernel_size, c, begin : begin + n], pull)
+            channel += guides[g][2]
+
+
+@compiled
+def _finish(scattered: Any, sums: Any, b: int, y: int, radius: int, border: int) -> None:
+    """Hand out a row that no further pixel adds to, and clear its place."""
+    width = scattered.shape[3]
+    for c in range(scattered.shape[1]):
+        row = sums[y % sums.shape[0], c]
+        out = scattered[b, c, y]
+        out[:] = row[radius : radius + width]
+        if border == _REPLICATE:
+            for i in range(radius):
+                out[0] += row[i]
+                out[width - 1] += row[radius + width + i]
+        row[:] = 0
