@@ -254,7 +254,8 @@ class Cascade(nn.Module):
             _Features(albedo, normal, depth, _depth_scale(depth), alone, exposure, length).of
         )
         if known is None and (parts is None or parts == [whole]):
-            initial = self.first(color * exposure, features(whole), guides, _top(color, exposure))
+            image = color * exposure
+            initial = self.first(image, features(whole), guides, _top(image))
             final = initial if self.second is None else self.second(initial, features(whole), guides, _top(initial))
             return Denoised(initial / exposure, final / exposure)
         if known is None:

@@ -197,6 +197,9 @@ def test_a_bad_frame_is_named(small_sequence: Path) -> None:
         def __getattr__(self, name: str) -> object:
             return getattr(sequence, name)
 
+        def __len__(self) -> int:
+            return len(sequence)
+
         def frame(self, number: int, reference: bool = True) -> Frame:
             return original.replace(albedo=albedo) if number == 1 else sequence.frame(number, reference)
 

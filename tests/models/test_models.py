@@ -333,7 +333,8 @@ def test_a_part_of_an_image_is_that_of_the_whole(name: str, top: int, left: int)
     assert sum(part.grown(model.halo, (237, 331)).pixels for part in parts) < 0.8 * 237 * 331
     whole, part = model(*frame, known=known), model(*frame, known=known, parts=parts)
     for a, b, given in zip(whole, part, (known.initial, known.final), strict=True):
-        assert torch.equal(a, b)
+        # Convolutions choose the order of their sums by the size of the image and the number of threads.
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5 * float(a.mean()))
         assert torch.equal(torch.where(known.mask, b, given), given)
     assert not torch.equal(whole.initial, known.initial)
 
@@ -343,7 +344,8 @@ def test_a_part_needs_all_around_it_that_the_network_sees(monkeypatch: pytest.Mo
     model, frame, known = half_known("cascaded", 100, 131)
     parts, whole = model.parts(known.mask), model(*frame, known=known)
     monkeypatch.setattr(Cascade, "halo", 24)
-    assert not torch.equal(model(*frame, known=known, parts=parts).final, whole.final)
+    off = (model(*frame, known=known, parts=parts).final - whole.final).abs().max()
+    assert off > 1e-3 * whole.final.mean()
 
 
 @torch.inference_mode()
