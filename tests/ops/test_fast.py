@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -272,3 +274,19 @@ def test_accumulation_refuses_what_the_plain_form_refuses(settings: dict[str, An
     for backend in ("torch", "numba"):
         with pytest.raises(ValueError, match=message):
             ops.accumulate(**inputs, **settings, backend=backend)
+
+
+def test_without_a_folder_for_compiled_code_it_is_compiled_anew() -> None:
+    code = (
+        "import numba.core.caching as caching, torch\n"
+        "for name in dir(caching):\n"
+        "    kind = getattr(caching, name)\n"
+        "    if hasattr(kind, '_locator_classes'):\n"
+        "        kind._locator_classes = []\n"
+        "from mcdenoise.ops import kernel_conv\n"
+        "image, kernel = torch.rand(1, 3, 4, 5), torch.rand(1, 9, 4, 5)\n"
+        "found, expected = (kernel_conv(image, kernel, backend=name) for name in ('numba', 'torch'))\n"
+        "torch.testing.assert_close(found, expected)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -14,6 +14,7 @@ All its kernels are in this file: numba compiles them again when their own file 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -57,7 +58,14 @@ class _Inputs(NamedTuple):
     border: int
 
 
-compiled = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+def compiled(function: Callable[..., Any]) -> Any:
+    """``function`` compiled, once for all runs: beside this file or, failing that, in the user's cache folder."""
+    compiler = functools.partial(numba.njit, nogil=True, error_model="numpy", fastmath={"contract"})
+    try:
+        return compiler(cache=True)(function)
+    except RuntimeError:
+        # No such folder can be written to: compiled anew in every run.
+        return compiler()(function)
 
 
 def filtered(
