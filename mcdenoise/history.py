@@ -7,6 +7,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.buffers import Frame
@@ -71,6 +72,16 @@ def _compressed(color: Tensor) -> Tensor:
     return color.detach().mean(1, keepdim=True).clamp_min(0).sqrt().sqrt()
 
 
+def _lag(lag: HistoryLag, history: Tensor, recent: Tensor, variance: Tensor) -> Tensor:
+    """The test in half the resolution, for a quarter of the time: a window holds as many pixels, in blocks of four."""
+    height, width = history.shape[-2:]
+    halves = (
+        F.avg_pool2d(image, 2, ceil_mode=True, count_include_pad=False) for image in (history, recent, variance / 4)
+    )
+    share: Tensor = lag(*halves).repeat_interleave(2, -2).repeat_interleave(2, -1)
+    return share[..., :height, :width]
+
+
 def _equal(a: Tensor | None, b: Tensor | None) -> bool:
     if a is None or b is None or a.device != b.device:
         return False
@@ -97,23 +108,27 @@ class _State(NamedTuple):
     """The past of a shot.
 
     Args:
-        color: ``(B, 3, H, W)``; where lag is looked for ``(B, 5, H, W)``, also the means of compressed radiance and of
-            its square.
-        recent: ``(B, 4, H, W)`` color and compressed radiance of a shorter past, where lag is looked for.
+        color: ``(B, 3, H, W)``; where lag is looked for ``(B, 9, H, W)``: also the means of compressed radiance and of
+            its square, and of a shorter past color and compressed radiance.
+        length: of the longer past.
+        surface: what was seen.
+        view_projection: by which camera.
     """
 
     color: Tensor
-    recent: Tensor | None
     length: Tensor
     surface: Surface
     view_projection: Tensor | None
 
 
+# The channels of a state.
+_COLOR, _MEAN, _SQUARE, _RECENT, _RECENT_MEAN = slice(0, 3), slice(3, 4), slice(4, 5), slice(5, 9), slice(8, 9)
+
+
 class _Past(NamedTuple):
-    """A frame with its past: the first three of the next :class:`_State`, and why there is no more past, or ``""``."""
+    """A frame with its past: the first two of the next :class:`_State`, and why there is no more past, or ``""``."""
 
     color: Tensor
-    recent: Tensor | None
     length: Tensor
     reset: str
 
@@ -151,7 +166,8 @@ class History:
         fireflies: how fireflies are clamped; ``ClampFireflies(math.inf)`` leaves them.
         specular_length: the longest history of what is seen in mirrors and through glass while the image moves, in
             frames, at least 0; infinity treats them as everything else.
-        anti_lag: the test for changes of light; ``HistoryLag(math.inf)`` makes none, in a third of the time.
+        anti_lag: the test for changes of light, in half the resolution; ``HistoryLag(math.inf)`` makes none, in half
+            the time.
 
     Raises:
         ValueError: ``specular_length`` is negative.
@@ -171,10 +187,6 @@ class History:
         self.specular_length = specular_length
         anti_lag = HistoryLag() if anti_lag is None else anti_lag
         self.anti_lag = None if math.isinf(anti_lag.threshold) else anti_lag
-        # The same rule with a shorter memory.
-        rule = self.accumulate
-        alpha_min = max(rule.alpha_min, _RECENT_ALPHA)
-        self._shorter = Accumulate(alpha_min, rule.rule, rule.position_limit, rule.normal_limit)
         self._state: _State | None = None
 
     def reset(self) -> None:
@@ -218,17 +230,17 @@ class History:
         entering = color
         # What has no past and will be none is compared with nothing.
         if self.anti_lag is not None and (keeps or self._state is not None):
-            compressed = _compressed(color)
-            entering = torch.cat([color, compressed, compressed.square()], 1)
+            mean = _compressed(color)
+            entering = torch.cat([color, mean, mean.square(), color, mean], 1)
         past = self._blend(frame, entering, reprojects)
         surface = Surface(frame.position, frame.normal, frame.depth)
-        self._state = _State(past.color, past.recent, past.length, surface, frame.view_projection) if keeps else None
-        return Accumulated(past.color[:, :3], color, past.length, past.reset)
+        self._state = _State(past.color, past.length, surface, frame.view_projection) if keeps else None
+        return Accumulated(past.color[:, _COLOR], color, past.length, past.reset)
 
     def _blend(self, frame: Frame, color: Tensor, reprojects: bool) -> _Past:
         """The frame with its past."""
         state = self._state
-        first = _Past(color, color[:, :4] if color.shape[1] > 3 else None, torch.ones_like(color[:, :1]), "first frame")
+        first = _Past(color, torch.ones_like(color[:, :1]), "first frame")
         if state is None:
             lost = frame.motion is None and (frame.position is None or frame.view_projection is None)
             return first._replace(reset=_NO_WAY) if lost else first
@@ -247,23 +259,27 @@ class History:
         if frame.albedo is not None and motion is not None:
             both = by_rows(self._shortened, color, past, length, frame.albedo, motion)
             past, length = both[:, :-1], both[:, -1:]
-        if self.anti_lag is None or state.recent is None:
-            return _Past(past, None, length, "")
-        recent, _ = self._shorter(color[:, :4], state.recent, state.length, motion, surface, state.surface)
-        reach = self.anti_lag.kernel_size // 2
-        every = by_rows(partial(self._without_lag, self.anti_lag), color, past, recent, length, reach=reach)
-        return _Past(every[:, :5], every[:, 5:9], every[:, 9:], "")
+        if self.anti_lag is not None:
+            # Pairs of rows stay together.
+            reach = 2 * (self.anti_lag.kernel_size // 2)
+            both = by_rows(partial(self._without_lag, self.anti_lag), color, past, length, reach=reach)
+            past, length = both[:, :-1], both[:, -1:]
+        return _Past(past, length, "")
 
-    def _without_lag(self, lag: HistoryLag, color: Tensor, past: Tensor, recent: Tensor, length: Tensor) -> Tensor:
-        """Past, recent past and length of what still holds: of the recent one by the frame, of the long one by that."""
-        mean, square = past[:, 3:4], past[:, 4:]
+    def _without_lag(self, lag: HistoryLag, color: Tensor, past: Tensor, length: Tensor) -> Tensor:
+        """Color and length of what still holds: of the recent past by the frame, of the long one by the recent one."""
+        mean, square = past[:, _MEAN], past[:, _SQUARE]
         counted = length.clamp_min(2)
         variance = (square - mean.square()).clamp_min(0) * (counted / (counted - 1))
-        recent = torch.lerp(recent, color[:, :4], lag(recent[:, 3:], color[:, 3:4], variance))
-        share = lag(mean, recent[:, 3:], variance / length.clamp_max(_RECENT_FRAMES))
+        # Accumulated with the long one's share of the frame, which is the smaller one.
+        alpha_min = max(self.accumulate.alpha_min, _RECENT_ALPHA)
+        share = self._share_of_past(length, alpha_min) / self._share_of_past(length).clamp_min(1e-6)
+        recent = torch.lerp(color[:, _RECENT], past[:, _RECENT], share)
+        recent = torch.lerp(recent, color[:, _RECENT], _lag(lag, recent[:, 3:], color[:, _RECENT_MEAN], variance))
+        share = _lag(lag, mean, recent[:, 3:], variance / length.clamp_max(_RECENT_FRAMES))
         shorter = torch.cat([recent, recent[:, 3:].square() + variance], 1)
-        length = torch.lerp(length, length.clamp_max(1 / self._shorter.alpha_min), share)
-        return torch.cat([torch.lerp(past, shorter, share), recent, length], 1)
+        longer = torch.lerp(past[:, : _RECENT.start], shorter, share)
+        return torch.cat([longer, recent, torch.lerp(length, length.clamp_max(1 / alpha_min), share)], 1)
 
     def _shortened(self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor) -> Tensor:
         """Color and length if the past of mirrors and glass that move is no longer than ``specular_length``.
@@ -280,6 +296,6 @@ class History:
         shortened = torch.lerp(color, accumulated, share.to(color.dtype))
         return torch.cat([torch.where(too_long, shortened, accumulated), torch.where(too_long, longest, length)], 1)
 
-    def _share_of_past(self, length: Tensor) -> Tensor:
+    def _share_of_past(self, length: Tensor, alpha_min: float | None = None) -> Tensor:
         """The weight of the past in a result of history length ``length``, see :func:`mcdenoise.ops.accumulate`."""
-        return 1 - (1 / length).clamp_min(self.accumulate.alpha_min)
+        return 1 - (1 / length).clamp_min(self.accumulate.alpha_min if alpha_min is None else alpha_min)

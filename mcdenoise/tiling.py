@@ -150,7 +150,7 @@ class Frames(NamedTuple):
             return self._bytes(after)
         # Color as it is and as it enters; the old past with the features it belongs to; the new one, long and short, as
         # accumulated and without lag.
-        past = 8 + _KEPT + 11 + _KEPT
+        past = 12 + _KEPT + 2 * _KEPT
         return self._bytes(max(after, self._channels() + self._channels("position", "normal", "depth") + past))
 
     def _channels(self, *names: str) -> int:

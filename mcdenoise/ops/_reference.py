@@ -197,7 +197,7 @@ def clamp_fireflies(image: Tensor, *, limit: float = 30.0, kernel_size: int = 7)
 
 
 def history_lag(
-    history: Tensor, recent: Tensor, variance: Tensor, *, threshold: float = 2.0, kernel_size: int = 11
+    history: Tensor, recent: Tensor, variance: Tensor, *, threshold: float = 2.0, kernel_size: int = 5
 ) -> Tensor:
     """``clamp((z^2 / threshold^2 - 1) / 3, 0, 1)`` of the difference of local means in standard errors ``z``."""
     batch, channels, height, width = history.shape

@@ -10,7 +10,7 @@ from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._window import accumulator_dtype
 
 THRESHOLD = 2.0
-KERNEL_SIZE = 11
+KERNEL_SIZE = 5
 # Of the local mean: a difference that no eye sees is no lag, however little noise there is.
 SMALLEST = 1e-3
 
