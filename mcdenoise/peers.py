@@ -22,7 +22,7 @@ from mcdenoise.denoiser import Images
 from mcdenoise.errors import InputError
 from mcdenoise.history import History
 from mcdenoise.models import normalize_depth
-from mcdenoise.ops import demodulate, remodulate
+from mcdenoise.ops import HistoryLag, demodulate, remodulate
 
 Quality = Literal["fast", "balanced", "high"]
 Auxiliary = Literal["noisy", "clean", "prefiltered"]
@@ -195,6 +195,11 @@ class Oidn:
             raise RuntimeError(f"Open Image Denoise: {message}")
 
 
+def _history() -> History:
+    # Denoised frames flicker, and have no noise that would excuse it: the test for lag would take that for light.
+    return History(anti_lag=HistoryLag(math.inf))
+
+
 @dataclass(frozen=True)
 class OidnPeer:
     """Open Image Denoise in one setting.
@@ -208,7 +213,7 @@ class OidnPeer:
             radiance divided by the albedo, which the result is multiplied with. ``"accumulated after"`` starts from one
             sample a pixel, and accumulates the results by the rule that makes the accumulated image.
         prefilter: denoises albedo and normal, by default with ``oidn`` and for every call.
-        history: accumulates afterwards, where ``source`` says so.
+        history: accumulates afterwards, where ``source`` says so; without a test for lag, which serves these worse.
     """
 
     oidn: Oidn
@@ -216,7 +221,7 @@ class OidnPeer:
     aux: Auxiliary
     source: Source
     prefilter: Callable[[Frame], Frame] | None = None
-    history: History = field(default_factory=History, compare=False, repr=False)
+    history: History = field(default_factory=_history, compare=False, repr=False)
 
     family = "OIDN"
 
