@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.denoiser import Images
 from mcdenoise.errors import InputError
 from mcdenoise.history import History
-from mcdenoise.ops import demodulate, remodulate
+from mcdenoise.ops import HistoryLag, demodulate, remodulate
 from mcdenoise.peers import JointBilateral, Oidn, OidnPeer, joint_bilateral_peers, oidn_peers
 
 
@@ -130,7 +131,7 @@ def test_oidn_peers_are_every_setting(oidn: Oidn) -> None:
 
 def test_accumulated_after_is_the_history_of_denoised_frames(oidn: Oidn, small_sequence: Path) -> None:
     sequence = open_sequence(small_sequence)
-    peer, history = OidnPeer(oidn, "fast", "clean", "accumulated after"), History()
+    peer, history = OidnPeer(oidn, "fast", "clean", "accumulated after"), History(anti_lag=HistoryLag(math.inf))
     results = []
     for number in (0, 1, 2):
         frame, _ = sequence.frame(number).validate()
