@@ -495,6 +495,22 @@ def test_after_a_change_a_new_past_grows() -> None:
     assert abs(past.color.mean() - 0.2) < 0.02
 
 
+@pytest.mark.parametrize("pixels", [2 * 16, 100])
+def test_the_past_is_the_same_a_few_rows_at_a_time(pixels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    g, frames = torch.Generator().manual_seed(1), switched(6, 9, 0.3)
+    albedo = torch.rand(1, 3, 16, 16, generator=g) * (torch.rand(1, 1, 16, 16, generator=g) > 0.2)
+    motion = torch.rand(1, 2, 16, 16, generator=g) - 0.5
+    frames = [frame.replace(albedo=albedo, motion=motion) for frame in frames]
+    whole, bands = History(), History()
+    expected = [whole.update(frame) for frame in frames]
+    assert expected[-1].length.max() < 9
+    monkeypatch.setattr("mcdenoise.ops._rows._PIXELS", pixels)
+    for frame, past in zip(frames, expected, strict=True):
+        found = bands.update(frame)
+        assert torch.equal(found.color, past.color)
+        assert torch.equal(found.length, past.length)
+
+
 def test_a_first_frame_a_cut_and_another_size_begin_a_recent_past_too() -> None:
     history, fresh = History(), History()
     floor = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
