@@ -6,7 +6,7 @@ import functools
 import importlib
 import importlib.util
 import os
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
@@ -46,16 +46,11 @@ def choose_backend(
         ValueError: the backend is unknown, or cannot run; the message says why.
     """
     check_backend(backend)
-    if backend is None:
-        backend = _fastest(tensors[0])
-        return "torch" if _obstacle(backend, tensors, differentiable, forms) else backend
-    for known in BACKENDS:
-        if backend == known:
-            obstacle = _obstacle(known, tensors, differentiable, forms)
-            if obstacle:
-                raise ValueError(f"backend: expected one that can run here, found {backend!r}, which {obstacle}")
-            return known
-    raise AssertionError(backend)
+    wanted = _fastest(tensors[0]) if backend is None else cast(Backend, backend)
+    obstacle = _obstacle(wanted, tensors, differentiable, forms)
+    if obstacle and backend is not None:
+        raise ValueError(f"backend: expected one that can run here, found {backend!r}, which {obstacle}")
+    return "torch" if obstacle else wanted
 
 
 def _fastest(image: Tensor | None) -> Backend:
