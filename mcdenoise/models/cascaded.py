@@ -99,13 +99,17 @@ class FusionModule(nn.Module):
 class PixelPredictor(nn.Module):
     """P: predicts the image itself at three scales and fuses them, coarse to fine.
 
+    Beside what it makes of the noisy pixels itself, its U-Net is given the logarithm of their means at each coarser
+    scale: with one path a pixel most of the light of a dark surface is in few bright pixels, whose mean is easily taken
+    of radiance, but not of its logarithm or of what a maximum leaves of it.
+
     Args:
         width: feature channels of the U-Net.
     """
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.unet = UNet(3 + FEATURES, width)
+        self.unet = UNet(3 + FEATURES, width, coarse_channels=3)
         self.heads = nn.ModuleList(nn.Conv2d(width, 3, 3, padding=1) for _ in range(UNet.scales))
         self.fusions = nn.ModuleList(FusionModule() for _ in range(UNet.scales - 1))
         for head in self.heads:
@@ -122,7 +126,11 @@ class PixelPredictor(nn.Module):
     ) -> Tensor:
         """See :class:`Predictor`; there are no weights to guide."""
         logs = torch.log1p(image)
-        levels = self.unet(torch.cat([logs, features], 1))
+        means: list[Tensor] = []
+        for _ in range(self.unet.levels - 1):
+            image = downsample(image)
+            means.append(torch.log1p(image))
+        levels = self.unet(torch.cat([logs, features], 1), means)
         # The heads predict the logarithm of the radiance, on top of the input's: a network at rest is the identity,
         # and errors are relative, as the eye and the loss see them. No pixel grows beyond the brightest of the input.
         top = logs.amax((1, 2, 3), keepdim=True) if top is None else top

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -19,6 +21,7 @@ class UNet(nn.Module):
         in_channels: channels of the input.
         width: feature channels of every convolution (the paper's 40).
         levels: number of scales, at least 4; 4 in the paper.
+        coarse_channels: channels that the encoder is given at each scale but the finest, beside its own features.
 
     Raises:
         ValueError: there are too few levels.
@@ -26,14 +29,16 @@ class UNet(nn.Module):
 
     scales = 3
 
-    def __init__(self, in_channels: int, width: int, levels: int = 4) -> None:
+    def __init__(self, in_channels: int, width: int, levels: int = 4, coarse_channels: int = 0) -> None:
         super().__init__()
         # The coarsest level is the encoder's alone.
         if levels <= self.scales:
             raise ValueError(f"levels: expected at least {self.scales + 1}, found {levels}")
         self.levels, self.width = levels, width
         self.multiple: int = 2 ** (levels - 1)
-        self.encoder = nn.ModuleList(_block(in_channels if level == 0 else width, width) for level in range(levels))
+        self.encoder = nn.ModuleList(
+            _block(width + coarse_channels if level else in_channels, width) for level in range(levels)
+        )
         self.up = nn.ModuleList(nn.ConvTranspose2d(width, width, 2, stride=2) for _ in range(levels - 1))
         self.decoder = nn.ModuleList(_block(2 * width, width) for _ in range(levels - 1))
 
@@ -46,22 +51,26 @@ class UNet(nn.Module):
         convolutions: int = sum(2 << level for level in (*down, *up))
         return convolutions + self.multiple - 1
 
-    def forward(self, x: Tensor) -> list[Tensor]:
+    def forward(self, x: Tensor, coarse: Sequence[Tensor] = ()) -> list[Tensor]:
         """Features at full, half and quarter resolution.
 
         Args:
             x: ``(B, in_channels, H, W)``.
+            coarse: what the encoder is given besides, ``(B, coarse_channels, ceil(H / s), ceil(W / s))`` for ``s`` = 2,
+                4, ...: one for each scale but the finest, or none.
 
         Returns:
             Three tensors ``(B, width, ceil(H / s), ceil(W / s))`` for ``s`` = 1, 2, 4.
         """
         height, width = x.shape[-2:]
-        missing = (0, -width % self.multiple, 0, -height % self.multiple)
-        if any(missing):
-            x = F.pad(x, missing, mode="replicate")
+        x = _padded(x, (height + -height % self.multiple, width + -width % self.multiple))
         skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):
-            x = block(x if level == 0 else _max_pool(x))
+            if level:
+                x = _max_pool(x)
+            if level and coarse:
+                x = torch.cat([x, _padded(coarse[level - 1].to(x.dtype), x.shape[-2:])], 1)
+            x = block(x)
             skips.append(x)
         skips.pop()
         features: list[Tensor] = []
@@ -70,6 +79,12 @@ class UNet(nn.Module):
             features.append(x)
         finest_first = features[: -self.scales - 1 : -1]
         return [f[..., : -(-height // 2**s), : -(-width // 2**s)] for s, f in enumerate(finest_first)]
+
+
+def _padded(x: Tensor, size: Sequence[int]) -> Tensor:
+    """``x``, its last row and column repeated up to ``size``."""
+    missing = (0, size[1] - x.shape[-1], 0, size[0] - x.shape[-2])
+    return F.pad(x, missing, mode="replicate") if any(missing) else x
 
 
 class _ReLU(nn.Module):

@@ -1,6 +1,6 @@
-"""Give weights of the paper's ten input channels the four of the history, on which they do not depend yet.
+"""Give weights of fewer input channels those that their model has by now, on which they do not depend yet.
 
-    python training/add_history_inputs.py OLD.safetensors -o NEW.safetensors
+    python training/widen_inputs.py OLD.safetensors -o NEW.safetensors
 
 The images stay the same: the new channels are multiplied with zeros, from which training starts.
 """
@@ -13,7 +13,6 @@ from safetensors import safe_open
 
 from mcdenoise.data.files import atomic_path
 from mcdenoise.models import create_model, describe_weights, save_weights
-from mcdenoise.models.cascaded import FEATURES
 
 
 def main() -> None:
@@ -25,11 +24,12 @@ def main() -> None:
     about = describe_weights(options.weights)
     with safe_open(options.weights, framework="pt") as file:
         tensors = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118 - a handle is no dict
-    for key, tensor in tensors.items():
-        if key.endswith("unet.encoder.0.0.weight"):
-            missing = 3 + FEATURES - tensor.shape[1]
-            tensors[key] = torch.cat([tensor, tensor.new_zeros(len(tensor), missing, 3, 3)], 1)
     model = create_model(about["architecture"], **about["settings"])
+    for key, own in model.state_dict().items():
+        tensor = tensors[key]
+        if own.dim() == 4 and own.shape[1] > tensor.shape[1]:
+            missing = tensor.new_zeros(len(tensor), own.shape[1] - tensor.shape[1], *tensor.shape[2:])
+            tensors[key] = torch.cat([tensor, missing], 1)
     model.load_state_dict(tensors)
     texts = {key: value for key, value in about.items() if key not in ("architecture", "settings", "sha256")}
     with atomic_path(options.out) as temporary:
