@@ -1,7 +1,7 @@
-"""The fast form of accumulation as a torch operator: reprojection, test and blending in one pass, without derivatives.
+"""The fast forms of motion and accumulation as torch operators, without derivatives.
 
-Nothing is trained through it, and pixel by pixel its taps lie anywhere: there is nothing to vectorise, only forty
-passes over the image to save.
+Nothing is trained through them, and pixel by pixel the taps of a history lie anywhere: there is nothing to vectorise,
+only forty passes over the image to save. So one pass does all that :class:`mcdenoise.history.History` asks of it, too.
 """
 
 from __future__ import annotations
@@ -15,14 +15,61 @@ from torch import Tensor
 
 from mcdenoise.ops._fast._numba_filter import compiled, share_rows, source
 from mcdenoise.ops._fast._operator import custom_op
+from mcdenoise.ops.demodulation import NO_ALBEDO
+
+
+@custom_op(
+    "mcdenoise::motion_from_position",
+    device_types="cpu",
+    schema="(Tensor position, Tensor previous_view_projection) -> Tensor",
+)
+def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
+    """See :func:`mcdenoise.ops.motion_from_position`."""
+    dtype = torch.promote_types(position.dtype, torch.float32)
+    batch, _, height, width = position.shape
+    motion = torch.empty((batch, 2, height, width), dtype=dtype)
+    if motion.numel():
+        arguments = (motion.numpy(), source(position.to(dtype)), previous_view_projection.detach().to(dtype).contiguous().numpy())
+        share_rows(position, lambda *rows: _motion(*arguments, *rows))
+    return motion
+
+
+@motion_from_position.register_fake
+def _(position: Tensor, previous_view_projection: Tensor) -> Tensor:
+    batch, _, height, width = position.shape
+    dtype = torch.promote_types(position.dtype, torch.float32)
+    return position.new_empty((batch, 2, height, width), dtype=dtype)
+
+
+@compiled
+def _motion(motion: Any, position: Any, matrices: Any, b: int, first: int, last: int) -> None:
+    _, _, height, width = motion.shape
+    memory, strides, _ = position
+    number = motion.dtype.type
+    m, one, half, infinite = matrices[b], number(1), number(0.5), number(np.inf)
+    m00, m01, m03, m10, m11, m13 = m[0, 0], m[0, 1], m[0, 3], m[1, 0], m[1, 1], m[1, 3]
+    m20, m21, m23, m30, m31, m33 = m[2, 0], m[2, 1], m[2, 3], m[3, 0], m[3, 1], m[3, 3]
+    wide, high = number(width) * half, number(height) * half
+    for y in range(first, last):
+        start, down = b * strides[0] + y * strides[2], number(y) + half
+        across, along = motion[b, 0, y], motion[b, 1, y]
+        for i in range(width):
+            at = start + i * strides[3]
+            px, py, pz = memory[at], memory[at + strides[1]], memory[at + 2 * strides[1]]
+            w = px * m03 + py * m13 + pz * m23 + m33
+            # A NaN is what infinity times zero and the difference of two infinities are.
+            in_front = w > 0 and (px - px) + (py - py) + (pz - pz) == 0
+            u, v = (px * m00 + py * m10 + pz * m20 + m30) / w, (px * m01 + py * m11 + pz * m21 + m31) / w
+            across[i] = (u + one) * wide - (number(i) + half) if in_front else infinite
+            along[i] = (v + one) * high - down if in_front else infinite
 
 
 @custom_op(
     "mcdenoise::accumulate",
     device_types="cpu",
     schema="(Tensor color, Tensor previous, Tensor previous_length, Tensor? motion, Tensor?[] surface, "
-    "Tensor?[] previous_surface, float alpha_min, bool bmfr, float position_limit, float normal_limit) "
-    "-> (Tensor, Tensor)",
+    "Tensor?[] previous_surface, float alpha_min, bool bmfr, float position_limit, float normal_limit, "
+    "float recent_alpha, Tensor? albedo, float longest, float still) -> (Tensor, Tensor, Tensor)",
 )
 def accumulate(
     color: Tensor,
@@ -35,11 +82,16 @@ def accumulate(
     bmfr: bool,
     position_limit: float,
     normal_limit: float,
-) -> tuple[Tensor, Tensor]:
-    """See :func:`mcdenoise.ops.accumulate`; the surfaces have the same buffers."""
+    recent_alpha: float,
+    albedo: Tensor | None,
+    longest: float,
+    still: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See :func:`mcdenoise.ops.temporal.accumulate_numba`; the surfaces have the same buffers."""
     dtype = torch.promote_types(color.dtype, torch.float32)
-    accumulated = torch.empty(color.shape, dtype=dtype)
+    accumulated = torch.empty(previous.shape, dtype=dtype)
     length = torch.empty(previous_length.shape, dtype=dtype)
+    kept = torch.zeros(previous.shape[0], previous.shape[2], dtype=torch.int64)
     if accumulated.numel():
         nothing = torch.empty((0, 0, 0, 0))
         surfaces = (
@@ -48,32 +100,42 @@ def accumulate(
         )
         images = (
             source((nothing if image is None else image).to(dtype))
-            for image in (color, previous, previous_length, motion)
+            for image in (color, previous, previous_length, motion, albedo)
         )
-        limits = tuple(accumulated.new_tensor([alpha_min, position_limit, normal_limit]).tolist())
-        arguments = (accumulated.numpy(), length.numpy(), *images, *surfaces, *limits, bmfr)
+        # In the dtype of the sums: a number in double precision would make the sums so.
+        limits = accumulated.new_tensor(
+            [alpha_min, position_limit, normal_limit, recent_alpha, NO_ALBEDO, longest, still]
+        ).numpy()
+        arguments = (accumulated.numpy(), length.numpy(), kept.numpy(), *images, *surfaces, *limits, bmfr)
         share_rows(color, lambda *rows: _accumulate(*arguments, *rows))
-    return accumulated.to(color.dtype), length.to(previous_length.dtype)
+    return accumulated.to(color.dtype), length.to(previous_length.dtype), kept
 
 
 @accumulate.register_fake
-def _(color: Tensor, previous: Tensor, previous_length: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
-    return color.new_empty(color.shape), previous_length.new_empty(previous_length.shape)
+def _(color: Tensor, previous: Tensor, previous_length: Tensor, *_: Any) -> tuple[Tensor, Tensor, Tensor]:
+    kept = previous.new_empty((previous.shape[0], previous.shape[2]), dtype=torch.int64)
+    return color.new_empty(previous.shape), previous_length.new_empty(previous_length.shape), kept
 
 
 @compiled
 def _accumulate(
     accumulated: Any,
     lengths: Any,
+    counts: Any,
     color: Any,
     previous: Any,
     previous_length: Any,
     motion: Any,
+    albedo: Any,
     here: Any,
     there: Any,
     alpha_min: float,
     position_limit: float,
     normal_limit: float,
+    recent_alpha: float,
+    no_albedo: float,
+    longest: float,
+    still: float,
     bmfr: bool,
     b: int,
     first: int,
@@ -85,20 +147,24 @@ def _accumulate(
     by pixel, which takes ten times as long as all the rest.
     """
     _, channels, height, width = accumulated.shape
-    (new, new_strides, _), (old, old_strides, _), (old_length, length_strides, _) = color, previous, previous_length
+    (new, new_strides, fresh), (old, old_strides, _), (old_length, length_strides, _) = color, previous, previous_length
     moved, motion_strides, moves = motion
     (p, p_strides, positions), (n, n_strides, normals), (d, d_strides, depths) = here
     (tap_p, tap_p_strides, _), (tap_n, tap_n_strides, _), (tap_d, tap_d_strides, _) = there
+    tint, tint_strides, tints = albedo
     taps = 4 if moves else 1
-    sums, one, zero = np.empty(channels, accumulated.dtype), accumulated.dtype.type(1), accumulated.dtype.type(0)
+    number = accumulated.dtype.type
+    one, zero, half, least = number(1), number(0), number(0.5), number(1e-6)
+    weights, places = np.empty(4, accumulated.dtype), np.empty(4, np.int64)
     for y in range(first, last):
+        count = 0
         for x in range(width):
             at_new = b * new_strides[0] + y * new_strides[2] + x * new_strides[3]
             at_p = b * p_strides[0] + y * p_strides[2] + x * p_strides[3]
             at_n = b * n_strides[0] + y * n_strides[2] + x * n_strides[3]
             depth = d[b * d_strides[0] + y * d_strides[2] + x * d_strides[3]] if depths else zero
             hit = math.isfinite(depth)
-            qx, qy = accumulated.dtype.type(x), accumulated.dtype.type(y)
+            qx, qy = number(x), number(y)
             if moves:
                 at_motion = b * motion_strides[0] + y * motion_strides[2] + x * motion_strides[3]
                 qx += moved[at_motion]
@@ -106,9 +172,9 @@ def _accumulate(
             # Not so for a NaN either.
             reachable = -1 < qx < width and -1 < qy < height
             left, top = (math.floor(qx), math.floor(qy)) if reachable else (0, 0)
-            fx, fy = qx - accumulated.dtype.type(left), qy - accumulated.dtype.type(top)
-            sums[:] = 0
+            fx, fy = qx - number(left), qy - number(top)
             weight = length = zero
+            kept = 0
             for tap in range(taps if reachable else 0):
                 row, column = top + tap // 2, left + tap % 2
                 if row < 0 or row >= height or column < 0 or column >= width:
@@ -147,18 +213,43 @@ def _accumulate(
                 at_length = b * length_strides[0] + row * length_strides[2] + column * length_strides[3]
                 weight += bilinear
                 length += bilinear * old_length[at_length]
-                for c in range(channels):
-                    sums[c] += bilinear * old[at_old + c * old_strides[1]]
+                weights[kept], places[kept] = bilinear, at_old
+                kept += 1
+            # Beside those that are kept, one of them once more, with no weight: what is left out may hold anything.
+            for tap in range(kept, 4):
+                weights[tap], places[tap] = zero, places[0]
             found = weight > 0
-            length = length / weight if found else zero
-            alpha = max(one / (length + one), alpha_min) if found else one
-            for c in range(channels):
-                value = new[at_new + c * new_strides[1]]
-                if found:
-                    history = sums[c] / weight
+            if not found:
+                for c in range(channels):
+                    accumulated[b, c, y, x] = new[at_new + (c if c < fresh else c - fresh) * new_strides[1]]
+                lengths[b, 0, y, x] = one
+                continue
+            length = length / weight
+            alpha = max(one / (length + one), alpha_min)
+            length = min(np.rint(length) + one, number(255)) if bmfr else length + one
+            if length > one:
+                count += 1
+            if moves and tints and length > longest:
+                dx, dy = moved[at_motion], moved[at_motion + motion_strides[1]]
+                at_tint = b * tint_strides[0] + y * tint_strides[2] + x * tint_strides[3]
+                specular = dx * dx + dy * dy > still * still
+                for c in range(3):
+                    specular = specular and tint[at_tint + c * tint_strides[1]] < no_albedo
+                if specular:
+                    share = one - max(one / length, alpha_min)
+                    length = longest
+                    alpha = one - (one - alpha) * (one - max(one / length, alpha_min)) / max(share, least)
+            lengths[b, 0, y, x] = length
+            w0, w1, w2, w3 = weights[0] / weight, weights[1] / weight, weights[2] / weight, weights[3] / weight
+            i0, i1, i2, i3 = places[0], places[1], places[2], places[3]
+            for start in range(0, channels, fresh):
+                if start > 0:
+                    share = one - max(one / length, alpha_min)
+                    alpha = one - (one - alpha) * (one - max(one / length, recent_alpha)) / max(share, least)
+                for c in range(start, min(start + fresh, channels)):
+                    value, plane = new[at_new + (c - start) * new_strides[1]], c * old_strides[1]
+                    history = w0 * old[i0 + plane] + w1 * old[i1 + plane] + w2 * old[i2 + plane] + w3 * old[i3 + plane]
                     # From the nearer end, as torch.lerp does.
                     change = value - history
-                    value = history + alpha * change if alpha < 0.5 else value - change * (one - alpha)
-                accumulated[b, c, y, x] = value
-            grown = min(np.rint(length) + one, 255) if bmfr else length + one
-            lengths[b, 0, y, x] = grown if found else one
+                    accumulated[b, c, y, x] = history + alpha * change if alpha < half else value - change * (one - alpha)
+        counts[b, y] = count
