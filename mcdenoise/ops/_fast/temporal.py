@@ -17,6 +17,9 @@ from mcdenoise.ops._fast._numba_filter import compiled, share_rows, source
 from mcdenoise.ops._fast._operator import custom_op
 from mcdenoise.ops.demodulation import NO_ALBEDO
 
+# Pixels whose taps are held at a time: they stay in the first-level cache.
+_CHUNK = 128
+
 
 @custom_op(
     "mcdenoise::motion_from_position",
@@ -144,7 +147,8 @@ def _accumulate(
     """Rows ``first`` to ``last`` of the result, by the rules of :func:`mcdenoise.ops.reproject`.
 
     In one piece, and with the memory of each image in a variable: handed to other functions, arrays are counted, pixel
-    by pixel, which takes ten times as long as all the rest.
+    by pixel, which takes ten times as long as all the rest. The taps of a run of pixels are found first and summed
+    then, channel by channel: the planes of an image often begin a power of two apart, and the cache holds few such.
     """
     _, channels, height, width = accumulated.shape
     (new, new_strides, fresh), (old, old_strides, _), (old_length, length_strides, _) = color, previous, previous_length
@@ -155,101 +159,135 @@ def _accumulate(
     taps = 4 if moves else 1
     number = accumulated.dtype.type
     one, zero, half, least = number(1), number(0), number(0.5), number(1e-6)
-    weights, places = np.empty(4, accumulated.dtype), np.empty(4, np.int64)
+    weights, places = np.empty((_CHUNK, 4), accumulated.dtype), np.empty((_CHUNK, 4), np.uint64)
+    sums, values = np.empty((channels, _CHUNK), accumulated.dtype), np.empty(_CHUNK, accumulated.dtype)
+    # Weight of the frame, and that in the recent past.
+    alphas = np.empty((2, _CHUNK), accumulated.dtype)
     for y in range(first, last):
         count = 0
-        for x in range(width):
-            at_new = b * new_strides[0] + y * new_strides[2] + x * new_strides[3]
-            at_p = b * p_strides[0] + y * p_strides[2] + x * p_strides[3]
-            at_n = b * n_strides[0] + y * n_strides[2] + x * n_strides[3]
-            depth = d[b * d_strides[0] + y * d_strides[2] + x * d_strides[3]] if depths else zero
-            hit = math.isfinite(depth)
-            qx, qy = number(x), number(y)
-            if moves:
-                at_motion = b * motion_strides[0] + y * motion_strides[2] + x * motion_strides[3]
-                qx += moved[at_motion]
-                qy += moved[at_motion + motion_strides[1]]
-            # Not so for a NaN either.
-            reachable = -1 < qx < width and -1 < qy < height
-            left, top = (math.floor(qx), math.floor(qy)) if reachable else (0, 0)
-            fx, fy = qx - number(left), qy - number(top)
-            weight = length = zero
-            kept = 0
-            for tap in range(taps if reachable else 0):
-                row, column = top + tap // 2, left + tap % 2
-                if row < 0 or row >= height or column < 0 or column >= width:
-                    continue
-                at_tap_p = b * tap_p_strides[0] + row * tap_p_strides[2] + column * tap_p_strides[3]
-                at_tap_n = b * tap_n_strides[0] + row * tap_n_strides[2] + column * tap_n_strides[3]
+        for x0 in range(0, width, _CHUNK):
+            size = min(_CHUNK, width - x0)
+            for i in range(size):
+                x = x0 + i
+                at_p = b * p_strides[0] + y * p_strides[2] + x * p_strides[3]
+                at_n = b * n_strides[0] + y * n_strides[2] + x * n_strides[3]
+                normal, point = (zero, zero, zero), (zero, zero, zero)
                 if normals:
-                    turn = zero
-                    for c in range(3):
-                        difference = tap_n[at_tap_n + c * tap_n_strides[1]] - n[at_n + c * n_strides[1]]
-                        turn += difference * difference
-                    if not (turn < normal_limit or (turn == normal_limit and not bmfr)):
+                    normal = (n[at_n], n[at_n + n_strides[1]], n[at_n + 2 * n_strides[1]])
+                if positions:
+                    point = (p[at_p], p[at_p + p_strides[1]], p[at_p + 2 * p_strides[1]])
+                at_motion = b * motion_strides[0] + y * motion_strides[2] + x * motion_strides[3]
+                depth = d[b * d_strides[0] + y * d_strides[2] + x * d_strides[3]] if depths else zero
+                hit = math.isfinite(depth)
+                qx, qy = number(x), number(y)
+                if moves:
+                    qx += moved[at_motion]
+                    qy += moved[at_motion + motion_strides[1]]
+                # Not so for a NaN either.
+                reachable = -1 < qx < width and -1 < qy < height
+                left, top = (np.int64(qx) - (qx < 0), np.int64(qy) - (qy < 0)) if reachable else (0, 0)
+                fx, fy = qx - number(left), qy - number(top)
+                weight = length = zero
+                kept = 0
+                for tap in range(taps if reachable else 0):
+                    row, column = top + tap // 2, left + tap % 2
+                    if row < 0 or row >= height or column < 0 or column >= width:
                         continue
-                if bmfr or depths:
-                    squares = across = zero
-                    for c in range(3 if positions else 0):
-                        difference = tap_p[at_tap_p + c * tap_p_strides[1]] - p[at_p + c * p_strides[1]]
-                        squares += difference * difference
-                        if normals:
-                            across += difference * n[at_n + c * n_strides[1]]
-                    if bmfr:
-                        if positions and not squares < position_limit:
+                    at_tap_p = np.uint64(b * tap_p_strides[0] + row * tap_p_strides[2] + column * tap_p_strides[3])
+                    at_tap_n = np.uint64(b * tap_n_strides[0] + row * tap_n_strides[2] + column * tap_n_strides[3])
+                    if normals:
+                        turn = zero
+                        for c in range(3):
+                            difference = tap_n[at_tap_n + np.uint64(c * tap_n_strides[1])] - normal[c]
+                            turn += difference * difference
+                        if not (turn < normal_limit or (turn == normal_limit and not bmfr)):
                             continue
-                    else:
-                        tap_depth = tap_d[b * tap_d_strides[0] + row * tap_d_strides[2] + column * tap_d_strides[3]]
-                        if math.isfinite(tap_depth) != hit:
-                            continue
-                        # Where nothing was hit there is no distance to compare.
-                        if hit:
-                            off_plane = abs(across) if normals else math.sqrt(squares)
-                            distance = off_plane if positions else abs(tap_depth - depth)
-                            if not distance <= position_limit * depth:
+                    if bmfr or depths:
+                        squares = across = zero
+                        for c in range(3 if positions else 0):
+                            difference = tap_p[at_tap_p + np.uint64(c * tap_p_strides[1])] - point[c]
+                            squares += difference * difference
+                            if normals:
+                                across += difference * normal[c]
+                        if bmfr:
+                            if positions and not squares < position_limit:
                                 continue
-                bilinear = (fx if tap % 2 else one - fx) * (fy if tap // 2 else one - fy)
-                at_old = b * old_strides[0] + row * old_strides[2] + column * old_strides[3]
-                at_length = b * length_strides[0] + row * length_strides[2] + column * length_strides[3]
-                weight += bilinear
-                length += bilinear * old_length[at_length]
-                weights[kept], places[kept] = bilinear, at_old
-                kept += 1
-            # Beside those that are kept, one of them once more, with no weight: what is left out may hold anything.
-            for tap in range(kept, 4):
-                weights[tap], places[tap] = zero, places[0]
-            found = weight > 0
-            if not found:
+                        else:
+                            tap_depth = tap_d[b * tap_d_strides[0] + row * tap_d_strides[2] + column * tap_d_strides[3]]
+                            if math.isfinite(tap_depth) != hit:
+                                continue
+                            # Where nothing was hit there is no distance to compare.
+                            if hit:
+                                off_plane = abs(across) if normals else math.sqrt(squares)
+                                distance = off_plane if positions else abs(tap_depth - depth)
+                                if not distance <= position_limit * depth:
+                                    continue
+                    bilinear = (fx if tap % 2 else one - fx) * (fy if tap // 2 else one - fy)
+                    weight += bilinear
+                    length += (
+                        bilinear
+                        * old_length[b * length_strides[0] + row * length_strides[2] + column * length_strides[3]]
+                    )
+                    weights[i, kept] = bilinear
+                    places[i, kept] = b * old_strides[0] + row * old_strides[2] + column * old_strides[3]
+                    kept += 1
+                # What is left out may hold anything: beside the others, one of them stands once more, weightless.
+                for tap in range(kept, 4):
+                    weights[i, tap] = zero
+                    places[i, tap] = places[i, 0] if kept else np.uint64(0)
+                if not weight > 0:
+                    alphas[:, i] = one
+                    lengths[b, 0, y, x] = one
+                    continue
+                inverse = one / weight
+                for tap in range(kept):
+                    weights[i, tap] *= inverse
+                length = length * inverse + one
+                newest = one / length
+                alpha = max(newest, alpha_min)
+                excess = one
+                if bmfr:
+                    # What is shortened goes by the rounded length, which was not blended with.
+                    length = min(np.rint(length - one) + one, number(255))
+                    newest = one / length
+                    excess = (one - alpha) / max(one - max(newest, alpha_min), least)
+                if length > one:
+                    count += 1
+                if moves and tints and length > longest:
+                    dx, dy = moved[at_motion], moved[at_motion + motion_strides[1]]
+                    at_tint = b * tint_strides[0] + y * tint_strides[2] + x * tint_strides[3]
+                    specular = dx * dx + dy * dy > still * still
+                    for c in range(3):
+                        specular = specular and tint[at_tint + c * tint_strides[1]] < no_albedo
+                    if specular:
+                        length, newest = longest, one / longest
+                        alpha = one - excess * (one - max(newest, alpha_min))
+                lengths[b, 0, y, x] = length
+                alphas[0, i] = alpha
+                alphas[1, i] = one - excess * (one - max(newest, recent_alpha))
+            for i in range(size):
+                w0, w1, w2, w3 = weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3]
+                i0, i1, i2, i3 = places[i, 0], places[i, 1], places[i, 2], places[i, 3]
+                plane = np.uint64(0)
                 for c in range(channels):
-                    accumulated[b, c, y, x] = new[at_new + (c if c < fresh else c - fresh) * new_strides[1]]
-                lengths[b, 0, y, x] = one
-                continue
-            length = length / weight
-            alpha = max(one / (length + one), alpha_min)
-            length = min(np.rint(length) + one, number(255)) if bmfr else length + one
-            if length > one:
-                count += 1
-            if moves and tints and length > longest:
-                dx, dy = moved[at_motion], moved[at_motion + motion_strides[1]]
-                at_tint = b * tint_strides[0] + y * tint_strides[2] + x * tint_strides[3]
-                specular = dx * dx + dy * dy > still * still
-                for c in range(3):
-                    specular = specular and tint[at_tint + c * tint_strides[1]] < no_albedo
-                if specular:
-                    share = one - max(one / length, alpha_min)
-                    length = longest
-                    alpha = one - (one - alpha) * (one - max(one / length, alpha_min)) / max(share, least)
-            lengths[b, 0, y, x] = length
-            w0, w1, w2, w3 = weights[0] / weight, weights[1] / weight, weights[2] / weight, weights[3] / weight
-            i0, i1, i2, i3 = places[0], places[1], places[2], places[3]
-            for start in range(0, channels, fresh):
-                if start > 0:
-                    share = one - max(one / length, alpha_min)
-                    alpha = one - (one - alpha) * (one - max(one / length, recent_alpha)) / max(share, least)
-                for c in range(start, min(start + fresh, channels)):
-                    value, plane = new[at_new + (c - start) * new_strides[1]], c * old_strides[1]
-                    history = w0 * old[i0 + plane] + w1 * old[i1 + plane] + w2 * old[i2 + plane] + w3 * old[i3 + plane]
+                    sums[c, i] = (
+                        w0 * old[i0 + plane] + w1 * old[i1 + plane] + w2 * old[i2 + plane] + w3 * old[i3 + plane]
+                    )
+                    plane += np.uint64(old_strides[1])
+            for c in range(channels):
+                recent = 1 if c >= fresh else 0
+                start = b * new_strides[0] + (c - recent * fresh) * new_strides[1]
+                start += y * new_strides[2] + x0 * new_strides[3]
+                if new_strides[3] == 1:
+                    values[:size] = new[start : start + size]
+                else:
+                    for i in range(size):
+                        values[i] = new[start + i * new_strides[3]]
+                out, history, alpha = accumulated[b, c, y, x0 : x0 + size], sums[c], alphas[recent]
+                for i in range(size):
                     # From the nearer end, as torch.lerp does.
-                    change = value - history
-                    accumulated[b, c, y, x] = history + alpha * change if alpha < half else value - change * (one - alpha)
+                    change = values[i] - history[i]
+                    far = history[i] + alpha[i] * change
+                    near = values[i] - change * (one - alpha[i])
+                    out[i] = far if alpha[i] < half else near if alpha[i] < one else values[i]
         counts[b, y] = count
