@@ -56,7 +56,9 @@ def _(color: Tensor, albedo: Tensor | None, limit: float, kernel_size: int, root
 
 
 @compiled
-def _demodulate(row: Any, divisor: Any, color: Any, albedo: Any, floor: float, no_albedo: float, b: int, y: int) -> None:
+def _demodulate(
+    row: Any, divisor: Any, color: Any, albedo: Any, floor: float, no_albedo: float, b: int, y: int
+) -> None:
     """One row of all channels."""
     channels, width = row.shape
     memory, strides, _ = color
@@ -211,11 +213,17 @@ def give_up_lag(
     share_rows(halves, lambda *rows: _find_lag(blocks, image, lengths, color.numpy(), *limits, alpha, radius, *rows))
 
 
+@give_up_lag.register_fake
+def _(past: Tensor, *_: Any) -> None:
+    return None
+
+
 @compiled
 def _between(a: float, b: float, share: float) -> float:
     """From the nearer end, as torch.lerp does."""
     one, change = type(a)(1), b - a
     return a + share * change if share + share < one else b - change * (one - share)
+
 
 @compiled
 def _variance(variance: Any, root: Any, square: Any, length: Any) -> None:
@@ -227,7 +235,9 @@ def _variance(variance: Any, root: Any, square: Any, length: Any) -> None:
 
 
 @compiled
-def _halve(halves: Any, past: Any, lengths: Any, color: Any, recent_frames: float, b: int, first: int, last: int) -> None:
+def _halve(
+    halves: Any, past: Any, lengths: Any, color: Any, recent_frames: float, b: int, first: int, last: int
+) -> None:
     _, _, height, width = past.shape
     _, _, _, columns = halves.shape
     number = halves.dtype.type
@@ -264,7 +274,15 @@ def _add(total: Any, values: Any) -> None:
 
 @compiled
 def _lag(
-    share: Any, sums: Any, history: Any, recent: Any, variance: Any, threshold: float, smallest: float, radius: int, y: int
+    share: Any,
+    sums: Any,
+    history: Any,
+    recent: Any,
+    variance: Any,
+    threshold: float,
+    smallest: float,
+    radius: int,
+    y: int,
 ) -> None:
     """One row of :func:`mcdenoise.ops.history_lag`; ``sums`` has room for three with ``radius`` more at both ends."""
     height, width = history.shape

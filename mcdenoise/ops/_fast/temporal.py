@@ -32,7 +32,11 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
     batch, _, height, width = position.shape
     motion = torch.empty((batch, 2, height, width), dtype=dtype)
     if motion.numel():
-        arguments = (motion.numpy(), source(position.to(dtype)), previous_view_projection.detach().to(dtype).contiguous().numpy())
+        arguments = (
+            motion.numpy(),
+            source(position.to(dtype)),
+            previous_view_projection.detach().to(dtype).contiguous().numpy(),
+        )
         share_rows(position, lambda *rows: _motion(*arguments, *rows))
     return motion
 
