@@ -181,8 +181,8 @@ class History:
         fireflies: how fireflies are clamped; ``ClampFireflies(math.inf)`` leaves them.
         specular_length: the longest history of what is seen in mirrors and through glass while the image moves, in
             frames, at least 0; infinity treats them as everything else.
-        anti_lag: the test for changes of light, in half the resolution; ``HistoryLag(math.inf)`` makes none, in half
-            the time.
+        anti_lag: the test for changes of light, in half the resolution; ``HistoryLag(math.inf)`` makes none, in two
+            thirds of the time.
 
     Raises:
         ValueError: ``specular_length`` is negative.

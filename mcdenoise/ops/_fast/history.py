@@ -241,7 +241,7 @@ def _halve(
     _, _, height, width = past.shape
     _, _, _, columns = halves.shape
     number = halves.dtype.type
-    # Of two rows; where the width is odd, the last column is twice as wide.
+    # Sums of two rows; where the width is odd, the last column is there twice.
     rows, variance = np.empty((5, 2 * columns), halves.dtype), np.empty(width, halves.dtype)
     for y in range(first, last):
         count = min(2 * y + 2, height) - 2 * y
@@ -261,9 +261,9 @@ def _halve(
                 rows[k, width] = rows[k, width - 1]
         for k in range(5):
             # A mean's variance is a quarter of the four pixels'.
-            share, block, pixels = number((0.5 if k < 3 else 0.125) / count), halves[b, k, y], rows[k]
+            part, block, pixels = number((0.5 if k < 3 else 0.125) / count), halves[b, k, y], rows[k]
             for x in range(columns):
-                block[x] = share * (pixels[2 * x] + pixels[2 * x + 1])
+                block[x] = part * (pixels[2 * x] + pixels[2 * x + 1])
 
 
 @compiled
