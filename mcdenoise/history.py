@@ -20,7 +20,9 @@ from mcdenoise.ops import (
     demodulate,
     motion_from_position,
 )
+from mcdenoise.ops._backend import Backend, choose_backend
 from mcdenoise.ops._rows import by_rows
+from mcdenoise.ops.temporal import Shorter, accumulate_numba
 
 # A cut leaves a few accidental matches; a fast pan keeps far more than this share of the image.
 _CUT_SHARE = 0.05
@@ -120,9 +122,18 @@ class _State(NamedTuple):
     surface: Surface
     view_projection: Tensor | None
 
+    def fits(self, color: Tensor) -> bool:
+        """Whether it can be the past of this image."""
+        return self.length.shape == color[:, :1].shape and self.length.device == color.device
+
 
 # The channels of a state.
 _COLOR, _MEAN, _SQUARE, _RECENT, _RECENT_MEAN = slice(0, 3), slice(3, 4), slice(4, 5), slice(5, 9), slice(8, 9)
+
+
+def _with_recent(entering: Tensor) -> Tensor:
+    """All channels of a :class:`_State`."""
+    return torch.cat([entering, entering[:, : _SQUARE.start]], 1) if entering.shape[1] > _SQUARE.start else entering
 
 
 class _Past(NamedTuple):
@@ -131,6 +142,10 @@ class _Past(NamedTuple):
     color: Tensor
     length: Tensor
     reset: str
+
+
+def _no_past(entering: Tensor, reset: str) -> _Past:
+    return _Past(_with_recent(entering), torch.ones_like(entering[:, :1]), reset)
 
 
 class History:
@@ -166,8 +181,8 @@ class History:
         fireflies: how fireflies are clamped; ``ClampFireflies(math.inf)`` leaves them.
         specular_length: the longest history of what is seen in mirrors and through glass while the image moves, in
             frames, at least 0; infinity treats them as everything else.
-        anti_lag: the test for changes of light, in half the resolution; ``HistoryLag(math.inf)`` makes none, in half
-            the time.
+        anti_lag: the test for changes of light, in half the resolution; ``HistoryLag(math.inf)`` makes none, in two
+            thirds of the time.
 
     Raises:
         ValueError: ``specular_length`` is negative.
@@ -220,42 +235,63 @@ class History:
             reprojects: look for each pixel's past where it was; not needed for a frame that :meth:`is_still`.
             keeps: remember the frame; not needed for the last one.
         """
-        frame = frame.with_depth()
-        reach = self.fireflies.kernel_size // 2
-        if demodulates and frame.albedo is not None:
-            color = by_rows(lambda *rows: self.fireflies(demodulate(*rows)), frame.color, frame.albedo, reach=reach)
-        else:
-            color = by_rows(self.fireflies, frame.color, reach=reach)
-        color = color.to(torch.promote_types(color.dtype, torch.float32))
-        entering = color
+        frame, state = frame.with_depth(), self._state
+        before = () if state is None or not state.fits(frame.color) else (state.color, state.length)
+        images = (frame.color, *(image for _, image in frame.items()), *before)
+        backend = choose_backend(self.accumulate.backend, *images, differentiable=False, forms=("torch", "numba"))
         # What has no past and will be none is compared with nothing.
-        if self.anti_lag is not None and (keeps or self._state is not None):
-            mean = _compressed(color)
-            entering = torch.cat([color, mean, mean.square(), color, mean], 1)
-        past = self._blend(frame, entering, reprojects)
+        compared = self.anti_lag is not None and (keeps or state is not None)
+        entering = (self._entering_numba if backend == "numba" else self._entering)(
+            frame.color, frame.albedo if demodulates else None, compared
+        )
+        past = self._blend(frame, entering, reprojects, backend)
         surface = Surface(frame.position, frame.normal, frame.depth)
         self._state = _State(past.color, past.length, surface, frame.view_projection) if keeps else None
-        return Accumulated(past.color[:, _COLOR], color, past.length, past.reset)
+        return Accumulated(past.color[:, _COLOR], entering[:, _COLOR], past.length, past.reset)
 
-    def _blend(self, frame: Frame, color: Tensor, reprojects: bool) -> _Past:
+    def _entering(self, color: Tensor, albedo: Tensor | None, compared: bool) -> Tensor:
+        """The frame as it is accumulated: all channels of a :class:`_State` but the recent ones, which are the same."""
+        reach = self.fireflies.kernel_size // 2
+        if albedo is not None:
+            color = by_rows(lambda *rows: self.fireflies(demodulate(*rows)), color, albedo, reach=reach)
+        else:
+            color = by_rows(self.fireflies, color, reach=reach)
+        color = color.to(torch.promote_types(color.dtype, torch.float32))
+        if not compared:
+            return color
+        mean = _compressed(color)
+        return torch.cat([color, mean, mean.square()], 1)
+
+    def _entering_numba(self, color: Tensor, albedo: Tensor | None, compared: bool) -> Tensor:
+        from mcdenoise.ops._fast import history as fast
+
+        entering: Tensor = fast.incoming(color, albedo, self.fireflies.limit, self.fireflies.kernel_size, compared)
+        return entering
+
+    def _blend(self, frame: Frame, entering: Tensor, reprojects: bool, backend: Backend) -> _Past:
         """The frame with its past."""
         state = self._state
-        first = _Past(color, torch.ones_like(color[:, :1]), "first frame")
         if state is None:
             lost = frame.motion is None and (frame.position is None or frame.view_projection is None)
-            return first._replace(reset=_NO_WAY) if lost else first
-        if state.color.shape != color.shape or state.color.device != color.device:
-            return first._replace(reset="size change")
+            return _no_past(entering, _NO_WAY if lost else "first frame")
+        if not state.fits(entering):
+            return _no_past(entering, "size change")
         motion = None
-        if reprojects:
-            still = frame.motion is None and self.is_still(frame)
-            motion = torch.zeros_like(color[:, :2]) if still else motion_to_previous(frame, state.view_projection)
+        if reprojects and (frame.motion is not None or not self.is_still(frame)):
+            motion = motion_to_previous(frame, state.view_projection)
             if motion is None:
-                return first._replace(reset=_NO_WAY)
-        surface = surface_before(frame)
-        past, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
+                return _no_past(entering, _NO_WAY)
+        blended = (self._blended_numba if backend == "numba" else self._blended)(frame, entering, motion, state)
+        return _no_past(entering, "cut") if blended is None else _Past(*blended, "")
+
+    def _blended(
+        self, frame: Frame, entering: Tensor, motion: Tensor | None, state: _State
+    ) -> tuple[Tensor, Tensor] | None:
+        """Color and length of the frame with its past, ``None`` at a cut."""
+        color = _with_recent(entering)
+        past, length = self.accumulate(color, state.color, state.length, motion, surface_before(frame), state.surface)
         if int((length > 1).sum()) < _CUT_SHARE * length.numel():
-            return first._replace(reset="cut")
+            return None
         if frame.albedo is not None and motion is not None:
             both = by_rows(self._shortened, color, past, length, frame.albedo, motion)
             past, length = both[:, :-1], both[:, -1:]
@@ -264,7 +300,27 @@ class History:
             reach = 2 * (self.anti_lag.kernel_size // 2)
             both = by_rows(partial(self._without_lag, self.anti_lag), color, past, length, reach=reach)
             past, length = both[:, :-1], both[:, -1:]
-        return _Past(past, length, "")
+        return past, length
+
+    def _blended_numba(
+        self, frame: Frame, entering: Tensor, motion: Tensor | None, state: _State
+    ) -> tuple[Tensor, Tensor] | None:
+        """As :meth:`_blended`, with one pass over the images for all but the test for lag, which is in three."""
+        from mcdenoise.ops._fast import history as fast
+
+        rule = self.accumulate
+        recent_alpha = max(rule.alpha_min, _RECENT_ALPHA)
+        past, length, kept = accumulate_numba(
+            *(entering, state.color, state.length, motion, surface_before(frame), state.surface),
+            *(rule.alpha_min, rule.rule, rule.position_limit, rule.normal_limit),
+            Shorter(recent_alpha, frame.albedo, self.specular_length + 1, _STILL),
+        )
+        if int(kept.sum()) < _CUT_SHARE * length.numel():
+            return None
+        if self.anti_lag is not None:
+            settings = (self.anti_lag.threshold, self.anti_lag.kernel_size, recent_alpha, _RECENT_FRAMES)
+            fast.give_up_lag(past, length, entering, *settings)
+        return past, length
 
     def _without_lag(self, lag: HistoryLag, color: Tensor, past: Tensor, length: Tensor) -> Tensor:
         """Color and length of what still holds: of the recent past by the frame, of the long one by the recent one."""

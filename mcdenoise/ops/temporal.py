@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, NamedTuple
 
 import torch
@@ -33,7 +34,9 @@ class Surface(NamedTuple):
     depth: Tensor | None = None
 
 
-def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
+def motion_from_position(
+    position: Tensor, previous_view_projection: Tensor, *, backend: Backend | None = None
+) -> Tensor:
     """Where each static surface point was in the previous frame, relative to where it is now.
 
     ``clip = [x y z 1] @ M``, ``(u, v) = (clip.xy / clip.w + 1) / 2``, ``motion = (u W, v H) - current pixel centre``.
@@ -41,6 +44,8 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
     Args:
         position: ``(B, 3, H, W)`` world-space hit points of the current frame, scene units.
         previous_view_projection: ``(B, 4, 4)`` row-vector world-to-clip matrix of the previous frame, clip y down.
+        backend: ``"torch"``, ``"numba"`` (CPU only, without derivatives), or ``None`` for the faster of those that
+            can run.
 
     Returns:
         ``(B, 2, H, W)`` motion in pixels, x right and y down, ``previous = current + motion``; infinite where the
@@ -49,7 +54,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree.
+        ValueError: shapes disagree, or the backend cannot run.
 
     Differentiable in ``position`` and ``previous_view_projection``, to any order, where the point was in front.
     Half precision is projected in float32 (a pixel of a wide image needs more than 11 bits).
@@ -62,6 +67,9 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
         [0.25, 0.0]
     """
     sizes = check_shapes(position=(position, "B 3 H W"), previous_view_projection=(previous_view_projection, "B 4 4"))
+    images = (position, previous_view_projection)
+    if choose_backend(backend, *images, differentiable=False, forms=("torch", "numba")) == "numba":
+        return _motion_numba(*images)
     height, width = sizes["H"], sizes["W"]
     dtype = torch.promote_types(position.dtype, torch.float32)
     matrix = previous_view_projection.to(dtype)
@@ -75,6 +83,13 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
     previous = (clip[:, :2] / torch.where(in_front, w, 1) + 1) / 2 * scale
     centre = _pixel_grid(height, width, position.device, dtype) + 0.5
     return torch.where(in_front, previous - centre, torch.inf)
+
+
+def _motion_numba(position: Tensor, previous_view_projection: Tensor) -> Tensor:
+    from mcdenoise.ops._fast import temporal as fast
+
+    result: Tensor = fast.motion_from_position(position, previous_view_projection)
+    return result
 
 
 def reproject(
@@ -252,9 +267,9 @@ def accumulate(
     images = (color, previous, previous_length)
     surfaces = (*(surface or ()), *(previous_surface or ()))
     if choose_backend(backend, *images, motion, *surfaces, differentiable=False, forms=("torch", "numba")) == "numba":
-        return _accumulate_numba(
-            *images, motion, surface, previous_surface, alpha_min, rule, position_limit, normal_limit
-        )
+        return accumulate_numba(
+            *images, motion, surface, previous_surface, alpha_min, rule, position_limit, normal_limit, Shorter()
+        )[:2]
     dtype = torch.promote_types(color.dtype, torch.float32)
     channels = color.shape[1]
     both, weight = reproject(
@@ -276,7 +291,23 @@ def accumulate(
     return accumulated.to(color.dtype), length.to(previous_length.dtype)
 
 
-def _accumulate_numba(
+class Shorter(NamedTuple):
+    """Where the past is to be shorter, see :class:`mcdenoise.history.History`.
+
+    Args:
+        recent_alpha: smallest weight of the current frame in a second, shorter past of the first channels.
+        albedo: ``(B, 3, H, W)``, which says where a mirror or glass is seen.
+        longest: the longest history of what is seen there while it moves, in frames.
+        still: what moves by no more does not move, in pixels.
+    """
+
+    recent_alpha: float = 1.0
+    albedo: Tensor | None = None
+    longest: float = math.inf
+    still: float = 0.0
+
+
+def accumulate_numba(
     color: Tensor,
     previous: Tensor,
     previous_length: Tensor,
@@ -287,7 +318,12 @@ def _accumulate_numba(
     rule: Rule,
     position_limit: float | None,
     normal_limit: float | None,
-) -> tuple[Tensor, Tensor]:
+    shorter: Shorter,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """:func:`accumulate` with a past that is shorter in places or channels, and how many pixels of each row have one.
+
+    Channels that ``previous`` has more than ``color`` are the second past of the first of them.
+    """
     from mcdenoise.ops._fast import temporal as fast
 
     _check_known(rule)
@@ -298,8 +334,8 @@ def _accumulate_numba(
         position_limit = DEPTH_LIMIT if here.position is None else PLANE_LIMIT
     if normal_limit is None:
         normal_limit = NORMAL_LIMIT_SQUARED
-    settings = (alpha_min, rule == "bmfr", position_limit, normal_limit)
-    result: tuple[Tensor, Tensor] = fast.accumulate(
+    settings = (alpha_min, rule == "bmfr", position_limit, normal_limit, *shorter)
+    result: tuple[Tensor, Tensor, Tensor] = fast.accumulate(
         color, previous, previous_length, motion, list(here), list(there), *settings
     )
     return result

@@ -276,6 +276,33 @@ def test_accumulation_refuses_what_the_plain_form_refuses(settings: dict[str, An
             ops.accumulate(**inputs, **settings, backend=backend)
 
 
+MOTION = next(op for op in OPS if op.name == "motion_from_position")
+
+
+@every_dtype
+@pytest.mark.parametrize("case", [case for case in MOTION.cases if case.kind != "extreme"], ids=lambda case: case.name)
+def test_motion_is_that_of_the_plain_form(case: Case, dtype: torch.dtype) -> None:
+    inputs = case.inputs(dtype)
+    plain = ops.motion_from_position(**inputs, backend="torch")
+    for layout in (torch.clone, channels_last, transposed):
+        position = layout(inputs["position"])
+        motion = ops.motion_from_position(position, inputs["previous_view_projection"], backend="numba")
+        assert motion.dtype == plain.dtype
+        assert torch.equal(motion.isinf(), plain.isinf())
+        eps, largest = torch.finfo(motion.dtype).eps, plain[plain.isfinite()].abs().max().item()
+        torch.testing.assert_close(motion, plain, rtol=8 * eps, atol=8 * eps * (largest + sum(plain.shape[2:])))
+
+
+def test_motion_of_what_was_not_seen_is_infinite() -> None:
+    matrix = torch.eye(4)[None]
+    matrix[:, 2, 3], matrix[:, 3, 3] = 1, 0  # clip w = z
+    position = torch.tensor(
+        [[0.0, 0, 1], [0, 0, -1], [0, 0, 0], [torch.inf, 0, 1], [0, torch.nan, 1], [0, 0, torch.inf]]
+    )
+    motion = ops.motion_from_position(position.T.reshape(1, 3, 1, 6), matrix, backend="numba")
+    assert motion.isinf().all(1).flatten().tolist() == [False, True, True, True, True, True]
+
+
 def test_without_a_folder_for_compiled_code_it_is_compiled_anew() -> None:
     code = (
         "import numba.core.caching as caching, torch\n"

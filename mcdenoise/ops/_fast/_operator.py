@@ -15,7 +15,7 @@ class Operator:
 
     Args:
         name: such as ``"mcdenoise::accumulate"``.
-        function: computes it, and neither changes nor returns an argument.
+        function: computes it, returns no argument, and changes none that the schema does not say is changed.
         device_types: where, such as ``"cpu"``; everywhere by default.
         schema: its arguments and results.
     """

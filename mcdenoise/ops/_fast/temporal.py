@@ -1,7 +1,7 @@
-"""The fast form of accumulation as a torch operator: reprojection, test and blending in one pass, without derivatives.
+"""The fast forms of motion and accumulation as torch operators, without derivatives.
 
-Nothing is trained through it, and pixel by pixel its taps lie anywhere: there is nothing to vectorise, only forty
-passes over the image to save.
+Nothing is trained through them, and pixel by pixel the taps of a history lie anywhere: there is nothing to vectorise,
+only forty passes over the image to save. So one pass does all that :class:`mcdenoise.history.History` asks of it, too.
 """
 
 from __future__ import annotations
@@ -15,14 +15,68 @@ from torch import Tensor
 
 from mcdenoise.ops._fast._numba_filter import compiled, share_rows, source
 from mcdenoise.ops._fast._operator import custom_op
+from mcdenoise.ops.demodulation import NO_ALBEDO
+
+# Pixels whose taps are held at a time: they stay in the first-level cache.
+_CHUNK = 128
+
+
+@custom_op(
+    "mcdenoise::motion_from_position",
+    device_types="cpu",
+    schema="(Tensor position, Tensor previous_view_projection) -> Tensor",
+)
+def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
+    """See :func:`mcdenoise.ops.motion_from_position`."""
+    dtype = torch.promote_types(position.dtype, torch.float32)
+    batch, _, height, width = position.shape
+    motion = torch.empty((batch, 2, height, width), dtype=dtype)
+    if motion.numel():
+        arguments = (
+            motion.numpy(),
+            source(position.to(dtype)),
+            previous_view_projection.detach().to(dtype).contiguous().numpy(),
+        )
+        share_rows(position, lambda *rows: _motion(*arguments, *rows))
+    return motion
+
+
+@motion_from_position.register_fake
+def _(position: Tensor, previous_view_projection: Tensor) -> Tensor:
+    batch, _, height, width = position.shape
+    dtype = torch.promote_types(position.dtype, torch.float32)
+    return position.new_empty((batch, 2, height, width), dtype=dtype)
+
+
+@compiled
+def _motion(motion: Any, position: Any, matrices: Any, b: int, first: int, last: int) -> None:
+    _, _, height, width = motion.shape
+    memory, strides, _ = position
+    number = motion.dtype.type
+    m, one, half, infinite = matrices[b], number(1), number(0.5), number(np.inf)
+    m00, m01, m03, m10, m11, m13 = m[0, 0], m[0, 1], m[0, 3], m[1, 0], m[1, 1], m[1, 3]
+    m20, m21, m23, m30, m31, m33 = m[2, 0], m[2, 1], m[2, 3], m[3, 0], m[3, 1], m[3, 3]
+    wide, high = number(width) * half, number(height) * half
+    for y in range(first, last):
+        start, down = b * strides[0] + y * strides[2], number(y) + half
+        across, along = motion[b, 0, y], motion[b, 1, y]
+        for i in range(width):
+            at = start + i * strides[3]
+            px, py, pz = memory[at], memory[at + strides[1]], memory[at + 2 * strides[1]]
+            w = px * m03 + py * m13 + pz * m23 + m33
+            # A NaN is what infinity times zero and the difference of two infinities are.
+            in_front = w > 0 and (px - px) + (py - py) + (pz - pz) == 0
+            u, v = (px * m00 + py * m10 + pz * m20 + m30) / w, (px * m01 + py * m11 + pz * m21 + m31) / w
+            across[i] = (u + one) * wide - (number(i) + half) if in_front else infinite
+            along[i] = (v + one) * high - down if in_front else infinite
 
 
 @custom_op(
     "mcdenoise::accumulate",
     device_types="cpu",
     schema="(Tensor color, Tensor previous, Tensor previous_length, Tensor? motion, Tensor?[] surface, "
-    "Tensor?[] previous_surface, float alpha_min, bool bmfr, float position_limit, float normal_limit) "
-    "-> (Tensor, Tensor)",
+    "Tensor?[] previous_surface, float alpha_min, bool bmfr, float position_limit, float normal_limit, "
+    "float recent_alpha, Tensor? albedo, float longest, float still) -> (Tensor, Tensor, Tensor)",
 )
 def accumulate(
     color: Tensor,
@@ -35,11 +89,16 @@ def accumulate(
     bmfr: bool,
     position_limit: float,
     normal_limit: float,
-) -> tuple[Tensor, Tensor]:
-    """See :func:`mcdenoise.ops.accumulate`; the surfaces have the same buffers."""
+    recent_alpha: float,
+    albedo: Tensor | None,
+    longest: float,
+    still: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See :func:`mcdenoise.ops.temporal.accumulate_numba`; the surfaces have the same buffers."""
     dtype = torch.promote_types(color.dtype, torch.float32)
-    accumulated = torch.empty(color.shape, dtype=dtype)
+    accumulated = torch.empty(previous.shape, dtype=dtype)
     length = torch.empty(previous_length.shape, dtype=dtype)
+    kept = torch.zeros(previous.shape[0], previous.shape[2], dtype=torch.int64)
     if accumulated.numel():
         nothing = torch.empty((0, 0, 0, 0))
         surfaces = (
@@ -48,32 +107,42 @@ def accumulate(
         )
         images = (
             source((nothing if image is None else image).to(dtype))
-            for image in (color, previous, previous_length, motion)
+            for image in (color, previous, previous_length, motion, albedo)
         )
-        limits = tuple(accumulated.new_tensor([alpha_min, position_limit, normal_limit]).tolist())
-        arguments = (accumulated.numpy(), length.numpy(), *images, *surfaces, *limits, bmfr)
+        # In the dtype of the sums: a number in double precision would make the sums so.
+        limits = accumulated.new_tensor(
+            [alpha_min, position_limit, normal_limit, recent_alpha, NO_ALBEDO, longest, still]
+        ).numpy()
+        arguments = (accumulated.numpy(), length.numpy(), kept.numpy(), *images, *surfaces, *limits, bmfr)
         share_rows(color, lambda *rows: _accumulate(*arguments, *rows))
-    return accumulated.to(color.dtype), length.to(previous_length.dtype)
+    return accumulated.to(color.dtype), length.to(previous_length.dtype), kept
 
 
 @accumulate.register_fake
-def _(color: Tensor, previous: Tensor, previous_length: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
-    return color.new_empty(color.shape), previous_length.new_empty(previous_length.shape)
+def _(color: Tensor, previous: Tensor, previous_length: Tensor, *_: Any) -> tuple[Tensor, Tensor, Tensor]:
+    kept = previous.new_empty((previous.shape[0], previous.shape[2]), dtype=torch.int64)
+    return color.new_empty(previous.shape), previous_length.new_empty(previous_length.shape), kept
 
 
 @compiled
 def _accumulate(
     accumulated: Any,
     lengths: Any,
+    counts: Any,
     color: Any,
     previous: Any,
     previous_length: Any,
     motion: Any,
+    albedo: Any,
     here: Any,
     there: Any,
     alpha_min: float,
     position_limit: float,
     normal_limit: float,
+    recent_alpha: float,
+    no_albedo: float,
+    longest: float,
+    still: float,
     bmfr: bool,
     b: int,
     first: int,
@@ -82,83 +151,147 @@ def _accumulate(
     """Rows ``first`` to ``last`` of the result, by the rules of :func:`mcdenoise.ops.reproject`.
 
     In one piece, and with the memory of each image in a variable: handed to other functions, arrays are counted, pixel
-    by pixel, which takes ten times as long as all the rest.
+    by pixel, which takes ten times as long as all the rest. The taps of a run of pixels are found first and summed
+    then, channel by channel: the planes of an image often begin a power of two apart, and the cache holds few such.
     """
     _, channels, height, width = accumulated.shape
-    (new, new_strides, _), (old, old_strides, _), (old_length, length_strides, _) = color, previous, previous_length
+    (new, new_strides, fresh), (old, old_strides, _), (old_length, length_strides, _) = color, previous, previous_length
     moved, motion_strides, moves = motion
     (p, p_strides, positions), (n, n_strides, normals), (d, d_strides, depths) = here
     (tap_p, tap_p_strides, _), (tap_n, tap_n_strides, _), (tap_d, tap_d_strides, _) = there
+    tint, tint_strides, tints = albedo
     taps = 4 if moves else 1
-    sums, one, zero = np.empty(channels, accumulated.dtype), accumulated.dtype.type(1), accumulated.dtype.type(0)
+    number = accumulated.dtype.type
+    one, zero, half, least = number(1), number(0), number(0.5), number(1e-6)
+    weights, places = np.empty((_CHUNK, 4), accumulated.dtype), np.empty((_CHUNK, 4), np.uint64)
+    sums, values = np.empty((channels, _CHUNK), accumulated.dtype), np.empty(_CHUNK, accumulated.dtype)
+    # Weight of the frame, and that in the recent past.
+    alphas = np.empty((2, _CHUNK), accumulated.dtype)
     for y in range(first, last):
-        for x in range(width):
-            at_new = b * new_strides[0] + y * new_strides[2] + x * new_strides[3]
-            at_p = b * p_strides[0] + y * p_strides[2] + x * p_strides[3]
-            at_n = b * n_strides[0] + y * n_strides[2] + x * n_strides[3]
-            depth = d[b * d_strides[0] + y * d_strides[2] + x * d_strides[3]] if depths else zero
-            hit = math.isfinite(depth)
-            qx, qy = accumulated.dtype.type(x), accumulated.dtype.type(y)
-            if moves:
-                at_motion = b * motion_strides[0] + y * motion_strides[2] + x * motion_strides[3]
-                qx += moved[at_motion]
-                qy += moved[at_motion + motion_strides[1]]
-            # Not so for a NaN either.
-            reachable = -1 < qx < width and -1 < qy < height
-            left, top = (math.floor(qx), math.floor(qy)) if reachable else (0, 0)
-            fx, fy = qx - accumulated.dtype.type(left), qy - accumulated.dtype.type(top)
-            sums[:] = 0
-            weight = length = zero
-            for tap in range(taps if reachable else 0):
-                row, column = top + tap // 2, left + tap % 2
-                if row < 0 or row >= height or column < 0 or column >= width:
-                    continue
-                at_tap_p = b * tap_p_strides[0] + row * tap_p_strides[2] + column * tap_p_strides[3]
-                at_tap_n = b * tap_n_strides[0] + row * tap_n_strides[2] + column * tap_n_strides[3]
+        count = 0
+        for x0 in range(0, width, _CHUNK):
+            size = min(_CHUNK, width - x0)
+            for i in range(size):
+                x = x0 + i
+                at_p = b * p_strides[0] + y * p_strides[2] + x * p_strides[3]
+                at_n = b * n_strides[0] + y * n_strides[2] + x * n_strides[3]
+                normal, point = (zero, zero, zero), (zero, zero, zero)
                 if normals:
-                    turn = zero
-                    for c in range(3):
-                        difference = tap_n[at_tap_n + c * tap_n_strides[1]] - n[at_n + c * n_strides[1]]
-                        turn += difference * difference
-                    if not (turn < normal_limit or (turn == normal_limit and not bmfr)):
+                    normal = (n[at_n], n[at_n + n_strides[1]], n[at_n + 2 * n_strides[1]])
+                if positions:
+                    point = (p[at_p], p[at_p + p_strides[1]], p[at_p + 2 * p_strides[1]])
+                at_motion = b * motion_strides[0] + y * motion_strides[2] + x * motion_strides[3]
+                depth = d[b * d_strides[0] + y * d_strides[2] + x * d_strides[3]] if depths else zero
+                hit = math.isfinite(depth)
+                qx, qy = number(x), number(y)
+                if moves:
+                    qx += moved[at_motion]
+                    qy += moved[at_motion + motion_strides[1]]
+                # Not so for a NaN either.
+                reachable = -1 < qx < width and -1 < qy < height
+                left, top = (np.int64(qx) - (qx < 0), np.int64(qy) - (qy < 0)) if reachable else (0, 0)
+                fx, fy = qx - number(left), qy - number(top)
+                weight = length = zero
+                kept = 0
+                for tap in range(taps if reachable else 0):
+                    row, column = top + tap // 2, left + tap % 2
+                    if row < 0 or row >= height or column < 0 or column >= width:
                         continue
-                if bmfr or depths:
-                    squares = across = zero
-                    for c in range(3 if positions else 0):
-                        difference = tap_p[at_tap_p + c * tap_p_strides[1]] - p[at_p + c * p_strides[1]]
-                        squares += difference * difference
-                        if normals:
-                            across += difference * n[at_n + c * n_strides[1]]
-                    if bmfr:
-                        if positions and not squares < position_limit:
+                    at_tap_p = np.uint64(b * tap_p_strides[0] + row * tap_p_strides[2] + column * tap_p_strides[3])
+                    at_tap_n = np.uint64(b * tap_n_strides[0] + row * tap_n_strides[2] + column * tap_n_strides[3])
+                    if normals:
+                        turn = zero
+                        for c in range(3):
+                            difference = tap_n[at_tap_n + np.uint64(c * tap_n_strides[1])] - normal[c]
+                            turn += difference * difference
+                        if not (turn < normal_limit or (turn == normal_limit and not bmfr)):
                             continue
-                    else:
-                        tap_depth = tap_d[b * tap_d_strides[0] + row * tap_d_strides[2] + column * tap_d_strides[3]]
-                        if math.isfinite(tap_depth) != hit:
-                            continue
-                        # Where nothing was hit there is no distance to compare.
-                        if hit:
-                            off_plane = abs(across) if normals else math.sqrt(squares)
-                            distance = off_plane if positions else abs(tap_depth - depth)
-                            if not distance <= position_limit * depth:
+                    if bmfr or depths:
+                        squares = across = zero
+                        for c in range(3 if positions else 0):
+                            difference = tap_p[at_tap_p + np.uint64(c * tap_p_strides[1])] - point[c]
+                            squares += difference * difference
+                            if normals:
+                                across += difference * normal[c]
+                        if bmfr:
+                            if positions and not squares < position_limit:
                                 continue
-                bilinear = (fx if tap % 2 else one - fx) * (fy if tap // 2 else one - fy)
-                at_old = b * old_strides[0] + row * old_strides[2] + column * old_strides[3]
-                at_length = b * length_strides[0] + row * length_strides[2] + column * length_strides[3]
-                weight += bilinear
-                length += bilinear * old_length[at_length]
+                        else:
+                            tap_depth = tap_d[b * tap_d_strides[0] + row * tap_d_strides[2] + column * tap_d_strides[3]]
+                            if math.isfinite(tap_depth) != hit:
+                                continue
+                            # Where nothing was hit there is no distance to compare.
+                            if hit:
+                                off_plane = abs(across) if normals else math.sqrt(squares)
+                                distance = off_plane if positions else abs(tap_depth - depth)
+                                if not distance <= position_limit * depth:
+                                    continue
+                    bilinear = (fx if tap % 2 else one - fx) * (fy if tap // 2 else one - fy)
+                    weight += bilinear
+                    length += (
+                        bilinear
+                        * old_length[b * length_strides[0] + row * length_strides[2] + column * length_strides[3]]
+                    )
+                    weights[i, kept] = bilinear
+                    places[i, kept] = b * old_strides[0] + row * old_strides[2] + column * old_strides[3]
+                    kept += 1
+                # What is left out may hold anything: beside the others, one of them stands once more, weightless.
+                for tap in range(kept, 4):
+                    weights[i, tap] = zero
+                    places[i, tap] = places[i, 0] if kept else np.uint64(0)
+                if not weight > 0:
+                    alphas[:, i] = one
+                    lengths[b, 0, y, x] = one
+                    continue
+                inverse = one / weight
+                for tap in range(kept):
+                    weights[i, tap] *= inverse
+                length = length * inverse + one
+                newest = one / length
+                alpha = max(newest, alpha_min)
+                excess = one
+                if bmfr:
+                    # What is shortened goes by the rounded length, which was not blended with.
+                    length = min(np.rint(length - one) + one, number(255))
+                    newest = one / length
+                    excess = (one - alpha) / max(one - max(newest, alpha_min), least)
+                if length > one:
+                    count += 1
+                if moves and tints and length > longest:
+                    dx, dy = moved[at_motion], moved[at_motion + motion_strides[1]]
+                    at_tint = b * tint_strides[0] + y * tint_strides[2] + x * tint_strides[3]
+                    specular = dx * dx + dy * dy > still * still
+                    for c in range(3):
+                        specular = specular and tint[at_tint + c * tint_strides[1]] < no_albedo
+                    if specular:
+                        length, newest = longest, one / longest
+                        alpha = one - excess * (one - max(newest, alpha_min))
+                lengths[b, 0, y, x] = length
+                alphas[0, i] = alpha
+                alphas[1, i] = one - excess * (one - max(newest, recent_alpha))
+            for i in range(size):
+                w0, w1, w2, w3 = weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3]
+                i0, i1, i2, i3 = places[i, 0], places[i, 1], places[i, 2], places[i, 3]
+                plane = np.uint64(0)
                 for c in range(channels):
-                    sums[c] += bilinear * old[at_old + c * old_strides[1]]
-            found = weight > 0
-            length = length / weight if found else zero
-            alpha = max(one / (length + one), alpha_min) if found else one
+                    sums[c, i] = (
+                        w0 * old[i0 + plane] + w1 * old[i1 + plane] + w2 * old[i2 + plane] + w3 * old[i3 + plane]
+                    )
+                    plane += np.uint64(old_strides[1])
             for c in range(channels):
-                value = new[at_new + c * new_strides[1]]
-                if found:
-                    history = sums[c] / weight
+                recent = 1 if c >= fresh else 0
+                start = b * new_strides[0] + (c - recent * fresh) * new_strides[1]
+                start += y * new_strides[2] + x0 * new_strides[3]
+                if new_strides[3] == 1:
+                    values[:size] = new[start : start + size]
+                else:
+                    for i in range(size):
+                        values[i] = new[start + i * new_strides[3]]
+                out, history, alpha = accumulated[b, c, y, x0 : x0 + size], sums[c], alphas[recent]
+                for i in range(size):
                     # From the nearer end, as torch.lerp does.
-                    change = value - history
-                    value = history + alpha * change if alpha < 0.5 else value - change * (one - alpha)
-                accumulated[b, c, y, x] = value
-            grown = min(np.rint(length) + one, 255) if bmfr else length + one
-            lengths[b, 0, y, x] = grown if found else one
+                    change = values[i] - history[i]
+                    far = history[i] + alpha[i] * change
+                    near = values[i] - change * (one - alpha[i])
+                    out[i] = far if alpha[i] < half else near if alpha[i] < one else values[i]
+        counts[b, y] = count

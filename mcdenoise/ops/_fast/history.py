@@ -1,0 +1,367 @@
+"""What :class:`mcdenoise.history.History` does before and after accumulation, as torch operators without derivatives.
+
+What takes plain torch dozens of passes over the image takes one row after the other here, while it is in the cache.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mcdenoise.ops._fast._numba_filter import compiled, share_rows, source
+from mcdenoise.ops._fast._operator import custom_op
+from mcdenoise.ops.demodulation import FLOOR, NO_ALBEDO
+from mcdenoise.ops.lag import SMALLEST
+
+
+@custom_op(
+    "mcdenoise::incoming",
+    device_types="cpu",
+    schema="(Tensor color, Tensor? albedo, float limit, int kernel_size, bool roots) -> Tensor",
+)
+def incoming(color: Tensor, albedo: Tensor | None, limit: float, kernel_size: int, roots: bool) -> Tensor:
+    """Color without albedo and fireflies; for the test for lag also what that compares.
+
+    Args:
+        color: ``(B, 3, H, W)`` radiance.
+        albedo: ``(B, 3, H, W)``, to be divided by; see :func:`mcdenoise.ops.demodulate`.
+        limit: see :func:`mcdenoise.ops.clamp_fireflies`.
+        kernel_size: likewise.
+        roots: whether two more channels are wanted: the fourth root of the channels' mean, and its square.
+
+    Returns:
+        ``(B, 3 or 5, H, W)``, at least float32.
+    """
+    dtype = torch.promote_types(color.dtype, torch.float32)
+    batch, channels, height, width = color.shape
+    out = torch.empty((batch, channels + 2 * roots, height, width), dtype=dtype)
+    nothing = torch.empty((0, 0, 0, 0), dtype=dtype)
+    images = (source((nothing if image is None else image).to(dtype)) for image in (color, albedo))
+    clamps = limit < math.inf and height * width > 1
+    settings = out.new_tensor([FLOOR, NO_ALBEDO, min(limit, torch.finfo(dtype).max)]).numpy()
+    arguments = (out.numpy(), *images, *settings, clamps, kernel_size // 2, roots)
+    share_rows(color, lambda *rows: _incoming(*arguments, *rows))
+    return out
+
+
+@incoming.register_fake
+def _(color: Tensor, albedo: Tensor | None, limit: float, kernel_size: int, roots: bool) -> Tensor:
+    batch, channels, height, width = color.shape
+    dtype = torch.promote_types(color.dtype, torch.float32)
+    return color.new_empty((batch, channels + 2 * roots, height, width), dtype=dtype)
+
+
+@compiled
+def _demodulate(
+    row: Any, divisor: Any, color: Any, albedo: Any, floor: float, no_albedo: float, b: int, y: int
+) -> None:
+    """One row of all channels."""
+    channels, width = row.shape
+    memory, strides, _ = color
+    for c in range(channels):
+        _copy(row[c], memory, b * strides[0] + c * strides[1] + y * strides[2], strides[3])
+    memory, strides, tints = albedo
+    if tints == 0:
+        return
+    most = divisor[channels]
+    for c in range(channels):
+        tint = divisor[c]
+        _copy(tint, memory, b * strides[0] + c * strides[1] + y * strides[2], strides[3])
+        for x in range(width):
+            most[x] = tint[x] if c == 0 else max(most[x], tint[x])
+    one = row.dtype.type(1)
+    for c in range(channels):
+        values, tint = row[c], divisor[c]
+        for x in range(width):
+            values[x] /= max(tint[x], floor) if most[x] >= no_albedo else one
+
+
+@compiled
+def _copy(row: Any, memory: Any, start: int, stride: int) -> None:
+    if stride == 1:
+        row[:] = memory[start : start + row.size]
+    else:
+        for x in range(row.size):
+            row[x] = memory[start + x * stride]
+
+
+@compiled
+def _incoming(
+    out: Any,
+    color: Any,
+    albedo: Any,
+    floor: float,
+    no_albedo: float,
+    limit: float,
+    clamps: bool,
+    radius: int,
+    roots: bool,
+    b: int,
+    first: int,
+    last: int,
+) -> None:
+    """Rows ``first`` to ``last``; those around a row wait in a ring as long as its windows need them."""
+    _, _, height, width = out.shape
+    channels, size = color[2], 2 * radius + 1
+    number, reach = out.dtype.type, radius if clamps else 0
+    one, zero = number(1), number(0)
+    ring, divisor = np.empty((size, channels, width), out.dtype), np.empty((channels + 1, width), out.dtype)
+    # Brightness with a margin, the sum of it beside each pixel, and that with the pixel itself.
+    light = np.zeros((size, width + 2 * radius), out.dtype)
+    beside, across = np.zeros((size, width), out.dtype), np.zeros((size, width), out.dtype)
+    highest, columns = np.empty(width, out.dtype), np.empty(width, out.dtype)
+    for x in range(width):
+        columns[x] = number(min(x + radius, width - 1) - max(x - radius, 0) + 1)
+    # A power of two, which rounds nothing: no sum of a window overflows.
+    scale = one
+    while channels * size * size * scale >= one:
+        scale *= number(0.5)
+    for ahead in range(first - reach, last + reach):
+        place = ahead % size
+        inside = 0 <= ahead < height
+        if inside:
+            _demodulate(ring[place], divisor, color, albedo, floor, no_albedo, b, ahead)
+        if clamps:
+            beside[place] = 0
+            across[place] = 0
+            if inside:
+                inner, sides, whole = light[place, radius : radius + width], beside[place], across[place]
+                inner[:] = 0
+                for c in range(channels):
+                    values = ring[place, c]
+                    for x in range(width):
+                        inner[x] += scale * values[x]
+                for d in range(size):
+                    if d != radius:
+                        shifted = light[place, d : d + width]
+                        for x in range(width):
+                            sides[x] += shifted[x]
+                for x in range(width):
+                    whole[x] = sides[x] + inner[x]
+        y = ahead - reach
+        if y < first:
+            continue
+        here = y % size
+        if clamps:
+            highest[:] = beside[here]
+            for dy in range(1, radius + 1):
+                above, below = across[(y - dy) % size], across[(y + dy) % size]
+                for x in range(width):
+                    highest[x] += above[x] + below[x]
+            rows = number(min(y + radius, height - 1) - max(y - radius, 0) + 1)
+            for x in range(width):
+                highest[x] *= limit / (rows * columns[x] - one)
+            inner = light[here, radius : radius + width]
+            for c in range(channels):
+                values, clamped = ring[here, c], out[b, c, y]
+                for x in range(width):
+                    clamped[x] = values[x] / inner[x] * highest[x] if inner[x] > highest[x] else values[x]
+        else:
+            for c in range(channels):
+                out[b, c, y] = ring[here, c]
+        if roots:
+            root, square = out[b, channels, y], out[b, channels + 1, y]
+            root[:] = 0
+            for c in range(channels):
+                values = out[b, c, y]
+                for x in range(width):
+                    root[x] += values[x]
+            for x in range(width):
+                root[x] = math.sqrt(math.sqrt(max(root[x] / number(channels), zero)))
+                square[x] = root[x] * root[x]
+
+
+@custom_op(
+    "mcdenoise::give_up_lag",
+    device_types="cpu",
+    schema="(Tensor(a!) past, Tensor(b!) length, Tensor color, float threshold, int kernel_size, float recent_alpha, "
+    "float recent_frames) -> ()",
+)
+def give_up_lag(
+    past: Tensor,
+    length: Tensor,
+    color: Tensor,
+    threshold: float,
+    kernel_size: int,
+    recent_alpha: float,
+    recent_frames: float,
+) -> None:
+    """Give up what does not hold any more: of the recent past by the frame, of the long one by the recent one.
+
+    Args:
+        past: ``(B, 9, H, W)`` contiguous: color, root and its square, and the recent color and root; changed.
+        length: ``(B, 1, H, W)`` contiguous, of the longer past, in frames; changed.
+        color: ``(B, 5, H, W)`` contiguous, of the current frame, as :func:`incoming` has it.
+        threshold: see :func:`mcdenoise.ops.history_lag`.
+        kernel_size: likewise, in half the resolution.
+        recent_alpha: smallest weight of a frame in the recent past.
+        recent_frames: as many equally weighted frames have its noise.
+    """
+    batch, _, height, width = past.shape
+    # Of blocks of four pixels: the roots of recent past, frame and past, the variances of the first two's noise; then
+    # the recent past without lag, and both shares.
+    halves = past.new_empty((batch, 8, (height + 1) // 2, (width + 1) // 2))
+    settings = past.new_tensor([threshold, SMALLEST, recent_alpha, recent_frames]).numpy()
+    limits, alpha, frames = settings[:2], settings[2], settings[3]
+    blocks, image, lengths, radius = halves.numpy(), past.numpy(), length.numpy(), kernel_size // 2
+    share_rows(halves, lambda *rows: _halve(blocks, image, lengths, color.numpy(), frames, *rows))
+    share_rows(halves, lambda *rows: _find_recent_lag(blocks, *limits, radius, *rows))
+    share_rows(halves, lambda *rows: _find_lag(blocks, image, lengths, color.numpy(), *limits, alpha, radius, *rows))
+
+
+@give_up_lag.register_fake
+def _(past: Tensor, *_: Any) -> None:
+    return None
+
+
+@compiled
+def _between(a: float, b: float, share: float) -> float:
+    """From the nearer end, as torch.lerp does."""
+    one, change = type(a)(1), b - a
+    return a + share * change if share + share < one else b - change * (one - share)
+
+
+@compiled
+def _variance(variance: Any, root: Any, square: Any, length: Any) -> None:
+    """Of the noise of one frame, in a row."""
+    zero, one, two = variance.dtype.type(0), variance.dtype.type(1), variance.dtype.type(2)
+    for x in range(variance.size):
+        counted = max(length[x], two)
+        variance[x] = max(square[x] - root[x] * root[x], zero) * (counted / (counted - one))
+
+
+@compiled
+def _halve(
+    halves: Any, past: Any, lengths: Any, color: Any, recent_frames: float, b: int, first: int, last: int
+) -> None:
+    _, _, height, width = past.shape
+    _, _, _, columns = halves.shape
+    number = halves.dtype.type
+    # Sums of two rows; where the width is odd, the last column is there twice.
+    rows, variance = np.empty((5, 2 * columns), halves.dtype), np.empty(width, halves.dtype)
+    for y in range(first, last):
+        count = min(2 * y + 2, height) - 2 * y
+        rows[:] = 0
+        for row in range(2 * y, 2 * y + count):
+            length = lengths[b, 0, row]
+            _variance(variance, past[b, 3, row], past[b, 4, row], length)
+            _add(rows[0, :width], past[b, 8, row])
+            _add(rows[1, :width], color[b, 3, row])
+            _add(rows[2, :width], past[b, 3, row])
+            _add(rows[3, :width], variance)
+            for x in range(width):
+                variance[x] /= min(length[x], recent_frames)
+            _add(rows[4, :width], variance)
+        if width % 2:
+            for k in range(5):
+                rows[k, width] = rows[k, width - 1]
+        for k in range(5):
+            # A mean's variance is a quarter of the four pixels'.
+            part, block, pixels = number((0.5 if k < 3 else 0.125) / count), halves[b, k, y], rows[k]
+            for x in range(columns):
+                block[x] = part * (pixels[2 * x] + pixels[2 * x + 1])
+
+
+@compiled
+def _add(total: Any, values: Any) -> None:
+    for x in range(total.size):
+        total[x] += values[x]
+
+
+@compiled
+def _lag(
+    share: Any,
+    sums: Any,
+    history: Any,
+    recent: Any,
+    variance: Any,
+    threshold: float,
+    smallest: float,
+    radius: int,
+    y: int,
+) -> None:
+    """One row of :func:`mcdenoise.ops.history_lag`; ``sums`` has room for three with ``radius`` more at both ends."""
+    height, width = history.shape
+    number = share.dtype.type
+    zero, one, half, third = number(0), number(1), number(0.5), number(1 / 3)
+    top, bottom = max(y - radius, 0), min(y + radius + 1, height)
+    means, differences, errors = np.zeros((3, width), share.dtype)
+    sums[:] = 0
+    recents, changes, noises = sums[:, radius : radius + width]
+    for row in range(top, bottom):
+        long, short = history[row], recent[row]
+        for x in range(width):
+            recents[x] += short[x]
+            changes[x] += short[x] - long[x]
+        _add(noises, variance[row])
+    for d in range(2 * radius + 1):
+        _add(means, sums[0, d : d + width])
+        _add(differences, sums[1, d : d + width])
+        _add(errors, sums[2, d : d + width])
+    square = threshold * threshold
+    for x in range(width):
+        inverse = one / number((bottom - top) * (min(x + radius + 1, width) - max(x - radius, 0)))
+        mean, difference = means[x] * inverse, differences[x] * inverse
+        least = smallest * (abs(mean - difference) + abs(mean)) * half
+        noise = square * (errors[x] * inverse * inverse + least * least)
+        ratio = difference * difference / noise if noise > zero else zero
+        share[x] = min(max((ratio - one) * third, zero), one)
+
+
+@compiled
+def _find_recent_lag(
+    halves: Any, threshold: float, smallest: float, radius: int, b: int, first: int, last: int
+) -> None:
+    """How far the recent past lags behind the frame, and its root without that."""
+    width = halves.shape[3]
+    sums = np.empty((3, width + 2 * radius), halves.dtype)
+    recent, current, variance = halves[b, 0], halves[b, 1], halves[b, 3]
+    for y in range(first, last):
+        share, root, before, now = halves[b, 6, y], halves[b, 5, y], recent[y], current[y]
+        _lag(share, sums, recent, current, variance, threshold, smallest, radius, y)
+        for x in range(width):
+            root[x] = _between(before[x], now[x], share[x])
+
+
+@compiled
+def _find_lag(
+    halves: Any,
+    past: Any,
+    lengths: Any,
+    color: Any,
+    threshold: float,
+    smallest: float,
+    recent_alpha: float,
+    radius: int,
+    b: int,
+    first: int,
+    last: int,
+) -> None:
+    """How far the past lags behind the recent one; both without their lag."""
+    _, _, height, width = past.shape
+    columns = halves.shape[3]
+    sums, variance = np.empty((3, columns + 2 * radius), halves.dtype), np.empty(width, halves.dtype)
+    number = halves.dtype.type
+    zero, shortest = number(0), number(1) / recent_alpha
+    for y in range(first, last):
+        recent_share, share = halves[b, 6, y], halves[b, 7, y]
+        _lag(share, sums, halves[b, 2], halves[b, 5], halves[b, 4], threshold, smallest, radius, y)
+        for row in range(2 * y, min(2 * y + 2, height)):
+            length = lengths[b, 0, row]
+            _variance(variance, past[b, 3, row], past[b, 4, row], length)
+            # Most pixels keep what they have.
+            for x in range(width):
+                little, much = recent_share[x >> 1], share[x >> 1]
+                if not (little > zero or much > zero):
+                    continue
+                for c in range(4):
+                    recent = _between(past[b, 5 + c, row, x], color[b, c, row, x], little)
+                    past[b, 5 + c, row, x] = recent
+                    past[b, c, row, x] = _between(past[b, c, row, x], recent, much)
+                square = past[b, 8, row, x] * past[b, 8, row, x] + variance[x]
+                past[b, 4, row, x] = _between(past[b, 4, row, x], square, much)
+                length[x] = _between(length[x], min(length[x], shortest), much)

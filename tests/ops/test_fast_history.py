@@ -1,0 +1,251 @@
+"""The compiled form of a shot's past against the plain one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from plain_form import channels_last, every_other_column, slice_of_pixels, transposed
+from torch import Tensor
+
+from mcdenoise.buffers import Frame
+from mcdenoise.history import Accumulated, History
+from mcdenoise.ops import Accumulate, ClampFireflies, HistoryLag, clamp_fireflies, demodulate
+from mcdenoise.ops._fast import _numba_filter
+from mcdenoise.ops._fast.history import give_up_lag, incoming
+from mcdenoise.ops._fast.temporal import accumulate, motion_from_position
+
+SIZE = (37, 23)
+FRAMES = 9
+BMFR = {"alpha_min": 0.2, "rule": "bmfr", "position_limit": 0.01, "normal_limit": 0.3}
+
+
+@pytest.fixture(autouse=True)
+def nan_in_fresh_memory() -> Iterator[None]:
+    """Fills what is left to be written with NaN, so that what was forgotten shows."""
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+def camera(shift: float) -> Tensor:
+    """Looks along z from ``x = shift``."""
+    matrix = torch.zeros(1, 4, 4, dtype=torch.float64)
+    matrix[0, 0, 0], matrix[0, 1, 1], matrix[0, 2, 2], matrix[0, 2, 3], matrix[0, 3, 0] = 1, 1, 1, 1, -shift
+    return matrix
+
+
+def shot(
+    *without: str, size: tuple[int, int] = SIZE, batch: int = 1, speed: float = 0.07, dtype: torch.dtype = torch.float64
+) -> list[Frame]:
+    """A rough wall before a sky, partly without albedo, seen in passing; on the left the light goes down."""
+    g = torch.Generator().manual_seed(0)
+    height, width = size
+    rows, columns = torch.meshgrid(
+        (torch.arange(height) + 0.5) / height * 2 - 1, (torch.arange(width) + 0.5) / width * 2 - 1, indexing="ij"
+    )
+
+    def draw(channels: int) -> Tensor:
+        return torch.rand(batch, channels, height, width, generator=g, dtype=torch.float64)
+
+    frames, rough = [], 0.02 * draw(1)
+    for number in range(FRAMES):
+        x, light = number * speed, torch.where(columns > 0, 1.0, 1.0 if number < 6 else 0.2)
+        depth = 2 + 0.1 * torch.sin(7 * (columns * 2 + x)) + rough
+        position = torch.cat([depth * columns + x, depth * rows, depth], 1)
+        noise = -torch.log(draw(3).clamp_min(1e-6)) * torch.where(draw(1) < 0.01, 500, 1)
+        sky = (rows < -0.7).expand_as(depth)
+        buffers = {
+            "albedo": (0.1 + 0.9 * draw(3)) * (draw(1) > 0.2),
+            "normal": torch.nn.functional.normalize(draw(3) * 0.4 + torch.tensor([0.0, 0, -1]).reshape(1, 3, 1, 1)),
+            "depth": torch.where(sky, torch.inf, depth),
+            "position": torch.where(sky, 0, position),
+            "previous_position": torch.where(sky, 0, position) + 1e-3,
+            "motion": 2 * draw(2) - 1,
+            "view_projection": camera(x).expand(batch, 4, 4),
+        }
+        frame = Frame(color=light * noise, **{name: value for name, value in buffers.items() if name not in without})
+        frames.append(frame.to(dtype))
+    return frames
+
+
+def passed(frames: list[Frame], backend: Any, rule: dict[str, Any] | None = None, **settings: Any) -> list[Accumulated]:
+    history = History(Accumulate(**(rule or {}), backend=backend), **settings)
+    return [history.update(frame) for frame in frames]
+
+
+def assert_same(found: list[Accumulated], expected: list[Accumulated], tolerance: float) -> None:
+    for a, b in zip(found, expected, strict=True):
+        assert a.reset == b.reset
+        for image, plain in zip(a[:3], b[:3], strict=True):
+            assert image.dtype == plain.dtype
+            torch.testing.assert_close(image, plain, rtol=tolerance, atol=tolerance * plain.abs().mean().item())
+
+
+WAYS = {
+    "nothing": shot("motion", "previous_position", speed=0.0),
+    "motion": shot("previous_position"),
+    "positions": shot("motion", "previous_position"),
+    "previous positions": shot("motion"),
+    "without normals": shot("motion", "previous_position", "normal"),
+    "without albedo": shot("motion", "albedo"),
+    "without depth": shot("motion", "depth"),
+    "color and motion alone": shot("albedo", "normal", "depth", "position", "previous_position"),
+    "two images": shot("previous_position", batch=2),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("rule", [{}, BMFR, {"alpha_min": 0.4}, {"alpha_min": 1.0}], ids=str)
+def test_the_past_is_that_of_the_plain_form(way: str, rule: dict[str, Any]) -> None:
+    frames = WAYS[way]
+    if "rule" in rule and (frames[0].normal is None or frames[0].position is None):
+        with pytest.raises(ValueError, match="needs it in both frames"):
+            passed(frames, "numba", rule)
+        return
+    if way == "without normals":
+        # Else a neighbour lies too far off.
+        rule = {**rule, "position_limit": 0.2}
+    expected = passed(frames, "torch", rule)
+    assert expected[5].length.max() > 3
+    assert_same(passed(frames, "numba", rule), expected, 1e-9)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"anti_lag": HistoryLag(math.inf)},
+        {"anti_lag": HistoryLag(0.1, 3)},
+        {"anti_lag": HistoryLag(1.0, 9)},
+        {"specular_length": 0},
+        {"specular_length": math.inf},
+        {"fireflies": ClampFireflies(math.inf)},
+        {"fireflies": ClampFireflies(2.0, 3)},
+        {"fireflies": ClampFireflies(5.0, 11)},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("rule", [{}, BMFR], ids=str)
+def test_settings(settings: dict[str, Any], rule: dict[str, Any]) -> None:
+    frames = WAYS["motion"]
+    assert_same(passed(frames, "numba", rule, **settings), passed(frames, "torch", rule, **settings), 1e-9)
+
+
+@pytest.mark.parametrize("way", ["nothing", "motion"])
+def test_some_of_these_pasts_are_short(way: str) -> None:
+    """Otherwise there would be nothing to compare."""
+    lagging, past = passed(WAYS[way], "torch", anti_lag=HistoryLag(math.inf))[-1], passed(WAYS[way], "torch")[-1]
+    assert 0.1 < (past.length < lagging.length).double().mean() < 0.9
+    alike = passed(WAYS["motion"], "torch", specular_length=math.inf)[5]
+    assert 0.05 < (passed(WAYS["motion"], "torch")[5].length < alike.length).double().mean() < 0.9
+    assert 0.1 < (alike.length == 1).double().mean() < 0.9
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (1, 9), (8, 1), (3, 2), (6, 300)], ids=str)
+def test_sizes(size: tuple[int, int]) -> None:
+    frames = shot("previous_position", size=size)
+    assert_same(passed(frames, "numba"), passed(frames, "torch"), 1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16], ids=str)
+def test_other_dtypes(dtype: torch.dtype) -> None:
+    frames = shot("previous_position", "position", dtype=dtype)
+    found = passed(frames, "numba")
+    assert found[-1].color.dtype == torch.float32
+    # The plain form rounds what is demodulated, and what is clamped, to the dtype of the frame.
+    same = [frame.to(torch.float32) for frame in frames]
+    assert_same(found, passed(same, "torch"), 1e-3)
+
+
+@pytest.mark.parametrize("layout", [channels_last, slice_of_pixels, every_other_column, transposed])
+def test_layout_in_memory_and_threads_change_nothing(
+    layout: Callable[[Tensor], Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_numba_filter, "_PIXELS_A_THREAD", 1)
+    threads, expected = torch.get_num_threads(), passed(WAYS["two images"], "numba")
+    laid_out = [
+        frame.replace(**{name: layout(image) for name, image in frame.items() if name != "view_projection"})
+        for frame in WAYS["two images"]
+    ]
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            for a, b in zip(passed(laid_out, "numba"), expected, strict=True):
+                assert all(map(torch.equal, a[:3], b[:3]))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_a_cut_another_size_and_what_is_not_kept() -> None:
+    frames = WAYS["motion"]
+    turned = frames[3].replace(normal=-frames[3].normal)
+    mixed = [*frames[:3], turned, frames[4], shot("previous_position", size=(8, 9))[5], frames[6]]
+    expected = passed(mixed, "torch")
+    assert [past.reset for past in expected] == ["first frame", "", "", "cut", "cut", "size change", "size change"]
+    assert_same(passed(mixed, "numba"), expected, 1e-9)
+    histories = [History(Accumulate(backend=backend)) for backend in ("numba", "torch")]
+    for frame, keeps in zip(frames, [True, False, False, True, True, False, True, True, True], strict=True):
+        assert_same(*([history.update(frame, keeps=keeps)] for history in histories), 1e-9)
+
+
+def test_the_result_of_a_frame_is_not_changed_by_the_next() -> None:
+    history = History(Accumulate(backend="numba"))
+    first = history.update(WAYS["motion"][0])
+    before = [image.clone() for image in first[:3]]
+    for frame in WAYS["motion"][1:]:
+        history.update(frame)
+    assert all(map(torch.equal, first[:3], before))
+
+
+def test_frames_with_derivatives_take_the_plain_form() -> None:
+    frames = shot("previous_position", size=(96, 96), dtype=torch.float32)[:3]
+    color = frames[1].color.requires_grad_()
+    history = History()
+    for frame in frames:
+        past = history.update(frame)
+    gradient = torch.autograd.grad(past.color.sum(), color)[0]
+    assert gradient.isfinite().all()
+    assert gradient.abs().max() > 0
+    with pytest.raises(ValueError, match="found 'numba', which has no derivatives of this op"):
+        passed(frames, "numba")
+
+
+@pytest.mark.parametrize("with_albedo", [True, False])
+@pytest.mark.parametrize("limit", [30.0, 0.5, math.inf])
+def test_what_enters_is_demodulated_and_clamped(limit: float, with_albedo: bool) -> None:
+    frame = WAYS["motion"][0]
+    assert frame.albedo is not None
+    color = demodulate(frame.color, frame.albedo) if with_albedo else frame.color
+    expected = clamp_fireflies(color, limit=limit)
+    found = incoming(frame.color, frame.albedo if with_albedo else None, limit, 7, True)
+    torch.testing.assert_close(found[:, :3], expected, rtol=1e-14, atol=0)
+    torch.testing.assert_close(found[:, 3:4], expected.mean(1, keepdim=True) ** 0.25, rtol=1e-14, atol=0)
+    torch.testing.assert_close(found[:, 4:], expected.mean(1, keepdim=True) ** 0.5, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("scale", [1e-37, 1e30])
+def test_any_exposure(scale: float) -> None:
+    frames = shot("previous_position", dtype=torch.float32)
+    expected = passed(frames, "numba")
+    for past, dark in zip(
+        expected, passed([frame.replace(color=frame.color * scale) for frame in frames], "numba"), strict=True
+    ):
+        torch.testing.assert_close(dark.color / scale, past.color, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_they_are_what_their_schemas_say() -> None:
+    frame = WAYS["motion"][0]
+    image, length = torch.rand(2, 1, 9, *SIZE), torch.full((1, 1, *SIZE), 5.0)
+    surface = [frame.position, frame.normal, frame.depth]
+    blended = (image[0, :, :5], image[1], length, frame.motion, surface, surface, 0.1, False, 0.02, 0.5, 0.25)
+    for operator, arguments in (
+        (incoming, (frame.color, frame.albedo, 30.0, 7, True)),
+        (motion_from_position, (frame.position, frame.view_projection)),
+        (accumulate, (*blended, frame.albedo, 3.0, 0.05)),
+        (give_up_lag, (image[0], length, image[1, :, :5].contiguous(), 2.0, 5, 0.25, 7.0)),
+    ):
+        torch.library.opcheck(operator._overload, arguments, test_utils=("test_schema", "test_faketensor"))
