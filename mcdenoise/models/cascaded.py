@@ -19,7 +19,7 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.unet import UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
 from mcdenoise.ops._backend import choose_backend
-from mcdenoise.ops._fused import gated_fusion, softplus, stacked
+from mcdenoise.ops._fused import depth_scale, gated_fusion, network_features, network_input, normalized_depth, softplus
 from mcdenoise.ops._rows import by_rows
 
 FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, its share 1
@@ -133,7 +133,7 @@ class PixelPredictor(nn.Module):
     ) -> Tensor:
         """See :class:`Predictor`; there are no weights to guide."""
         logs = torch.log1p(image)
-        levels = self.unet(stacked(logs, features))
+        levels = self.unet(network_input(logs, features, logarithms=False))
         # The heads predict the logarithm of the radiance, on top of the input's: a network at rest is the identity,
         # and errors are relative, as the eye and the loss see them. No pixel grows beyond the brightest of the input.
         top = logs.amax((1, 2, 3), keepdim=True) if top is None else top
@@ -176,7 +176,7 @@ class KernelPredictor(nn.Module):
         self, image: Tensor, features: Tensor, guides: Collection[str] = GUIDES, top: Tensor | None = None
     ) -> Tensor:
         """See :class:`Predictor`."""
-        levels = self.unet(stacked(torch.log1p(image), features))
+        levels = self.unet(network_input(image, features))
         guiding = {"normal": features[:, 3:6], "depth": features[:, 6:7]}
         guiding = {name: guide for name, guide in guiding.items() if name in guides}
         top = torch.log1p(image).amax((1, 2, 3), keepdim=True) if top is None else top
@@ -188,8 +188,7 @@ class KernelPredictor(nn.Module):
             logits = prediction[:, : self.taps]
             # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
             if self.bilateral:
-                f1_f2_f3 = softplus(prediction[:, self.taps :], backend=backend).split(1, 1)
-                *falloffs, f3 = (f * unit for f, unit in zip(f1_f2_f3, SCALE_UNITS, strict=True))
+                *falloffs, f3 = softplus(prediction[:, self.taps :], SCALE_UNITS, backend=backend).split(1, 1)
                 falloffs = [falloff for falloff, name in zip(falloffs, GUIDES, strict=True) if name in guiding]
                 filtered = cross_bilateral_filter(
                     image, logits, list(guiding.values()), falloffs, f3, border="renormalize", backend=backend
@@ -262,7 +261,7 @@ class Cascade(nn.Module):
         alone = color if current is None else current
         # Both networks see the same, and often all of it at once.
         features = functools.lru_cache(maxsize=1)(
-            _Features(albedo, normal, depth, _depth_scale(depth), alone, exposure, length).of
+            _Features(albedo, normal, depth, depth_scale(depth), alone, exposure, length).of
         )
         if known is None and (parts is None or parts == [whole]):
             image = color * exposure
@@ -339,11 +338,9 @@ class _Features(NamedTuple):
 
     def of(self, part: Region) -> Tensor:
         """The features of a part, ``(B, 11, h, w)``."""
-        alone = torch.log1p(part.of(self.current) * self.exposure)
-        depth = part.of(self.depth)
-        share = torch.ones_like(depth) if self.length is None else 1 / part.of(self.length)
-        near = _normalized(depth, *self.depth_scale)
-        return torch.cat([part.of(self.albedo), part.of(self.normal) * 0.5 + 0.5, near, alone, share], 1)
+        length = None if self.length is None else part.of(self.length)
+        images = (part.of(image) for image in (self.albedo, self.normal, self.depth, self.current))
+        return network_features(*images, length, self.exposure, self.depth_scale)
 
 
 def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
@@ -378,28 +375,7 @@ def normalize_depth(depth: Tensor) -> Tensor:
     Returns:
         ``(B, 1, H, W)`` in [0, 1]. The typical depth is the image's geometric mean over what was hit.
     """
-    return _normalized(depth, *_depth_scale(depth))
-
-
-def _depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
-    """The largest depth of what was hit, and the typical one as a share of it, ``(B, 1, 1, 1)``."""
-
-    def finite(rows: Tensor) -> Tensor:
-        return _at_least_float32(torch.where(torch.isfinite(rows), rows, 0)).clamp_min(1e-30)
-
-    def logs(rows: Tensor) -> Tensor:
-        return (torch.log(finite(rows) / largest) * torch.isfinite(rows)).sum(-1, keepdim=True)
-
-    # Of the largest, so that the logarithms are small numbers in any unit.
-    largest = by_rows(lambda rows: finite(rows).amax(-1, keepdim=True), depth).amax((1, 2, 3), keepdim=True)
-    count = torch.isfinite(depth).sum((1, 2, 3), keepdim=True).clamp_min(1)
-    return largest, torch.exp(by_rows(logs, depth).sum((1, 2, 3), keepdim=True) / count)
-
-
-def _normalized(depth: Tensor, largest: Tensor, typical: Tensor) -> Tensor:
-    hit = torch.isfinite(depth)
-    shares = _at_least_float32(torch.where(hit, depth, 0)).clamp_min(1e-30) / largest
-    return torch.where(hit, shares / (shares + typical), 1).to(depth.dtype)
+    return normalized_depth(depth, *depth_scale(depth))
 
 
 def _top(image: Tensor, factor: Tensor | float = 1.0) -> Tensor:

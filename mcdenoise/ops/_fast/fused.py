@@ -31,38 +31,55 @@ from mcdenoise.ops._window import accumulator_dtype
 _CHUNK = 256
 
 
-@custom_op("mcdenoise::stacked", device_types="cpu", schema="(Tensor images, Tensor features, ScalarType dtype) -> Tensor")
-def stacked(images: Tensor, features: Tensor, dtype: torch.dtype) -> Tensor:
-    """See :func:`mcdenoise.ops._fused.stacked`."""
-    result = _empty_stacked(images, features, dtype)
+@custom_op(
+    "mcdenoise::network_input",
+    device_types="cpu",
+    schema="(Tensor image, Tensor features, bool logarithms, ScalarType dtype) -> Tensor",
+)
+def network_input(image: Tensor, features: Tensor, logarithms: bool, dtype: torch.dtype) -> Tensor:
+    """See :func:`mcdenoise.ops._fused.network_input`."""
+    result = _empty_input(image, features, logarithms, dtype)
     if result.numel():
         sums = torch.promote_types(dtype, torch.float32)
-        arguments = (source(result), source(_readable(images, sums)), source(_readable(features, sums)))
+        arguments = (source(result), source(_readable(image, sums)), source(_readable(features, sums)))
         buffer = np.empty((result.shape[1], _CHUNK), torch.empty((), dtype=sums).numpy().dtype)
-        share_rows(images, lambda *rows: _stack(*arguments, np.empty_like(buffer), result.shape[3], *rows))
+        share_rows(image, lambda *rows: _stack(*arguments, logarithms, np.empty_like(buffer), result.shape[3], *rows))
     return result
 
 
-@stacked.register_fake
-def _empty_stacked(images: Tensor, features: Tensor, dtype: torch.dtype) -> Tensor:
-    batch, channels, height, width = images.shape
+@network_input.register_fake
+def _empty_input(image: Tensor, features: Tensor, _: bool, dtype: torch.dtype) -> Tensor:
+    batch, channels, height, width = image.shape
     shape = (batch, channels + features.shape[1], height, width)
-    return torch.empty(shape, dtype=dtype, device=images.device, memory_format=torch.channels_last)
+    return torch.empty(shape, dtype=dtype, device=image.device, memory_format=torch.channels_last)
 
 
 @compiled
-def _stack(out: Any, images: Any, features: Any, rows: Any, width: int, b: int, first: int, last: int) -> None:
+def _stack(
+    out: Any, image: Any, features: Any, logarithms: bool, rows: Any, width: int, b: int, first: int, last: int
+) -> None:
     memory, strides, channels = out
+    own, one = image[2], rows.dtype.type(1)
     bits = np.empty((channels, rows.shape[1]), memory.dtype)
     for y in range(first, last):
         for x0 in range(0, width, rows.shape[1]):
             n = min(rows.shape[1], width - x0)
-            _read_run(rows, images, b, y, x0, n)
-            _read_run(rows[images[2] :], features, b, y, x0, n)
+            for c in range(own):
+                _read_row(rows[c, :n], image, b, c, y, x0)
+                if logarithms:
+                    _to_logarithms(rows[c, :n], one)
+            for c in range(own, channels):
+                _read_row(rows[c, :n], features, b, c - own, y, x0)
             for c in range(channels):
                 _round(bits[c, :n], rows[c])
             start = b * strides[0] + y * strides[2] + x0 * strides[3]
             _interleave(memory[start : start + n * channels], bits)
+
+
+@compiled
+def _to_logarithms(values: Any, factor: Any) -> None:
+    for x in range(values.size):
+        values[x] = _log1p(values[x] * factor)
 
 
 @compiled
@@ -83,38 +100,186 @@ def _interleave(pixels: Any, rows: Any) -> None:
 
 
 @compiled
-def _read_run(rows: Any, image: Any, b: int, y: int, x0: int, n: int) -> None:
-    """A run of pixels, one row a channel."""
-    _, strides, channels = image
-    start = b * strides[0] + y * strides[2] + x0 * strides[3]
-    for c in range(channels):
-        _copy_row(rows[c, :n], image, start + c * strides[1], strides[3])
+def _read_row(row: Any, image: Any, b: int, c: int, y: int, x0: int) -> None:
+    """A run of pixels of one channel."""
+    strides = image[1]
+    _copy_row(row, image, b * strides[0] + c * strides[1] + y * strides[2] + x0 * strides[3], strides[3])
 
 
-@custom_op("mcdenoise::softplus", device_types="cpu", schema="(Tensor x) -> Tensor")
-def softplus(x: Tensor) -> Tensor:
+@custom_op(
+    "mcdenoise::network_features",
+    device_types="cpu",
+    schema="(Tensor albedo, Tensor normal, Tensor depth, Tensor current, Tensor? length, Tensor exposure, "
+    "Tensor largest, Tensor typical) -> Tensor",
+)
+def network_features(
+    albedo: Tensor,
+    normal: Tensor,
+    depth: Tensor,
+    current: Tensor,
+    length: Tensor | None,
+    exposure: Tensor,
+    largest: Tensor,
+    typical: Tensor,
+) -> Tensor:
+    """See :func:`mcdenoise.ops._fused.network_features`."""
+    result = _empty_features(albedo)
+    if result.numel():
+        nothing = source(torch.empty((0, 0, 0, 0), dtype=result.dtype))
+        images = tuple(source(image.to(result.dtype)) for image in (albedo, normal, depth, current))
+        lengths = nothing if length is None else source(length.to(result.dtype))
+        factors = torch.cat([exposure, largest, typical], 1).to(result.dtype).flatten(1).numpy()
+        share_rows(albedo, lambda *rows: _assemble(result.numpy(), images, lengths, factors, *rows))
+    return result
+
+
+@network_features.register_fake
+def _empty_features(albedo: Tensor, *_: Any) -> Tensor:
+    batch, _, height, width = albedo.shape
+    return albedo.new_empty((batch, 11, height, width))
+
+
+@compiled
+def _assemble(out: Any, images: Any, length: Any, factors: Any, b: int, first: int, last: int) -> None:
+    albedo, normal, depth, current = images
+    half, one = out.dtype.type(0.5), out.dtype.type(1)
+    exposure, largest, typical = factors[b]
+    for y in range(first, last):
+        for c in range(3):
+            _read_row(out[b, c, y], albedo, b, c, y, 0)
+            row = out[b, 3 + c, y]
+            _read_row(row, normal, b, c, y, 0)
+            for x in range(row.size):
+                row[x] = row[x] * half + half
+            row = out[b, 7 + c, y]
+            _read_row(row, current, b, c, y, 0)
+            _to_logarithms(row, exposure)
+        row = out[b, 6, y]
+        _read_row(row, depth, b, 0, y, 0)
+        _normalize(row, largest, typical)
+        row = out[b, 10, y]
+        if length[2]:
+            _read_row(row, length, b, 0, y, 0)
+            for x in range(row.size):
+                row[x] = one / row[x]
+        else:
+            row[:] = one
+
+
+@compiled
+def _normalize(depths: Any, largest: Any, typical: Any) -> None:
+    least, infinity, one = depths.dtype.type(1e-30), depths.dtype.type(np.inf), depths.dtype.type(1)
+    for x in range(depths.size):
+        depth = depths[x]
+        share = max(depth, least) / largest
+        depths[x] = share / (share + typical) if depth < infinity else one
+
+
+@custom_op("mcdenoise::depth_scale", device_types="cpu", schema="(Tensor depth) -> (Tensor, Tensor)")
+def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
+    """See :func:`mcdenoise.ops._fused.depth_scale`."""
+    batch, _, height, _ = depth.shape
+    dtype = accumulator_dtype(depth.dtype)
+    image = source(_readable(depth, dtype))
+    rows = torch.zeros((3, batch, height), dtype=dtype)
+    arguments = (rows.numpy(), image, depth.shape[3])
+    share_rows(depth, lambda *share: _largest_of_rows(*arguments, *share))
+    largest = rows[0].amax(1, keepdim=True).clamp_min(1e-30)
+    share_rows(depth, lambda *share: _logarithms_of_rows(*arguments, largest[:, 0].numpy(), *share))
+    logarithms, count = rows[1:].double().sum(2, keepdim=True)
+    typical = torch.exp(logarithms / count.clamp_min(1)).to(dtype)
+    return largest.reshape(batch, 1, 1, 1), typical.reshape(batch, 1, 1, 1)
+
+
+@depth_scale.register_fake
+def _(depth: Tensor) -> tuple[Tensor, Tensor]:
+    largest = depth.new_empty((depth.shape[0], 1, 1, 1), dtype=accumulator_dtype(depth.dtype))
+    return largest, torch.empty_like(largest)
+
+
+@compiled
+def _largest_of_rows(out: Any, depth: Any, width: int, b: int, first: int, last: int) -> None:
+    row, infinity = np.empty(width, out.dtype), out.dtype.type(np.inf)
+    for y in range(first, last):
+        _read_row(row, depth, b, 0, y, 0)
+        largest = out.dtype.type(0)
+        for x in range(width):
+            if row[x] < infinity:
+                largest = max(largest, row[x])
+        out[0, b, y] = largest
+
+
+@compiled
+def _logarithms_of_rows(out: Any, depth: Any, width: int, largest: Any, b: int, first: int, last: int) -> None:
+    row, hits, scale = np.empty(width, out.dtype), np.empty(width, out.dtype), largest[b]
+    zero, one = out.dtype.type(0), out.dtype.type(1)
+    infinity, least = out.dtype.type(np.inf), out.dtype.type(1e-30)
+    for y in range(first, last):
+        _read_row(row, depth, b, 0, y, 0)
+        for x in range(width):
+            hit = row[x] < infinity
+            hits[x] = one if hit else zero
+            row[x] = _log(max(row[x], least) / scale) if hit else zero
+        out[1, b, y] = row.sum()
+        out[2, b, y] = hits.sum()
+
+
+@custom_op("mcdenoise::softplus", device_types="cpu", schema="(Tensor x, float[] units) -> Tensor")
+def softplus(x: Tensor, units: list[float]) -> Tensor:
     """See :func:`mcdenoise.ops._fused.softplus`."""
     result = _empty_planes(x)
     if result.numel():
-        arguments = (result.numpy(), source(_readable(x, result.dtype)))
+        arguments = (result.numpy(), source(_readable(x, result.dtype)), result.new_tensor(units).numpy())
         share_rows(x, lambda *rows: _softplus_rows(*arguments, *rows))
     return result
 
 
 @softplus.register_fake
-def _empty_planes(x: Tensor) -> Tensor:
+def _empty_planes(x: Tensor, *_: Any) -> Tensor:
     return x.new_empty(x.shape, dtype=accumulator_dtype(x.dtype))
 
 
 @compiled
-def _softplus_rows(out: Any, x: Any, b: int, first: int, last: int) -> None:
+def _softplus_rows(out: Any, x: Any, units: Any, b: int, first: int, last: int) -> None:
     for y in range(first, last):
-        _read_run(out[b, :, y], x, b, y, 0, out.shape[3])
         for c in range(out.shape[1]):
             row = out[b, c, y]
+            _read_row(row, x, b, c, y, 0)
             zero = row.dtype.type(0)
             for i in range(row.size):
-                row[i] = max(row[i], zero) + _log1p(_exp(-abs(row[i])))
+                row[i] = units[c] * (max(row[i], zero) + _log1p(_exp(-abs(row[i]))))
+
+
+@custom_op("mcdenoise::downsample", device_types="cpu", schema="(Tensor image) -> Tensor")
+def downsample(image: Tensor) -> Tensor:
+    """See :func:`mcdenoise.ops.downsample`."""
+    result = _empty_half(image).to(accumulator_dtype(image.dtype))
+    if result.numel():
+        arguments = (result.numpy(), source(_readable(image, result.dtype)), *image.shape[2:])
+        share_rows(result, lambda *rows: _halve(*arguments, *rows))
+    return result.to(image.dtype)
+
+
+@downsample.register_fake
+def _empty_half(image: Tensor) -> Tensor:
+    batch, channels, height, width = image.shape
+    return image.new_empty((batch, channels, (height + 1) // 2, (width + 1) // 2))
+
+
+@compiled
+def _halve(out: Any, image: Any, height: int, width: int, b: int, first: int, last: int) -> None:
+    channels = out.shape[1]
+    upper, lower = np.empty(width, out.dtype), np.empty(width, out.dtype)
+    quarter, half = out.dtype.type(0.25), out.dtype.type(0.5)
+    for y in range(first, last):
+        for c in range(channels):
+            _read_row(upper, image, b, c, 2 * y, 0)
+            _read_row(lower, image, b, c, min(2 * y + 1, height - 1), 0)
+            row = out[b, c, y]
+            for x in range(width // 2):
+                row[x] = (upper[2 * x] + upper[2 * x + 1] + lower[2 * x] + lower[2 * x + 1]) * quarter
+            if width % 2:
+                row[width // 2] = (upper[width - 1] + lower[width - 1]) * half
 
 
 @custom_op(
@@ -201,19 +366,14 @@ def _fetch_both(
     if y < 0 or y >= height:
         rows[:] = 0
         return
-    _, strides, _ = fine
-    _, residual_strides, residuals = residual
-    _, coarse_strides, _ = coarse
     for c in range(channels):
         row = rows[c, 1 : width + 1]
-        _copy_row(row, fine, b * strides[0] + c * strides[1] + y * strides[2], strides[3])
-        if residuals:
-            start = b * residual_strides[0] + c * residual_strides[1] + y * residual_strides[2]
-            _copy_row(buffer, residual, start, residual_strides[3])
+        _read_row(row, fine, b, c, y, 0)
+        if residual[2]:
+            _read_row(buffer, residual, b, c, y, 0)
             for x in range(width):
                 row[x] += buffer[x]
-        start = b * coarse_strides[0] + c * coarse_strides[1] + y // 2 * coarse_strides[2]
-        _copy_row(half, coarse, start, coarse_strides[3])
+        _read_row(half, coarse, b, c, y // 2, 0)
         _double(rows[channels + c, 1 : width + 1], half)
 
 
@@ -268,6 +428,39 @@ def _to_radiance(values: Any, top: Any) -> None:
         values[x] = _expm1(top if value > top else value)
 
 
+def _log(value: Any) -> Any:
+    """``log`` of a positive number, which LLVM vectorises for float32 in this form only."""
+
+
+def _math_log(value: Any) -> Any:
+    return math.log(value)
+
+
+@overload(_log)
+def _log_overload(value: Any) -> Any:
+    if value != types.float32:
+        return _math_log
+    # Cephes' logf: of 2^n (1 + f) with 1 + f from sqrt(1/2) to sqrt(2), n log(2) in two parts and a polynomial.
+    c0, c1, c2 = np.float32(7.0376836292e-2), np.float32(-1.1514610310e-1), np.float32(1.1676998740e-1)
+    c3, c4, c5 = np.float32(-1.2420140846e-1), np.float32(1.4249322787e-1), np.float32(-1.6668057665e-1)
+    c6, c7, c8 = np.float32(2.0000714765e-1), np.float32(-2.4999993993e-1), np.float32(3.3333331174e-1)
+    high, low = np.float32(0.693359375), np.float32(-2.12194440e-4)
+    one, half, infinity = np.float32(1), np.float32(0.5), np.float32(np.inf)
+    bits_of_root, mantissa = np.int32(0x3F3504F3), np.int32(23)
+
+    def log(value: Any) -> Any:
+        bits = np.float32(value).view(np.int32)
+        n = np.int32(np.int32(bits - bits_of_root) >> mantissa)
+        f = np.int32(bits - np.int32(n << mantissa)).view(np.float32) - one
+        p = ((((((((c0 * f + c1) * f + c2) * f + c3) * f + c4) * f + c5) * f + c6) * f + c7) * f + c8) * f
+        exponent, square = np.float32(n), f * f
+        result = f + (p * square + (exponent * low - half * square)) + exponent * high
+        # Neither infinity nor a NaN is less.
+        return result if value < infinity else value
+
+    return log
+
+
 def _log1p(value: Any) -> Any:
     """``log1p`` of what is not negative, which LLVM vectorises for float32 in this form only."""
 
@@ -280,25 +473,12 @@ def _math_log1p(value: Any) -> Any:
 def _log1p_overload(value: Any) -> Any:
     if value != types.float32:
         return _math_log1p
-    # Cephes' logf of u = 1 + x = 2^n m, with m from sqrt(1/2) to sqrt(2), and what u lost of x by rounding.
-    c0, c1, c2 = np.float32(7.0376836292e-2), np.float32(-1.1514610310e-1), np.float32(1.1676998740e-1)
-    c3, c4, c5 = np.float32(-1.2420140846e-1), np.float32(1.4249322787e-1), np.float32(-1.6668057665e-1)
-    c6, c7, c8 = np.float32(2.0000714765e-1), np.float32(-2.4999993993e-1), np.float32(3.3333331174e-1)
-    high, low = np.float32(0.693359375), np.float32(-2.12194440e-4)
-    one, half, infinity = np.float32(1), np.float32(0.5), np.float32(np.inf)
-    root, mantissa = np.int32(0x3F3504F3), np.int32(23)  # the bits of sqrt(1/2)
+    one, infinity = np.float32(1), np.float32(np.inf)
 
     def log1p(value: Any) -> Any:
-        u = np.float32(value + one)
-        bits = np.int32(np.float32(u).view(np.int32) - root)
-        n = np.int32(bits >> mantissa)
-        f = np.int32(np.float32(u).view(np.int32) - np.int32(n << mantissa)).view(np.float32) - one
-        p = ((((((((c0 * f + c1) * f + c2) * f + c3) * f + c4) * f + c5) * f + c6) * f + c7) * f + c8) * f
-        exponent = np.float32(n)
-        square = f * f
-        lost = (value - (u - one)) / u
-        result = (f + (p * square + (exponent * low - half * square) + lost)) + exponent * high
-        return result if u < infinity else u
+        u = value + one
+        # With what the sum lost by rounding.
+        return _log(u) + (value - (u - one)) / u if value < infinity else value
 
     return log1p
 
