@@ -104,7 +104,8 @@ class FusionModule(nn.Module):
         Returns:
             ``(B, 3, H, W)`` logarithms of radiance, or radiance.
         """
-        return gated_fusion(fine, coarse, self.conv.weight, self.conv.bias, residual=residual, top=top)
+        weight, bias = self.conv.parameters()
+        return gated_fusion(fine, coarse, weight, bias, residual=residual, top=top)
 
 
 class PixelPredictor(nn.Module):
@@ -339,8 +340,8 @@ class _Features(NamedTuple):
     def of(self, part: Region) -> Tensor:
         """The features of a part, ``(B, 11, h, w)``."""
         length = None if self.length is None else part.of(self.length)
-        images = (part.of(image) for image in (self.albedo, self.normal, self.depth, self.current))
-        return network_features(*images, length, self.exposure, self.depth_scale)
+        albedo, normal, depth, current = map(part.of, (self.albedo, self.normal, self.depth, self.current))
+        return network_features(albedo, normal, depth, current, length, self.exposure, self.depth_scale)
 
 
 def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:

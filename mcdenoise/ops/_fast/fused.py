@@ -27,8 +27,8 @@ from mcdenoise.ops._fast._numba_filter import (
 from mcdenoise.ops._fast._operator import custom_op
 from mcdenoise.ops._window import accumulator_dtype
 
-# Pixels whose channels are gathered at a time: they stay in the first-level cache.
-_CHUNK = 256
+# Pixels whose channels are gathered at a time: they stay in the second-level cache.
+_CHUNK = 1024
 
 
 @custom_op(
@@ -135,8 +135,7 @@ def network_features(
 
 @network_features.register_fake
 def _empty_features(albedo: Tensor, *_: Any) -> Tensor:
-    batch, _, height, width = albedo.shape
-    return albedo.new_empty((batch, 11, height, width))
+    return albedo.new_empty((albedo.shape[0], 11, *albedo.shape[2:]))
 
 
 @compiled
