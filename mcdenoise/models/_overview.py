@@ -41,7 +41,8 @@ def overview() -> list[ModelOverview]:
     entries = []
     for name in list_models():
         model = create_model(name)
-        with FlopCounterMode(display=False) as counter, torch.no_grad():
+        # The counter knows torch's convolutions, not those that are fused where nobody asks for derivatives.
+        with FlopCounterMode(display=False) as counter, torch.enable_grad():
             model(*inputs)
         macs = counter.get_total_flops() / 2 / _SIDE**2
         parameters = sum(parameter.numel() for parameter in model.parameters())

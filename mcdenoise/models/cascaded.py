@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, Protocol
 
 import torch
@@ -17,8 +17,9 @@ from torch import Tensor, nn
 from mcdenoise.models._regions import Region, regions
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.unet import UNet
-from mcdenoise.ops import cross_bilateral_filter, downsample, laplacian_fusion, upsample
+from mcdenoise.ops import cross_bilateral_filter, downsample
 from mcdenoise.ops._backend import choose_backend
+from mcdenoise.ops._fused import depth_scale, gated_fusion, network_features, network_input, normalized_depth, softplus
 from mcdenoise.ops._rows import by_rows
 
 FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, its share 1
@@ -89,11 +90,22 @@ class FusionModule(nn.Module):
         super().__init__()
         self.conv = nn.Conv2d(6, 1, 3, padding=1)
 
-    def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        """``(B, 3, H, W)`` fine and ``(B, 3, ceil(H / 2), ceil(W / 2))`` coarse image to their fusion."""
-        both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)
-        alpha = torch.sigmoid(self.conv(both))
-        return laplacian_fusion(fine, coarse, alpha.to(fine.dtype))
+    def forward(
+        self, fine: Tensor, coarse: Tensor, residual: Tensor | None = None, top: Tensor | None = None
+    ) -> Tensor:
+        """Fuse two scales.
+
+        Args:
+            fine: ``(B, 3, H, W)``.
+            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))``.
+            residual: ``(B, 3, H, W)`` to be added to the fine image; none by default.
+            top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result. With it, the result is radiance.
+
+        Returns:
+            ``(B, 3, H, W)`` logarithms of radiance, or radiance.
+        """
+        weight, bias = self.conv.parameters()
+        return gated_fusion(fine, coarse, weight, bias, residual=residual, top=top)
 
 
 class PixelPredictor(nn.Module):
@@ -130,15 +142,15 @@ class PixelPredictor(nn.Module):
         for _ in range(self.unet.levels - 1):
             image = downsample(image)
             means.append(torch.log1p(image))
-        levels = self.unet(torch.cat([logs, features], 1), means)
+        levels = self.unet(network_input(logs, features, logarithms=False), means)
         # The heads predict the logarithm of the radiance, on top of the input's: a network at rest is the identity,
         # and errors are relative, as the eye and the loss see them. No pixel grows beyond the brightest of the input.
         top = logs.amax((1, 2, 3), keepdim=True) if top is None else top
-        images: list[Tensor] = []
+        scales: list[tuple[Tensor, Tensor]] = []
         for head, level in zip(self.heads, levels, strict=True):
-            images.append(_at_least_float32(head(level)) + logs)
+            scales.append((logs, head(level)))
             logs = downsample(logs)
-        return torch.expm1(torch.minimum(_fuse(images, self.fusions).clamp_min(0), top))
+        return _fuse(scales, self.fusions, top)
 
 
 class KernelPredictor(nn.Module):
@@ -173,31 +185,30 @@ class KernelPredictor(nn.Module):
         self, image: Tensor, features: Tensor, guides: Collection[str] = GUIDES, top: Tensor | None = None
     ) -> Tensor:
         """See :class:`Predictor`."""
-        levels = self.unet(torch.cat([torch.log1p(image), features], 1))
+        levels = self.unet(network_input(image, features))
         guiding = {"normal": features[:, 3:6], "depth": features[:, 6:7]}
         guiding = {name: guide for name, guide in guiding.items() if name in guides}
         top = torch.log1p(image).amax((1, 2, 3), keepdim=True) if top is None else top
         # One for all scales: a part of an image must not be filtered otherwise than the whole.
         backend = choose_backend(None, image, *levels)
-        images: list[Tensor] = []
+        scales: list[tuple[Tensor, None]] = []
         for head, level in zip(self.heads, levels, strict=True):
             prediction = head(level)
             logits = prediction[:, : self.taps]
             # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
             if self.bilateral:
-                f1_f2_f3 = F.softplus(_at_least_float32(prediction[:, self.taps :]).contiguous()).split(1, 1)
-                *scales, f3 = (f * unit for f, unit in zip(f1_f2_f3, SCALE_UNITS, strict=True))
-                scales = [scale for scale, name in zip(scales, GUIDES, strict=True) if name in guiding]
+                *falloffs, f3 = softplus(prediction[:, self.taps :], SCALE_UNITS, backend=backend).split(1, 1)
+                falloffs = [falloff for falloff, name in zip(falloffs, GUIDES, strict=True) if name in guiding]
                 filtered = cross_bilateral_filter(
-                    image, logits, list(guiding.values()), scales, f3, border="renormalize", backend=backend
+                    image, logits, list(guiding.values()), falloffs, f3, border="renormalize", backend=backend
                 )
             else:
                 filtered = cross_bilateral_filter(image, logits, border="renormalize", backend=backend)
-            images.append(torch.log1p(filtered))
+            scales.append((torch.log1p(filtered), None))
             image = downsample(image)
             guiding = {name: downsample(guide) for name, guide in guiding.items()}
         # Each scale is a weighted mean; their fusion could leave the range of the input.
-        return torch.expm1(torch.minimum(_fuse(images, self.fusions).clamp_min(0), top))
+        return _fuse(scales, self.fusions, top)
 
 
 class Cascade(nn.Module):
@@ -259,7 +270,7 @@ class Cascade(nn.Module):
         alone = color if current is None else current
         # Both networks see the same, and often all of it at once.
         features = functools.lru_cache(maxsize=1)(
-            _Features(albedo, normal, depth, _depth_scale(depth), alone, exposure, length).of
+            _Features(albedo, normal, depth, depth_scale(depth), alone, exposure, length).of
         )
         if known is None and (parts is None or parts == [whole]):
             image = color * exposure
@@ -336,11 +347,9 @@ class _Features(NamedTuple):
 
     def of(self, part: Region) -> Tensor:
         """The features of a part, ``(B, 11, h, w)``."""
-        alone = torch.log1p(part.of(self.current) * self.exposure)
-        depth = part.of(self.depth)
-        share = torch.ones_like(depth) if self.length is None else 1 / part.of(self.length)
-        near = _normalized(depth, *self.depth_scale)
-        return torch.cat([part.of(self.albedo), part.of(self.normal) * 0.5 + 0.5, near, alone, share], 1)
+        length = None if self.length is None else part.of(self.length)
+        albedo, normal, depth, current = map(part.of, (self.albedo, self.normal, self.depth, self.current))
+        return network_features(albedo, normal, depth, current, length, self.exposure, self.depth_scale)
 
 
 def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
@@ -375,28 +384,7 @@ def normalize_depth(depth: Tensor) -> Tensor:
     Returns:
         ``(B, 1, H, W)`` in [0, 1]. The typical depth is the image's geometric mean over what was hit.
     """
-    return _normalized(depth, *_depth_scale(depth))
-
-
-def _depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
-    """The largest depth of what was hit, and the typical one as a share of it, ``(B, 1, 1, 1)``."""
-
-    def finite(rows: Tensor) -> Tensor:
-        return _at_least_float32(torch.where(torch.isfinite(rows), rows, 0)).clamp_min(1e-30)
-
-    def logs(rows: Tensor) -> Tensor:
-        return (torch.log(finite(rows) / largest) * torch.isfinite(rows)).sum(-1, keepdim=True)
-
-    # Of the largest, so that the logarithms are small numbers in any unit.
-    largest = by_rows(lambda rows: finite(rows).amax(-1, keepdim=True), depth).amax((1, 2, 3), keepdim=True)
-    count = torch.isfinite(depth).sum((1, 2, 3), keepdim=True).clamp_min(1)
-    return largest, torch.exp(by_rows(logs, depth).sum((1, 2, 3), keepdim=True) / count)
-
-
-def _normalized(depth: Tensor, largest: Tensor, typical: Tensor) -> Tensor:
-    hit = torch.isfinite(depth)
-    shares = _at_least_float32(torch.where(hit, depth, 0)).clamp_min(1e-30) / largest
-    return torch.where(hit, shares / (shares + typical), 1).to(depth.dtype)
+    return normalized_depth(depth, *depth_scale(depth))
 
 
 def _top(image: Tensor, factor: Tensor | float = 1.0) -> Tensor:
@@ -415,10 +403,13 @@ def _reach(unet: UNet, radius: int) -> int:
     return max(unet.reach(scale) + ((1 + radius) << scale) for scale in range(UNet.scales)) + fusions
 
 
-def _fuse(images: list[Tensor], fusions: nn.ModuleList) -> Tensor:
-    fused = images[-1]
-    for fine, fusion in zip(images[-2::-1], fusions, strict=True):
-        fused = fusion(fine, fused)
+def _fuse(scales: Sequence[tuple[Tensor, Tensor | None]], fusions: nn.ModuleList, top: Tensor) -> Tensor:
+    """Logarithms of radiance, finest scale first, each with what is to be added to them, to radiance up to ``top``."""
+    logs, residual = scales[-1]
+    fused = logs if residual is None else _at_least_float32(residual) + logs
+    for scale, fusion in zip(range(len(fusions) - 1, -1, -1), fusions, strict=True):
+        logs, residual = scales[scale]
+        fused = fusion(logs, fused, residual, top if scale == 0 else None)
     return fused
 
 

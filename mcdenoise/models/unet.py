@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -87,23 +88,51 @@ def _padded(x: Tensor, size: Sequence[int]) -> Tensor:
     return F.pad(x, missing, mode="replicate") if any(missing) else x
 
 
-class _ReLU(nn.Module):
-    """ReLU in place: neither the convolution before it nor its own derivative needs what it overwrites."""
+class _Block(nn.Sequential):
+    """Convolutions and ReLUs in turn, which are one step where no derivative is asked for."""
 
     def forward(self, x: Tensor) -> Tensor:
-        if x.dtype == torch.bfloat16 and _plain_inference(x):
-            # The sign of a bfloat16 is that of its bits as an integer, which a CPU clamps ten times as fast.
-            x.view(torch.int16).clamp_min_(0)
-            return x
-        return F.relu(x, inplace=True)
+        fused = _plain_inference(x)
+        for layer in self:
+            if not fused:
+                x = layer(x)
+            elif isinstance(layer, nn.Conv2d):
+                x = _convolved_with_relu(x, layer)
+        return x
+
+
+def _convolved_with_relu(x: Tensor, layer: nn.Conv2d) -> Tensor:
+    """A 3x3 convolution and ReLU, in one where oneDNN can: torch has this for what it compiles only."""
+    dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
+    if not _has_fused_convolution(dtype):
+        return F.relu_(layer(x))
+    weight, bias = (parameter.to(dtype) for parameter in layer.parameters())
+    ones = [1, 1]
+    result: Tensor = torch.ops.mkldnn._convolution_pointwise(
+        x.to(dtype), weight, bias, ones, ones, ones, 1, "relu", [], ""
+    )
+    return result
+
+
+@functools.cache
+def _has_fused_convolution(dtype: torch.dtype) -> bool:
+    try:
+        onednn = torch.ops.mkldnn
+        supported = {torch.float32: True, torch.bfloat16: onednn._is_mkldnn_bf16_supported()}
+        return supported.get(dtype, False) and hasattr(onednn, "_convolution_pointwise")
+    except AttributeError:
+        # Built without oneDNN.
+        return False
 
 
 def _max_pool(x: Tensor) -> Tensor:
-    """``F.max_pool2d(x, 2)``, in half the time where nobody asks which of the pixels it was."""
+    """``F.max_pool2d(x, 2)`` of what is not negative, in less time where nobody asks which of the pixels it was."""
     if not _plain_inference(x):
         return F.max_pool2d(x, 2)
-    rows = torch.maximum(x[..., ::2, :], x[..., 1::2, :])
-    return torch.maximum(rows[..., ::2], rows[..., 1::2])
+    # Behind a ReLU, bfloat16 numbers are in the order of their bits as integers, which a CPU compares twice as fast.
+    values = x.view(torch.int16) if x.dtype == torch.bfloat16 else x
+    rows = torch.maximum(values[..., ::2, :], values[..., 1::2, :])
+    return torch.maximum(rows[..., ::2], rows[..., 1::2]).view(x.dtype)
 
 
 def _plain_inference(x: Tensor) -> bool:
@@ -111,11 +140,12 @@ def _plain_inference(x: Tensor) -> bool:
 
 
 def _block(in_channels: int, out_channels: int) -> nn.Sequential:
-    block = nn.Sequential(
+    # In place: neither a convolution nor its own derivative needs what a ReLU overwrites.
+    block = _Block(
         nn.Conv2d(in_channels, out_channels, 3, padding=1),
-        _ReLU(),
+        nn.ReLU(inplace=True),
         nn.Conv2d(out_channels, out_channels, 3, padding=1),
-        _ReLU(),
+        nn.ReLU(inplace=True),
     )
     for layer in block:
         if isinstance(layer, nn.Conv2d):

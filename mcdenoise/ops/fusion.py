@@ -5,11 +5,12 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from mcdenoise.ops._backend import Backend, choose_backend
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._window import accumulator_dtype
 
 
-def downsample(image: Tensor) -> Tensor:
+def downsample(image: Tensor, *, backend: Backend | None = None) -> Tensor:
     """Average blocks of 2x2 pixels.
 
     ``out[y, x] = mean of image[2y : 2y + 2, 2x : 2x + 2]``; where the height or width is odd, the last blocks hold
@@ -17,13 +18,14 @@ def downsample(image: Tensor) -> Tensor:
 
     Args:
         image: ``(B, C, H, W)``, any unit, up to a quarter of the largest number.
+        backend: ``"torch"``; ``"numba"`` (CPU, without derivatives), or ``None`` for the fastest that can run.
 
     Returns:
         ``(B, C, ceil(H / 2), ceil(W / 2))``.
 
     Raises:
         TypeError: the image is no floating-point tensor.
-        ValueError: the image is not four-dimensional.
+        ValueError: the image is not four-dimensional, or the backend cannot run.
 
     Differentiable in ``image``, to any order.
 
@@ -37,6 +39,11 @@ def downsample(image: Tensor) -> Tensor:
     check_shapes(image=(image, "B C H W"))
     if 0 in image.shape:
         return image[..., ::2, ::2]
+    if choose_backend(backend, image, differentiable=False, forms=("torch", "numba")) != "torch":
+        from mcdenoise.ops._fast import fused as fast
+
+        result: Tensor = fast.downsample(image)
+        return result
     return F.avg_pool2d(image, 2, ceil_mode=True, count_include_pad=False)
 
 

@@ -1,0 +1,514 @@
+"""The fast forms of what networks do between their convolutions as torch operators, without derivatives.
+
+Row by row, each a run of loops that are vectorised: no argument is copied as a whole, whatever its layout and
+precision, and nothing that is on the way to a result is stored but for a few rows.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numba import types
+from numba.extending import overload
+from torch import Tensor
+
+from mcdenoise.ops._fast._numba_filter import (
+    _copy_row,
+    _exp,
+    _readable,
+    _rounded,
+    compiled,
+    share_rows,
+    source,
+)
+from mcdenoise.ops._fast._operator import custom_op
+from mcdenoise.ops._window import accumulator_dtype
+
+# Pixels whose channels are gathered at a time: they stay in the second-level cache.
+_CHUNK = 1024
+
+
+@custom_op(
+    "mcdenoise::network_input",
+    device_types="cpu",
+    schema="(Tensor image, Tensor features, bool logarithms, ScalarType dtype) -> Tensor",
+)
+def network_input(image: Tensor, features: Tensor, logarithms: bool, dtype: torch.dtype) -> Tensor:
+    """See :func:`mcdenoise.ops._fused.network_input`."""
+    result = _empty_input(image, features, logarithms, dtype)
+    if result.numel():
+        sums = torch.promote_types(dtype, torch.float32)
+        arguments = (source(result), source(_readable(image, sums)), source(_readable(features, sums)))
+        buffer = np.empty((result.shape[1], _CHUNK), torch.empty((), dtype=sums).numpy().dtype)
+        share_rows(image, lambda *rows: _stack(*arguments, logarithms, np.empty_like(buffer), result.shape[3], *rows))
+    return result
+
+
+@network_input.register_fake
+def _empty_input(image: Tensor, features: Tensor, _: bool, dtype: torch.dtype) -> Tensor:
+    batch, channels, height, width = image.shape
+    shape = (batch, channels + features.shape[1], height, width)
+    return torch.empty(shape, dtype=dtype, device=image.device, memory_format=torch.channels_last)
+
+
+@compiled
+def _stack(
+    out: Any, image: Any, features: Any, logarithms: bool, rows: Any, width: int, b: int, first: int, last: int
+) -> None:
+    memory, strides, channels = out
+    own, one = image[2], rows.dtype.type(1)
+    bits = np.empty((channels, rows.shape[1]), memory.dtype)
+    for y in range(first, last):
+        for x0 in range(0, width, rows.shape[1]):
+            n = min(rows.shape[1], width - x0)
+            for c in range(own):
+                _read_row(rows[c, :n], image, b, c, y, x0)
+                if logarithms:
+                    _to_logarithms(rows[c, :n], one)
+            for c in range(own, channels):
+                _read_row(rows[c, :n], features, b, c - own, y, x0)
+            for c in range(channels):
+                _round(bits[c, :n], rows[c])
+            start = b * strides[0] + y * strides[2] + x0 * strides[3]
+            _interleave(memory[start : start + n * channels], bits)
+
+
+@compiled
+def _to_logarithms(values: Any, factor: Any) -> None:
+    for x in range(values.size):
+        values[x] = _log1p(values[x] * factor)
+
+
+@compiled
+def _round(bits: Any, values: Any) -> None:
+    for x in range(bits.size):
+        bits[x] = _rounded(values[x], bits)
+
+
+@compiled
+def _interleave(pixels: Any, rows: Any) -> None:
+    """Rows of channels to pixels with their channels side by side."""
+    channels = rows.shape[0]
+    n = pixels.size // channels
+    for c in range(channels):
+        row = rows[c]
+        for x in range(n):
+            pixels[x * channels + c] = row[x]
+
+
+@compiled
+def _read_row(row: Any, image: Any, b: int, c: int, y: int, x0: int) -> None:
+    """A run of pixels of one channel."""
+    strides = image[1]
+    _copy_row(row, image, b * strides[0] + c * strides[1] + y * strides[2] + x0 * strides[3], strides[3])
+
+
+@custom_op(
+    "mcdenoise::network_features",
+    device_types="cpu",
+    schema="(Tensor albedo, Tensor normal, Tensor depth, Tensor current, Tensor? length, Tensor exposure, "
+    "Tensor largest, Tensor typical) -> Tensor",
+)
+def network_features(
+    albedo: Tensor,
+    normal: Tensor,
+    depth: Tensor,
+    current: Tensor,
+    length: Tensor | None,
+    exposure: Tensor,
+    largest: Tensor,
+    typical: Tensor,
+) -> Tensor:
+    """See :func:`mcdenoise.ops._fused.network_features`."""
+    result = _empty_features(albedo)
+    if result.numel():
+        nothing = source(torch.empty((0, 0, 0, 0), dtype=result.dtype))
+        images = tuple(source(image.to(result.dtype)) for image in (albedo, normal, depth, current))
+        lengths = nothing if length is None else source(length.to(result.dtype))
+        factors = torch.cat([exposure, largest, typical], 1).to(result.dtype).flatten(1).numpy()
+        share_rows(albedo, lambda *rows: _assemble(result.numpy(), images, lengths, factors, *rows))
+    return result
+
+
+@network_features.register_fake
+def _empty_features(albedo: Tensor, *_: Any) -> Tensor:
+    return albedo.new_empty((albedo.shape[0], 11, *albedo.shape[2:]))
+
+
+@compiled
+def _assemble(out: Any, images: Any, length: Any, factors: Any, b: int, first: int, last: int) -> None:
+    albedo, normal, depth, current = images
+    half, one = out.dtype.type(0.5), out.dtype.type(1)
+    exposure, largest, typical = factors[b]
+    for y in range(first, last):
+        for c in range(3):
+            _read_row(out[b, c, y], albedo, b, c, y, 0)
+            row = out[b, 3 + c, y]
+            _read_row(row, normal, b, c, y, 0)
+            for x in range(row.size):
+                row[x] = row[x] * half + half
+            row = out[b, 7 + c, y]
+            _read_row(row, current, b, c, y, 0)
+            _to_logarithms(row, exposure)
+        row = out[b, 6, y]
+        _read_row(row, depth, b, 0, y, 0)
+        _normalize(row, largest, typical)
+        row = out[b, 10, y]
+        if length[2]:
+            _read_row(row, length, b, 0, y, 0)
+            for x in range(row.size):
+                row[x] = one / row[x]
+        else:
+            row[:] = one
+
+
+@compiled
+def _normalize(depths: Any, largest: Any, typical: Any) -> None:
+    least, infinity, one = depths.dtype.type(1e-30), depths.dtype.type(np.inf), depths.dtype.type(1)
+    for x in range(depths.size):
+        depth = depths[x]
+        share = max(depth, least) / largest
+        depths[x] = share / (share + typical) if depth < infinity else one
+
+
+@custom_op("mcdenoise::depth_scale", device_types="cpu", schema="(Tensor depth) -> (Tensor, Tensor)")
+def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
+    """See :func:`mcdenoise.ops._fused.depth_scale`."""
+    batch, _, height, _ = depth.shape
+    dtype = accumulator_dtype(depth.dtype)
+    image = source(_readable(depth, dtype))
+    rows = torch.zeros((3, batch, height), dtype=dtype)
+    arguments = (rows.numpy(), image, depth.shape[3])
+    share_rows(depth, lambda *share: _largest_of_rows(*arguments, *share))
+    largest = rows[0].amax(1, keepdim=True).clamp_min(1e-30)
+    share_rows(depth, lambda *share: _logarithms_of_rows(*arguments, largest[:, 0].numpy(), *share))
+    logarithms, count = rows[1:].double().sum(2, keepdim=True)
+    typical = torch.exp(logarithms / count.clamp_min(1)).to(dtype)
+    return largest.reshape(batch, 1, 1, 1), typical.reshape(batch, 1, 1, 1)
+
+
+@depth_scale.register_fake
+def _(depth: Tensor) -> tuple[Tensor, Tensor]:
+    largest = depth.new_empty((depth.shape[0], 1, 1, 1), dtype=accumulator_dtype(depth.dtype))
+    return largest, torch.empty_like(largest)
+
+
+@compiled
+def _largest_of_rows(out: Any, depth: Any, width: int, b: int, first: int, last: int) -> None:
+    row, infinity = np.empty(width, out.dtype), out.dtype.type(np.inf)
+    for y in range(first, last):
+        _read_row(row, depth, b, 0, y, 0)
+        largest = out.dtype.type(0)
+        for x in range(width):
+            if row[x] < infinity:
+                largest = max(largest, row[x])
+        out[0, b, y] = largest
+
+
+@compiled
+def _logarithms_of_rows(out: Any, depth: Any, width: int, largest: Any, b: int, first: int, last: int) -> None:
+    row, hits, scale = np.empty(width, out.dtype), np.empty(width, out.dtype), largest[b]
+    zero, one = out.dtype.type(0), out.dtype.type(1)
+    infinity, least = out.dtype.type(np.inf), out.dtype.type(1e-30)
+    for y in range(first, last):
+        _read_row(row, depth, b, 0, y, 0)
+        for x in range(width):
+            hit = row[x] < infinity
+            hits[x] = one if hit else zero
+            row[x] = _log(max(row[x], least) / scale) if hit else zero
+        out[1, b, y] = row.sum()
+        out[2, b, y] = hits.sum()
+
+
+@custom_op("mcdenoise::softplus", device_types="cpu", schema="(Tensor x, float[] units) -> Tensor")
+def softplus(x: Tensor, units: list[float]) -> Tensor:
+    """See :func:`mcdenoise.ops._fused.softplus`."""
+    result = _empty_planes(x)
+    if result.numel():
+        arguments = (result.numpy(), source(_readable(x, result.dtype)), result.new_tensor(units).numpy())
+        share_rows(x, lambda *rows: _softplus_rows(*arguments, *rows))
+    return result
+
+
+@softplus.register_fake
+def _empty_planes(x: Tensor, *_: Any) -> Tensor:
+    return x.new_empty(x.shape, dtype=accumulator_dtype(x.dtype))
+
+
+@compiled
+def _softplus_rows(out: Any, x: Any, units: Any, b: int, first: int, last: int) -> None:
+    for y in range(first, last):
+        for c in range(out.shape[1]):
+            row = out[b, c, y]
+            _read_row(row, x, b, c, y, 0)
+            zero = row.dtype.type(0)
+            for i in range(row.size):
+                row[i] = units[c] * (max(row[i], zero) + _log1p(_exp(-abs(row[i]))))
+
+
+@custom_op("mcdenoise::downsample", device_types="cpu", schema="(Tensor image) -> Tensor")
+def downsample(image: Tensor) -> Tensor:
+    """See :func:`mcdenoise.ops.downsample`."""
+    result = _empty_half(image).to(accumulator_dtype(image.dtype))
+    if result.numel():
+        arguments = (result.numpy(), source(_readable(image, result.dtype)), *image.shape[2:])
+        share_rows(result, lambda *rows: _halve(*arguments, *rows))
+    return result.to(image.dtype)
+
+
+@downsample.register_fake
+def _empty_half(image: Tensor) -> Tensor:
+    batch, channels, height, width = image.shape
+    return image.new_empty((batch, channels, (height + 1) // 2, (width + 1) // 2))
+
+
+@compiled
+def _halve(out: Any, image: Any, height: int, width: int, b: int, first: int, last: int) -> None:
+    channels = out.shape[1]
+    upper, lower = np.empty(width, out.dtype), np.empty(width, out.dtype)
+    quarter, half = out.dtype.type(0.25), out.dtype.type(0.5)
+    for y in range(first, last):
+        for c in range(channels):
+            _read_row(upper, image, b, c, 2 * y, 0)
+            _read_row(lower, image, b, c, min(2 * y + 1, height - 1), 0)
+            row = out[b, c, y]
+            for x in range(width // 2):
+                row[x] = (upper[2 * x] + upper[2 * x + 1] + lower[2 * x] + lower[2 * x + 1]) * quarter
+            if width % 2:
+                row[width // 2] = (upper[width - 1] + lower[width - 1]) * half
+
+
+@custom_op(
+    "mcdenoise::gated_fusion",
+    device_types="cpu",
+    schema="(Tensor fine, Tensor coarse, Tensor weight, Tensor bias, Tensor? residual, Tensor? top) -> Tensor",
+)
+def gated_fusion(
+    fine: Tensor, coarse: Tensor, weight: Tensor, bias: Tensor, residual: Tensor | None, top: Tensor | None
+) -> Tensor:
+    """See :func:`mcdenoise.ops._fused.gated_fusion`."""
+    result = _empty_planes(fine)
+    dtype = result.dtype
+    if result.numel():
+        nothing = source(torch.empty((0, 0, 0, 0), dtype=dtype))
+        limits = torch.empty(0, dtype=dtype) if top is None else top.to(dtype).expand(len(fine), 1, 1, 1).flatten()
+        arguments = (
+            result.numpy(),
+            source(_readable(fine, dtype)),
+            nothing if residual is None else source(_readable(residual, dtype)),
+            source(_readable(coarse, dtype)),
+            weight.detach().to(dtype).contiguous().numpy(),
+            bias.detach().to(dtype).numpy(),
+            limits.numpy(),
+        )
+        share_rows(fine, lambda *rows: _fuse(*arguments, *rows))
+    return result
+
+
+@gated_fusion.register_fake
+def _(fine: Tensor, *_: Any) -> Tensor:
+    return _empty_planes(fine)
+
+
+@compiled
+def _fuse(
+    out: Any,
+    fine: Any,
+    residual: Any,
+    coarse: Any,
+    weight: Any,
+    bias: Any,
+    top: Any,
+    b: int,
+    first: int,
+    last: int,
+) -> None:
+    """Rows ``first`` to ``last`` of the result, two at a time: they share the blocks whose mean is exchanged."""
+    _, channels, height, width = out.shape
+    dtype = out.dtype
+    # Four rows of both images, the coarse one upsampled, with the zeros of the convolution around them.
+    ring = np.zeros((4, 2 * channels, width + 2), dtype)
+    alpha, change = np.empty(width, dtype), np.empty((channels, width), dtype)
+    half = np.empty((width + 1) // 2, dtype)
+    begin = first // 2 * 2
+    for y in range(begin, last, 2):
+        for row in range(y - 1 if y == begin else y + 1, y + 3):
+            _fetch_both(ring[row % 4], fine, residual, coarse, half, change[0], b, row, height)
+        for c in range(channels):
+            upper = ring[y % 4, c, 1 : width + 1]
+            lower = ring[(y + 1 if y + 1 < height else y) % 4, c, 1 : width + 1]
+            low = ring[y % 4, channels + c, 1 : width + 1]
+            _subtract_means(change[c], low, upper, lower)
+        for row in range(max(y, first), min(y + 2, last)):
+            alpha[:] = bias[0]
+            for dy in range(3):
+                rows = ring[(row + dy - 1) % 4]
+                for c in range(2 * channels):
+                    _correlate(alpha, rows[c], weight[0, c, dy])
+            _sigmoid(alpha)
+            for c in range(channels):
+                values = out[b, c, row]
+                _add_share(values, ring[row % 4, c, 1 : width + 1], alpha, change[c])
+                if top.size:
+                    _to_radiance(values, top[b])
+
+
+@compiled
+def _fetch_both(
+    rows: Any, fine: Any, residual: Any, coarse: Any, half: Any, buffer: Any, b: int, y: int, height: int
+) -> None:
+    """Row ``y`` of the fine and of the upsampled coarse image; zeros beyond the image."""
+    channels, width = fine[2], buffer.size
+    if y < 0 or y >= height:
+        rows[:] = 0
+        return
+    for c in range(channels):
+        row = rows[c, 1 : width + 1]
+        _read_row(row, fine, b, c, y, 0)
+        if residual[2]:
+            _read_row(buffer, residual, b, c, y, 0)
+            for x in range(width):
+                row[x] += buffer[x]
+        _read_row(half, coarse, b, c, y // 2, 0)
+        _double(rows[channels + c, 1 : width + 1], half)
+
+
+@compiled
+def _double(row: Any, half: Any) -> None:
+    """Each number twice, and the last of an odd row once."""
+    for x in range(row.size // 2):
+        row[2 * x] = half[x]
+        row[2 * x + 1] = half[x]
+    if row.size % 2:
+        row[row.size - 1] = half[half.size - 1]
+
+
+@compiled
+def _subtract_means(change: Any, low: Any, upper: Any, lower: Any) -> None:
+    """``low`` without the means of the blocks of two rows, for each pixel of one of them."""
+    quarter, half, width = change.dtype.type(0.25), change.dtype.type(0.5), change.size
+    for x in range(width // 2):
+        mean = (upper[2 * x] + upper[2 * x + 1] + lower[2 * x] + lower[2 * x + 1]) * quarter
+        change[2 * x] = low[2 * x] - mean
+        change[2 * x + 1] = low[2 * x + 1] - mean
+    if width % 2:
+        change[width - 1] = low[width - 1] - (upper[width - 1] + lower[width - 1]) * half
+
+
+@compiled
+def _correlate(total: Any, row: Any, weights: Any) -> None:
+    left, centre, right = weights
+    for x in range(total.size):
+        total[x] += left * row[x] + centre * row[x + 1] + right * row[x + 2]
+
+
+@compiled
+def _sigmoid(values: Any) -> None:
+    one = values.dtype.type(1)
+    for x in range(values.size):
+        values[x] = one / (one + _exp(-values[x]))
+
+
+@compiled
+def _add_share(out: Any, values: Any, share: Any, change: Any) -> None:
+    for x in range(out.size):
+        out[x] = values[x] + share[x] * change[x]
+
+
+@compiled
+def _to_radiance(values: Any, top: Any) -> None:
+    zero = values.dtype.type(0)
+    for x in range(values.size):
+        # A comparison with a NaN is false, and the NaN stays.
+        value = zero if values[x] < zero else values[x]
+        values[x] = _expm1(top if value > top else value)
+
+
+def _log(value: Any) -> Any:
+    """``log`` of a positive number, which LLVM vectorises for float32 in this form only."""
+
+
+def _math_log(value: Any) -> Any:
+    return math.log(value)
+
+
+@overload(_log)
+def _log_overload(value: Any) -> Any:
+    if value != types.float32:
+        return _math_log
+    # Cephes' logf: of 2^n (1 + f) with 1 + f from sqrt(1/2) to sqrt(2), n log(2) in two parts and a polynomial.
+    c0, c1, c2 = np.float32(7.0376836292e-2), np.float32(-1.1514610310e-1), np.float32(1.1676998740e-1)
+    c3, c4, c5 = np.float32(-1.2420140846e-1), np.float32(1.4249322787e-1), np.float32(-1.6668057665e-1)
+    c6, c7, c8 = np.float32(2.0000714765e-1), np.float32(-2.4999993993e-1), np.float32(3.3333331174e-1)
+    high, low = np.float32(0.693359375), np.float32(-2.12194440e-4)
+    one, half, infinity = np.float32(1), np.float32(0.5), np.float32(np.inf)
+    bits_of_root, mantissa = np.int32(0x3F3504F3), np.int32(23)
+
+    def log(value: Any) -> Any:
+        bits = np.float32(value).view(np.int32)
+        n = np.int32(np.int32(bits - bits_of_root) >> mantissa)
+        f = np.int32(bits - np.int32(n << mantissa)).view(np.float32) - one
+        p = ((((((((c0 * f + c1) * f + c2) * f + c3) * f + c4) * f + c5) * f + c6) * f + c7) * f + c8) * f
+        exponent, square = np.float32(n), f * f
+        result = f + (p * square + (exponent * low - half * square)) + exponent * high
+        # Neither infinity nor a NaN is less.
+        return result if value < infinity else value
+
+    return log
+
+
+def _log1p(value: Any) -> Any:
+    """``log1p`` of what is not negative, which LLVM vectorises for float32 in this form only."""
+
+
+def _math_log1p(value: Any) -> Any:
+    return math.log1p(value)
+
+
+@overload(_log1p)
+def _log1p_overload(value: Any) -> Any:
+    if value != types.float32:
+        return _math_log1p
+    one, infinity = np.float32(1), np.float32(np.inf)
+
+    def log1p(value: Any) -> Any:
+        u = value + one
+        # With what the sum lost by rounding.
+        return _log(u) + (value - (u - one)) / u if value < infinity else value
+
+    return log1p
+
+
+def _expm1(value: Any) -> Any:
+    """``expm1``, which LLVM vectorises for float32 in this form only."""
+
+
+def _math_expm1(value: Any) -> Any:
+    return math.expm1(value)
+
+
+@overload(_expm1)
+def _expm1_overload(value: Any) -> Any:
+    if value != types.float32:
+        return _math_expm1
+    # exp(x) - 1 = 2^n (exp(r) - 1) + (2^n - 1), with the polynomial of Cephes' expf.
+    log2_e, high, low = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
+    magic, one, infinity = np.float32(12582912.0), np.float32(1), np.float32(np.inf)
+    least, most = np.float32(-87.0), np.float32(88.3)
+    c0, c1, c2 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
+    c3, c4, c5 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1), np.float32(5.0000001201e-1)
+    bias, mantissa = np.int32(127), np.int32(23)
+
+    def expm1(value: Any) -> Any:
+        x = max(min(value, most), least)
+        n = (x * log2_e + magic) - magic
+        r = (x - n * high) - n * low
+        p = (((((c0 * r + c1) * r + c2) * r + c3) * r + c4) * r + c5) * r * r + r
+        power = np.int32(np.int32(np.int32(n) + bias) << mantissa).view(np.float32)
+        result = p * power + (power - one)
+        return infinity if value > most else result + (value - value)
+
+    return expm1

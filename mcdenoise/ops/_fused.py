@@ -1,0 +1,178 @@
+"""What networks do between their convolutions, each step in one pass over the image.
+
+Not part of the ops that users compose: each is a few of those, or of torch's, in a row, as its plain form says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.ops._backend import Backend, choose_backend
+from mcdenoise.ops._rows import by_rows
+from mcdenoise.ops._window import accumulator_dtype
+from mcdenoise.ops.fusion import laplacian_fusion, upsample
+
+_FORMS: tuple[Backend, ...] = ("torch", "numba")
+
+
+def network_input(
+    image: Tensor, features: Tensor, *, logarithms: bool = True, backend: Backend | None = None
+) -> Tensor:
+    """``torch.cat([torch.log1p(image), features], 1)`` as a convolution takes it: channels-last, precision of autocast.
+
+    Args:
+        image: ``(B, C, H, W)`` radiance; or logarithms of radiance already.
+        features: ``(B, F, H, W)`` of the same dtype.
+        logarithms: whether to take them.
+        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
+
+    Returns:
+        ``(B, C + F, H, W)``. The plain form leaves layout and precision to the convolution.
+    """
+    chosen = choose_backend(backend, image, features, differentiable=False, forms=_FORMS)
+    device = image.device.type
+    dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else image.dtype
+    if chosen == "torch" or torch.float16 in (image.dtype, features.dtype, dtype):
+        return torch.cat([torch.log1p(image) if logarithms else image, features], 1)
+    from mcdenoise.ops._fast import fused as fast
+
+    result: Tensor = fast.network_input(image, features, logarithms, dtype)
+    return result
+
+
+def depth_scale(depth: Tensor, *, backend: Backend | None = None) -> tuple[Tensor, Tensor]:
+    """The largest depth of what was hit, and the typical one as a share of it: the geometric mean.
+
+    Args:
+        depth: ``(B, 1, H, W)`` distance, any unit, ``inf`` where nothing was hit.
+        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
+
+    Returns:
+        ``(B, 1, 1, 1)`` each, at least float32; depths below 1e-30 count as that.
+    """
+    if choose_backend(backend, depth, differentiable=False, forms=_FORMS) != "torch":
+        from mcdenoise.ops._fast import fused as fast
+
+        scale: tuple[Tensor, Tensor] = fast.depth_scale(depth)
+        return scale
+
+    def finite(rows: Tensor) -> Tensor:
+        rows = torch.where(torch.isfinite(rows), rows, 0)
+        return rows.to(accumulator_dtype(rows.dtype)).clamp_min(1e-30)
+
+    def logs(rows: Tensor) -> Tensor:
+        return (torch.log(finite(rows) / largest) * torch.isfinite(rows)).sum(-1, keepdim=True)
+
+    # Of the largest, so that the logarithms are small numbers in any unit.
+    largest = by_rows(lambda rows: finite(rows).amax(-1, keepdim=True), depth).amax((1, 2, 3), keepdim=True)
+    count = torch.isfinite(depth).sum((1, 2, 3), keepdim=True).clamp_min(1)
+    return largest, torch.exp(by_rows(logs, depth).sum((1, 2, 3), keepdim=True) / count)
+
+
+def normalized_depth(depth: Tensor, largest: Tensor, typical: Tensor) -> Tensor:
+    """``d / (d + typical d)`` with :func:`depth_scale`, and 1 where nothing was hit."""
+    hit = torch.isfinite(depth)
+    shares = torch.where(hit, depth, 0).to(largest.dtype).clamp_min(1e-30) / largest
+    return torch.where(hit, shares / (shares + typical), 1).to(depth.dtype)
+
+
+def network_features(
+    albedo: Tensor,
+    normal: Tensor,
+    depth: Tensor,
+    current: Tensor,
+    length: Tensor | None,
+    exposure: Tensor,
+    scale: tuple[Tensor, Tensor],
+    *,
+    backend: Backend | None = None,
+) -> Tensor:
+    """Buffers as a network sees them, each in a range from 0 to about 1.
+
+    Args:
+        albedo: ``(B, 3, H, W)`` in [0, 1].
+        normal: ``(B, 3, H, W)`` in [-1, 1].
+        depth: ``(B, 1, H, W)`` distance, ``inf`` where nothing was hit.
+        current: ``(B, 3, H, W)`` radiance.
+        length: ``(B, 1, H, W)`` at least 1; 1 by default.
+        exposure: ``(B, 1, 1, 1)`` factor of the radiance.
+        scale: of :func:`depth_scale`.
+        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
+
+    Returns:
+        ``(B, 11, H, W)``: albedo, normal, depth, logarithm of the radiance, and one over the length.
+    """
+    given = (albedo, normal, depth, current, length, exposure, *scale)
+    chosen = choose_backend(backend, *given, differentiable=False, forms=_FORMS)
+    if chosen != "torch" and albedo.dtype in (torch.float32, torch.float64):
+        from mcdenoise.ops._fast import fused as fast
+
+        result: Tensor = fast.network_features(*given)
+        return result
+    share = torch.ones_like(depth) if length is None else 1 / length
+    near = normalized_depth(depth, *scale)
+    return torch.cat([albedo, normal * 0.5 + 0.5, near, torch.log1p(current * exposure), share], 1)
+
+
+def gated_fusion(
+    fine: Tensor,
+    coarse: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    *,
+    residual: Tensor | None = None,
+    top: Tensor | None = None,
+    backend: Backend | None = None,
+) -> Tensor:
+    """Fuse two scales with an ``alpha`` that a convolution of both predicts.
+
+    ``laplacian_fusion(i, coarse, sigmoid(conv3x3([i, upsample(coarse)])))`` with ``i = fine + residual``.
+
+    Args:
+        fine: ``(B, C, H, W)``, any unit; logarithms of radiance if there is a ``top``.
+        coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` of the same unit and dtype.
+        weight: ``(1, 2 C, 3, 3)``.
+        bias: ``(1,)``.
+        residual: ``(B, C, H, W)`` to be added to ``fine``, any dtype; none by default.
+        top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result, which is then handed out as radiance:
+            ``expm1`` of what is brought to the range from 0 to ``top``.
+        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
+
+    Returns:
+        ``(B, C, H, W)``, at least float32. The fast form computes ``alpha`` in the dtype of the result, also under
+        autocast.
+    """
+    given = (fine, coarse, weight, bias, residual, top)
+    chosen = choose_backend(backend, *given, differentiable=False, forms=_FORMS)
+    if chosen != "torch":
+        from mcdenoise.ops._fast import fused as fast
+
+        result: Tensor = fast.gated_fusion(*given)
+        return result
+    if residual is not None:
+        fine = residual.to(accumulator_dtype(residual.dtype)) + fine
+    both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)
+    alpha = torch.sigmoid(F.conv2d(both, weight, bias, padding=1))
+    fused = laplacian_fusion(fine, coarse, alpha.to(fine.dtype))
+    return fused if top is None else torch.expm1(torch.minimum(fused.clamp_min(0), top))
+
+
+def softplus(x: Tensor, units: Sequence[float], *, backend: Backend | None = None) -> Tensor:
+    """``F.softplus(x)`` in units of its own for each channel, as contiguous planes of at least float32.
+
+    Args:
+        x: ``(B, C, H, W)`` of any layout, such as some channels of a network's prediction.
+        units: factor of each channel of the result.
+        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
+    """
+    if choose_backend(backend, x, differentiable=False, forms=_FORMS) == "torch":
+        planes = F.softplus(x.to(accumulator_dtype(x.dtype)).contiguous())
+        return planes * planes.new_tensor(units).reshape(-1, 1, 1)
+    from mcdenoise.ops._fast import fused as fast
+
+    result: Tensor = fast.softplus(x, list(units))
+    return result

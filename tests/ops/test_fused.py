@@ -1,0 +1,215 @@
+"""The compiled steps between a network's convolutions against their plain forms, which are formulas of torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from plain_form import channels_last, every_other_column, slice_of_pixels, transposed
+from torch import Tensor
+
+from mcdenoise.ops import _fused, downsample
+from mcdenoise.ops._fast import _numba_filter
+
+# Of the largest number in a result: a few roundings of sums of up to 54 products.
+TOLERANCE = {dtype: 32 * torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
+SIZES = [(1, 1, 1), (2, 5, 7), (1, 8, 300), (2, 33, 2), (1, 2, 1030)]
+
+every_size = pytest.mark.parametrize("size", SIZES, ids=str)
+every_dtype = pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+
+
+@pytest.fixture(autouse=True)
+def nan_in_fresh_memory() -> Iterator[None]:
+    """Fills what is left to be written with NaN, so that what was forgotten shows."""
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+def as_it_is(tensor: Tensor) -> Tensor:
+    return tensor
+
+
+def draw(seed: int, batch: int, channels: int, height: int, width: int, dtype: torch.dtype) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(batch, channels, height, width, generator=generator, dtype=torch.float64).to(dtype)
+
+
+Call = tuple[Callable[..., Any], list[Any], dict[str, Any]]
+
+
+def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tensor], Tensor] = as_it_is) -> list[Call]:
+    """Every step with arguments of its kind."""
+    batch, height, width = size
+
+    def some(seed: int, channels: int, like: torch.dtype = dtype) -> Tensor:
+        return layout(draw(seed, batch, channels, height, width, like))
+
+    coarse = layout(draw(1, batch, 3, (height + 1) // 2, (width + 1) // 2, dtype) + 1)
+    weight, bias = draw(2, 1, 6, 3, 3, dtype) * 0.3, torch.tensor([0.2], dtype=dtype)
+    top = 1 + torch.arange(1, batch + 1, dtype=dtype).reshape(-1, 1, 1, 1)
+    radiance = layout(draw(3, batch, 3, height, width, dtype).exp())
+    depth = draw(4, batch, 1, height, width, dtype).exp() * 20
+    depth[..., 0, -1] = torch.inf
+    depth = layout(depth)
+    scale = _fused.depth_scale(depth, backend="torch")
+    exposure = top * 0.7
+    buffers = [some(5, 3), some(6, 3), depth, radiance]
+    calls: list[Call] = [
+        (_fused.gated_fusion, [some(7, 3), coarse, weight, bias], {}),
+        (_fused.gated_fusion, [some(7, 3), coarse, weight, bias], {"residual": some(8, 3), "top": top}),
+        (_fused.softplus, [some(9, 3) * 30, (10.0, 1000.0, 1.0)], {}),
+        (_fused.network_input, [radiance, some(10, 11)], {}),
+        (_fused.network_input, [some(11, 3), some(10, 11)], {"logarithms": False}),
+        (_fused.depth_scale, [depth], {}),
+        (_fused.network_features, [*buffers, 1 + some(12, 1).abs(), exposure, scale], {}),
+        (_fused.network_features, [*buffers, None, exposure, scale], {}),
+        (downsample, [some(13, 3)], {}),
+    ]
+    return calls
+
+
+def results(call: Call, backend: str) -> list[Tensor]:
+    function, arguments, settings = call
+    found = function(*arguments, **settings, backend=backend)
+    return [found] if isinstance(found, Tensor) else list(found)
+
+
+def assert_same(actual: list[Tensor], expected: list[Tensor], tolerance: float) -> None:
+    for a, e in zip(actual, expected, strict=True):
+        assert (a.dtype, a.shape) == (e.dtype, e.shape)
+        torch.testing.assert_close(a, e, rtol=tolerance, atol=tolerance * float(e.abs().max()))
+
+
+@every_dtype
+@every_size
+def test_fast_is_plain(size: tuple[int, int, int], dtype: torch.dtype) -> None:
+    for call in calls(size, dtype):
+        # The plain softplus is the number itself from 20 on.
+        tolerance = max(TOLERANCE[dtype], 1e-9 if call[0] is _fused.softplus else 0)
+        assert_same(results(call, "numba"), results(call, "torch"), tolerance)
+
+
+@pytest.mark.parametrize("layout", [channels_last, slice_of_pixels, every_other_column, transposed])
+def test_layout_in_memory_changes_nothing(layout: Callable[[Tensor], Tensor]) -> None:
+    size = (2, 5, 70)
+    for laid_out, contiguous in zip(calls(size, torch.float32, layout), calls(size, torch.float32), strict=True):
+        assert all(map(torch.equal, results(laid_out, "numba"), results(contiguous, "numba")))
+
+
+def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_numba_filter, "_PIXELS_A_THREAD", 1)
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            found.append([result for call in calls((2, 9, 6), torch.float32) for result in results(call, "numba")])
+    finally:
+        torch.set_num_threads(threads)
+    for other in found[1:]:
+        assert all(map(torch.equal, other, found[0]))
+
+
+@every_size
+def test_predictions_in_bfloat16_are_read_as_they_are(size: tuple[int, int, int]) -> None:
+    batch, height, width = size
+    fine, coarse = draw(1, batch, 3, height, width, torch.float32), draw(2, *_half(size), torch.float32)
+    prediction = channels_last(draw(3, batch, 12, height, width, torch.bfloat16))
+    weight, bias = draw(4, 1, 6, 3, 3, torch.float32), torch.zeros(1)
+    read: list[Call] = [
+        (_fused.gated_fusion, [fine, coarse, weight, bias], {"residual": prediction[:, 9:]}),
+        (_fused.softplus, [prediction[:, 9:], (1.0, 2.0, 3.0)], {}),
+    ]
+    for call in read:
+        assert_same(results(call, "numba"), results(call, "torch"), TOLERANCE[torch.float32])
+
+
+def _half(size: tuple[int, int, int]) -> tuple[int, int, int, int]:
+    return size[0], 3, (size[1] + 1) // 2, (size[2] + 1) // 2
+
+
+@every_size
+def test_the_input_of_a_network_has_the_precision_of_autocast(size: tuple[int, int, int]) -> None:
+    batch, height, width = size
+    image, features = (draw(seed, batch, count, height, width, torch.float32) for seed, count in ((1, 3), (2, 11)))
+    for logarithms in (False, True):
+        with torch.autocast("cpu", torch.bfloat16):
+            found = _fused.network_input(image.exp(), features, logarithms=logarithms, backend="numba")
+        plain = _fused.network_input(image.exp(), features, logarithms=logarithms, backend="torch")
+        assert found.dtype == torch.bfloat16
+        assert found.is_contiguous(memory_format=torch.channels_last)
+        if logarithms:
+            # On either side of what is rounded.
+            torch.testing.assert_close(found.float(), plain, rtol=2**-8, atol=0)
+        else:
+            assert torch.equal(found, plain.bfloat16())
+
+
+def test_alpha_under_autocast_is_that_of_float32() -> None:
+    call = calls((1, 8, 30), torch.float32)[1]
+    plain = results(call, "torch")
+    with torch.autocast("cpu", torch.bfloat16):
+        fast, rounded = results(call, "numba"), results(call, "torch")
+    assert_same(fast, plain, TOLERANCE[torch.float32])
+    assert (rounded[0] - plain[0]).abs().max() > 1e-4
+
+
+def test_numbers_of_any_size() -> None:
+    image = torch.tensor([0, 1e-40, 1e-30, 1e-8, 0.3, 0.5, 1, 7, 3e5, 1e20, 1e38, torch.inf, torch.nan])
+    image = image.reshape(1, 1, 1, -1).expand(1, 3, 2, -1)
+    nothing = torch.zeros(1, 0, 2, image.shape[-1])
+    found = _fused.network_input(image, nothing, backend="numba")
+    torch.testing.assert_close(found, torch.log1p(image), rtol=4e-7, atol=0, equal_nan=True)
+    # And back again, where a fusion changes nothing: alpha is 0.
+    logs = torch.log1p(image.nan_to_num(0, 1e38))
+    weight, bias, top = torch.zeros(1, 6, 3, 3), torch.tensor([-1e4]), torch.full((1, 1, 1, 1), 80.0)
+    given = (logs, downsample(logs), weight, bias)
+    fast, plain = (_fused.gated_fusion(*given, top=top, backend=name) for name in ("numba", "torch"))
+    torch.testing.assert_close(fast, plain, rtol=1e-5, atol=0)
+    torch.testing.assert_close(fast[..., :10], image[..., :10], rtol=1e-5, atol=1e-37)
+
+
+def test_nan_stays_where_it_is_and_below_zero_is_zero() -> None:
+    fine = torch.full((1, 3, 6, 9), -1.0)
+    fine[..., 2, 4] = torch.nan
+    weight, bias, top = torch.zeros(1, 6, 3, 3), torch.tensor([-1e4]), torch.ones(1, 1, 1, 1)
+    fused = _fused.gated_fusion(fine, torch.zeros(1, 3, 3, 5), weight, bias, top=top, backend="numba")
+    assert fused[..., 2, 4].isnan().all()
+    assert fused[..., 3:, 6:].unique().tolist() == [0]
+
+
+def test_where_nothing_was_hit_there_is_no_depth() -> None:
+    depth = torch.full((2, 1, 3, 4), torch.inf)
+    depth[1, 0, 1] = torch.tensor([1.0, 4.0, torch.inf, 2.0])
+    largest, typical = (part.flatten().tolist() for part in _fused.depth_scale(depth, backend="numba"))
+    assert largest == pytest.approx([1e-30, 4])
+    assert typical == pytest.approx([1, 0.5])
+
+
+def test_where_derivatives_are_asked_for_it_is_plain() -> None:
+    for function, arguments, settings in calls((1, 96, 96), torch.float32):
+        leaf = arguments[0].clone().requires_grad_()
+        found = function(leaf, *arguments[1:], **settings)
+        result = found if isinstance(found, Tensor) else found[1]
+        assert torch.autograd.grad(result.sum(), leaf)[0].shape == leaf.shape
+        with pytest.raises(ValueError, match="found 'numba', which has no derivatives of this op"):
+            function(leaf, *arguments[1:], **settings, backend="numba")
+
+
+def test_an_empty_batch() -> None:
+    for function, arguments, settings in calls((1, 4, 6), torch.float32):
+        empty = [x[:0] if isinstance(x, Tensor) and x.ndim == 4 and x.shape[1] != 6 else x for x in arguments]
+        if function in (_fused.softplus, _fused.network_input, downsample):
+            assert 0 in function(*empty, **settings, backend="numba").shape
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_goes_through_the_compiler() -> None:
+    for call in calls((1, 5, 8), torch.float32):
+        torch.compiler.reset()
+        compiled = torch.compile(call[0], fullgraph=True, backend="aot_eager")
+        with torch.no_grad():
+            assert_same(results((compiled, *call[1:]), "numba"), results(call, "numba"), 1e-6)
