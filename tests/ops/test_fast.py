@@ -94,6 +94,20 @@ def test_layout_in_memory_changes_nothing(op: Op, layout: Callable[[Tensor], Ten
     assert all(map(torch.equal, laid_out, outcomes(op, case, case.inputs(dtype), "numba")))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("border", ["replicate", "zeros", "renormalize"])
+def test_what_is_spread_is_the_same_without_the_slopes_of_the_kernel(border: Any, dtype: torch.dtype) -> None:
+    inputs = drawn(2, 3, 9, 300, 5, FAST[1]).inputs(dtype)
+    image, kernel = inputs["image"], inputs["kernel"]
+    alone, with_slopes = (
+        _numba_filter.derivatives(image, image, kernel, (), (), None, False, border, of_kernel=wanted)
+        for wanted in (False, True)
+    )
+    assert torch.equal(alone[0], with_slopes[0])
+    assert [of_kernel.numel() for of_kernel in (alone[1], with_slopes[1])] == [0, kernel.numel()]
+    assert torch.equal(ops.kernel_splat(image, kernel, border=border, backend="numba"), alone[0])
+
+
 @every_op
 def test_other_dtypes_beside_the_image(op: Op) -> None:
     case = drawn(1, 3, 5, 7, 3, op)

@@ -88,7 +88,7 @@ def filtered(
 
 def splatted(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
     """The transpose of the filter without guides: what its derivative spreads over an image."""
-    return derivatives(image, image, kernel, (), (), None, False, border)[0]
+    return derivatives(image, image, kernel, (), (), None, False, border, of_kernel=False)[0]
 
 
 def derivatives(
@@ -101,9 +101,11 @@ def derivatives(
     log_domain: bool,
     border: Border,
     of_guides: bool = False,
+    of_kernel: bool = True,
 ) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], Tensor]:
     """Of the image, kernel, guides, scales and distance scale, times ``gradient``; those of guides only if asked for.
 
+    All but the first need the slope of every weight, so that without that of the kernel there is none of them.
     Each has the dtype and shape of what it is the derivative of; what is absent or not asked for is empty.
     """
     dtype = _compute_dtype(image, kernel)
@@ -112,13 +114,13 @@ def derivatives(
     of_distance = torch.empty((batch, 0 if distance_scale is None else 1, height, width), dtype=dtype)
     planes = [image, *(guides if of_guides else ())]
     scattered = torch.empty((batch, sum(plane.shape[1] for plane in planes), height, width), dtype=dtype)
-    of_kernel = torch.empty_like(kernel, dtype=_readable(kernel, dtype).dtype)
+    slopes = torch.empty_like(kernel if of_kernel else kernel[:, :0], dtype=_readable(kernel, dtype).dtype)
     if scattered.numel():
         inputs = _inputs(dtype, image, kernel, guides, scales, distance_scale, log_domain, border)
         upstream = source(gradient.to(dtype))
         results = (
             scattered.numpy(),
-            source(of_kernel),
+            source(slopes),
             _filled_up([scale.numpy() for scale in of_scales], of_distance.numpy()),
             of_distance.numpy(),
         )
@@ -130,7 +132,7 @@ def derivatives(
     )
     return (
         of_image,
-        of_kernel.to(kernel.dtype),
+        slopes.to(kernel.dtype),
         guide_gradients,
         [part.to(scale.dtype) for part, scale in zip(of_scales, scales, strict=True)],
         of_distance if distance_scale is None else of_distance.to(distance_scale.dtype),
@@ -557,7 +559,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
     log_domain, border = inputs.log_domain, inputs.border
     radius, taps, chunk = kernel_size // 2, kernel_size**2, min(_CHUNK, width)
     dtype = scattered.dtype
-    of_guides = scattered.shape[1] > channels
+    of_guides, with_slopes = scattered.shape[1] > channels, of_kernel[2] > 0
     ring = np.zeros((kernel_size, _channels_of(inputs), width + 2 * radius), dtype)
     sums = np.zeros((kernel_size, scattered.shape[1], width + 2 * radius), dtype)
     weights, slopes = np.empty((taps, chunk), dtype), np.empty((taps, chunk), dtype)
@@ -568,7 +570,8 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
     start_row, end_row = max(first - radius, 0), min(last + radius, height)
     normalised = log_domain or border == _RENORMALIZE
     for row in range(start_row - radius, end_row + radius):
-        _fetch_all(ring, inputs, b, row)
+        if with_slopes:
+            _fetch_all(ring, inputs, b, row)
         y = row - radius
         if y < start_row:
             continue
@@ -584,7 +587,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
                 _multiply(upstream[c, :n], scale)
             # The slope of each weight; where weights are normalised, less what all of them share.
             shared[:] = 0
-            for t in range(taps):
+            for t in range(taps if with_slopes else 0):
                 start = x0 + t % kernel_size
                 neighbours = ring[(y + t // kernel_size - radius) % kernel_size]
                 slopes[t, :n] = 0
@@ -603,6 +606,8 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
                 if first <= target < last:
                     for c in range(channels):
                         _add_product(sums[target % kernel_size, c, start : start + n], weights[t, :n], upstream[c, :n])
+                if not with_slopes:
+                    continue
                 slope, weight = slopes[t, :n], weights[t, :n]
                 if normalised:
                     for x in range(n):
@@ -613,6 +618,8 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
                     # The exponent's slope takes the weight's place.
                     _multiply(weight, slope)
                     _multiply(slope, factors[t, :n])
+            if not with_slopes:
+                continue
             if mine:
                 _write_taps(of_kernel, slopes, b, y, x0, n)
             exponents = slopes if log_domain else weights
