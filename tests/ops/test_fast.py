@@ -203,6 +203,30 @@ def test_what_runs_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
     assert _backend.choose_backend(None, large) == "torch"
 
 
+def test_another_backend_may_be_preferred_for_a_while() -> None:
+    large, small = torch.rand(2, 3, 64, 64), torch.rand(1, 3, 4, 4)
+    with _backend.preferred("torch"):
+        assert _backend.choose_backend(None, large) == "torch"
+        assert _backend.choose_backend("numba", large) == "numba"
+        with pytest.raises(ValueError, match="backend: expected one of"), _backend.preferred("c"):  # type: ignore[arg-type]
+            pytest.fail("entered")
+        with _backend.preferred("numba"):
+            assert _backend.choose_backend(None, small) == "numba"
+            assert _backend.choose_backend(None, small.to("meta")) == "torch"
+    assert _backend.choose_backend(None, large) == "numba"
+
+
+def test_denormal_numbers_are_flushed_within_a_kernel_and_nowhere_else() -> None:
+    image, kernel = torch.full((1, 1, 3, 3), 1e-30), torch.full((1, 9, 3, 3), 1e-10)
+    for flush in (False, True):
+        torch.set_flush_denormal(flush)
+        try:
+            assert ops.kernel_conv(image, kernel, backend="numba").eq(0).all()
+            assert bool((image * kernel[:, :1] == 0).all()) is flush
+        finally:
+            torch.set_flush_denormal(False)
+
+
 def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
     image, kernel = torch.rand(1, 3, 4, 5), torch.rand(1, 9, 4, 5)
     with pytest.raises(ValueError, match="backend: expected one of torch, numba, triton, found 'cuda'"):

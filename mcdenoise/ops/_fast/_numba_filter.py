@@ -16,8 +16,10 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numba
@@ -33,6 +35,7 @@ from mcdenoise.ops._window import BORDERS, Border, accumulator_dtype, kernel_siz
 _CHUNK = 256
 # A thread of its own for fewer pixels costs more than it saves.
 _PIXELS_A_THREAD = 4096
+_SMALLEST = sys.float_info.min
 
 # Guides come in tuples of this length or a multiple of it, filled up with empty ones: each length is compiled anew.
 _GUIDES = 4
@@ -195,11 +198,12 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
 
     def share(number: int) -> None:
         row, end = rows * number // threads, rows * (number + 1) // threads
-        while row < end:
-            b, first = divmod(row, height)
-            last = min(height, first + end - row)
-            run(b, first, last)
-            row += last - first
+        with _denormals_flushed():
+            while row < end:
+                b, first = divmod(row, height)
+                last = min(height, first + end - row)
+                run(b, first, last)
+                row += last - first
 
     if threads == 1:
         share(0)
@@ -209,6 +213,17 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
         share(0)
         for other in others:
             other.result()
+
+
+@contextmanager
+def _denormals_flushed() -> Iterator[None]:
+    """Numbers below the smallest normal one are 0 in this thread: small weights of small gradients take far longer."""
+    already = _SMALLEST / 2 == 0
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(already)
 
 
 def _load(value: Any) -> Any:
