@@ -331,3 +331,18 @@ def test_training_speed_times_both_forms_in_both_precisions(small_sequence: Path
         assert [len(values) for values in times.values()] == [2] * 4
         for line, values in zip(lines[3:], times.values(), strict=True):
             assert float(line.split()[2]) == pytest.approx(sum(values) / 2, abs=0.51)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory as Linux tells it")
+def test_large_frames_prints_what_a_pixel_costs(tmp_path: Path) -> None:
+    file = tmp_path / "costs.json"
+    arguments = ("--sizes", "64x48,96x64", "--model", "cascaded_tiny", "--max-memory", "2", "--threads", "1")
+    lines = run("large_frames.py", *arguments, "--json", file).splitlines()
+    assert lines[0] == "cascaded_tiny, bfloat16, within 2 GB, 2 frames"
+    costs = json.loads(file.read_text())["costs"]
+    assert [cost["size"] for cost in costs] == ["64x48", "96x64"]
+    for line, cost in zip(lines[3:], costs, strict=True):
+        size, network, total, peak, tiles = line.split(maxsplit=4)
+        assert (size, tiles) == (cost["size"], "whole frames: all within 2 GB")
+        assert 0 < float(network) < float(total)
+        assert 0.2 < float(peak) < 2

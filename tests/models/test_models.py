@@ -159,11 +159,13 @@ def test_shortcuts_of_training_change_no_derivative(monkeypatch: pytest.MonkeyPa
     image = torch.randn(1, 4, 21, 34).bfloat16()
 
     def derivatives() -> tuple[list[Tensor], list[Tensor]]:
-        first = torch.autograd.grad(sum(f.square().sum() for f in net(image)), list(net.parameters()), create_graph=True)
-        # Without a record, too: the second time on a path of its own.
-        plain = torch.autograd.grad(sum(f.square().sum() for f in net(image)), list(net.parameters()))
-        second = torch.autograd.grad(sum(g.float().square().sum() for g in first), list(net.parameters()))
-        assert all(map(torch.equal, first, plain))
+        parameters = list(net.parameters())
+        on_record, plain = (
+            torch.autograd.grad(sum(f.square().sum() for f in net(image)), parameters, create_graph=record)
+            for record in (True, False)
+        )
+        assert all(map(torch.equal, on_record, plain))
+        second = torch.autograd.grad(sum(g.float().square().sum() for g in on_record), parameters)
         return list(plain), list(second)
 
     fast = derivatives()
