@@ -131,10 +131,10 @@ class _ReLUOfBits(Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        (result,) = ctx.saved_tensors
+        result: Tensor = ctx.saved_tensors[0]
         if torch.is_grad_enabled():
             return torch.where(result > 0, gradient, 0)
-        bits = torch.ops.aten.threshold_backward(gradient.view(torch.int16), result.view(torch.int16), 0)
+        bits: Tensor = torch.ops.aten.threshold_backward(gradient.view(torch.int16), result.view(torch.int16), 0)
         return bits.view(torch.bfloat16)
 
 
