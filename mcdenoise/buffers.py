@@ -57,6 +57,9 @@ BUFFERS: dict[str, BufferSpec] = {
 }
 
 
+# What says where a pixel was in the frame before, and nothing else: of no use to a frame without one.
+OF_THE_PAST = frozenset({"position", "motion", "previous_position"})
+
 _MATRIX = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "world-to-clip matrix")
 
 
@@ -149,6 +152,10 @@ class Frame:
         column = self.view_projection[:, :, 3, None, None]
         depth = (self.position * column[:, :3]).sum(1, keepdim=True) + column[:, 3:]
         return self.replace(depth=torch.where(depth > 0, depth, torch.inf))
+
+    def without_past(self) -> Frame:
+        """The same frame without the buffers that only a frame with a past needs."""
+        return self.replace(**dict.fromkeys(OF_THE_PAST))
 
     def validate(self) -> tuple[Frame, int]:
         """Look at every value: repair what is a renderer's daily bread, refuse what would spoil the result.

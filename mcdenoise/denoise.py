@@ -163,11 +163,15 @@ class _Times(NamedTuple):
 
 def _read_frames(sequence: Sequence, denoiser: Denoiser, *, reference: bool) -> Iterator[tuple[int, Frame, _Times]]:
     """Each frame, and meanwhile the next one is read, if there is room for it. Resets the denoiser."""
-    denoiser.reset(sequence.buffers - (set() if reference else {"reference"}), len(sequence), sequence.size)
+    buffers = sequence.buffers - (set() if reference else {"reference"})
+    denoiser.reset(buffers, len(sequence), sequence.size)
+    streaming = denoiser.plan.has_past(buffers)
 
     def read(number: int) -> tuple[Frame, float]:
         start = time.perf_counter()
-        return sequence.frame(number, reference=reference), _since(start)
+        frame = sequence.frame(number, reference=reference)
+        # A depth may be that of the positions.
+        return frame if streaming else frame.with_depth().without_past(), _since(start)
 
     with ThreadPoolExecutor(1) as reader:
         # No frame has a name here: whoever gets it decides when it goes.

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.buffers import Frame, Inspected
+from mcdenoise.buffers import OF_THE_PAST, Frame, Inspected
 from mcdenoise.errors import InputError
 from mcdenoise.history import Accumulated, History
 from mcdenoise.models import Denoised, Known, Region, create_model
@@ -152,7 +152,8 @@ class Denoiser:
         """Forget the past: the next frame is the first of a shot. A cut and a change of size do so by themselves.
 
         Args:
-            buffers: names of the buffers that every frame of the shot will have, where that is known.
+            buffers: names of the buffers that every frame of the shot will have, where that is known. Those that only
+                serve a past (:meth:`mcdenoise.buffers.Frame.without_past`) are not counted where there will be none.
             frames: how many frames there will be, where that is known.
             size: their height and width, where that and the buffers are known. Then ``has_room_ahead`` says whether
                 there is memory to read the next frame while one is denoised.
@@ -165,7 +166,8 @@ class Denoiser:
         # Of one frame there is nothing ahead.
         self.has_room_ahead = size is not None and frames != 1
         if buffers is not None and size is not None and self._takes_plan:
-            shot = Frames(size, frozenset(buffers), self.plan.has_past(buffers))
+            streaming = self.plan.has_past(buffers)
+            shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else OF_THE_PAST), streaming)
             self._tiling(shot)
             self.has_room_ahead = self.has_room_ahead and self._memory.has_room_ahead(shot, self._needs())
 

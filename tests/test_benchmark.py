@@ -621,10 +621,15 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
     assert len(stored["costs"]) == len(rows) == len(results.costs)
     for row, cost in zip(rows, stored["costs"], strict=True):
         assert (row["op"], row["backend"], row["dtype"]) == (cost["op"], cost["backend"], cost["dtype"])
+        machine = stored["machine"]
+        assert (row["processor"], row["threads"]) == (machine["processor"], str(machine["threads"]))
+        assert f"mcdenoise {machine['packages']['mcdenoise']}, torch " in row["packages"]
+        assert ", commit " in row["packages"]
         if cost["failure"]:
             continue
         assert float(row["relative error"]) == cost["error"]
         assert float(row["ms"]) == cost["milliseconds"]["median"]
+        assert float(row["over copy"]) == pytest.approx(float(row["ms"]) / cost["copy"])
 
 
 def with_backends(image: Tensor, *, backend: Literal["exact", "off", "absent"] | None = None) -> Tensor:

@@ -313,3 +313,36 @@ def test_start_up_times_whole_processes(tmp_path: Path) -> None:
     assert min(own) > min(torch_alone) > min(times["pyoidn, fast, without torch"])
     for line, (name, values) in zip(lines[2:], times.items(), strict=True):
         assert re.fullmatch(rf"{re.escape(name)} +{sum(values) / 2:.2f} +.*", line)
+
+
+def test_training_speed_times_both_forms_in_both_precisions(small_sequence: Path, tmp_path: Path) -> None:
+    pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
+    file = tmp_path / "times.json"
+    small = ("--model", "cascaded_tiny", "--batch", "1", "--frames", "2", "--crop", "16", "--threads", "1")
+    for sequences in ((), (small_sequence,)):
+        lines = run("training_speed.py", *sequences, *small, "--rounds", "2", "--json", file).splitlines()
+        assert lines[0] == "cascaded_tiny, 1 clips of 2 frames of 16x16, 2 rounds"
+        assert ", 1 threads, mcdenoise " in lines[1]
+        assert [line[:20].split() for line in lines[3:]] == [
+            [precision, form] for precision in ("32-true", "bf16-mixed") for form in ("fast", "plain")
+        ]
+        assert lines[4].endswith(" 1.00")
+        times = json.loads(file.read_text())["milliseconds"]
+        assert [len(values) for values in times.values()] == [2] * 4
+        for line, values in zip(lines[3:], times.values(), strict=True):
+            assert float(line.split()[2]) == pytest.approx(sum(values) / 2, abs=0.51)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory as Linux tells it")
+def test_large_frames_prints_what_a_pixel_costs(tmp_path: Path) -> None:
+    file = tmp_path / "costs.json"
+    arguments = ("--sizes", "64x48,96x64", "--model", "cascaded_tiny", "--max-memory", "2", "--threads", "1")
+    lines = run("large_frames.py", *arguments, "--json", file).splitlines()
+    assert lines[0] == "cascaded_tiny, bfloat16, within 2 GB, 2 frames"
+    costs = json.loads(file.read_text())["costs"]
+    assert [cost["size"] for cost in costs] == ["64x48", "96x64"]
+    for line, cost in zip(lines[3:], costs, strict=True):
+        size, network, total, peak, tiles = line.split(maxsplit=4)
+        assert (size, tiles) == (cost["size"], "whole frames: all within 2 GB")
+        assert 0 < float(network) < float(total)
+        assert 0.2 < float(peak) < 2

@@ -218,6 +218,23 @@ def test_memory_that_is_too_short_is_told_before_a_frame_is_read(
     assert list((tmp_path / "out").iterdir()) == []
 
 
+def test_what_only_serves_a_past_is_not_kept_without_one(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[set[str]] = []
+    inspect = Frame.inspect
+    monkeypatch.setattr(Frame, "inspect", lambda self: seen.append({name for name, _ in self.items()}) or inspect(self))
+    for frames, kept in (("2", False), ("1-2", True)):
+        seen.clear()
+        opened = open_sequence(small_sequence, frames)
+        report = denoise_sequence(opened, tmp_path / frames, Denoiser(small_model()), "small")
+        assert all(("position" in names) is kept for names in seen)
+        # From the positions, which say it in this folder.
+        assert all("depth" in names for names in seen)
+        accumulate = next(row for row in report.plan if row["stage"] == "accumulate")
+        assert accumulate["reason"] == ("positions and cameras" if kept else "one frame")
+
+
 # Measured on one core: 3.77 GB of the first, 1.96 GB of the last with 0.05 GB less kept free.
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
@@ -227,13 +244,15 @@ def test_memory_that_is_too_short_is_told_before_a_frame_is_read(
     [
         ("cascaded_tiny", "bfloat16", 7680, 4320, 4.0),
         ("cascaded", "float32", 7680, 4320, 4.0),
+        ("cascaded", "bfloat16", 7680, 4320, 4.0),
         ("cascaded", "float32", 3840, 2160, 2.0),
     ],
 )
 def test_the_peak_of_memory_stays_below_the_limit(
     model: str, precision: str, width: int, height: int, limit: float, tmp_path: Path
 ) -> None:
-    write_bmfr_frame(tmp_path / "large" / "inputs", 0, synthetic(width, height).replace(motion=None))
+    frame = synthetic(width, height).replace(motion=None)
+    write_bmfr_frame(tmp_path / "large" / "inputs", 0, frame.replace(position=torch.rand_like(frame.color)))
     options = ("--model", model, "--precision", precision, "--max-memory", str(limit))
     printed, peak = denoise(tmp_path / "large", "-o", tmp_path / "out", *options)
     print(f"{model}, {precision}, {width}x{height}: {peak:.2f} GB\n{printed}")

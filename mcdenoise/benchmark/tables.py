@@ -30,7 +30,9 @@ def write_csv(results: Results, folder: Path) -> None:
 
 
 def write_ops_csv(results: OpResults, folder: Path) -> None:
-    """Write ``ops.csv``: a row for each op, backend and dtype."""
+    """Write ``ops.csv``: a row for each op, backend and dtype, each with where and with what it was measured."""
+    machine = results.machine
+    packages = ", ".join(f"{name} {version}" for name, version in machine.packages.items())
     rows = [
         {
             "op": cost.op,
@@ -43,7 +45,13 @@ def write_ops_csv(results: OpResults, folder: Path) -> None:
             **_times("ms", cost.milliseconds),
             "MiB": cost.mebibytes,
             "copy ms": cost.copy,
+            "over copy": cost.over_copy,
             "failure": cost.failure,
+            "created": results.created,
+            "processor": machine.processor,
+            "device": machine.device,
+            "threads": machine.threads,
+            "packages": packages,
         }
         for cost in results.costs
     ]

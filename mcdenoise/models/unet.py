@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from mcdenoise.ops._autograd import Function
 
 
 class UNet(nn.Module):
@@ -40,7 +43,7 @@ class UNet(nn.Module):
         self.encoder = nn.ModuleList(
             _block(width + coarse_channels if level else in_channels, width) for level in range(levels)
         )
-        self.up = nn.ModuleList(nn.ConvTranspose2d(width, width, 2, stride=2) for _ in range(levels - 1))
+        self.up = nn.ModuleList(_Upsampling(width, width, 2, stride=2) for _ in range(levels - 1))
         self.decoder = nn.ModuleList(_block(2 * width, width) for _ in range(levels - 1))
 
     def reach(self, scale: int) -> int:
@@ -125,6 +128,68 @@ def _has_fused_convolution(dtype: torch.dtype) -> bool:
         return False
 
 
+class _Upsampling(nn.ConvTranspose2d):
+    """A transposed convolution whose bias learns in a twentieth of the time."""
+
+    def forward(self, x: Tensor, output_size: list[int] | None = None) -> Tensor:
+        if self.bias is None or not torch.is_grad_enabled():
+            return super().forward(x, output_size)
+        return _Biased.apply(F.conv_transpose2d(x, self.weight, self.bias.detach(), self.stride), self.bias)
+
+
+class _Biased(Function):
+    """A result that a bias is in already, with its derivative in the bias: a plain sum.
+
+    On a CPU torch takes four times as long for that as for all other derivatives of a transposed convolution together.
+    """
+
+    @staticmethod
+    def forward(result: Tensor, bias: Tensor) -> Tensor:
+        return result
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.dtype = inputs[1].dtype
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        return gradient, gradient.sum((0, 2, 3)).to(ctx.dtype)
+
+
+class _ReLU(nn.Module):
+    """ReLU in place: neither the convolution before it nor its own derivative needs what it overwrites."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        if x.dtype == torch.bfloat16 and x.device.type == "cpu" and not torch.compiler.is_compiling():
+            return _ReLUOfBits.apply(x)
+        return F.relu(x, inplace=True)
+
+
+class _ReLUOfBits(Function):
+    """ReLU of bfloat16 in place.
+
+    The sign of a bfloat16 is that of its bits as an integer, which a CPU clamps and compares many times as fast.
+    """
+
+    @staticmethod
+    def forward(x: Tensor) -> Tensor:
+        x.view(torch.int16).clamp_min_(0)
+        return x
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.mark_dirty(*inputs)
+        ctx.save_for_backward(output)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        result: Tensor = ctx.saved_tensors[0]
+        if torch.is_grad_enabled():
+            return torch.where(result > 0, gradient, 0)
+        bits: Tensor = torch.ops.aten.threshold_backward(gradient.view(torch.int16), result.view(torch.int16), 0)
+        return bits.view(torch.bfloat16)
+
+
 def _max_pool(x: Tensor) -> Tensor:
     """``F.max_pool2d(x, 2)`` of what is not negative, in less time where nobody asks which of the pixels it was."""
     if not _plain_inference(x):
@@ -140,12 +205,11 @@ def _plain_inference(x: Tensor) -> bool:
 
 
 def _block(in_channels: int, out_channels: int) -> nn.Sequential:
-    # In place: neither a convolution nor its own derivative needs what a ReLU overwrites.
     block = _Block(
         nn.Conv2d(in_channels, out_channels, 3, padding=1),
-        nn.ReLU(inplace=True),
+        _ReLU(),
         nn.Conv2d(out_channels, out_channels, 3, padding=1),
-        nn.ReLU(inplace=True),
+        _ReLU(),
     )
     for layer in block:
         if isinstance(layer, nn.Conv2d):

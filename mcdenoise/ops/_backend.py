@@ -6,6 +6,8 @@ import functools
 import importlib
 import importlib.util
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Literal, cast, get_args
 
 import torch
@@ -18,6 +20,8 @@ _FOUND = {name: importlib.util.find_spec(name) is not None for name in ("numba",
 _EXTRAS = {"numba": "fast", "triton": "gpu"}
 # Pixels of a batch below which importing numba and calling it takes longer than the plain form does.
 _FEW_PIXELS = 8192
+# What to take where nothing is named, of all that can run; see `preferred`.
+_preferred: Backend | None = None
 # Triton's interpreter computes with the memory of any device, slowly: for tests.
 _INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
@@ -53,8 +57,22 @@ def choose_backend(
     return "torch" if obstacle else wanted
 
 
+@contextmanager
+def preferred(backend: Backend) -> Iterator[None]:
+    """Within it, ops that are told no backend take this one where it can run: to measure what the choice is worth."""
+    global _preferred
+    check_backend(backend)
+    before, _preferred = _preferred, backend
+    try:
+        yield
+    finally:
+        _preferred = before
+
+
 def _fastest(image: Tensor | None) -> Backend:
     """What to take for an image if nothing is in its way."""
+    if _preferred is not None:
+        return _preferred
     if image is None or torch.compiler.is_exporting():
         return "torch"
     if image.device.type == "cuda":

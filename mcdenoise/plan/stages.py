@@ -128,7 +128,7 @@ class Plan:
         self._still = still
         self.stages = []
         frame, _, ranges = inspected
-        alone = _SINGLE if not _can_reproject(dict(frame.items())) else "one frame" if self._frames == 1 else ""
+        alone = "one frame" if self._frames == 1 else "" if _can_reproject(dict(frame.items())) else _SINGLE
         source = "motion" if frame.motion is not None else "positions and cameras"
         self._note("accumulate", alone or source, left_out=alone != "")
         reprojects = self._needs("reproject", alone or ("nothing moves in the image" if still else ""), source)

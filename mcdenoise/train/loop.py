@@ -113,7 +113,7 @@ def train(
         run.claim(config=settled, data=identity)
     fabric.barrier()
 
-    trainer = _Trainer(config, network, fabric)
+    trainer = Trainer(config, network, fabric)
     first, provenance = run.load(*trainer.parts)
     weights = out / f"{config.model}.safetensors"
     if first == config.steps and weights.exists():
@@ -130,7 +130,7 @@ def train(
     return weights
 
 
-class _Trainer:
+class Trainer:
     """A network and what it learns with.
 
     Args:
@@ -207,7 +207,7 @@ def _moving_average(network: nn.Module, decay: float) -> AveragedModel:
 
 
 def _run(
-    trainer: _Trainer,
+    trainer: Trainer,
     data: TrainingData,
     run: RunFolder,
     first: int,

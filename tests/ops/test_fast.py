@@ -94,6 +94,20 @@ def test_layout_in_memory_changes_nothing(op: Op, layout: Callable[[Tensor], Ten
     assert all(map(torch.equal, laid_out, outcomes(op, case, case.inputs(dtype), "numba")))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("border", ["replicate", "zeros", "renormalize"])
+def test_what_is_spread_is_the_same_without_the_slopes_of_the_kernel(border: Any, dtype: torch.dtype) -> None:
+    inputs = drawn(2, 3, 9, 300, 5, FAST[1]).inputs(dtype)
+    image, kernel = inputs["image"], inputs["kernel"]
+    alone, with_slopes = (
+        _numba_filter.derivatives(image, image, kernel, (), (), None, False, border, of_kernel=wanted)
+        for wanted in (False, True)
+    )
+    assert torch.equal(alone[0], with_slopes[0])
+    assert [of_kernel.numel() for of_kernel in (alone[1], with_slopes[1])] == [0, kernel.numel()]
+    assert torch.equal(ops.kernel_splat(image, kernel, border=border, backend="numba"), alone[0])
+
+
 @every_op
 def test_other_dtypes_beside_the_image(op: Op) -> None:
     case = drawn(1, 3, 5, 7, 3, op)
@@ -187,6 +201,30 @@ def test_what_runs_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
     assert _backend.choose_backend("numba", small) == "numba"
     monkeypatch.setattr(_backend, "_missing", lambda backend: "cannot be imported")
     assert _backend.choose_backend(None, large) == "torch"
+
+
+def test_another_backend_may_be_preferred_for_a_while() -> None:
+    large, small = torch.rand(2, 3, 64, 64), torch.rand(1, 3, 4, 4)
+    with _backend.preferred("torch"):
+        assert _backend.choose_backend(None, large) == "torch"
+        assert _backend.choose_backend("numba", large) == "numba"
+        with pytest.raises(ValueError, match="backend: expected one of"), _backend.preferred("c"):  # type: ignore[arg-type]
+            pytest.fail("entered")
+        with _backend.preferred("numba"):
+            assert _backend.choose_backend(None, small) == "numba"
+            assert _backend.choose_backend(None, small.to("meta")) == "torch"
+    assert _backend.choose_backend(None, large) == "numba"
+
+
+def test_denormal_numbers_are_flushed_within_a_kernel_and_nowhere_else() -> None:
+    image, kernel = torch.full((1, 1, 3, 3), 1e-30), torch.full((1, 9, 3, 3), 1e-10)
+    for flush in (False, True):
+        torch.set_flush_denormal(flush)
+        try:
+            assert ops.kernel_conv(image, kernel, backend="numba").eq(0).all()
+            assert bool((image * kernel[:, :1] == 0).all()) is flush
+        finally:
+            torch.set_flush_denormal(False)
 
 
 def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,8 +16,10 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numba
@@ -33,6 +35,7 @@ from mcdenoise.ops._window import BORDERS, Border, accumulator_dtype, kernel_siz
 _CHUNK = 256
 # A thread of its own for fewer pixels costs more than it saves.
 _PIXELS_A_THREAD = 4096
+_SMALLEST = sys.float_info.min
 
 # Guides come in tuples of this length or a multiple of it, filled up with empty ones: each length is compiled anew.
 _GUIDES = 4
@@ -88,7 +91,7 @@ def filtered(
 
 def splatted(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
     """The transpose of the filter without guides: what its derivative spreads over an image."""
-    return derivatives(image, image, kernel, (), (), None, False, border)[0]
+    return derivatives(image, image, kernel, (), (), None, False, border, of_kernel=False)[0]
 
 
 def derivatives(
@@ -101,9 +104,11 @@ def derivatives(
     log_domain: bool,
     border: Border,
     of_guides: bool = False,
+    of_kernel: bool = True,
 ) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], Tensor]:
     """Of the image, kernel, guides, scales and distance scale, times ``gradient``; those of guides only if asked for.
 
+    All but the first need the slope of every weight, so that without that of the kernel there is none of them.
     Each has the dtype and shape of what it is the derivative of; what is absent or not asked for is empty.
     """
     dtype = _compute_dtype(image, kernel)
@@ -112,13 +117,13 @@ def derivatives(
     of_distance = torch.empty((batch, 0 if distance_scale is None else 1, height, width), dtype=dtype)
     planes = [image, *(guides if of_guides else ())]
     scattered = torch.empty((batch, sum(plane.shape[1] for plane in planes), height, width), dtype=dtype)
-    of_kernel = torch.empty_like(kernel, dtype=_readable(kernel, dtype).dtype)
+    slopes = torch.empty_like(kernel if of_kernel else kernel[:, :0], dtype=_readable(kernel, dtype).dtype)
     if scattered.numel():
         inputs = _inputs(dtype, image, kernel, guides, scales, distance_scale, log_domain, border)
         upstream = source(gradient.to(dtype))
         results = (
             scattered.numpy(),
-            source(of_kernel),
+            source(slopes),
             _filled_up([scale.numpy() for scale in of_scales], of_distance.numpy()),
             of_distance.numpy(),
         )
@@ -130,7 +135,7 @@ def derivatives(
     )
     return (
         of_image,
-        of_kernel.to(kernel.dtype),
+        slopes.to(kernel.dtype),
         guide_gradients,
         [part.to(scale.dtype) for part, scale in zip(of_scales, scales, strict=True)],
         of_distance if distance_scale is None else of_distance.to(distance_scale.dtype),
@@ -193,11 +198,12 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
 
     def share(number: int) -> None:
         row, end = rows * number // threads, rows * (number + 1) // threads
-        while row < end:
-            b, first = divmod(row, height)
-            last = min(height, first + end - row)
-            run(b, first, last)
-            row += last - first
+        with _denormals_flushed():
+            while row < end:
+                b, first = divmod(row, height)
+                last = min(height, first + end - row)
+                run(b, first, last)
+                row += last - first
 
     if threads == 1:
         share(0)
@@ -207,6 +213,17 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
         share(0)
         for other in others:
             other.result()
+
+
+@contextmanager
+def _denormals_flushed() -> Iterator[None]:
+    """Numbers below the smallest normal one are 0 in this thread: small weights of small gradients take far longer."""
+    already = _SMALLEST / 2 == 0
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(already)
 
 
 def _load(value: Any) -> Any:
@@ -557,7 +574,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
     log_domain, border = inputs.log_domain, inputs.border
     radius, taps, chunk = kernel_size // 2, kernel_size**2, min(_CHUNK, width)
     dtype = scattered.dtype
-    of_guides = scattered.shape[1] > channels
+    of_guides, with_slopes = scattered.shape[1] > channels, of_kernel[2] > 0
     ring = np.zeros((kernel_size, _channels_of(inputs), width + 2 * radius), dtype)
     sums = np.zeros((kernel_size, scattered.shape[1], width + 2 * radius), dtype)
     weights, slopes = np.empty((taps, chunk), dtype), np.empty((taps, chunk), dtype)
@@ -568,7 +585,8 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
     start_row, end_row = max(first - radius, 0), min(last + radius, height)
     normalised = log_domain or border == _RENORMALIZE
     for row in range(start_row - radius, end_row + radius):
-        _fetch_all(ring, inputs, b, row)
+        if with_slopes:
+            _fetch_all(ring, inputs, b, row)
         y = row - radius
         if y < start_row:
             continue
@@ -584,7 +602,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
                 _multiply(upstream[c, :n], scale)
             # The slope of each weight; where weights are normalised, less what all of them share.
             shared[:] = 0
-            for t in range(taps):
+            for t in range(taps if with_slopes else 0):
                 start = x0 + t % kernel_size
                 neighbours = ring[(y + t // kernel_size - radius) % kernel_size]
                 slopes[t, :n] = 0
@@ -603,6 +621,8 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
                 if first <= target < last:
                     for c in range(channels):
                         _add_product(sums[target % kernel_size, c, start : start + n], weights[t, :n], upstream[c, :n])
+                if not with_slopes:
+                    continue
                 slope, weight = slopes[t, :n], weights[t, :n]
                 if normalised:
                     for x in range(n):
@@ -613,6 +633,8 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
                     # The exponent's slope takes the weight's place.
                     _multiply(weight, slope)
                     _multiply(slope, factors[t, :n])
+            if not with_slopes:
+                continue
             if mine:
                 _write_taps(of_kernel, slopes, b, y, x0, n)
             exponents = slopes if log_domain else weights

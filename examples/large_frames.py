@@ -1,0 +1,94 @@
+"""What a pixel costs in frames of any size, whole process, within a limit of memory.
+
+    python examples/large_frames.py
+    python examples/large_frames.py --sizes 1280x720,3840x2160 --model cascaded_tiny --max-memory 2 --json costs.json
+
+Writes a synthetic sequence of each size (color, albedo, normal, depth and position, without cameras: single frames),
+denoises it with `mcdenoise denoise --max-memory`, which chooses the tiles, and prints of each size the tiles, the
+nanoseconds a pixel of the network and of all stages but reading and writing, by the median of the frames after the
+first, and the peak of the process's memory. 7680x4320 takes minutes and a gigabyte of disk.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+
+from mcdenoise.benchmark import parse_sizes
+from mcdenoise.benchmark.machine import describe_machine
+from mcdenoise.benchmark.sizes import synthetic_frame
+from mcdenoise.data.bmfr import write_bmfr_frame
+from mcdenoise.data.files import write_text
+from mcdenoise.errors import InputError
+
+
+def measure(width: int, height: int, options: argparse.Namespace, folder: Path) -> dict[str, object]:
+    """What it costs to denoise frames of a size, in a process of its own."""
+    frame = synthetic_frame(width, height).replace(motion=None)
+    for number in range(options.frames):
+        write_bmfr_frame(folder / "wall" / "inputs", number, frame)
+    del frame
+    command = [sys.executable, "-m", "mcdenoise", "denoise", folder / "wall", "-o", folder / "out"]
+    command += ["--model", options.model, "--precision", options.precision, "--threads", options.threads]
+    with (folder / "log").open("w+") as log:
+        process = subprocess.Popen(
+            [*map(str, command), f"--max-memory={options.max_memory}"], stdout=log, stderr=subprocess.STDOUT
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        log.seek(0)
+        if process.returncode:
+            raise InputError(f"{width}x{height}: expected to be denoised, found: {log.read().strip()[-300:]}")
+    report = json.loads((folder / "out" / "denoise.json").read_text())
+    stages = {name: spent * 1e6 / (width * height) for name, spent in report["milliseconds"].items()}
+    del stages["waiting"]
+    return {
+        "size": f"{width}x{height}",
+        "network": stages["network"],
+        "total": sum(stages.values()),
+        "stages": stages,
+        "peak": usage.ru_maxrss * 1024 / 1e9,
+        "tiles": report["tiles"],
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--sizes", default="1280x720,1920x1080,3840x2160,7680x4320", metavar="WxH,...")
+    parser.add_argument("--model", default="cascaded")
+    parser.add_argument("--precision", default="bfloat16", choices=["float32", "bfloat16"])
+    parser.add_argument("--max-memory", type=float, default=4.0, metavar="GB")
+    parser.add_argument("--frames", type=int, default=2, help="of each size; the first warms up")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure to this file too")
+    options = parser.parse_args()
+
+    for name, lowest in (("threads", 1), ("frames", 2)):
+        if getattr(options, name) < lowest:
+            raise InputError(f"--{name}: expected at least {lowest}, found {getattr(options, name)}")
+    torch.set_num_threads(options.threads)
+    machine = describe_machine("cpu")
+    print(f"{options.model}, {options.precision}, within {options.max_memory:g} GB, {options.frames} frames")
+    print(f"{machine.processor}, {options.threads} threads, torch {machine.packages['torch']}")
+    print(f"{'size':<12}{'network, ns a pixel':>20}{'total':>8}{'peak, GB':>10}  tiles")
+    costs = []
+    for width, height in parse_sizes(options.sizes):
+        with tempfile.TemporaryDirectory() as folder:
+            cost = measure(width, height, options, Path(folder))
+        costs.append(cost)
+        print("{size:<12}{network:>20.0f}{total:>8.0f}{peak:>10.2f}  {tiles}".format(**cost), flush=True)
+    if options.json:
+        write_text(options.json, json.dumps({"machine": vars(machine), "costs": costs}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)

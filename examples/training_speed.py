@@ -1,0 +1,138 @@
+"""Time training steps with the fast forms of the operators and with the plain ones, on the same clips, taking turns.
+
+    python examples/training_speed.py
+    python examples/training_speed.py SEQUENCE... --model cascaded_small --rounds 10 --json times.json
+
+A step is that of `mcdenoise train`: its clips are drawn, the network runs forward and backward, the optimiser and the
+averaged weights follow. Without a sequence the clips are noise. Every round makes one step in each way and precision,
+one after the other, so that whatever else the machine does hits all alike; two rounds warm up and are not counted.
+Prints medians, quartiles and steps a second, and how many times as fast the fast forms are. As in the command, freed
+memory is kept (mcdenoise/heap.py).
+"""
+
+import argparse
+import json
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import torch
+
+from mcdenoise.benchmark.machine import describe_machine, fix_threads
+from mcdenoise.data.cache import PARTS, Shot
+from mcdenoise.data.clips import ClipSampler
+from mcdenoise.data.files import write_text
+from mcdenoise.errors import InputError
+from mcdenoise.heap import keep_heap
+from mcdenoise.models import create_model
+from mcdenoise.ops._backend import preferred
+from mcdenoise.train import TrainConfig
+from mcdenoise.train.config import Precision, check_config
+from mcdenoise.train.data import DataFolders
+from mcdenoise.train.devices import open_fabric
+from mcdenoise.train.loop import Trainer
+
+WARM_UP = 2
+
+
+def noise(config: TrainConfig) -> ClipSampler:
+    """Clips of a shot without a picture: every buffer is noise in its range."""
+    generator = np.random.default_rng(config.seed)
+    size = (config.frames, sum(PARTS.values()), config.crop, config.crop)
+    color, current, length, albedo, normal, depth, reference = np.split(
+        generator.random(size, np.float32), np.cumsum(list(PARTS.values()))[:-1], 1
+    )
+    noisy = np.concatenate([color, current, np.ceil(8 * length).clip(1)], 1)
+    features = {"albedo": albedo, "normal": 2 * normal - 1, "depth": 10 * depth, "reference": reference}
+    return ClipSampler([Shot((noisy,), features)], config.frames, config.crop)
+
+
+def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:
+    """Clips of sequences, decoded into a folder that goes with this process."""
+    if not sequences:
+        return noise(config)
+    with tempfile.TemporaryDirectory() as cache:
+        return DataFolders.open(config, sequences, []).load(Path(cache)).sampler
+
+
+def steps(config: TrainConfig, sampler: ClipSampler, plain: bool) -> Callable[[int], None]:
+    """Makes the step of a number; all start from the same weights."""
+    torch.manual_seed(config.seed)
+    trainer = Trainer(config, create_model(config.model).train(), open_fabric("cpu", config.precision, config.batch))
+
+    def step(number: int) -> None:
+        with preferred("torch") if plain else nullcontext():
+            trainer.step(number, sampler.draw(trainer.seeds(number)))
+
+    return step
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("sequences", nargs="*", type=Path, metavar="SEQUENCE", help="folders with references")
+    parser.add_argument("--model", default="cascaded")
+    parser.add_argument("--batch", type=int, default=2)
+    parser.add_argument("--frames", type=int, default=4)
+    parser.add_argument("--crop", type=int, default=128)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every time to this file too")
+    options = parser.parse_args()
+
+    for name, lowest in (("threads", 1), ("rounds", 2)):
+        if getattr(options, name) < lowest:
+            raise InputError(f"--{name}: expected at least {lowest}, found {getattr(options, name)}")
+    fix_threads(options.threads)
+    keep_heap()
+    ways: dict[tuple[Precision, str], Callable[[int], None]] = {}
+    for precision in get_args(Precision):
+        config = TrainConfig(
+            model=options.model,
+            batch=options.batch,
+            frames=options.frames,
+            crop=options.crop,
+            precision=precision,
+            gradient_norm=1.0,
+            ema=0.998,
+            validation_frames=0,
+        )
+        check_config(config, 1)
+        sampler = clips(config, options.sequences)
+        for form in ("fast", "plain"):
+            ways[precision, form] = steps(config, sampler, form == "plain")
+
+    times: dict[tuple[Precision, str], list[float]] = {way: [] for way in ways}
+    for number in range(WARM_UP + options.rounds):
+        for way, step in ways.items():
+            start = time.perf_counter()
+            step(number)
+            if number >= WARM_UP:
+                times[way].append((time.perf_counter() - start) * 1e3)
+
+    machine = describe_machine("cpu")
+    size = f"{options.batch} clips of {options.frames} frames of {options.crop}x{options.crop}"
+    print(f"{options.model}, {size}, {options.rounds} rounds")
+    print(f"{machine.processor}, {options.threads} threads, {', '.join(map(' '.join, machine.packages.items()))}")
+    print(f"{'precision':<12}{'ops':<8}{'ms a step':>10}{'quartiles':>16}{'steps/s':>10}{'plain / this':>14}")
+    for (precision, form), values in times.items():
+        low, median, high = statistics.quantiles(values, n=4)
+        ratio = statistics.median(times[precision, "plain"]) / median
+        spread = f"{low:.0f} .. {high:.0f}"
+        print(f"{precision:<12}{form:<8}{median:>10.0f}{spread:>16}{1e3 / median:>10.2f}{ratio:>14.2f}")
+    if options.json:
+        written = {f"{precision}, {form}": values for (precision, form), values in times.items()}
+        write_text(options.json, json.dumps({"machine": vars(machine), "milliseconds": written}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
