@@ -216,12 +216,13 @@ def test_another_backend_may_be_preferred_for_a_while() -> None:
     assert _backend.choose_backend(None, large) == "numba"
 
 
-def test_denormal_numbers_are_flushed_within_a_kernel_and_nowhere_else() -> None:
+def test_denormal_numbers_are_flushed_in_derivatives_and_nowhere_else() -> None:
     image, kernel = torch.full((1, 1, 3, 3), 1e-30), torch.full((1, 9, 3, 3), 1e-10)
     for flush in (False, True):
         torch.set_flush_denormal(flush)
         try:
-            assert ops.kernel_conv(image, kernel, backend="numba").eq(0).all()
+            assert ops.kernel_splat(image, kernel, backend="numba").eq(0).all()
+            assert bool(ops.kernel_conv(image, kernel, backend="numba").eq(0).all()) is flush
             assert bool((image * kernel[:, :1] == 0).all()) is flush
         finally:
             torch.set_flush_denormal(False)

@@ -127,7 +127,12 @@ def derivatives(
             _filled_up([scale.numpy() for scale in of_scales], of_distance.numpy()),
             of_distance.numpy(),
         )
-        share_rows(image, lambda *rows: _backward(results, upstream, inputs, *rows))
+
+        def run(b: int, first: int, last: int) -> None:
+            with _denormals_flushed():
+                _backward(results, upstream, inputs, b, first, last)
+
+        share_rows(image, run)
     of_planes = torch.split(scattered, [plane.shape[1] for plane in planes], 1)
     # Custom ops hand out tensors of their own, and no views.
     of_image, *guide_gradients = (
@@ -198,12 +203,11 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
 
     def share(number: int) -> None:
         row, end = rows * number // threads, rows * (number + 1) // threads
-        with _denormals_flushed():
-            while row < end:
-                b, first = divmod(row, height)
-                last = min(height, first + end - row)
-                run(b, first, last)
-                row += last - first
+        while row < end:
+            b, first = divmod(row, height)
+            last = min(height, first + end - row)
+            run(b, first, last)
+            row += last - first
 
     if threads == 1:
         share(0)
