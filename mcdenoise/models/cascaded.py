@@ -91,7 +91,12 @@ class FusionModule(nn.Module):
         self.conv = nn.Conv2d(6, 1, 3, padding=1)
 
     def forward(
-        self, fine: Tensor, coarse: Tensor, residual: Tensor | None = None, top: Tensor | None = None
+        self,
+        fine: Tensor,
+        coarse: Tensor,
+        residual: Tensor | None = None,
+        top: Tensor | None = None,
+        logarithms: bool = False,
     ) -> Tensor:
         """Fuse two scales.
 
@@ -99,13 +104,14 @@ class FusionModule(nn.Module):
             fine: ``(B, 3, H, W)``.
             coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))``.
             residual: ``(B, 3, H, W)`` to be added to the fine image; none by default.
+            logarithms: whether to take those of the fine image, which then is radiance.
             top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result. With it, the result is radiance.
 
         Returns:
             ``(B, 3, H, W)`` logarithms of radiance, or radiance.
         """
         weight, bias = self.conv.parameters()
-        return gated_fusion(fine, coarse, weight, bias, residual=residual, top=top)
+        return gated_fusion(fine, coarse, weight, bias, residual=residual, top=top, logarithms=logarithms)
 
 
 class PixelPredictor(nn.Module):
@@ -146,11 +152,12 @@ class PixelPredictor(nn.Module):
         # The heads predict the logarithm of the radiance, on top of the input's: a network at rest is the identity,
         # and errors are relative, as the eye and the loss see them. No pixel grows beyond the brightest of the input.
         top = logs.amax((1, 2, 3), keepdim=True) if top is None else top
-        scales: list[tuple[Tensor, Tensor]] = []
-        for head, level in zip(self.heads, levels, strict=True):
-            scales.append((logs, head(level)))
+        scales: list[Tensor] = []
+        for _ in levels:
+            scales.append(logs)
             logs = downsample(logs)
-        return _fuse(scales, self.fusions, top)
+        residuals = [head(level) for head, level in zip(self.heads, levels, strict=True)]
+        return _fuse(scales, residuals, self.fusions, top)
 
 
 class KernelPredictor(nn.Module):
@@ -191,7 +198,7 @@ class KernelPredictor(nn.Module):
         top = torch.log1p(image).amax((1, 2, 3), keepdim=True) if top is None else top
         # One for all scales: a part of an image must not be filtered otherwise than the whole.
         backend = choose_backend(None, image, *levels)
-        scales: list[tuple[Tensor, None]] = []
+        scales: list[Tensor] = []
         for head, level in zip(self.heads, levels, strict=True):
             prediction = head(level)
             logits = prediction[:, : self.taps]
@@ -204,11 +211,11 @@ class KernelPredictor(nn.Module):
                 )
             else:
                 filtered = cross_bilateral_filter(image, logits, border="renormalize", backend=backend)
-            scales.append((torch.log1p(filtered), None))
+            scales.append(filtered)
             image = downsample(image)
             guiding = {name: downsample(guide) for name, guide in guiding.items()}
         # Each scale is a weighted mean; their fusion could leave the range of the input.
-        return _fuse(scales, self.fusions, top)
+        return _fuse(scales, None, self.fusions, top)
 
 
 class Cascade(nn.Module):
@@ -403,13 +410,13 @@ def _reach(unet: UNet, radius: int) -> int:
     return max(unet.reach(scale) + ((1 + radius) << scale) for scale in range(UNet.scales)) + fusions
 
 
-def _fuse(scales: Sequence[tuple[Tensor, Tensor | None]], fusions: nn.ModuleList, top: Tensor) -> Tensor:
-    """Logarithms of radiance, finest scale first, each with what is to be added to them, to radiance up to ``top``."""
-    logs, residual = scales[-1]
-    fused = logs if residual is None else _at_least_float32(residual) + logs
+def _fuse(images: Sequence[Tensor], residuals: Sequence[Tensor] | None, fusions: nn.ModuleList, top: Tensor) -> Tensor:
+    """All scales, finest first, to radiance up to ``top``: radiance, or logarithms of it and what to add to them."""
+    radiance = residuals is None
+    fused = torch.log1p(images[-1]) if residuals is None else _at_least_float32(residuals[-1]) + images[-1]
     for scale, fusion in zip(range(len(fusions) - 1, -1, -1), fusions, strict=True):
-        logs, residual = scales[scale]
-        fused = fusion(logs, fused, residual, top if scale == 0 else None)
+        residual = None if residuals is None else residuals[scale]
+        fused = fusion(images[scale], fused, residual, None if scale else top, logarithms=radiance)
     return fused
 
 

@@ -73,7 +73,8 @@ class UNet(nn.Module):
             if level:
                 x = _max_pool(x)
             if level and coarse:
-                x = torch.cat([x, _padded(coarse[level - 1].to(x.dtype), x.shape[-2:])], 1)
+                given = coarse[level - 1].to(x.dtype, memory_format=_layout(x))
+                x = torch.cat([x, _padded(given, x.shape[-2:])], 1)
             x = block(x)
             skips.append(x)
         skips.pop()
@@ -83,6 +84,12 @@ class UNet(nn.Module):
             features.append(x)
         finest_first = features[: -self.scales - 1 : -1]
         return [f[..., : -(-height // 2**s), : -(-width // 2**s)] for s, f in enumerate(finest_first)]
+
+
+def _layout(x: Tensor) -> torch.memory_format:
+    """Channels of several layouts are concatenated number by number."""
+    channels_last = x.is_contiguous(memory_format=torch.channels_last)
+    return torch.channels_last if channels_last else torch.contiguous_format
 
 
 def _padded(x: Tensor, size: Sequence[int]) -> Tensor:

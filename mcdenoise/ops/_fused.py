@@ -126,6 +126,7 @@ def gated_fusion(
     *,
     residual: Tensor | None = None,
     top: Tensor | None = None,
+    logarithms: bool = False,
     backend: Backend | None = None,
 ) -> Tensor:
     """Fuse two scales with an ``alpha`` that a convolution of both predicts.
@@ -140,6 +141,7 @@ def gated_fusion(
         residual: ``(B, C, H, W)`` to be added to ``fine``, any dtype; none by default.
         top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result, which is then handed out as radiance:
             ``expm1`` of what is brought to the range from 0 to ``top``.
+        logarithms: whether to take those of ``fine``, which then is radiance: ``log1p``.
         backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
@@ -151,8 +153,10 @@ def gated_fusion(
     if chosen != "torch":
         from mcdenoise.ops._fast import fused as fast
 
-        result: Tensor = fast.gated_fusion(*given)
+        result: Tensor = fast.gated_fusion(*given, logarithms)
         return result
+    if logarithms:
+        fine = torch.log1p(fine)
     if residual is not None:
         fine = residual.to(accumulator_dtype(residual.dtype)) + fine
     both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)

@@ -61,6 +61,7 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
     calls: list[Call] = [
         (_fused.gated_fusion, [some(7, 3), coarse, weight, bias], {}),
         (_fused.gated_fusion, [some(7, 3), coarse, weight, bias], {"residual": some(8, 3), "top": top}),
+        (_fused.gated_fusion, [some(7, 3).abs(), coarse, weight, bias], {"logarithms": True}),
         (_fused.softplus, [some(9, 3) * 30, (10.0, 1000.0, 1.0)], {}),
         (_fused.network_input, [radiance, some(10, 11)], {}),
         (_fused.network_input, [some(11, 3), some(10, 11)], {"logarithms": False}),

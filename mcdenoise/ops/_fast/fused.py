@@ -284,10 +284,17 @@ def _halve(out: Any, image: Any, height: int, width: int, b: int, first: int, la
 @custom_op(
     "mcdenoise::gated_fusion",
     device_types="cpu",
-    schema="(Tensor fine, Tensor coarse, Tensor weight, Tensor bias, Tensor? residual, Tensor? top) -> Tensor",
+    schema="(Tensor fine, Tensor coarse, Tensor weight, Tensor bias, Tensor? residual, Tensor? top, bool logarithms) "
+    "-> Tensor",
 )
 def gated_fusion(
-    fine: Tensor, coarse: Tensor, weight: Tensor, bias: Tensor, residual: Tensor | None, top: Tensor | None
+    fine: Tensor,
+    coarse: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    residual: Tensor | None,
+    top: Tensor | None,
+    logarithms: bool,
 ) -> Tensor:
     """See :func:`mcdenoise.ops._fused.gated_fusion`."""
     result = _empty_planes(fine)
@@ -303,6 +310,7 @@ def gated_fusion(
             weight.detach().to(dtype).contiguous().numpy(),
             bias.detach().to(dtype).numpy(),
             limits.numpy(),
+            logarithms,
         )
         share_rows(fine, lambda *rows: _fuse(*arguments, *rows))
     return result
@@ -322,6 +330,7 @@ def _fuse(
     weight: Any,
     bias: Any,
     top: Any,
+    logarithms: bool,
     b: int,
     first: int,
     last: int,
@@ -336,7 +345,7 @@ def _fuse(
     begin = first // 2 * 2
     for y in range(begin, last, 2):
         for row in range(y - 1 if y == begin else y + 1, y + 3):
-            _fetch_both(ring[row % 4], fine, residual, coarse, half, change[0], b, row, height)
+            _fetch_both(ring[row % 4], fine, logarithms, residual, coarse, half, change[0], b, row, height)
         for c in range(channels):
             upper = ring[y % 4, c, 1 : width + 1]
             lower = ring[(y + 1 if y + 1 < height else y) % 4, c, 1 : width + 1]
@@ -358,7 +367,16 @@ def _fuse(
 
 @compiled
 def _fetch_both(
-    rows: Any, fine: Any, residual: Any, coarse: Any, half: Any, buffer: Any, b: int, y: int, height: int
+    rows: Any,
+    fine: Any,
+    logarithms: bool,
+    residual: Any,
+    coarse: Any,
+    half: Any,
+    buffer: Any,
+    b: int,
+    y: int,
+    height: int,
 ) -> None:
     """Row ``y`` of the fine and of the upsampled coarse image; zeros beyond the image."""
     channels, width = fine[2], buffer.size
@@ -368,6 +386,8 @@ def _fetch_both(
     for c in range(channels):
         row = rows[c, 1 : width + 1]
         _read_row(row, fine, b, c, y, 0)
+        if logarithms:
+            _to_logarithms(row, row.dtype.type(1))
         if residual[2]:
             _read_row(buffer, residual, b, c, y, 0)
             for x in range(width):
