@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 
 from mcdenoise.data.cache import PARTS, Array, Shot
 from mcdenoise.errors import InputError
-from mcdenoise.ops import demodulate
+from mcdenoise.ops import NO_ALBEDO, demodulate
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,8 @@ class ClipSampler:
             mean: emitters seen directly, of which few training scenes have any.
         exposure: all light of a clip is scaled by up to so many stops, up or down.
         tint: each colour channel of the light is scaled by up to so many stops, up or down.
+        gloss: chance that what has no albedo in a clip (mirrors, glass, black gloss, and lamps) is darker, by up to six
+            stops: emitters are common there, and a network that knows nothing else takes a black screen for one.
 
     Raises:
         InputError: no shot is long enough, or one is smaller than the crop.
@@ -86,10 +88,11 @@ class ClipSampler:
         lamps: float = 0.0,
         exposure: float = 0.0,
         tint: float = 0.0,
+        gloss: float = 0.0,
     ) -> None:
         self.shots = [shot for shot in shots if len(shot) >= frames]
         self.frames, self.crop = frames, crop
-        self.lamps, self.exposure, self.tint = lamps, exposure, tint
+        self.lamps, self.exposure, self.tint, self.gloss = lamps, exposure, tint, gloss
         check_sizes([(len(shot), shot.size) for shot in self.shots], frames, crop)
         self.chances = torch.tensor([float(len(shot)) for shot in self.shots])
         self.flips_and_turns = nn.Sequential(
@@ -131,12 +134,17 @@ class ClipSampler:
             ],
             turn=self._draw_turn(),
         )
-        color, current, _, _, normal, _, reference = stack.split(list(PARTS.values()), 1)
+        color, current, _, albedo, normal, _, reference = stack.split(list(PARTS.values()), 1)
         normal *= (torch.randint(2, (3, 1, 1)) * 2 - 1).float()
         stops = self.exposure * (2 * torch.rand(1) - 1) + self.tint * (2 * torch.rand(3) - 1)
         light = torch.exp2(stops).reshape(3, 1, 1)
         for image in (color, current, reference):
             image *= light
+        if self.gloss and float(torch.rand(())) < self.gloss:
+            # Less is reflected or sent out towards the camera; what that would take from other surfaces is left out.
+            share = torch.where(albedo.amax(1, keepdim=True) < NO_ALBEDO, torch.exp2(-6 * torch.rand(())), 1)
+            for image in (color, current, reference):
+                image *= share
         if self.lamps and float(torch.rand(())) < self.lamps:
             mean = reference.mean()
             for _ in range(1 + _randint(3)):

@@ -42,6 +42,7 @@ class TrainConfig:
         lamps: chance that a clip gets lamps: rectangles of constant radiance, without noise, brighter than the rest.
         exposure: the light of a clip is scaled by up to so many stops.
         tint: each colour channel of the light is scaled by up to so many stops.
+        gloss: chance that what has no albedo in a clip (mirrors, glass, lamps) is darker, by up to six stops.
         precision: bf16-mixed runs convolutions in bfloat16.
         seed: of weights and clips.
     """
@@ -63,6 +64,7 @@ class TrainConfig:
     lamps: float = 0.0
     exposure: float = 0.0
     tint: float = 0.0
+    gloss: float = 0.0
     precision: Precision = "32-true"
     seed: int = 0
 
@@ -109,7 +111,8 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
         raise InputError(f"learning_rate: expected a positive number, found {config.learning_rate}")
     if not 0 <= config.ema < 1:
         raise InputError(f"ema: expected in [0, 1), found {config.ema}")
-    if not 0 <= config.lamps <= 1:
-        raise InputError(f"lamps: expected in [0, 1], found {config.lamps}")
+    for name in ("lamps", "gloss"):
+        if not 0 <= settings[name] <= 1:
+            raise InputError(f"{name}: expected in [0, 1], found {settings[name]}")
     if not 0 < config.alpha_min <= 1:
         raise InputError(f"alpha_min: expected in (0, 1], found {config.alpha_min}")

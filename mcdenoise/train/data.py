@@ -88,7 +88,13 @@ class DataFolders:
             watched.append((sequence.name, cached.shots[0]))
             description.setdefault("validation_sequences", []).append(_describe(sequence, cached.sha256))
         sampler = ClipSampler(
-            shots, config.frames, config.crop, lamps=config.lamps, exposure=config.exposure, tint=config.tint
+            shots,
+            config.frames,
+            config.crop,
+            lamps=config.lamps,
+            exposure=config.exposure,
+            tint=config.tint,
+            gloss=config.gloss,
         )
         return TrainingData(sampler, watched, description)
 
