@@ -12,7 +12,9 @@ import pytest
 import torch
 
 from mcdenoise.data import open_sequence, read_exr
+from mcdenoise.data.camera_path import Camera
 from mcdenoise.errors import InputError
+from mcdenoise.models import create_model, load_weights, save_weights
 
 SCRIPTS = Path(__file__).parents[1] / "training"
 
@@ -47,7 +49,7 @@ def test_cleaned_references(small_sequence: Path, tmp_path: Path, place: str) ->
 
 def test_more_noise_of_a_scene_that_moves(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    from mcdenoise.render import Camera, render_sequence
+    from mcdenoise.render import render_sequence
 
     scene = tmp_path / "scene.xml"
     scene.write_text(
@@ -76,3 +78,39 @@ def test_more_noise_needs_the_cameras(small_sequence: Path, tmp_path: Path) -> N
     with pytest.raises(InputError, match=r"camera\.json: expected cameras and max_depth"):
         script("more_noise").add_realisations(small_sequence, tmp_path / "scene.xml", tmp_path / "out", 2)
     assert not (tmp_path / "out").exists()
+
+
+def test_wider_inputs_change_no_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    model = create_model("cascaded", width=8)
+    for parameter in model.parameters():
+        parameter.data = parameter.data.half().float()
+    # As if the U-Net of the first network were not given the last two channels of the features.
+    first = model.first.unet.encoder[0][0]
+    first.weight.data[:, -2:] = 0
+    wide = model.state_dict()
+    monkeypatch.setattr(
+        model, "state_dict", lambda: {**wide, "first.unet.encoder.0.0.weight": first.weight.data[:, :-2]}
+    )
+    old, new = tmp_path / "old.safetensors", tmp_path / "new.safetensors"
+    old.write_bytes(save_weights(model, "cascaded", {"width": 8}, {"steps": "7"}))
+    new.write_bytes(script("widen_inputs").widened(old))
+    loaded = load_weights(new)
+    assert all(torch.equal(value, wide[key]) for key, value in loaded.state_dict().items())
+
+
+def test_a_zoomed_shot_shows_a_part_of_the_image() -> None:
+    path = [Camera.look_at((0, 1, i / 10), (0, 1, 5), fov_x=90) for i in range(9)]
+    zoomed = script("zoomed_cameras").zoomed
+    for seed in range(20):
+        shot = zoomed(path, 4, (2.0, 8.0), np.random.default_rng(seed))
+        assert len(shot) == 4
+        start = next(i for i, camera in enumerate(path) if np.allclose(camera.to_world[:3, 3], shot[0].to_world[:3, 3]))
+        for wide, narrow in zip(path[start:], shot, strict=False):
+            np.testing.assert_allclose(narrow.to_world[:3, :3].T @ narrow.to_world[:3, :3], np.eye(3), atol=1e-12)
+            np.testing.assert_array_equal(narrow.to_world[:3, 3], wide.to_world[:3, 3])
+            assert 2 <= 1 / np.tan(np.radians(narrow.fov_x) / 2) <= 8
+            # The middle of the narrow image, in the image of 16:9 of the wide one.
+            x, y, z = wide.to_world[:3, :3].T @ narrow.to_world[:3, 2]
+            assert abs(x / z) < 1
+            assert abs(y / z) < 9 / 16

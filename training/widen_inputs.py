@@ -15,14 +15,10 @@ from mcdenoise.data.files import atomic_path
 from mcdenoise.models import create_model, describe_weights, save_weights
 
 
-def main() -> None:
-    """Parse and convert."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("weights", type=Path, metavar="OLD")
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="NEW")
-    options = parser.parse_args()
-    about = describe_weights(options.weights)
-    with safe_open(options.weights, framework="pt") as file:
+def widened(path: Path) -> bytes:
+    """The file of the wider model's weights."""
+    about = describe_weights(path)
+    with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118 - a handle is no dict
     model = create_model(about["architecture"], **about["settings"])
     for key, own in model.state_dict().items():
@@ -32,8 +28,17 @@ def main() -> None:
             tensors[key] = torch.cat([tensor, missing], 1)
     model.load_state_dict(tensors)
     texts = {key: value for key, value in about.items() if key not in ("architecture", "settings", "sha256")}
+    return save_weights(model, about["architecture"], about["settings"], texts)
+
+
+def main() -> None:
+    """Parse and convert."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("weights", type=Path, metavar="OLD")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="NEW")
+    options = parser.parse_args()
     with atomic_path(options.out) as temporary:
-        temporary.write_bytes(save_weights(model, about["architecture"], about["settings"], texts))
+        temporary.write_bytes(widened(options.weights))
 
 
 if __name__ == "__main__":

@@ -198,13 +198,14 @@ class KernelPredictor(nn.Module):
         top = torch.log1p(image).amax((1, 2, 3), keepdim=True) if top is None else top
         # One for all scales: a part of an image must not be filtered otherwise than the whole.
         backend = choose_backend(None, image, *levels)
+        undifferentiated = choose_backend(None, image, *levels, differentiable=False, forms=("torch", "numba"))
         scales: list[Tensor] = []
         for head, level in zip(self.heads, levels, strict=True):
             prediction = head(level)
             logits = prediction[:, : self.taps]
             # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
             if self.bilateral:
-                *falloffs, f3 = softplus(prediction[:, self.taps :], SCALE_UNITS, backend=backend).split(1, 1)
+                *falloffs, f3 = softplus(prediction[:, self.taps :], SCALE_UNITS, backend=undifferentiated).split(1, 1)
                 falloffs = [falloff for falloff, name in zip(falloffs, GUIDES, strict=True) if name in guiding]
                 filtered = cross_bilateral_filter(
                     image, logits, list(guiding.values()), falloffs, f3, border="renormalize", backend=backend

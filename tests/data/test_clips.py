@@ -137,6 +137,23 @@ def test_tint_scales_each_channel_alike_in_color_and_reference() -> None:
     assert (factors.std(2) > 0.01).all()
 
 
+def test_gloss_darkens_what_has_no_albedo_and_nothing_else() -> None:
+    stack, seeds = numbered(), list(range(40))
+    start = sum(list(PARTS.values())[: list(PARTS).index("albedo")])
+    stack[:, start : start + PARTS["albedo"], :, :3] = 0
+    plain = ClipSampler([shot_of(stack)], 2, 4).draw(seeds)
+    dark = ClipSampler([shot_of(stack)], 2, 4, gloss=1.0).draw(seeds)
+    black = (plain.albedo == 0).all(2, keepdim=True)
+    shares = dark.color / plain.color
+    assert torch.equal(dark.albedo, plain.albedo)
+    assert (shares.masked_select(~black) == 1).all()
+    torch.testing.assert_close(dark.current, plain.current * shares)
+    torch.testing.assert_close(dark.reference, plain.reference * shares)
+    darkened = shares.masked_select(black)
+    assert 2**-6 <= darkened.min() < 2**-4
+    assert 2**-2 < darkened.max() <= 1
+
+
 def test_lamps_shine_alike_in_color_and_reference() -> None:
     """A clip of nothing: whatever is in it is a lamp, noise-free, in all frames, and brighter than nothing."""
     stack = torch.zeros(4, 17, 20, 24)

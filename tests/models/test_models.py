@@ -36,6 +36,7 @@ from mcdenoise.models import (
 from mcdenoise.models._regions import regions
 from mcdenoise.models.cascaded import FEATURES, auto_exposure, normalize_depth
 from mcdenoise.ops import cross_bilateral_weights, kernel_conv
+from mcdenoise.ops._backend import preferred
 
 SHIPPED = Path(__file__).parents[2] / "mcdenoise" / "models" / "weights"
 WIDTH = 8
@@ -477,6 +478,21 @@ def test_a_constant_guide_guides_nothing(name: str, size: tuple[int, int]) -> No
         assert all(torch.equal(a, b) for a, b in zip(expected, result, strict=True))
     other = model(color, albedo, normal, constant[1], guides=())
     assert not torch.equal(other.final, model(color, albedo, normal, constant[1]).final)
+
+
+def test_large_images_have_the_derivatives_of_the_plain_form() -> None:
+    """Large enough for compiled forms, some of which have no derivatives."""
+    gradients = []
+    for backend in ("torch", "numba"):
+        torch.manual_seed(0)
+        model = create_model("cascaded", width=8)
+        for head in model.first.heads:
+            nn.init.normal_(head.weight, std=0.1)
+        with preferred(backend):
+            model(*inputs(96, 110)).final.mean().backward()
+        gradients.append([parameter.grad for parameter in model.parameters()])
+    for fast, plain in zip(*gradients, strict=True):
+        torch.testing.assert_close(fast, plain, rtol=1e-3, atol=1e-6)
 
 
 def test_golden() -> None:
