@@ -313,6 +313,11 @@ class OpCost:
             ``None`` where it failed.
         mebibytes: inputs and outputs together, each once: what must move at least.
         copy: milliseconds that a copy takes which moves as much.
+        with_derivatives: milliseconds of one call and of its derivatives in all floating-point inputs; ``None`` where
+            it has none.
+        mebibytes_with_derivatives: what must move at least: with the inputs read once more, the results' derivatives
+            read and those of the inputs written.
+        copy_with_derivatives: milliseconds that a copy takes which moves as much.
         failure: why there is no result.
     """
 
@@ -324,12 +329,21 @@ class OpCost:
     error: float | None = None
     mebibytes: float | None = None
     copy: float | None = None
+    with_derivatives: Spread | None = None
+    mebibytes_with_derivatives: float | None = None
+    copy_with_derivatives: float | None = None
     failure: str = ""
 
     @property
     def over_copy(self) -> float | None:
         """How many times as long as that copy it takes; 1 is as fast as memory is."""
         return self.milliseconds.median / self.copy if self.milliseconds and self.copy else None
+
+    @property
+    def over_copy_with_derivatives(self) -> float | None:
+        """Likewise with the derivatives."""
+        both = self.with_derivatives, self.copy_with_derivatives
+        return both[0].median / both[1] if both[0] and both[1] else None
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import score_sequence
 from mcdenoise.models import Denoised, create_model, pretrained_models, save_weights
-from mcdenoise.ops import downsample
+from mcdenoise.ops import downsample, upsample
 from mcdenoise.ops._cases import OPS, Op
 from mcdenoise.results import Cell, Cost, LeftOut, Machine, Method, OpResults, Results, Spread
 
@@ -606,10 +606,18 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
         assert cost.milliseconds.count == 3
         assert cost.copy == pytest.approx(cost.mebibytes * 2**20 / (results.bandwidth * 1e9) * 1e3)
         assert cost.over_copy == pytest.approx(cost.milliseconds.median / cost.copy)
+        if cost.backend == "numba" and cost.op in ("accumulate", "downsample", "motion_from_position"):
+            assert cost.with_derivatives is cost.over_copy_with_derivatives is None
+        else:
+            assert cost.with_derivatives.count == 3
+            ratio = cost.with_derivatives.median / cost.copy_with_derivatives
+            assert cost.over_copy_with_derivatives == pytest.approx(ratio)
     assert by_name["downsample", "bfloat16"].error > 1e-4
     # A kernel of 25 taps: 25 values and an RGB image in, an RGB image out.
     assert by_name["kernel_conv", "float32"].mebibytes == (25 + 3 + 3) * 33 * 20 * 4 / 2**20
     assert by_name["kernel_conv", "float16"].mebibytes == (25 + 3 + 3) * 33 * 20 * 2 / 2**20
+    # The kernel and both images once more, and the derivatives of kernel and image.
+    assert by_name["kernel_conv", "float32"].mebibytes_with_derivatives == (31 + 31 + 28) * 33 * 20 * 4 / 2**20
     # Five channels, of which a quarter of the pixels remains.
     assert by_name["downsample", "float32"].mebibytes == 5 * (33 * 20 + 17 * 10) * 4 / 2**20
     assert by_name["upsample", "float32"].mebibytes == 5 * (33 * 20 + 17 * 10) * 4 / 2**20
@@ -640,7 +648,7 @@ def with_backends(image: Tensor, *, backend: Literal["exact", "off", "absent"] |
 
 def test_every_backend_has_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mcdenoise.benchmark.operators, "_COPY_BYTES", 2**20)
-    assert backends(downsample) == [None]
+    assert backends(upsample) == [None]
     assert backends(with_backends) == ["exact", "off", "absent"]
     (plain,) = (op for op in OPS if op.function is downsample)
     results = benchmark_ops(size=(16, 12), rounds=1, ops=[replace(plain, function=with_backends)])

@@ -37,6 +37,9 @@ class _Entry:
     dtype: torch.dtype
     times: list[float] = field(default_factory=list)
     mebibytes: float = 0.0
+    times_with_derivatives: list[float] = field(default_factory=list)
+    mebibytes_with_derivatives: float = 0.0
+    upstream: list[Tensor] = field(default_factory=list)
     error: float | None = None
     failure: str = ""
 
@@ -47,13 +50,46 @@ class _Entry:
         results = self.op.function(**inputs, **settings)
         return (results,) if isinstance(results, Tensor) else tuple(results)
 
+    def differentiate(self, inputs: dict[str, Any], settings: dict[str, Any]) -> list[Tensor] | None:
+        """Derivatives in all floating-point inputs of the sum of the results, ``None`` if there are none."""
+        leaves: list[Tensor] = []
+
+        def leaf(tensor: Tensor) -> Tensor:
+            if not tensor.is_floating_point():
+                return tensor
+            leaves.append(tensor.detach().requires_grad_())
+            return leaves[-1]
+
+        inputs = map_tensors(leaf, inputs)
+        try:
+            results = [result for result in self.call(inputs, settings) if result.requires_grad]
+        except ValueError:  # this backend has none
+            return None
+        if not results:
+            return None
+        # Made in the rounds that warm up.
+        self.upstream = self.upstream or [torch.ones_like(result) for result in results]
+        found = torch.autograd.grad(results, leaves, self.upstream, allow_unused=True)
+        return [gradient for gradient in found if gradient is not None]
+
     def cost(self, bandwidth: float) -> OpCost:
         """What was found out; ``bandwidth`` in bytes a second."""
         about = self.op.name, self.backend or "torch", str(self.dtype).removeprefix("torch."), self.case.name
         if self.failure:
             return OpCost(*about, failure=self.failure)
-        copy = self.mebibytes * 2**20 / bandwidth * 1e3
-        return OpCost(*about, Spread.of(self.times), self.error, self.mebibytes, copy)
+        forward, both = (
+            mebibytes * 2**20 / bandwidth * 1e3 for mebibytes in (self.mebibytes, self.mebibytes_with_derivatives)
+        )
+        cost = OpCost(*about, Spread.of(self.times), self.error, self.mebibytes, forward)
+        if not self.times_with_derivatives:
+            return cost
+        spread = Spread.of(self.times_with_derivatives)
+        return replace(
+            cost,
+            with_derivatives=spread,
+            mebibytes_with_derivatives=self.mebibytes_with_derivatives,
+            copy_with_derivatives=both,
+        )
 
 
 def benchmark_ops(
@@ -67,7 +103,7 @@ def benchmark_ops(
     ops: Iterable[Op] = OPS,
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> OpResults:
-    """Time every op, forward, in each of its backends and in float32, bfloat16 and float16.
+    """Time every op, alone and with its derivatives, in each of its backends and in float32, bfloat16 and float16.
 
     The inputs are those of an ordinary case, see :func:`largest_case`, repeated to the size. All backends and
     dtypes of an op, and a copy of 256 MiB, take turns; two rounds warm up. The error is that over the op's ordinary
@@ -102,7 +138,6 @@ def benchmark_ops(
     return results
 
 
-@torch.inference_mode()
 def _measure(
     size: tuple[int, int],
     rounds: int,
@@ -151,17 +186,27 @@ def _take_turns(
             if entry.failure:
                 continue
             try:
-                if turn == 0:
-                    entry.error = _error(entry, device)
+                with torch.inference_mode():
+                    if turn == 0:
+                        entry.error = _error(entry, device)
+                    start = watch.mark()
+                    results = entry.call(tensors, settings)
+                    taken = watch.between(start, watch.mark())
+                forward = _bytes(tensors) + sum(result.nbytes for result in results)
                 start = watch.mark()
-                results = entry.call(tensors, settings)
-                taken = watch.between(start, watch.mark())
+                gradients = entry.differentiate(tensors, settings)
+                with_derivatives = watch.between(start, watch.mark())
             except Exception as error:  # whatever a backend refuses with: the others go on
                 entry.failure = one_line(error)
                 continue
-            entry.mebibytes = (_bytes(tensors) + sum(result.nbytes for result in results)) / 2**20
+            entry.mebibytes = forward / 2**20
             if turn >= _WARM_UP:
                 entry.times.append(taken)
+            if gradients is not None:
+                moved = 2 * forward + sum(gradient.nbytes for gradient in gradients)
+                entry.mebibytes_with_derivatives = moved / 2**20
+                if turn >= _WARM_UP:
+                    entry.times_with_derivatives.append(with_derivatives)
         start = watch.mark()
         copy()
         taken = watch.between(start, watch.mark())

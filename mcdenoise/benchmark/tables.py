@@ -46,6 +46,9 @@ def write_ops_csv(results: OpResults, folder: Path) -> None:
             "MiB": cost.mebibytes,
             "copy ms": cost.copy,
             "over copy": cost.over_copy,
+            **_times("ms with derivatives", cost.with_derivatives),
+            "copy ms with derivatives": cost.copy_with_derivatives,
+            "over copy with derivatives": cost.over_copy_with_derivatives,
             "failure": cost.failure,
             "created": results.created,
             "processor": machine.processor,
@@ -119,6 +122,8 @@ def op_rows(results: OpResults) -> list[dict[str, str]]:
             "MiB": _number(cost.mebibytes, ".1f"),
             "copy ms": _number(cost.copy, ".2f"),
             "/ copy": _number(cost.over_copy, ".1f"),
+            "derivatives too, ms": _number(_median(cost.with_derivatives), ".2f"),
+            "/ their copy": _number(cost.over_copy_with_derivatives, ".1f"),
             "failure": cost.failure,
         }
         for cost in results.costs
