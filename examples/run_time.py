@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise import models
+from mcdenoise.benchmark.machine import describe_machine
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
@@ -102,7 +103,8 @@ def main() -> None:
         low, median, high = statistics.quantiles(values, n=4)
         print(f"{name:<28}{median:>8.0f}{f'{low:.0f} .. {high:.0f}':>16}{median / unit:>13.2f}")
     if options.json:
-        write_text(options.json, json.dumps(times, indent=2) + "\n")
+        machine = describe_machine("cpu")
+        write_text(options.json, json.dumps({"machine": vars(machine), "milliseconds": times}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from mcdenoise.benchmark.machine import describe_machine
 from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.data.bmfr import write_bmfr_frame
 from mcdenoise.data.files import write_text
@@ -120,7 +121,8 @@ def main() -> None:
         low, median, high = statistics.quantiles(values, n=4)
         print(f"{name:<46}{median:>8.2f}{f'{low:.2f} .. {high:.2f}':>16}{median - first:>+9.2f}")
     if options.json:
-        write_text(options.json, json.dumps(times, indent=2) + "\n")
+        machine = vars(describe_machine("cpu")) | {"threads": options.threads}
+        write_text(options.json, json.dumps({"machine": machine, "seconds": times}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

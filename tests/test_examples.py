@@ -204,7 +204,9 @@ def test_run_time_prints_a_line_for_each_network(tmp_path: Path) -> None:
     names = ["OIDN fast", "OIDN balanced", "OIDN high, clean aux", "cascaded_tiny", "cascaded_tiny, bfloat16"]
     assert [line[:28].strip() for line in lines[2:]] == names
     assert lines[2].endswith(" 1.00")
-    assert {name: len(times) for name, times in json.loads(file.read_text()).items()} == dict.fromkeys(names, 2)
+    written = json.loads(file.read_text())
+    assert {name: len(times) for name, times in written["milliseconds"].items()} == dict.fromkeys(names, 2)
+    assert written["machine"]["threads"] == 1
 
 
 def test_error_vs_runtime_draws_what_it_prints(small_sequence: Path, tmp_path: Path) -> None:
@@ -306,7 +308,7 @@ def test_start_up_times_whole_processes(tmp_path: Path) -> None:
     arguments = ("--size", "64x48", "--rounds", "2", "--threads", "1", "--quality", "fast", "--json", file)
     lines = run("start_up.py", *arguments).splitlines()
     assert lines[0] == "64x48, one frame, whole process, 1 threads, 2 rounds"
-    times = json.loads(file.read_text())
+    times = json.loads(file.read_text())["seconds"]
     own, torch_alone = times["mcdenoise denoise, cascaded_tiny, float32"], times["import torch"]
     assert list(times)[:2] == ["pyoidn, fast", "pyoidn, fast, without torch"]
     assert all(len(values) == 2 for values in times.values())
