@@ -185,8 +185,11 @@ class Denoiser:
             InputError: a feature buffer holds NaN, an illegal infinity or a value far out of range; or there is too
                 little memory, see :meth:`reset`.
         """
-        frame, _, steps, result = self._network(frame)
-        return self._remodulated(frame, steps, result.final)[0]
+        frame, past, steps, result = self._network(frame)
+        final = result.final
+        # Of a large frame each image is much: what is not needed any more goes first.
+        del past, result
+        return self._remodulated(frame, steps, final)[0]
 
     def images(self, frame: Frame) -> Images:
         """As calling the denoiser, with the images on the way to the result."""

@@ -24,8 +24,8 @@ def return_heap() -> None:
     What is kept lies between what is in use, and cannot always be had again for something larger: a network then takes
     up to 1.4 times the memory.
     """
-    # What is smaller than the largest threshold that there is may stay, 128 MiB of it.
-    _set({_MMAP_MAX: 65536, _MMAP_THRESHOLD: 32 << 20, _TRIM_THRESHOLD: 128 << 20, _TOP_PAD: 16 << 20})
+    # What is smaller than the threshold may stay, 16 MiB of it.
+    _set({_MMAP_MAX: 65536, _MMAP_THRESHOLD: 4 << 20, _TRIM_THRESHOLD: 16 << 20, _TOP_PAD: 4 << 20})
 
 
 def _set(options: dict[int, int]) -> None:

@@ -24,8 +24,8 @@ _FEATURES = 2 * GB
 # Of a GPU's memory, in which the largest pieces are the fastest.
 _SHARE_OF_GPU = 0.4
 # What comes with the first frame: compiled kernels, the library of convolutions, its buffers, and what freed pieces
-# leave between them (with 0.15 GB less, a frame of 7680x4320 reached 4.08 of 4 GB).
-_LOADED_LATER = 0.5 * GB
+# leave between them.
+_LOADED_LATER = 0.45 * GB
 _BYTES = 4
 # Channels of a history: a long and a recent past, what they are compared by, and the length.
 _KEPT = 10
