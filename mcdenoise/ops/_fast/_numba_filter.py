@@ -19,7 +19,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, NamedTuple
 
 import numba
@@ -36,6 +36,7 @@ _CHUNK = 256
 # A thread of its own for fewer pixels costs more than it saves.
 _PIXELS_A_THREAD = 4096
 _SMALLEST = sys.float_info.min
+_ORDINARY = 1e-15
 
 # Guides come in tuples of this length or a multiple of it, filled up with empty ones: each length is compiled anew.
 _GUIDES = 4
@@ -128,8 +129,11 @@ def derivatives(
             of_distance.numpy(),
         )
 
+        # Beside ordinary numbers they are nothing; of numbers that are all small they may be all there is.
+        flush = all(float(torch.stack(torch.aminmax(part)).abs().amax()) > _ORDINARY for part in (image, gradient))
+
         def run(b: int, first: int, last: int) -> None:
-            with _denormals_flushed():
+            with _denormals_flushed() if flush else nullcontext():
                 _backward(results, upstream, inputs, b, first, last)
 
         share_rows(image, run)
