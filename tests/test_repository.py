@@ -14,6 +14,7 @@ MACHINE_PATH = re.compile(r"(^|[^A-Za-z0-9_.])/(home|root|tmp|opt|srv|work)/[a-z
 PICKLERS = {"cloudpickle", "dill", "joblib", "pickle", "shelve"}
 PICKLED = {".bin", ".ckpt", ".npy", ".npz", ".pickle", ".pkl", ".pt", ".pth"}
 WEIGHTS_LIMIT = 40e6
+FILE_LIMIT = 2e6
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +26,11 @@ def files() -> list[Path]:
     listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     paths = [ROOT / name for name in listed.split("\0") if name]
     return [path for path in paths if path.is_file()]
+
+
+def test_files_are_small(files: list[Path]) -> None:
+    assert [path.name for path in files if path.suffix != ".safetensors" and path.stat().st_size > FILE_LIMIT] == []
+    assert [path.name for path in files if path.suffix == ".whl"] == []
 
 
 def text_of(path: Path) -> str:
