@@ -152,10 +152,9 @@ class PixelPredictor(nn.Module):
         # The heads predict the logarithm of the radiance, on top of the input's: a network at rest is the identity,
         # and errors are relative, as the eye and the loss see them. No pixel grows beyond the brightest of the input.
         top = logs.amax((1, 2, 3), keepdim=True) if top is None else top
-        scales: list[Tensor] = []
-        for _ in levels:
-            scales.append(logs)
-            logs = downsample(logs)
+        scales = [logs]
+        for _ in levels[1:]:
+            scales.append(downsample(scales[-1]))
         residuals = [head(level) for head, level in zip(self.heads, levels, strict=True)]
         return _fuse(scales, residuals, self.fusions, top)
 
@@ -213,8 +212,9 @@ class KernelPredictor(nn.Module):
             else:
                 filtered = cross_bilateral_filter(image, logits, border="renormalize", backend=backend)
             scales.append(filtered)
-            image = downsample(image)
-            guiding = {name: downsample(guide) for name, guide in guiding.items()}
+            if len(scales) < len(levels):
+                image = downsample(image)
+                guiding = {name: downsample(guide) for name, guide in guiding.items()}
         # Each scale is a weighted mean; their fusion could leave the range of the input.
         return _fuse(scales, None, self.fusions, top)
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._fast._numba_filter import compiled, share_rows, source
+from mcdenoise.ops._fast._numba_filter import _copy_row, compiled, share_rows, source
 from mcdenoise.ops._fast._operator import custom_op
 from mcdenoise.ops.demodulation import FLOOR, NO_ALBEDO
 from mcdenoise.ops.lag import SMALLEST
@@ -61,16 +61,16 @@ def _demodulate(
 ) -> None:
     """One row of all channels."""
     channels, width = row.shape
-    memory, strides, _ = color
+    strides = color[1]
     for c in range(channels):
-        _copy(row[c], memory, b * strides[0] + c * strides[1] + y * strides[2], strides[3])
-    memory, strides, tints = albedo
+        _copy_row(row[c], color, b * strides[0] + c * strides[1] + y * strides[2], strides[3])
+    _, strides, tints = albedo
     if tints == 0:
         return
     most = divisor[channels]
     for c in range(channels):
         tint = divisor[c]
-        _copy(tint, memory, b * strides[0] + c * strides[1] + y * strides[2], strides[3])
+        _copy_row(tint, albedo, b * strides[0] + c * strides[1] + y * strides[2], strides[3])
         for x in range(width):
             most[x] = tint[x] if c == 0 else max(most[x], tint[x])
     one = row.dtype.type(1)
@@ -78,15 +78,6 @@ def _demodulate(
         values, tint = row[c], divisor[c]
         for x in range(width):
             values[x] /= max(tint[x], floor) if most[x] >= no_albedo else one
-
-
-@compiled
-def _copy(row: Any, memory: Any, start: int, stride: int) -> None:
-    if stride == 1:
-        row[:] = memory[start : start + row.size]
-    else:
-        for x in range(row.size):
-            row[x] = memory[start + x * stride]
 
 
 @compiled
