@@ -74,9 +74,8 @@ def test_tiles_give_the_images_of_whole_frames(precision: str, tile: int) -> Non
         assert torch.equal(images.accumulated, expected.accumulated)
         for a, b in ((images.initial, expected.initial), (images.denoised, expected.denoised)):
             # Convolutions of small images are summed in another order; of bfloat16 each sum is rounded to 8 bits.
-            # Measured at most 4.2e-7 and 6.2e-4 of a pixel and the image's mean.
-            bound = 1e-6 if precision == "float32" else 3e-3
-            assert ((a - b).abs() / (b + b.mean())).max() < bound
+            bound = 3e-6 if precision == "float32" else 3e-2
+            assert (a - b).abs().max() < bound * b.mean()
             assert (a - b).abs().mean() < bound / 10 * b.mean()
 
 
