@@ -286,6 +286,12 @@ def _firefly_cases() -> tuple[Case, ...]:
     def dark(g: Generator, *shape: int) -> Tensor:
         return torch.full(shape, 1e-4, dtype=torch.float64)
 
+    def sparse(g: Generator, *shape: int) -> Tensor:
+        image = torch.zeros(shape, dtype=torch.float64)
+        image[..., ::2, ::3] = _uniform(g, *image[..., ::2, ::3].shape)
+        image[..., 0, 0] *= 9
+        return image
+
     def half_precision_range(g: Generator, *shape: int) -> Tensor:
         """Bright enough that a sum of three channels overflows, and next to it the smallest normal number."""
         image = _uniform(g, *shape, low=5e4, high=6.5e4)
@@ -307,9 +313,10 @@ def _firefly_cases() -> tuple[Case, ...]:
         case("firefly at the border", "stiff", (1, 3, 4, 5), (3, 2)),
         case("fireflies side by side", "stiff", (1, 3, 4, 5), (1, 1), (1, 2), (2, 1), limit=2.0),
         case("six decades", "stiff", (1, 3, 3, 4), draw=_radiance, limit=2.0),
-        # Every pixel is at its limit, which is zero.
+        # Black pixels beside: whether they count jumps at zero, so there is no derivative.
         case("black", "extreme", (1, 3, 3, 3), draw=black, differentiable=False),
-        case("one bright pixel on black", "extreme", (1, 3, 3, 4), (1, 1), draw=black),
+        case("one bright pixel on black", "extreme", (1, 3, 3, 4), (1, 1), draw=black, differentiable=False),
+        case("one pixel in five lit", "extreme", (1, 3, 3, 5), draw=sparse, limit=1.5, differentiable=False),
         # A difference quotient of 1e30 says nothing.
         case("1e30 beside 1e-4", "extreme", (1, 3, 3, 5), (1, 4), draw=dark, value=1e30, differentiable=False),
         case("range of half precision", "extreme", (1, 3, 3, 5), draw=half_precision_range, limit=1.1),

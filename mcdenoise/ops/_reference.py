@@ -177,7 +177,7 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = 4e-2) -> Tensor:
 
 
 def clamp_fireflies(image: Tensor, *, limit: float = 30.0, kernel_size: int = 7) -> Tensor:
-    """``image[p] * min(1, limit n[p] / y[p])``, with the channels' mean ``y`` and its mean ``n`` over the others."""
+    """``image[p] * min(1, limit n[p] / y[p])``, with the channels' mean ``y`` and its mean ``n`` over lit others."""
     source, out = image.tolist(), _zeros(image.shape)
     batch, channels, height, width = image.shape
     radius = kernel_size // 2
@@ -189,7 +189,8 @@ def clamp_fireflies(image: Tensor, *, limit: float = 30.0, kernel_size: int = 7)
             for column in range(max(x - radius, 0), min(x + radius + 1, width))
             if (row, column) != (y, x)
         ]
-        highest = limit * sum(others) / len(others) if others else math.inf
+        lit = [other for other in others if other > 0]
+        highest = limit * sum(lit) / len(lit) if lit else math.inf
         factor = highest / brightness if brightness > highest else 1.0
         for c in range(channels):
             out[b][c][y][x] = source[b][c][y][x] * factor

@@ -17,14 +17,16 @@ KERNEL_SIZE = 7
 
 
 def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = KERNEL_SIZE) -> Tensor:
-    """Scale down every pixel that is brighter than ``limit`` times the mean of its neighbours, and keep its hue.
+    """Scale down every pixel that is brighter than ``limit`` times the mean of its lit neighbours, and keep its hue.
 
     With ``y`` the mean over the channels and ``n[p]`` the mean of ``y`` over the other pixels of the window around
-    ``p`` that lie in the image, ``out[p] = image[p] * min(1, limit * n[p] / y[p])``. A path that found a small bright
-    light by chance costs a denoiser more than it tells: in an accumulated history it stays for many frames. What is
-    lost is energy, of exactly those paths, and that of a light of one or two pixels in dark surroundings. Bright pixels
-    in the same window protect each other: with the defaults, away from the border, two keep 5/8 of themselves, and
-    three keep everything.
+    ``p`` that lie in the image and are not black, ``out[p] = image[p] * min(1, limit * n[p] / y[p])``; without any such
+    neighbour ``out[p] = image[p]``. A path that found a small bright light by chance costs a denoiser more than it
+    tells: in an accumulated history it stays for many frames. What is lost is energy, of exactly those paths.
+
+    Black pixels do not count, for they say nothing of what a path brings that finds light. Where one path in fifty
+    does, all the light is in pixels as bright as fifty times their neighbourhood's mean; no limit that is of use
+    elsewhere would leave it there.
 
     Args:
         image: ``(B, C, H, W)`` noisy radiance, finite and non-negative, any unit; usually demodulated.
@@ -33,8 +35,8 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
 
     Returns:
         ``(B, C, H, W)`` in the dtype of ``image``; what is below the limit is equal bit by bit. Half precision is
-        summed in float32. Holds from black to 1e30, to rounding also where both are in one window. An image of one
-        pixel has no neighbours and is returned as it is.
+        summed in float32. Holds from black to 1e30, to rounding also where both are in one window. Denormal
+        numbers may count as black.
 
     Raises:
         TypeError: the image is no floating-point tensor.
@@ -42,7 +44,7 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
 
     Differentiable in ``image`` where no pixel is exactly at its limit, to any order.
 
-    Source: no paper's; the usual clamp of single samples, with the neighbours' mean for a limit.
+    Source: no paper's; the usual clamp of single samples, with the lit neighbours' mean for a limit.
 
     Example:
         >>> image = torch.ones(1, 3, 5, 5)
@@ -50,9 +52,9 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
         >>> clamp_fireflies(image)[0, :, 2, 2].tolist()
         [30.0, 30.0, 30.0]
     """
-    sizes = check_shapes(image=(image, "B C H W"))
+    check_shapes(image=(image, "B C H W"))
     _check_settings(limit, kernel_size)
-    if limit == math.inf or image.numel() == 0 or sizes["H"] * sizes["W"] == 1:
+    if limit == math.inf or image.numel() == 0:
         return image
     source = image.to(accumulator_dtype(image.dtype))
     # Of the brightness only ratios matter, so it is scaled to where no sum overflows: by a power of two, which rounds
@@ -63,10 +65,11 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
     for channel in others:
         brightness = torch.add(brightness, channel, alpha=scale)
     brightness = brightness[:, None]
-    around, count = _neighbours(brightness, kernel_size // 2)
+    radius = kernel_size // 2
+    around, lit = _neighbours(brightness, radius), _neighbours((brightness > 0).to(source.dtype), radius)
     # Finite in the dtype: infinity times dark neighbours would be NaN.
-    highest = around * (min(limit, torch.finfo(source.dtype).max) / count)
-    bright = brightness > highest
+    highest = around * (min(limit, torch.finfo(source.dtype).max) / lit.clamp_min(1))
+    bright = (brightness > highest) & (lit > 0)
     # Divided first: the ratio of the limit to a very bright pixel, and of that its derivative, is too small a number.
     clamped = source / torch.where(bright, brightness, 1) * highest
     return torch.where(bright, clamped, source).to(image.dtype)
@@ -98,8 +101,8 @@ def _check_settings(limit: float, kernel_size: int) -> None:
         raise ValueError(f"kernel_size: expected odd and at least 3, found {kernel_size}")
 
 
-def _neighbours(values: Tensor, radius: int) -> tuple[Tensor, Tensor]:
-    """Sum over each pixel's window without the pixel itself, and the number of those pixels, ``(H, W)``.
+def _neighbours(values: Tensor, radius: int) -> Tensor:
+    """Sum over each pixel's window without the pixel itself.
 
     The hole is never summed: subtracted again, a very bright pixel would take its neighbours' digits with it. Nor is
     this a convolution, which takes many times as long on a CPU and may be rounded to TF32 on a GPU.
@@ -107,8 +110,7 @@ def _neighbours(values: Tensor, radius: int) -> tuple[Tensor, Tensor]:
     beside = _both_sides(values, radius, -1)
     around = _both_sides(beside + values, radius, -2)
     around += beside
-    rows, columns = (_inside(size, radius, values) for size in values.shape[-2:])
-    return around, rows[:, None] * columns - 1
+    return around
 
 
 def _both_sides(values: Tensor, radius: int, dim: int) -> Tensor:
@@ -121,9 +123,3 @@ def _both_sides(values: Tensor, radius: int, dim: int) -> Tensor:
         # The second in place, and those after it: fresh memory takes longer than the sum.
         run = run + padded.narrow(dim, start, reach) if start == 1 else run.add_(padded.narrow(dim, start, reach))
     return run.narrow(dim, 0, size) + run.narrow(dim, radius + 1, size)
-
-
-def _inside(size: int, radius: int, like: Tensor) -> Tensor:
-    """How many of the ``2 radius + 1`` values around each of ``size`` values exist."""
-    index = torch.arange(size, device=like.device)
-    return ((index + radius).clamp_max(size - 1) - (index - radius).clamp_min(0) + 1).to(like.dtype)

@@ -41,7 +41,7 @@ def incoming(color: Tensor, albedo: Tensor | None, limit: float, kernel_size: in
     out = torch.empty((batch, channels + 2 * roots, height, width), dtype=dtype)
     nothing = torch.empty((0, 0, 0, 0), dtype=dtype)
     images = (source((nothing if image is None else image).to(dtype)) for image in (color, albedo))
-    clamps = limit < math.inf and height * width > 1
+    clamps = limit < math.inf
     settings = out.new_tensor([FLOOR, NO_ALBEDO, min(limit, torch.finfo(dtype).max)]).numpy()
     arguments = (out.numpy(), *images, *settings, clamps, kernel_size // 2, roots)
     share_rows(color, lambda *rows: _incoming(*arguments, *rows))
@@ -101,12 +101,11 @@ def _incoming(
     number, reach = out.dtype.type, radius if clamps else 0
     one, zero = number(1), number(0)
     ring, divisor = np.empty((size, channels, width), out.dtype), np.empty((channels + 1, width), out.dtype)
-    # Brightness with a margin, the sum of it beside each pixel, and that with the pixel itself.
-    light = np.zeros((size, width + 2 * radius), out.dtype)
-    beside, across = np.zeros((size, width), out.dtype), np.zeros((size, width), out.dtype)
-    highest, columns = np.empty(width, out.dtype), np.empty(width, out.dtype)
-    for x in range(width):
-        columns[x] = number(min(x + radius, width - 1) - max(x - radius, 0) + 1)
+    # Brightness and whether there is any, with a margin; the sums of them beside each pixel, and those with the pixel.
+    light = np.zeros((2, size, width + 2 * radius), out.dtype)
+    beside, across = np.zeros((2, size, width), out.dtype), np.zeros((2, size, width), out.dtype)
+    around = np.empty((2, width), out.dtype)
+    highest, lit = around[0], around[1]
     # A power of two, which rounds nothing: no sum of a window overflows.
     scale = one
     while channels * size * size * scale >= one:
@@ -117,36 +116,40 @@ def _incoming(
         if inside:
             _demodulate(ring[place], divisor, color, albedo, floor, no_albedo, b, ahead)
         if clamps:
-            beside[place] = 0
-            across[place] = 0
+            beside[:, place] = 0
+            across[:, place] = 0
             if inside:
-                inner, sides, whole = light[place, radius : radius + width], beside[place], across[place]
+                inner, found = light[0, place, radius : radius + width], light[1, place, radius : radius + width]
                 inner[:] = 0
                 for c in range(channels):
                     values = ring[place, c]
                     for x in range(width):
                         inner[x] += scale * values[x]
-                for d in range(size):
-                    if d != radius:
-                        shifted = light[place, d : d + width]
-                        for x in range(width):
-                            sides[x] += shifted[x]
                 for x in range(width):
-                    whole[x] = sides[x] + inner[x]
+                    found[x] = one if inner[x] > zero else zero
+                for k in range(2):
+                    sides, whole = beside[k, place], across[k, place]
+                    for d in range(size):
+                        if d != radius:
+                            _add(sides, light[k, place, d : d + width])
+                    whole[:] = light[k, place, radius : radius + width]
+                    _add(whole, sides)
         y = ahead - reach
         if y < first:
             continue
         here = y % size
         if clamps:
-            highest[:] = beside[here]
-            for dy in range(1, radius + 1):
-                above, below = across[(y - dy) % size], across[(y + dy) % size]
-                for x in range(width):
-                    highest[x] += above[x] + below[x]
-            rows = number(min(y + radius, height - 1) - max(y - radius, 0) + 1)
+            for k in range(2):
+                total = around[k]
+                total[:] = beside[k, here]
+                for dy in range(1, radius + 1):
+                    above, below = across[k, (y - dy) % size], across[k, (y + dy) % size]
+                    for x in range(width):
+                        total[x] += above[x] + below[x]
+            inner = light[0, here, radius : radius + width]
             for x in range(width):
-                highest[x] *= limit / (rows * columns[x] - one)
-            inner = light[here, radius : radius + width]
+                # Without a lit neighbour a pixel is its own limit.
+                highest[x] = highest[x] * (limit / lit[x]) if lit[x] > zero else inner[x]
             for c in range(channels):
                 values, clamped = ring[here, c], out[b, c, y]
                 for x in range(width):
