@@ -36,6 +36,14 @@ class Region(NamedTuple):
             min(self.right + margin, width),
         )
 
+    def within(self, around: Region) -> Region:
+        """The same pixels, counted from the corner of a larger rectangle."""
+        return Region(*(side - start for side, start in zip(self, (around.top, around.left) * 2, strict=True)))
+
+    def halved(self) -> Region:
+        """The pixels of the image at half its size that have any of these in them."""
+        return Region(self.top // 2, self.left // 2, -(-self.bottom // 2), -(-self.right // 2))
+
     def split(self, side: int) -> list[Region]:
         """In tiles of about the same size, whose sides are multiples of 32 pixels, and no longer than ``side``.
 
@@ -78,6 +86,29 @@ def regions(needed: Tensor, halo: int) -> list[Region]:
     ]
     cost = sum(box.grown(halo, size).pixels for box in boxes)
     return [Region(0, 0, height, width)] if cost > _WORTHWHILE * height * width else boxes
+
+
+def halved(parts: list[Region], margin: int, size: tuple[int, int]) -> list[Region]:
+    """Rectangles of an image at half its size, no longer than ``parts``, that hold these with a margin around them.
+
+    Args:
+        parts: rectangles of the image.
+        margin: in pixels of the image.
+        size: of the image, height and width.
+    """
+    if not parts:
+        return []
+    tops, lefts, bottoms, rights = zip(*parts, strict=True)
+    box = Region(min(tops), min(lefts), max(bottoms), max(rights)).grown(margin, size).halved()
+    end = Region(0, 0, *size).halved()
+    box = Region(
+        box.top // TILE * TILE,
+        box.left // TILE * TILE,
+        min(-(-box.bottom // TILE) * TILE, end.bottom),
+        min(-(-box.right // TILE) * TILE, end.right),
+    )
+    longest = max(max(part.bottom - part.top, part.right - part.left) for part in parts)
+    return box.split(-(-longest // TILE) * TILE)
 
 
 def _boxes(tiles: Tensor, gap: int) -> list[Region]:

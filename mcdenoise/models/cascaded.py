@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.models._regions import Region, regions
+from mcdenoise.models._regions import Region, halved, regions
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.unet import UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
@@ -28,6 +28,8 @@ GUIDES = ("normal", "depth")
 # Numbers that are alive at once for each pixel of a part, measured: of a U-Net, in widths (what is concatenated, its
 # convolutions, and a third for the coarser levels); and of images and features, which are never rounded.
 _UNET_WIDTHS, _IMAGES = 4.5, 54
+# Low frequencies are those of blocks of 8x8 pixels, and below this share of a typical radiance they are left alone.
+_BLOCK, _DARK = 8, 1e-3
 
 
 class Denoised(NamedTuple):
@@ -225,18 +227,25 @@ class Cascade(nn.Module):
     Beside the paper's ten channels the networks see what accumulation did: the current frame alone, and how much of the
     accumulated image it is. So they can tell long histories from short ones, and lag from light.
 
+    With several ``resolutions`` the first network, with the same weights, also denoises the image at half its size, at a
+    quarter of it, and so on, and each size gives the next larger one its low frequencies (:func:`low_frequencies_of`).
+    A network sees no further than some 60 pixels. At one sample a pixel the mean of all of them is still noisy, and
+    four times as many in the same window are what it needs to tell how bright a wall is.
+
     Args:
         first: predicts the initial image R'.
         second: predicts the final image R'' from R'; ``None`` makes the initial image the final one.
+        resolutions: how many sizes of the image the first network denoises; 1 in the paper.
     """
 
     takes_history = True
     takes_plan = True
 
-    def __init__(self, first: nn.Module, second: nn.Module | None = None) -> None:
+    def __init__(self, first: nn.Module, second: nn.Module | None = None, resolutions: int = 1) -> None:
         super().__init__()
         self.first = first
         self.second = second
+        self.resolutions = resolutions
 
     def forward(
         self,
@@ -277,18 +286,23 @@ class Cascade(nn.Module):
         exposure = auto_exposure(color)
         alone = color if current is None else current
         # Both networks see the same, and often all of it at once.
-        features = functools.lru_cache(maxsize=1)(
-            _Features(albedo, normal, depth, depth_scale(depth), alone, exposure, length).of
-        )
+        buffers = _Features(albedo, normal, depth, depth_scale(depth), alone, exposure, length)
+        features = functools.lru_cache(maxsize=1)(buffers.of)
         if known is None and (parts is None or parts == [whole]):
             image = color * exposure
+            coarse = self._coarse(image, buffers, guides, _top(image), [whole], self.resolutions)
             initial = self.first(image, features(whole), guides, _top(image))
+            if coarse is not None:
+                initial = low_frequencies_of(initial, coarse, _top(image))
             final = initial if self.second is None else self.second(initial, features(whole), guides, _top(initial))
             return Denoised(initial / exposure, final / exposure)
         if known is None:
             known = Known(torch.zeros_like(depth[..., :1, :1], dtype=torch.bool).expand_as(depth), color, color)
-        better = functools.partial(self._completed, features, guides, known.mask, [whole] if parts is None else parts)
-        exposed = better(self.first, color, known.initial * exposure, exposure)
+        parts = [whole] if parts is None else parts
+        coarse = self._coarse(color, buffers, guides, _top(color, exposure), parts, self.resolutions, exposure)
+        better = functools.partial(self._completed, features, guides, known.mask, parts)
+        exposed = better(self.first, color, known.initial * exposure, exposure, coarse=coarse)
+        del coarse
         final = None
         if self.second is not None:
             final = better(self.second, exposed, known.final.clone(), divisor=exposure)
@@ -308,6 +322,8 @@ class Cascade(nn.Module):
         """Margin around a rectangle without which its pixels would not be the same, in pixels."""
         multiple = max((module.multiple for module in self.modules() if isinstance(module, UNet)), default=1)
         reach = max(int(part.reach) for part in (self.first, self.second) if part is not None)  # type: ignore[arg-type]
+        # Means are interpolated between neighbouring blocks.
+        reach = max(reach, int(self.first.reach) + _BLOCK) if self.resolutions > 1 else reach  # type: ignore[arg-type]
         return -(-reach // multiple) * multiple
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
@@ -318,6 +334,36 @@ class Cascade(nn.Module):
         """
         width = max((module.width for module in self.modules() if isinstance(module, UNet)), default=0)
         return _UNET_WIDTHS * width * (2 if bfloat16 else 4) + _IMAGES * 4
+
+    def _coarse(
+        self,
+        image: Tensor,
+        buffers: _Features,
+        guides: Collection[str],
+        top: Tensor,
+        parts: list[Region],
+        resolutions: int,
+        factor: Tensor | float = 1.0,
+    ) -> Tensor | None:
+        """The initial image at half the size of ``image * factor``, at least where ``parts`` of that depend on it."""
+        parts = halved(parts, _BLOCK, (image.shape[-2], image.shape[-1]))
+        if resolutions == 1 or not parts:
+            return None
+        image, buffers = downsample(image) * factor, buffers.halved()
+        coarse = self._coarse(image, buffers, guides, top, parts, resolutions - 1)
+        whole = Region(0, 0, image.shape[-2], image.shape[-1])
+        result = image
+        for part in parts:
+            around = part.grown(self.halo, (whole.bottom, whole.right))
+            better = self.first(around.of(image), buffers.of(around), guides, top)
+            if coarse is not None:
+                better = low_frequencies_of(better, around.halved().of(coarse), top)
+            if part == whole:
+                return better
+            if result is image:
+                result = torch.zeros_like(image, dtype=better.dtype)
+            part.of(result).copy_(part.within(around).of(better))
+        return result
 
     def _completed(
         self,
@@ -330,15 +376,20 @@ class Cascade(nn.Module):
         result: Tensor,
         factor: Tensor | float = 1.0,
         divisor: Tensor | float = 1.0,
+        coarse: Tensor | None = None,
     ) -> Tensor:
-        """``result``, with the pixels that are not known computed: ``predictor(image * factor) / divisor``."""
+        """``result``, with the pixels that are not known computed: ``predictor(image * factor) / divisor``.
+
+        Low frequencies are those of the ``coarse`` image, if there is one.
+        """
         top = _top(image, factor)
         for part in parts:
             around = part.grown(self.halo, (image.shape[-2], image.shape[-1]))
             better = predictor(around.of(image) * factor, features(around), guides, top)
-            inner = Region(*(side - start for side, start in zip(part, (around.top, around.left) * 2, strict=True)))
+            if coarse is not None:
+                better = low_frequencies_of(better, around.halved().of(coarse), top)
             there = part.of(result)
-            there.copy_(torch.where(part.of(known), there, inner.of(better) / divisor))
+            there.copy_(torch.where(part.of(known), there, part.within(around).of(better) / divisor))
         return result
 
 
@@ -358,6 +409,11 @@ class _Features(NamedTuple):
         length = None if self.length is None else part.of(self.length)
         albedo, normal, depth, current = map(part.of, (self.albedo, self.normal, self.depth, self.current))
         return network_features(albedo, normal, depth, current, length, self.exposure, self.depth_scale)
+
+    def halved(self) -> _Features:
+        """Those of the image at half its size."""
+        images = {name: getattr(self, name) for name in ("albedo", "normal", "depth", "current", "length")}
+        return self._replace(**{name: downsample(image) for name, image in images.items() if image is not None})
 
 
 def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
@@ -381,6 +437,28 @@ def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
     shares = (blocks / torch.where(lit, mean, 1)).clamp_min(1e-3)
     typical = (mean * torch.exp(torch.log(shares).mean((1, 2, 3), keepdim=True))).clamp_min(1e-30)
     return torch.where(lit, key / typical, 1).to(color.dtype)
+
+
+def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor) -> Tensor:
+    """An image with the means of another in the place of its own, over blocks of 8x8 pixels.
+
+    ``fine * (U m(coarse) + e) / (U m(fine) + e)`` with the means ``m`` of blocks, interpolated bilinearly by ``U``: where
+    a block holds a lamp and a dark wall, both are multiplied by what the lamp needs, and nothing of it gets on the wall.
+
+    Args:
+        fine: ``(B, 3, H, W)`` radiance in units of a typical one.
+        coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` of the same unit.
+        top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result.
+
+    Returns:
+        ``(B, 3, H, W)`` radiance.
+    """
+    own = downsample(fine)
+    for _ in range(_BLOCK.bit_length() - 2):
+        own, coarse = downsample(own), downsample(coarse)
+    wide = F.interpolate(torch.cat([coarse, own], 1), scale_factor=_BLOCK, mode="bilinear") + _DARK
+    wanted, found = wide[..., : fine.shape[-2], : fine.shape[-1]].chunk(2, 1)
+    return torch.minimum(fine * (wanted / found), torch.expm1(top))
 
 
 def normalize_depth(depth: Tensor) -> Tensor:
@@ -422,7 +500,13 @@ def _fuse(images: Sequence[Tensor], residuals: Sequence[Tensor] | None, fusions:
 
 
 def _register(
-    name: str, cascade: str, bilateral: bool, width: int, kernel_width: int | None = None, kernel_size: int = 5
+    name: str,
+    cascade: str,
+    bilateral: bool,
+    width: int,
+    kernel_width: int | None = None,
+    kernel_size: int = 5,
+    resolutions: int = 1,
 ) -> None:
     """Enter the cascade spelt as in the paper's Table 3, such as ``P+K``; its K may have a width of its own."""
 
@@ -433,7 +517,7 @@ def _register(
             PixelPredictor(width) if part == "P" else KernelPredictor(kernel_width or width, kernel_size, bilateral)
             for part in cascade.split("+")
         ]
-        return Cascade(*parts)
+        return Cascade(*parts, resolutions=resolutions)
 
     widths = f"widths {width} and {kernel_width}" if kernel_width else f"width {width}"
     kernels = f"{kernel_size}x{kernel_size} kernels, {'with' if bilateral else 'without'} bilateral weights"
@@ -441,9 +525,9 @@ def _register(
     register_model(name)(construct)
 
 
-_register("cascaded", "P+K", bilateral=True, width=40)
-_register("cascaded_small", "P+K", bilateral=True, width=16, kernel_width=32)
-_register("cascaded_tiny", "P+K", bilateral=True, width=16, kernel_size=3)
+_register("cascaded", "P+K", bilateral=True, width=40, resolutions=3)
+_register("cascaded_small", "P+K", bilateral=True, width=16, kernel_width=32, resolutions=3)
+_register("cascaded_tiny", "P+K", bilateral=True, width=16, kernel_size=3, resolutions=3)
 _register("cascaded_plain", "P+K", bilateral=False, width=40)
 _register("pixel", "P", bilateral=False, width=64)
 _register("kernel", "K", bilateral=True, width=64)
