@@ -227,10 +227,10 @@ class Cascade(nn.Module):
     Beside the paper's ten channels the networks see what accumulation did: the current frame alone, and how much of the
     accumulated image it is. So they can tell long histories from short ones, and lag from light.
 
-    With several ``resolutions`` the first network, with the same weights, also denoises the image at half its size, at a
-    quarter of it, and so on, and each size gives the next larger one its low frequencies (:func:`low_frequencies_of`).
-    A network sees no further than some 60 pixels. At one sample a pixel the mean of all of them is still noisy, and
-    four times as many in the same window are what it needs to tell how bright a wall is.
+    With several ``resolutions`` the first network, with the same weights, also denoises the image at half its size, at
+    a quarter of it, and so on, and each size gives the next larger one its low frequencies
+    (:func:`low_frequencies_of`). A network sees no further than some 60 pixels. At one sample a pixel the mean of all
+    of these is still noisy, and where light is sparse most of them are black.
 
     Args:
         first: predicts the initial image R'.
@@ -355,7 +355,7 @@ class Cascade(nn.Module):
         result = image
         for part in parts:
             around = part.grown(self.halo, (whole.bottom, whole.right))
-            better = self.first(around.of(image), buffers.of(around), guides, top)
+            better: Tensor = self.first(around.of(image), buffers.of(around), guides, top)
             if coarse is not None:
                 better = low_frequencies_of(better, around.halved().of(coarse), top)
             if part == whole:
@@ -412,8 +412,9 @@ class _Features(NamedTuple):
 
     def halved(self) -> _Features:
         """Those of the image at half its size."""
-        images = {name: getattr(self, name) for name in ("albedo", "normal", "depth", "current", "length")}
-        return self._replace(**{name: downsample(image) for name, image in images.items() if image is not None})
+        albedo, normal, depth, current = map(downsample, (self.albedo, self.normal, self.depth, self.current))
+        length = None if self.length is None else downsample(self.length)
+        return _Features(albedo, normal, depth, self.depth_scale, current, self.exposure, length)
 
 
 def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
@@ -442,8 +443,8 @@ def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
 def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor) -> Tensor:
     """An image with the means of another in the place of its own, over blocks of 8x8 pixels.
 
-    ``fine * (U m(coarse) + e) / (U m(fine) + e)`` with the means ``m`` of blocks, interpolated bilinearly by ``U``: where
-    a block holds a lamp and a dark wall, both are multiplied by what the lamp needs, and nothing of it gets on the wall.
+    ``fine * (U m(coarse) + e) / (U m(fine) + e)`` with the means ``m`` of blocks, interpolated bilinearly by ``U``. Since
+    it multiplies, and both means are interpolated alike, no light of a lamp gets on the dark wall beside it.
 
     Args:
         fine: ``(B, 3, H, W)`` radiance in units of a typical one.
@@ -517,7 +518,7 @@ def _register(
             PixelPredictor(width) if part == "P" else KernelPredictor(kernel_width or width, kernel_size, bilateral)
             for part in cascade.split("+")
         ]
-        return Cascade(*parts, resolutions=resolutions)
+        return Cascade(parts[0], parts[1] if len(parts) > 1 else None, resolutions)
 
     widths = f"widths {width} and {kernel_width}" if kernel_width else f"width {width}"
     kernels = f"{kernel_size}x{kernel_size} kernels, {'with' if bilateral else 'without'} bilateral weights"

@@ -13,8 +13,9 @@ from mcdenoise.buffers import Frame
 TILE = 32
 # One pixel in 16 says enough of a tile's noise, and whether it is worth while to look at all of them.
 _STRIDE = 4
-# Tiles on each side that a network sees; no model of the package looks further.
-_SEEN = 2
+# Tiles on each side that count for a network. Its lowest resolution sees twice as far, but what changes there moves a
+# result by no more than what it does to the exposure of the whole image.
+_SEEN = 4
 # A tile that is passed through comes back only when it is noisier than it had to be by this factor.
 _NOISE_HYSTERESIS = 2.0
 # A tile may change by this share of the tolerance from frame to frame before it is reused, and in all by the tolerance.
