@@ -443,8 +443,8 @@ def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
 def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor) -> Tensor:
     """An image with the means of another in the place of its own, over blocks of 8x8 pixels.
 
-    ``fine * (U m(coarse) + e) / (U m(fine) + e)`` with the means ``m`` of blocks, interpolated bilinearly by ``U``. Since
-    it multiplies, and both means are interpolated alike, no light of a lamp gets on the dark wall beside it.
+    ``fine * (U m(coarse) + e) / (U m(fine) + e)`` with the means ``m`` of blocks, interpolated bilinearly by ``U``.
+    Since it multiplies, and both means are interpolated alike, no light of a lamp gets on the dark wall beside it.
 
     Args:
         fine: ``(B, 3, H, W)`` radiance in units of a typical one.
