@@ -19,7 +19,16 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.unet import UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
 from mcdenoise.ops._backend import choose_backend
-from mcdenoise.ops._fused import depth_scale, gated_fusion, network_features, network_input, normalized_depth, softplus
+from mcdenoise.ops._fused import (
+    BLOCK,
+    depth_scale,
+    gated_fusion,
+    low_frequencies_of,
+    network_features,
+    network_input,
+    normalized_depth,
+    softplus,
+)
 from mcdenoise.ops._rows import by_rows
 
 FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, its share 1
@@ -28,8 +37,6 @@ GUIDES = ("normal", "depth")
 # Numbers that are alive at once for each pixel of a part, measured: of a U-Net, in widths (what is concatenated, its
 # convolutions, and a third for the coarser levels); and of images and features, which are never rounded.
 _UNET_WIDTHS, _IMAGES = 4.5, 54
-# Low frequencies are those of blocks of 8x8 pixels, and below this share of a typical radiance they are left alone.
-_BLOCK, _DARK = 8, 1e-3
 
 
 class Denoised(NamedTuple):
@@ -228,9 +235,9 @@ class Cascade(nn.Module):
     accumulated image it is. So they can tell long histories from short ones, and lag from light.
 
     With several ``resolutions`` the first network, with the same weights, also denoises the image at half its size, at
-    a quarter of it, and so on, and each size gives the next larger one its low frequencies
-    (:func:`low_frequencies_of`). A network sees no further than some 60 pixels. At one sample a pixel the mean of all
-    of these is still noisy, and where light is sparse most of them are black.
+    a quarter of it, and so on, and each size gives the next larger one its low frequencies (see
+    ``low_frequencies_of``). A network sees no further than some 60 pixels. At one sample a pixel the mean of all of
+    these is still noisy, and where light is sparse most of them are black.
 
     Args:
         first: predicts the initial image R'.
@@ -323,7 +330,7 @@ class Cascade(nn.Module):
         multiple = max((module.multiple for module in self.modules() if isinstance(module, UNet)), default=1)
         reach = max(int(part.reach) for part in (self.first, self.second) if part is not None)  # type: ignore[arg-type]
         # Means are interpolated between neighbouring blocks.
-        reach = max(reach, int(self.first.reach) + _BLOCK) if self.resolutions > 1 else reach  # type: ignore[arg-type]
+        reach = max(reach, int(self.first.reach) + BLOCK) if self.resolutions > 1 else reach  # type: ignore[arg-type]
         return -(-reach // multiple) * multiple
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
@@ -346,7 +353,7 @@ class Cascade(nn.Module):
         factor: Tensor | float = 1.0,
     ) -> Tensor | None:
         """The initial image at half the size of ``image * factor``, at least where ``parts`` of that depend on it."""
-        parts = halved(parts, _BLOCK, (image.shape[-2], image.shape[-1]))
+        parts = halved(parts, BLOCK, (image.shape[-2], image.shape[-1]))
         if resolutions == 1 or not parts:
             return None
         image, buffers = downsample(image) * factor, buffers.halved()
@@ -438,28 +445,6 @@ def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
     shares = (blocks / torch.where(lit, mean, 1)).clamp_min(1e-3)
     typical = (mean * torch.exp(torch.log(shares).mean((1, 2, 3), keepdim=True))).clamp_min(1e-30)
     return torch.where(lit, key / typical, 1).to(color.dtype)
-
-
-def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor) -> Tensor:
-    """An image with the means of another in the place of its own, over blocks of 8x8 pixels.
-
-    ``fine * (U m(coarse) + e) / (U m(fine) + e)`` with the means ``m`` of blocks, interpolated bilinearly by ``U``.
-    Since it multiplies, and both means are interpolated alike, no light of a lamp gets on the dark wall beside it.
-
-    Args:
-        fine: ``(B, 3, H, W)`` radiance in units of a typical one.
-        coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` of the same unit.
-        top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result.
-
-    Returns:
-        ``(B, 3, H, W)`` radiance.
-    """
-    own = downsample(fine)
-    for _ in range(_BLOCK.bit_length() - 2):
-        own, coarse = downsample(own), downsample(coarse)
-    wide = F.interpolate(torch.cat([coarse, own], 1), scale_factor=_BLOCK, mode="bilinear") + _DARK
-    wanted, found = wide[..., : fine.shape[-2], : fine.shape[-1]].chunk(2, 1)
-    return torch.minimum(fine * (wanted / found), torch.expm1(top))
 
 
 def normalize_depth(depth: Tensor) -> Tensor:

@@ -14,8 +14,12 @@ from torch import Tensor
 from mcdenoise.ops._backend import Backend, choose_backend
 from mcdenoise.ops._rows import by_rows
 from mcdenoise.ops._window import accumulator_dtype
-from mcdenoise.ops.fusion import laplacian_fusion, upsample
+from mcdenoise.ops.fusion import downsample, laplacian_fusion, upsample
 
+# Side of the blocks whose means are an image's low frequencies, in pixels. Below this share of a typical radiance they
+# are left alone.
+BLOCK = 8
+_DARK = 1e-3
 _FORMS: tuple[Backend, ...] = ("torch", "numba")
 
 
@@ -163,6 +167,34 @@ def gated_fusion(
     alpha = torch.sigmoid(F.conv2d(both, weight, bias, padding=1))
     fused = laplacian_fusion(fine, coarse, alpha.to(fine.dtype))
     return fused if top is None else torch.expm1(torch.minimum(fused.clamp_min(0), top))
+
+
+def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor, *, backend: Backend | None = None) -> Tensor:
+    """An image with the means of another in the place of its own, over blocks of 8x8 pixels.
+
+    ``fine * (U m(coarse) + e) / (U m(fine) + e)`` with the means ``m`` of blocks, interpolated bilinearly by ``U``.
+    Since it multiplies, and both means are interpolated alike, no light of a lamp gets on the dark wall beside it.
+
+    Args:
+        fine: ``(B, C, H, W)`` radiance in units of a typical one, up to 1e35.
+        coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` of the same unit and dtype.
+        top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result.
+        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
+
+    Returns:
+        ``(B, C, H, W)`` radiance, at most ``expm1(top)``.
+    """
+    means = downsample(fine)
+    for _ in range(BLOCK.bit_length() - 2):
+        means, coarse = downsample(means), downsample(coarse)
+    if choose_backend(backend, fine, means, coarse, top, differentiable=False, forms=_FORMS) != "torch":
+        from mcdenoise.ops._fast import fused as fast
+
+        result: Tensor = fast.low_frequencies_of(fine, means, coarse, torch.expm1(top), _DARK)
+        return result
+    wide = F.interpolate(torch.cat([coarse, means], 1), scale_factor=BLOCK, mode="bilinear") + _DARK
+    wanted, found = wide[..., : fine.shape[-2], : fine.shape[-1]].chunk(2, 1)
+    return torch.minimum(fine * (wanted / found), torch.expm1(top))
 
 
 def softplus(x: Tensor, units: Sequence[float], *, backend: Backend | None = None) -> Tensor:

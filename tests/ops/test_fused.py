@@ -59,6 +59,7 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
     exposure = top * 0.7
     buffers = [some(5, 3), some(6, 3), depth, radiance]
     calls: list[Call] = [
+        (_fused.low_frequencies_of, [radiance, coarse.abs(), 2 * top], {}),
         (_fused.gated_fusion, [some(7, 3), coarse, weight, bias], {}),
         (_fused.gated_fusion, [some(7, 3), coarse, weight, bias], {"residual": some(8, 3), "top": top}),
         (_fused.gated_fusion, [some(7, 3).abs(), coarse, weight, bias], {"logarithms": True}),

@@ -25,6 +25,7 @@ from mcdenoise.ops._fast._numba_filter import (
     source,
 )
 from mcdenoise.ops._fast._operator import custom_op
+from mcdenoise.ops._fused import BLOCK
 from mcdenoise.ops._window import accumulator_dtype
 
 # Pixels whose channels are gathered at a time: they stay in the second-level cache.
@@ -445,6 +446,65 @@ def _to_radiance(values: Any, top: Any) -> None:
         # A comparison with a NaN is false, and the NaN stays.
         value = zero if values[x] < zero else values[x]
         values[x] = _expm1(top if value > top else value)
+
+
+@custom_op(
+    "mcdenoise::low_frequencies_of",
+    device_types="cpu",
+    schema="(Tensor fine, Tensor means, Tensor coarse, Tensor most, float dark) -> Tensor",
+)
+def low_frequencies_of(fine: Tensor, means: Tensor, coarse: Tensor, most: Tensor, dark: float) -> Tensor:
+    """See :func:`mcdenoise.ops._fused.low_frequencies_of`; ``means`` and ``coarse`` are of blocks already."""
+    result = _empty_planes(fine)
+    dtype = result.dtype
+    if result.numel():
+        blocks = [image.to(dtype).contiguous().numpy() for image in (means, coarse)]
+        limits = most.to(dtype).expand(len(fine), 1, 1, 1).flatten()
+        settings = limits.new_tensor([dark]).numpy()
+        arguments = (result.numpy(), source(_readable(fine, dtype)), *blocks, limits.numpy(), *settings)
+        share_rows(fine, lambda *rows: _replace_means(*arguments, *rows))
+    return result
+
+
+@low_frequencies_of.register_fake
+def _(fine: Tensor, *_: Any) -> Tensor:
+    return _empty_planes(fine)
+
+
+@compiled
+def _replace_means(
+    out: Any, fine: Any, means: Any, coarse: Any, most: Any, dark: float, b: int, first: int, last: int
+) -> None:
+    _, channels, _, width = out.shape
+    _, _, rows, columns = means.shape
+    number = out.dtype.type
+    found, wanted = np.empty(columns, out.dtype), np.empty(columns, out.dtype)
+    left, right = np.empty(width, np.int64), np.empty(width, np.int64)
+    share = np.empty(width, out.dtype)
+    for x in range(width):
+        left[x], right[x], share[x] = _between_blocks(x, columns, number(0))
+    for y in range(first, last):
+        upper, lower, part = _between_blocks(y, rows, number(0))
+        for c in range(channels):
+            for x in range(columns):
+                found[x] = means[b, c, upper, x] + part * (means[b, c, lower, x] - means[b, c, upper, x]) + dark
+                wanted[x] = coarse[b, c, upper, x] + part * (coarse[b, c, lower, x] - coarse[b, c, upper, x]) + dark
+            row, limit = out[b, c, y], most[b]
+            _read_row(row, fine, b, c, y, 0)
+            for x in range(width):
+                i, k, s = left[x], right[x], share[x]
+                new, old = wanted[i] + s * (wanted[k] - wanted[i]), found[i] + s * (found[k] - found[i])
+                row[x] = min(row[x] * (new / old), limit)
+
+
+@compiled
+def _between_blocks(pixel: int, blocks: int, zero: Any) -> Any:
+    """The blocks on both sides of a pixel's centre, and how far it is on the way to the second."""
+    doubled = 2 * pixel + 1 - BLOCK
+    if doubled < 0:
+        return 0, 0, zero
+    first = doubled // (2 * BLOCK)
+    return first, min(first + 1, blocks - 1), type(zero)((doubled - 2 * BLOCK * first) / (2 * BLOCK))
 
 
 def _log(value: Any) -> Any:
