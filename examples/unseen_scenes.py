@@ -41,6 +41,7 @@ from mcdenoise.evaluate import (
     summary,
     verdicts,
 )
+from mcdenoise.models import Cascade
 from mcdenoise.peers import Peer, joint_bilateral_peers, oidn_peers
 
 
@@ -65,6 +66,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument("sequences", type=Path, nargs="+", metavar="SEQUENCE", help="folder of frames with references")
     parser.add_argument("--models", default="cascaded", metavar="NAMES", help="names that `mcdenoise models` lists")
     parser.add_argument("--weights", type=Path, metavar="FILE", help="your own weights of the one model that is named")
+    parser.add_argument(
+        "--resolutions", type=int, metavar="N", help="sizes of the image that a first network denoises, not its own"
+    )
     parser.add_argument(
         "--peers", choices=["oidn"], action="append", default=[], help="other denoisers; mcdenoise[peers]"
     )
@@ -91,12 +95,17 @@ def main() -> None:
     names = options.models.split(",")
     if options.weights and len(names) > 1:
         raise InputError(f"--weights: expected one model to load them into, found --models {options.models}")
+    if options.resolutions is not None and options.resolutions < 1:
+        raise InputError(f"--resolutions: expected at least 1, found {options.resolutions}")
     if options.flip_every < 1:
         raise InputError(f"--flip-every: expected at least 1, found {options.flip_every}")
     sequences = with_unique_names([open_sequence(path, options.frames) for path in options.sequences])
     for sequence in sequences:
         check_references(sequence)
     denoisers = {name: Denoiser(name, weights=options.weights) for name in names}
+    for denoiser in denoisers.values():
+        if options.resolutions and isinstance(denoiser.model, Cascade):
+            denoiser.model.resolutions = options.resolutions
     peers: list[Peer] = [] if options.no_bilateral else joint_bilateral_peers()
     if "oidn" in options.peers:
         peers += oidn_peers(threads=options.threads)
