@@ -270,8 +270,8 @@ def test_only_what_an_edit_changes_is_computed_again() -> None:
     # A frame that is repeated has the noise it has; its share in the average still changes at first.
     assert set(shares[:15]) == {0}
     assert shares[15:17] == [1, 1]
-    # The box lies in the first two of 5 x 7 tiles; two more on each side see it.
-    assert shares[17:] == [pytest.approx(1 - 3 * 4 / 35)] * 3
+    # The box lies in the first two of 5 x 7 tiles; four more on each side see it.
+    assert shares[17:] == [pytest.approx(1 - 5 * 6 / 35)] * 3
     assert errors[:15] == [0] * 15
     assert 0 < max(errors) < 1e-3
 
