@@ -1,6 +1,6 @@
 """The cascaded pixel-kernel network, and by composition K, P, K+P, K+K and P+K.
 
-``cascaded`` has the paper's sizes. ``cascaded_small`` (widths 16 and 32, 0.44 of the multiply-adds) and
+``cascaded`` has the paper's sizes. ``cascaded_small`` (widths 16 and 32, 0.41 of the multiply-adds) and
 ``cascaded_tiny`` (width 16, 3x3 kernels, 0.18 of them) are the same network for processors on which it is too slow.
 """
 
