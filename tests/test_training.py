@@ -14,7 +14,7 @@ import torch
 from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.data.camera_path import Camera
 from mcdenoise.errors import InputError
-from mcdenoise.models import create_model, load_weights, save_weights
+from mcdenoise.models import create_model, describe_weights, load_weights, save_weights
 
 SCRIPTS = Path(__file__).parents[1] / "training"
 
@@ -114,3 +114,24 @@ def test_a_zoomed_shot_shows_a_part_of_the_image() -> None:
             x, y, z = wide.to_world[:3, :3].T @ narrow.to_world[:3, 2]
             assert abs(x / z) < 1
             assert abs(y / z) < 9 / 16
+
+
+def test_weights_are_averaged(tmp_path: Path) -> None:
+    files = [tmp_path / "first.safetensors", tmp_path / "second.safetensors"]
+    models = [create_model("cascaded_tiny", width=4) for _ in files]
+    for number, (file, model) in enumerate(zip(files, models, strict=True)):
+        for parameter in model.parameters():
+            torch.nn.init.constant_(parameter, 1 + 2 * number)
+        file.write_bytes(save_weights(model, "cascaded_tiny", {"width": 4}, {"steps": str(number)}))
+    out = tmp_path / "mean.safetensors"
+    script("average_weights").average(files, out)
+    assert {float(value.unique()) for value in load_weights(out, "cascaded_tiny").state_dict().values()} == {2.0}
+    about = describe_weights(out)
+    assert about["steps"] == "1"
+    assert json.loads(about["mean_of"]) == [describe_weights(file)["sha256"] for file in files]
+    with pytest.raises(InputError, match="expected at least two files of weights, found 1"):
+        script("average_weights").average(files[:1], out)
+    other = tmp_path / "other.safetensors"
+    other.write_bytes(save_weights(create_model("cascaded", width=4), "cascaded", {"width": 4}, {}))
+    with pytest.raises(InputError, match="expected weights of model 'cascaded_tiny', found those of 'cascaded'"):
+        script("average_weights").average([other, *files], out)
