@@ -242,7 +242,7 @@ def test_a_firefly_does_not_survive(with_albedo: bool) -> None:
     buffers = {"albedo": constant(3, albedo, (9, 9))} if with_albedo else {}
     for number, color in enumerate(with_firefly(albedo)):
         past = history.update(still(color, **buffers))
-        assert past.color[..., 4, 4].unique().item() == pytest.approx(1 + 14 / (number + 1), rel=1e-5)
+        assert past.color[..., 4, 4].unique().item() == pytest.approx(1 + 79 / (number + 1), rel=1e-5)
     # Nothing else differs.
     past.color[..., 4, 4] = 1
     torch.testing.assert_close(past.color, constant(3, 1.0, (9, 9)))
