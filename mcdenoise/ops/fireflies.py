@@ -67,8 +67,9 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
     brightness = brightness[:, None]
     radius = kernel_size // 2
     around, lit = _neighbours(brightness, radius), _neighbours((brightness > 0).to(source.dtype), radius)
-    # Finite in the dtype: infinity times dark neighbours would be NaN.
-    highest = around * (min(limit, torch.finfo(source.dtype).max) / lit.clamp_min(1))
+    # Finite in the dtype: infinity times dark neighbours, or times a derivative of zero, would be NaN.
+    largest = torch.finfo(source.dtype).max
+    highest = (around * (min(limit, largest) / lit.clamp_min(1))).clamp_max(largest)
     bright = (brightness > highest) & (lit > 0)
     # Divided first: the ratio of the limit to a very bright pixel, and of that its derivative, is too small a number.
     clamped = source / torch.where(bright, brightness, 1) * highest
