@@ -42,6 +42,7 @@ from mcdenoise.evaluate import (
     verdicts,
 )
 from mcdenoise.models import Cascade
+from mcdenoise.ops import ClampFireflies
 from mcdenoise.peers import Peer, joint_bilateral_peers, oidn_peers
 
 
@@ -70,6 +71,9 @@ def parse() -> argparse.Namespace:
         "--resolutions", type=int, metavar="N", help="sizes of the image that a first network denoises, not its own"
     )
     parser.add_argument(
+        "--fireflies", type=float, metavar="LIMIT", help="of clamp_fireflies before the networks, not their own"
+    )
+    parser.add_argument(
         "--peers", choices=["oidn"], action="append", default=[], help="other denoisers; mcdenoise[peers]"
     )
     parser.add_argument(
@@ -84,6 +88,13 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--markdown", action="store_true", help="print Markdown tables")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every score to this file too")
     return parser.parse_args()
+
+
+def _clamp(limit: float) -> ClampFireflies:
+    try:
+        return ClampFireflies(limit)
+    except ValueError as error:
+        raise InputError(f"--fireflies: {error}") from error
 
 
 def main() -> None:
@@ -106,6 +117,8 @@ def main() -> None:
     for denoiser in denoisers.values():
         if options.resolutions and isinstance(denoiser.model, Cascade):
             denoiser.model.resolutions = options.resolutions
+        if options.fireflies is not None:
+            denoiser.history.fireflies = _clamp(options.fireflies)
     peers: list[Peer] = [] if options.no_bilateral else joint_bilateral_peers()
     if "oidn" in options.peers:
         peers += oidn_peers(threads=options.threads)

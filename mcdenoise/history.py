@@ -34,6 +34,10 @@ _NO_WAY = "no motion, and no position with a previous camera"
 _RECENT_ALPHA = 0.25
 # As many equally weighted frames have the noise of that history, once it is full: (2 - alpha) / alpha.
 _RECENT_FRAMES = 7
+# Light of more than this share, in the median block, is no firefly's; a shot whose light is caustics has another limit.
+_LOST, _CAUSTICS = 0.1, 120.0
+# Side of a block in pixels; rows of blocks that are looked at; and how few blocks say nothing.
+_BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
 
 
 def surface_before(frame: Frame) -> Surface:
@@ -82,6 +86,24 @@ def _lag(lag: HistoryLag, history: Tensor, recent: Tensor, variance: Tensor) -> 
     )
     share: Tensor = lag(*halves).repeat_interleave(2, -2).repeat_interleave(2, -1)
     return share[..., :height, :width]
+
+
+def _takes_light(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None) -> bool:
+    """Whether most of an image would lose much of its light; not told of images of a few blocks."""
+    rows = -(-color.shape[-2] // _BLOCK)
+    lost = []
+    for top in range(0, color.shape[-2], _BLOCK * -(-rows // _STRIPS)):
+        light = color[..., top : top + _BLOCK, :]
+        if albedo is not None:
+            light = demodulate(light, albedo[..., top : top + _BLOCK, :])
+        light = light.to(torch.promote_types(light.dtype, torch.float32))
+        before, after = (
+            F.avg_pool2d(image.mean(1, keepdim=True), _BLOCK, ceil_mode=True, count_include_pad=False)
+            for image in (light, clamp(light))
+        )
+        lost.append(1 - after[before > 0] / before[before > 0])
+    found = torch.cat(lost)
+    return found.numel() >= _LEAST_BLOCKS and bool(found.median() > _LOST)
 
 
 def _equal(a: Tensor | None, b: Tensor | None) -> bool:
@@ -158,10 +180,12 @@ class History:
     moves keeps its past. It compares the normals as they are: what turns by more than the normal limit from one frame
     to the next starts anew.
 
-    Before it is accumulated, a frame loses its fireflies. Where nothing diffuse is seen (no albedo in any channel:
-    mirrors, glass) and the image moves by more than 0.05 pixels, the past counts for no more than 2 frames, since
-    reflections do not move with the surface. Emitters and background have no albedo either and are treated alike; they
-    have little noise to lose. A frame without an albedo buffer says nothing of mirrors, and its past is kept.
+    Before it is accumulated, a frame loses its fireflies. Where most of the image would lose more than a tenth of its
+    light to that (the median block of 32x32 pixels of the shot's first frame), these are no fireflies but caustics, and
+    only what is 120 times as bright as its lit neighbours is clamped. Where nothing diffuse is seen (no albedo in any
+    channel: mirrors, glass) and the image moves by more than 0.05 pixels, the past counts for no more than 2 frames,
+    since reflections do not move with the surface. Emitters and background have no albedo either and are treated alike;
+    they have little noise to lose. A frame without an albedo buffer says nothing of mirrors, and its past is kept.
 
     Where a light is switched or moves, or a reflection moves over a glossy surface, the past is wrong although every
     surface is still there, and would fade in some 40 frames. It is given up where local means say so
@@ -178,7 +202,8 @@ class History:
     Args:
         accumulate: the rule and its limits; by default those that scale with depth. The published BMFR rule is
             ``Accumulate(0.2, "bmfr", position_limit, normal_limit)`` with the scene's squared limits.
-        fireflies: how fireflies are clamped; ``ClampFireflies(math.inf)`` leaves them.
+        fireflies: how fireflies are clamped, in every shot; ``ClampFireflies(math.inf)`` leaves them. By default as
+            above.
         specular_length: the longest history of what is seen in mirrors and through glass while the image moves, in
             frames, at least 0; infinity treats them as everything else.
         anti_lag: the test for changes of light, in half the resolution; ``HistoryLag(math.inf)`` makes none, in two
@@ -198,6 +223,7 @@ class History:
         if not specular_length >= 0:
             raise ValueError(f"specular_length: expected at least 0, found {specular_length}")
         self.accumulate = Accumulate() if accumulate is None else accumulate
+        self._fixed = fireflies
         self.fireflies = ClampFireflies() if fireflies is None else fireflies
         self.specular_length = specular_length
         anti_lag = HistoryLag() if anti_lag is None else anti_lag
@@ -239,6 +265,10 @@ class History:
         before = () if state is None or not state.fits(frame.color) else (state.color, state.length)
         images = (frame.color, *(image for _, image in frame.items()), *before)
         backend = choose_backend(self.accumulate.backend, *images, differentiable=False, forms=("torch", "numba"))
+        if self._fixed is None and not before:
+            strict = ClampFireflies()
+            caustic = _takes_light(strict, frame.color, frame.albedo if demodulates else None)
+            self.fireflies = ClampFireflies(_CAUSTICS) if caustic else strict
         # What has no past and will be none is compared with nothing.
         compared = self.anti_lag is not None and (keeps or state is not None)
         entering = (self._entering_numba if backend == "numba" else self._entering)(

@@ -178,11 +178,13 @@ def test_unseen_scenes_prints_plain_columns_too(small_sequence: Path, weights: P
     assert lines[1].split()[:3] == ["plane", "3", "noisy"]
 
 
-def test_unseen_scenes_shows_what_lower_resolutions_are_worth(small_sequence: Path, weights: Path) -> None:
+def test_unseen_scenes_shows_what_resolutions_and_fireflies_are_worth(small_sequence: Path, weights: Path) -> None:
     arguments = (small_sequence, "--weights", weights, "--no-bilateral", "--no-flip", "--frames", "1-3")
-    own, one = (run("unseen_scenes.py", *arguments, *more) for more in ((), ("--resolutions", "1")))
-    assert own.splitlines()[:3] == one.splitlines()[:3]
-    assert own.splitlines()[-1] != one.splitlines()[-1]
+    options: tuple[tuple[str, ...], ...] = ((), ("--resolutions", "1"), ("--fireflies", "0.5"))
+    own, *others = (run("unseen_scenes.py", *arguments, *more).splitlines() for more in options)
+    for other in others:
+        assert own[:3] == other[:3]
+        assert own[-1] != other[-1]
 
 
 def test_unseen_scenes_says_in_one_line_what_is_wrong(small_sequence: Path, weights: Path) -> None:

@@ -242,7 +242,7 @@ def test_a_firefly_does_not_survive(with_albedo: bool) -> None:
     buffers = {"albedo": constant(3, albedo, (9, 9))} if with_albedo else {}
     for number, color in enumerate(with_firefly(albedo)):
         past = history.update(still(color, **buffers))
-        assert past.color[..., 4, 4].unique().item() == pytest.approx(1 + 79 / (number + 1), rel=1e-5)
+        assert past.color[..., 4, 4].unique().item() == pytest.approx(1 + 14 / (number + 1), rel=1e-5)
     # Nothing else differs.
     past.color[..., 4, 4] = 1
     torch.testing.assert_close(past.color, constant(3, 1.0, (9, 9)))
@@ -262,6 +262,34 @@ def test_an_infinite_limit_leaves_fireflies() -> None:
     for color in colors:
         past = history.update(still(color, albedo=albedo))
     torch.testing.assert_close(past.color, demodulate(sum(colors) / 4, albedo))
+
+
+def caustics(share: float, size: tuple[int, int] = (128, 160)) -> Frame:
+    """Light 1, and in one pixel of 200 as much that all of these have ``share`` of it."""
+    hit = torch.rand(1, 1, *size, generator=torch.Generator().manual_seed(0)) < 1 / 200
+    return still(torch.where(hit, 200 * share / (1 - share), 1.0).expand(1, 3, *size))
+
+
+@pytest.mark.parametrize(("share", "kept"), [(0.1, False), (0.3, True)])
+def test_where_fireflies_are_much_of_the_light_they_are_caustics(share: float, kept: bool) -> None:
+    frame, history = caustics(share), History()
+    past = history.update(frame)
+    assert torch.equal(past.current, frame.color) is kept
+    # For the whole shot, and no longer.
+    assert torch.equal(history.update(caustics(0.1)).current, caustics(0.1).color) is kept
+    history.reset()
+    assert not torch.equal(history.update(caustics(0.1)).current, caustics(0.1).color)
+
+
+def test_one_firefly_is_no_caustic_however_bright() -> None:
+    color = constant(3, 1.0, (128, 160))
+    color[..., 64, 80] = 1e9
+    assert History().update(still(color)).current.max() == pytest.approx(15)
+
+
+def test_who_names_a_limit_gets_it() -> None:
+    frame = caustics(0.3)
+    assert not torch.equal(History(fireflies=ClampFireflies(15)).update(frame).current, frame.color)
 
 
 # Mirrors and glass

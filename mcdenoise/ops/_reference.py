@@ -176,7 +176,7 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = 4e-2) -> Tensor:
     return _tensor(out, image.shape)
 
 
-def clamp_fireflies(image: Tensor, *, limit: float = 80.0, kernel_size: int = 7) -> Tensor:
+def clamp_fireflies(image: Tensor, *, limit: float = 15.0, kernel_size: int = 7) -> Tensor:
     """``image[p] * min(1, limit n[p] / y[p])``, with the channels' mean ``y`` and its mean ``n`` over lit others."""
     source, out = image.tolist(), _zeros(image.shape)
     batch, channels, height, width = image.shape
