@@ -41,6 +41,7 @@ from mcdenoise.evaluate import (
     summary,
     verdicts,
 )
+from mcdenoise.history import History
 from mcdenoise.models import Cascade
 from mcdenoise.ops import ClampFireflies
 from mcdenoise.peers import Peer, joint_bilateral_peers, oidn_peers
@@ -118,7 +119,7 @@ def main() -> None:
         if options.resolutions and isinstance(denoiser.model, Cascade):
             denoiser.model.resolutions = options.resolutions
         if options.fireflies is not None:
-            denoiser.history.fireflies = _clamp(options.fireflies)
+            denoiser.history = History(denoiser.history.accumulate, _clamp(options.fireflies))
     peers: list[Peer] = [] if options.no_bilateral else joint_bilateral_peers()
     if "oidn" in options.peers:
         peers += oidn_peers(threads=options.threads)
