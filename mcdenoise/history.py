@@ -181,8 +181,9 @@ class History:
     to the next starts anew.
 
     Before it is accumulated, a frame loses its fireflies. Where most of the image would lose more than a tenth of its
-    light to that (the median block of 32x32 pixels of the shot's first frame), these are no fireflies but caustics, and
-    only what is 120 times as bright as its lit neighbours is clamped. Where nothing diffuse is seen (no albedo in any
+    light to that (the median block of 32x32 pixels of the first frame after a :meth:`reset` or a change of size; at a
+    cut the limit stays, and one holds for all images of a batch), these are no fireflies but caustics, and only what is
+    120 times as bright as its lit neighbours is clamped. Where nothing diffuse is seen (no albedo in any
     channel: mirrors, glass) and the image moves by more than 0.05 pixels, the past counts for no more than 2 frames,
     since reflections do not move with the surface. Emitters and background have no albedo either and are treated alike;
     they have little noise to lose. A frame without an albedo buffer says nothing of mirrors, and its past is kept.
@@ -223,7 +224,7 @@ class History:
         if not specular_length >= 0:
             raise ValueError(f"specular_length: expected at least 0, found {specular_length}")
         self.accumulate = Accumulate() if accumulate is None else accumulate
-        self._fixed = fireflies
+        self._chooses = fireflies is None
         self.fireflies = ClampFireflies() if fireflies is None else fireflies
         self.specular_length = specular_length
         anti_lag = HistoryLag() if anti_lag is None else anti_lag
@@ -265,7 +266,7 @@ class History:
         before = () if state is None or not state.fits(frame.color) else (state.color, state.length)
         images = (frame.color, *(image for _, image in frame.items()), *before)
         backend = choose_backend(self.accumulate.backend, *images, differentiable=False, forms=("torch", "numba"))
-        if self._fixed is None and not before:
+        if self._chooses and not before:
             strict = ClampFireflies()
             caustic = _takes_light(strict, frame.color, frame.albedo if demodulates else None)
             self.fireflies = ClampFireflies(_CAUSTICS) if caustic else strict

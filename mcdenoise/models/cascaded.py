@@ -297,10 +297,11 @@ class Cascade(nn.Module):
         features = functools.lru_cache(maxsize=1)(buffers.of)
         if known is None and (parts is None or parts == [whole]):
             image = color * exposure
-            coarse = self._coarse(image, buffers, guides, _top(image), [whole], self.resolutions)
-            initial = self.first(image, features(whole), guides, _top(image))
+            top = _top(image)
+            coarse = self._coarse(image, buffers, guides, top, [whole], self.resolutions)
+            initial = self.first(image, features(whole), guides, top)
             if coarse is not None:
-                initial = low_frequencies_of(initial, coarse, _top(image))
+                initial = low_frequencies_of(initial, coarse, top)
             final = initial if self.second is None else self.second(initial, features(whole), guides, _top(initial))
             return Denoised(initial / exposure, final / exposure)
         if known is None:

@@ -42,7 +42,7 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
         TypeError: the image is no floating-point tensor.
         ValueError: a shape or a setting does not fit.
 
-    Differentiable in ``image`` where no pixel is exactly at its limit, to any order.
+    Differentiable in ``image`` where no pixel is exactly at its limit and none is black, to any order.
 
     Source: no paper's; the usual clamp of single samples, with the lit neighbours' mean for a limit.
 

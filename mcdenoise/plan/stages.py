@@ -79,7 +79,7 @@ class Plan:
     there is no noise (:func:`mcdenoise.plan.noise_free`), since pixels without noise are copied, by every plan.
 
     Left out up to a tolerance, while nothing moves in the image: tiles of 32x32 pixels whose accumulated noise has
-    fallen below it are passed through; tiles that have changed by less, as far around them as a network sees, since
+    fallen below it are passed through; tiles that have changed by less, and four tiles around them too, since
     they were last computed are not computed again. Neither switches to and fro: a tile that is passed through comes
     back only at twice the noise, and one is reused only when it changes by less than a quarter of the tolerance from
     frame to frame.
