@@ -35,7 +35,7 @@ _RECENT_ALPHA = 0.25
 # As many equally weighted frames have the noise of that history, once it is full: (2 - alpha) / alpha.
 _RECENT_FRAMES = 7
 # Light of more than this share, in the median block, is no firefly's; a shot whose light is caustics has another limit.
-_LOST, _CAUSTICS = 0.1, 120.0
+_LOST, CAUSTICS = 0.1, 120.0
 # Side of a block in pixels; rows of blocks that are looked at; and how few blocks say nothing.
 _BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
 
@@ -269,7 +269,7 @@ class History:
         if self._chooses and not before:
             strict = ClampFireflies()
             caustic = _takes_light(strict, frame.color, frame.albedo if demodulates else None)
-            self.fireflies = ClampFireflies(_CAUSTICS) if caustic else strict
+            self.fireflies = ClampFireflies(CAUSTICS) if caustic else strict
         # What has no past and will be none is compared with nothing.
         compared = self.anti_lag is not None and (keeps or state is not None)
         entering = (self._entering_numba if backend == "numba" else self._entering)(

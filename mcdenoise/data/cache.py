@@ -29,8 +29,8 @@ from mcdenoise.buffers import Frame
 from mcdenoise.data import bmfr, camera_matrices, exr
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
-from mcdenoise.history import History
-from mcdenoise.ops import Accumulate, demodulation, fireflies, temporal
+from mcdenoise.history import CAUSTICS, History
+from mcdenoise.ops import Accumulate, ClampFireflies, demodulation, fireflies, temporal
 
 # name, channels: what a training clip holds, in the order in which :meth:`Shot.read` stacks it
 PARTS = {"color": 3, "current": 3, "length": 1, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
@@ -130,14 +130,20 @@ class _Plan:
     alpha_min: float
     firsts: tuple[int, ...]
     realisations: int
+    keep_fireflies: int
 
     @property
     def settings(self) -> list[Any]:
-        return [_FORMAT, self.sequence.numbers, self.alpha_min, self.firsts, self.realisations]
+        return [_FORMAT, self.sequence.numbers, self.alpha_min, self.firsts, self.realisations, self.keep_fireflies]
 
     @property
     def starts(self) -> list[_Start]:
         return [(first, realisation) for first in self.firsts for realisation in range(self.realisations)]
+
+    def history(self, realisation: int) -> History:
+        """A new one."""
+        kept = self.keep_fireflies > 0 and (realisation + 1) % self.keep_fireflies == 0
+        return History(Accumulate(self.alpha_min), ClampFireflies(CAUSTICS) if kept else None)
 
     def color_shape(self, first: int) -> tuple[int, ...]:
         return (len(self.sequence) - first, sum(PARTS[name] for name in _NOISY), *self.sequence.size)
@@ -161,7 +167,13 @@ def check_trainable(sequence: Sequence) -> None:
 
 
 def open_cached(
-    sequence: Sequence, folder: Path, *, alpha_min: float, firsts: list[int], realisations: int | None = None
+    sequence: Sequence,
+    folder: Path,
+    *,
+    alpha_min: float,
+    firsts: list[int],
+    realisations: int | None = None,
+    keep_fireflies: int = 0,
 ) -> CachedSequence:
     """A sequence as a network sees it, from a cache that is filled where it has to be.
 
@@ -178,6 +190,7 @@ def open_cached(
         alpha_min: see :func:`mcdenoise.ops.accumulate`.
         firsts: indices of the first frames, ascending.
         realisations: use so many; all by default.
+        keep_fireflies: every n-th realisation keeps its fireflies as if they were caustics; 0 for none.
 
     Raises:
         InputError: a buffer or a reference is missing or damaged, or the cache cannot be written; nothing half made is
@@ -185,9 +198,11 @@ def open_cached(
     """
     check_trainable(sequence)
     found = sequence.realisations if realisations is None else min(realisations, sequence.realisations)
-    plan = _Plan(sequence, alpha_min, tuple(firsts), found)
+    plan = _Plan(sequence, alpha_min, tuple(firsts), found, keep_fireflies)
     # Not how many realisations were found: what was made of fewer is stale, and goes.
-    identity = json.dumps([str(sequence.root.resolve()), sequence.numbers, alpha_min, firsts, realisations])
+    identity = json.dumps(
+        [str(sequence.root.resolve()), sequence.numbers, alpha_min, firsts, realisations, keep_fireflies]
+    )
     place = folder / f"{sequence.name[:100]}-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
     finished = place / _key(plan)[:32]
     cached = _load(finished, plan)
@@ -257,7 +272,7 @@ def _fill(finished: Path, plan: _Plan) -> None:
 def _build(folder: Path, plan: _Plan) -> None:
     """Decode the frames one after the other; only features in the making are held in memory."""
     sequence = plan.sequence
-    histories = {start: History(Accumulate(plan.alpha_min)) for start in plan.starts}
+    histories = {start: plan.history(start[1]) for start in plan.starts}
     features: dict[str, list[Array]] = {name: [] for name in _FEATURES}
     digest = hashlib.sha256()
     with ExitStack() as stack:

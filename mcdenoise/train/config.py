@@ -37,6 +37,8 @@ class TrainConfig:
             average is what is validated and what the run ends with. 0 takes the weights themselves.
         alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
         start_every: a shot also starts at every n-th frame, to train on short histories.
+        keep_fireflies: every n-th realisation of the noise keeps its fireflies as if they were caustics, see
+            :class:`mcdenoise.history.History`; 0 for none.
         validation_frames: the last frames of each sequence, kept for validation (the paper's 4); none of a sequence
             that would be left with less than one clip.
         lamps: chance that a clip gets lamps: rectangles of constant radiance, without noise, brighter than the rest.
@@ -60,6 +62,7 @@ class TrainConfig:
     ema: float = 0.0
     alpha_min: float = 0.1
     start_every: int = 4
+    keep_fireflies: int = 0
     validation_frames: int = 4
     lamps: float = 0.0
     exposure: float = 0.0
@@ -92,6 +95,7 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
         "temporal_weight": 0,
         "gradient_norm": 0,
         "start_every": 1,
+        "keep_fireflies": 0,
         "validation_frames": 0,
         "checkpoint_every": 1,
     }

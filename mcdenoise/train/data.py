@@ -76,7 +76,9 @@ class DataFolders:
             firsts = range(0, len(sequence), config.start_every)
             # A shot without room for a clip would be kept for nothing; the first one also has the checksum.
             useful = [first for first in firsts if first == 0 or length - first >= config.frames]
-            cached = open_cached(sequence, cache, alpha_min=config.alpha_min, firsts=useful)
+            cached = open_cached(
+                sequence, cache, alpha_min=config.alpha_min, firsts=useful, keep_fireflies=config.keep_fireflies
+            )
             shots += [shot.until(length - first) for first, shot in zip(useful, cached.shots, strict=True)]
             if held:
                 watched.append((sequence.name, cached.shots[0].last(len(held))))

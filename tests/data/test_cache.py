@@ -146,7 +146,22 @@ def test_a_stale_cache_is_made_again(noisy: Path, tmp_path: Path, reads: list[tu
     assert not set(entries(folder)) & set(before)
 
 
-@pytest.mark.parametrize("changes", [{"alpha_min": 0.2}, {"firsts": [0, 1]}, {"firsts": [0]}])
+def test_every_nth_realisation_keeps_its_fireflies(noisy: Path, tmp_path: Path) -> None:
+    for realisation in (0, 1):
+        folder = noisy / "inputs" / (f"realisation{realisation}" if realisation else "")
+        bright = np.ones((20, 24, 3), np.float32)
+        bright[10, 10] = 1e4
+        write_exr(folder / "color0.exr", bright, ["R", "G", "B"])
+        write_exr(folder / "albedo0.exr", np.ones((20, 24, 3), np.float32), ["R", "G", "B"])
+    brightest = [
+        opened(noisy, tmp_path / "cache", keep_fireflies=n).shots[0].read(realisation=k)[0, :6].amax((1, 2)).tolist()
+        for n in (0, 2)
+        for k in (0, 1)
+    ]
+    assert brightest == [[15.0] * 6, [15.0] * 6, [15.0] * 6, [120.0] * 6]
+
+
+@pytest.mark.parametrize("changes", [{"alpha_min": 0.2}, {"firsts": [0, 1]}, {"firsts": [0]}, {"keep_fireflies": 1}])
 def test_other_settings_have_their_own_place(
     small_sequence: Path, tmp_path: Path, reads: list[tuple[int, int]], changes: dict[str, Any]
 ) -> None:
