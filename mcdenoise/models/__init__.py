@@ -14,12 +14,13 @@ from mcdenoise.models.cascaded import (
     auto_exposure,
     normalize_depth,
 )
-from mcdenoise.models.unet import UNet
+from mcdenoise.models.unet import Head, UNet
 
 __all__ = [
     "Cascade",
     "Denoised",
     "FusionModule",
+    "Head",
     "KernelPredictor",
     "Known",
     "ModelOverview",

@@ -1,7 +1,8 @@
 """The cascaded pixel-kernel network, and by composition K, P, K+P, K+K and P+K.
 
 ``cascaded`` has the paper's sizes. ``cascaded_small`` (widths 16 and 32, 0.41 of the multiply-adds) and
-``cascaded_tiny`` (width 16, 3x3 kernels, 0.18 of them) are the same network for processors on which it is too slow.
+``cascaded_tiny`` (width 16, 3x3 kernels, 0.18 of them) are the same network for processors on which it is too slow, and
+``cascaded_micro`` (0.08 of them) is one whose U-Nets begin at half the resolution.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 
 from mcdenoise.models._regions import Region, halved, regions
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.unet import UNet
+from mcdenoise.models.unet import Head, UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
 from mcdenoise.ops._backend import choose_backend
 from mcdenoise.ops._fused import (
@@ -132,12 +133,13 @@ class PixelPredictor(nn.Module):
 
     Args:
         width: feature channels of the U-Net.
+        half: whether it has no level at full resolution, and twice the width at all coarser ones than the finest.
     """
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, half: bool = False) -> None:
         super().__init__()
-        self.unet = UNet(3 + FEATURES, width, coarse_channels=3)
-        self.heads = nn.ModuleList(nn.Conv2d(width, 3, 3, padding=1) for _ in range(UNet.scales))
+        self.unet = _unet(width, half, coarse_channels=3)
+        self.heads = nn.ModuleList(Head(self.unet, scale, 3) for scale in range(UNet.scales))
         self.fusions = nn.ModuleList(FusionModule() for _ in range(UNet.scales - 1))
         for head in self.heads:
             nn.init.zeros_(head.weight)  # type: ignore[arg-type]
@@ -154,6 +156,8 @@ class PixelPredictor(nn.Module):
         """See :class:`Predictor`; there are no weights to guide."""
         logs = torch.log1p(image)
         means: list[Tensor] = []
+        for _ in range(1, self.unet.stride):
+            image = downsample(image)
         for _ in range(self.unet.levels - 1):
             image = downsample(image)
             means.append(torch.log1p(image))
@@ -164,7 +168,8 @@ class PixelPredictor(nn.Module):
         scales = [logs]
         for _ in levels[1:]:
             scales.append(downsample(scales[-1]))
-        residuals = [head(level) for head, level in zip(self.heads, levels, strict=True)]
+        sizes = [scale.shape[-2:] for scale in scales]
+        residuals = [head(*both) for head, *both in zip(self.heads, levels, sizes, strict=True)]
         return _fuse(scales, residuals, self.fusions, top)
 
 
@@ -179,16 +184,17 @@ class KernelPredictor(nn.Module):
         width: feature channels of the U-Net.
         kernel_size: K, 5 in the paper.
         bilateral: adjust the kernels by normal, depth and distance.
+        half: as of :class:`PixelPredictor`.
     """
 
-    def __init__(self, width: int, kernel_size: int = 5, bilateral: bool = True) -> None:
+    def __init__(self, width: int, kernel_size: int = 5, bilateral: bool = True, half: bool = False) -> None:
         super().__init__()
         self.taps = kernel_size * kernel_size
         self.radius = kernel_size // 2
         self.bilateral = bilateral
-        self.unet = UNet(3 + FEATURES, width)
+        self.unet = _unet(width, half)
         channels = self.taps + (3 if bilateral else 0)
-        self.heads = nn.ModuleList(nn.Conv2d(width, channels, 3, padding=1) for _ in range(UNet.scales))
+        self.heads = nn.ModuleList(Head(self.unet, scale, channels) for scale in range(UNet.scales))
         self.fusions = nn.ModuleList(FusionModule() for _ in range(UNet.scales - 1))
 
     @property
@@ -209,7 +215,7 @@ class KernelPredictor(nn.Module):
         undifferentiated = choose_backend(None, image, *levels, differentiable=False, forms=("torch", "numba"))
         scales: list[Tensor] = []
         for head, level in zip(self.heads, levels, strict=True):
-            prediction = head(level)
+            prediction = head(level, image.shape[-2:])
             logits = prediction[:, : self.taps]
             # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
             if self.bilateral:
@@ -470,10 +476,17 @@ def _at_least_float32(tensor: Tensor) -> Tensor:
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
+def _unet(width: int, half: bool, coarse_channels: int = 0) -> UNet:
+    if not half:
+        return UNet(3 + FEATURES, width, coarse_channels=coarse_channels)
+    return UNet(3 + FEATURES, width, 3, coarse_channels, coarse_width=2 * width, half=True)
+
+
 def _reach(unet: UNet, radius: int) -> int:
     """Of a head, a filter and the fusions behind a U-Net: a pixel each, and the filter's radius, at their scales."""
     fusions = sum(1 << scale for scale in range(UNet.scales - 1))
-    return max(unet.reach(scale) + ((1 + radius) << scale) for scale in range(UNet.scales)) + fusions
+    heads = (max(1 << scale, unet.stride) for scale in range(UNet.scales))
+    return max(unet.reach(scale) + head + (radius << scale) for scale, head in enumerate(heads)) + fusions
 
 
 def _fuse(images: Sequence[Tensor], residuals: Sequence[Tensor] | None, fusions: nn.ModuleList, top: Tensor) -> Tensor:
@@ -494,6 +507,7 @@ def _register(
     kernel_width: int | None = None,
     kernel_size: int = 5,
     resolutions: int = 1,
+    half: bool = False,
 ) -> None:
     """Enter the cascade spelt as in the paper's Table 3, such as ``P+K``; its K may have a width of its own."""
 
@@ -501,20 +515,24 @@ def _register(
         width: int = width, kernel_width: int | None = kernel_width, kernel_size: int = kernel_size
     ) -> Cascade:
         parts = [
-            PixelPredictor(width) if part == "P" else KernelPredictor(kernel_width or width, kernel_size, bilateral)
+            PixelPredictor(width, half)
+            if part == "P"
+            else KernelPredictor(kernel_width or width, kernel_size, bilateral, half)
             for part in cascade.split("+")
         ]
         return Cascade(parts[0], parts[1] if len(parts) > 1 else None, resolutions)
 
     widths = f"widths {width} and {kernel_width}" if kernel_width else f"width {width}"
     kernels = f"{kernel_size}x{kernel_size} kernels, {'with' if bilateral else 'without'} bilateral weights"
-    construct.__doc__ = f"{cascade}, {widths}{f', {kernels}' if 'K' in cascade else ''}."
+    note = ", no level at full resolution" if half else ""
+    construct.__doc__ = f"{cascade}, {widths}{f', {kernels}' if 'K' in cascade else ''}{note}."
     register_model(name)(construct)
 
 
 _register("cascaded", "P+K", bilateral=True, width=40, resolutions=3)
 _register("cascaded_small", "P+K", bilateral=True, width=16, kernel_width=32, resolutions=3)
 _register("cascaded_tiny", "P+K", bilateral=True, width=16, kernel_size=3, resolutions=3)
+_register("cascaded_micro", "P+K", bilateral=True, width=16, kernel_size=3, resolutions=3, half=True)
 _register("cascaded_plain", "P+K", bilateral=False, width=40)
 _register("pixel", "P", bilateral=False, width=64)
 _register("kernel", "K", bilateral=True, width=64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,18 +15,24 @@ from mcdenoise.ops._autograd import Function
 
 
 class UNet(nn.Module):
-    """A U-Net of constant width that hands out the features of its last three decoder levels.
+    """A U-Net that hands out features of an image at full, half and quarter resolution: its last decoder levels.
 
     Each level is two 3x3 convolutions with ReLU; 2x2 max-pooling goes down, a 2x2 transposed convolution goes up, and
     the encoder's features of the same scale are concatenated before the decoder's convolutions (Ronneberger et al.
     2015; the paper's Sec. 3.2 and Fig. 2). Any image size: the image is padded to a multiple of ``2 ** (levels - 1)``
     by repeating its edge, and the features are cropped.
 
+    With ``half``, it has no level at full resolution, where most of the time goes: the first convolution is a 4x4 one
+    with a stride of 2, and a :class:`Head` predicts two by two pixels from each feature (``F.pixel_shuffle``, Shi et
+    al. 2016).
+
     Args:
         in_channels: channels of the input.
         width: feature channels of every convolution (the paper's 40).
-        levels: number of scales, at least 4; 4 in the paper.
+        levels: number of scales, at least 4, with ``half`` at least 3; 4 in the paper.
         coarse_channels: channels that the encoder is given at each scale but the finest, beside its own features.
+        coarse_width: feature channels of all levels but the finest; ``width`` by default.
+        half: whether the finest level is that of half the resolution.
 
     Raises:
         ValueError: there are too few levels.
@@ -33,26 +40,41 @@ class UNet(nn.Module):
 
     scales = 3
 
-    def __init__(self, in_channels: int, width: int, levels: int = 4, coarse_channels: int = 0) -> None:
+    def __init__(
+        self,
+        in_channels: int,
+        width: int,
+        levels: int = 4,
+        coarse_channels: int = 0,
+        coarse_width: int | None = None,
+        half: bool = False,
+    ) -> None:
         super().__init__()
-        # The coarsest level is the encoder's alone.
-        if levels <= self.scales:
-            raise ValueError(f"levels: expected at least {self.scales + 1}, found {levels}")
         self.levels, self.width = levels, width
-        self.multiple: int = 2 ** (levels - 1)
-        self.encoder = nn.ModuleList(
-            _block(width + coarse_channels if level else in_channels, width) for level in range(levels)
-        )
-        self.up = nn.ModuleList(_Upsampling(width, width, 2, stride=2) for _ in range(levels - 1))
-        self.decoder = nn.ModuleList(_block(2 * width, width) for _ in range(levels - 1))
+        self.stride = 2 if half else 1
+        # The coarsest level is the encoder's alone.
+        if levels <= self.level(self.scales - 1) + 1:
+            raise ValueError(f"levels: expected at least {self.level(self.scales - 1) + 2}, found {levels}")
+        self.multiple: int = self.stride * 2 ** (levels - 1)
+        self.widths = [width] + [coarse_width or width] * (levels - 1)
+        entering = [in_channels] + [finer + coarse_channels for finer in self.widths[:-1]]
+        strides = [self.stride] + [1] * (levels - 1)
+        self.encoder = nn.ModuleList(_block(*each) for each in zip(entering, self.widths, strides, strict=True))
+        upwards = list(itertools.pairwise(self.widths[::-1]))
+        self.up = nn.ModuleList(_Upsampling(coarser, finer, 2, stride=2) for coarser, finer in upwards)
+        self.decoder = nn.ModuleList(_block(2 * finer, finer) for _, finer in upwards)
+
+    def level(self, scale: int) -> int:
+        """Of which level the features of a scale are."""
+        return max(0, scale - self.stride + 1)
 
     def reach(self, scale: int) -> int:
         """How far from a pixel of the input a feature of scale ``2 ** scale`` may depend on it, in pixels of the input.
 
         Two 3x3 convolutions at each level on the way down and up again, and the rest of a block of the coarsest pixels.
         """
-        down, up = range(self.levels), range(scale, self.levels - 1)
-        convolutions: int = sum(2 << level for level in (*down, *up))
+        down, up = range(self.levels), range(self.level(scale), self.levels - 1)
+        convolutions: int = sum(2 * self.stride << level for level in (*down, *up))
         return convolutions + self.multiple - 1
 
     def forward(self, x: Tensor, coarse: Sequence[Tensor] = ()) -> list[Tensor]:
@@ -61,10 +83,11 @@ class UNet(nn.Module):
         Args:
             x: ``(B, in_channels, H, W)``.
             coarse: what the encoder is given besides, ``(B, coarse_channels, ceil(H / s), ceil(W / s))`` for ``s`` = 2,
-                4, ...: one for each scale but the finest, or none.
+                4, ..., with ``half`` from 4 on: one for each level but the finest, or none.
 
         Returns:
-            Three tensors ``(B, width, ceil(H / s), ceil(W / s))`` for ``s`` = 1, 2, 4.
+            Three tensors ``(B, width, ceil(H / s), ceil(W / s))`` for ``s`` = 1, 2, 4; with ``half`` 2, 2, 4, and what
+            is coarser than the finest level has its width.
         """
         height, width = x.shape[-2:]
         x = _padded(x, (height + -height % self.multiple, width + -width % self.multiple))
@@ -82,8 +105,40 @@ class UNet(nn.Module):
         for up, block in zip(self.up, self.decoder, strict=True):
             x = block(torch.cat([up(x), skips.pop()], 1))
             features.append(x)
-        finest_first = features[: -self.scales - 1 : -1]
-        return [f[..., : -(-height // 2**s), : -(-width // 2**s)] for s, f in enumerate(finest_first)]
+        found = []
+        for scale in range(self.scales):
+            level = self.level(scale)
+            side = self.stride << level
+            found.append(features[-1 - level][..., : -(-height // side), : -(-width // side)])
+        return found
+
+
+class Head(nn.Conv2d):
+    """A 3x3 convolution from a scale's features to what is predicted there.
+
+    Args:
+        unet: whose features.
+        scale: which of them.
+        channels: predicted for each pixel.
+    """
+
+    def __init__(self, unet: UNet, scale: int, channels: int) -> None:
+        side = 1 if scale else unet.stride
+        super().__init__(unet.widths[unet.level(scale)], channels * side**2, 3, padding=1)
+        self.side = side
+
+    def forward(self, features: Tensor, size: Sequence[int]) -> Tensor:  # type: ignore[override]
+        """Predict.
+
+        Args:
+            features: ``(B, width, h, w)``.
+            size: height and width of what is predicted.
+
+        Returns:
+            ``(B, channels, *size)``.
+        """
+        predicted = super().forward(features)
+        return predicted if self.side == 1 else F.pixel_shuffle(predicted, self.side)[..., : size[0], : size[1]]
 
 
 def _layout(x: Tensor) -> torch.memory_format:
@@ -112,14 +167,13 @@ class _Block(nn.Sequential):
 
 
 def _convolved_with_relu(x: Tensor, layer: nn.Conv2d) -> Tensor:
-    """A 3x3 convolution and ReLU, in one where oneDNN can: torch has this for what it compiles only."""
+    """A convolution and ReLU, in one where oneDNN can: torch has this for what it compiles only."""
     dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
     if not _has_fused_convolution(dtype):
         return F.relu_(layer(x))
     weight, bias = (parameter.to(dtype) for parameter in layer.parameters())
-    ones = [1, 1]
     result: Tensor = torch.ops.mkldnn._convolution_pointwise(
-        x.to(dtype), weight, bias, ones, ones, ones, 1, "relu", [], ""
+        x.to(dtype), weight, bias, layer.padding, layer.stride, layer.dilation, 1, "relu", [], ""
     )
     return result
 
@@ -211,9 +265,9 @@ def _plain_inference(x: Tensor) -> bool:
     return x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
 
 
-def _block(in_channels: int, out_channels: int) -> nn.Sequential:
+def _block(in_channels: int, out_channels: int, stride: int = 1) -> nn.Sequential:
     block = _Block(
-        nn.Conv2d(in_channels, out_channels, 3, padding=1),
+        nn.Conv2d(in_channels, out_channels, 2 + stride, stride, padding=1),
         _ReLU(),
         nn.Conv2d(out_channels, out_channels, 3, padding=1),
         _ReLU(),

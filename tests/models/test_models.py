@@ -19,6 +19,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.models import (
     Cascade,
     Denoised,
+    Head,
     KernelPredictor,
     Known,
     PixelPredictor,
@@ -87,6 +88,7 @@ CASCADES = {
     "cascaded_plain": ("P+K", False),
     "cascaded_small": ("P+K", True),
     "cascaded_tiny": ("P+K", True),
+    "cascaded_micro": ("P+K", True),
 }
 
 
@@ -305,12 +307,19 @@ def test_the_kernel_heads_are_those_of_the_paper() -> None:
 
 @pytest.mark.parametrize(
     ("name", "widths", "taps"),
-    [("cascaded", (40, 40), 25), ("cascaded_small", (16, 32), 25), ("cascaded_tiny", (16, 16), 9)],
+    [
+        ("cascaded", (40, 40), 25),
+        ("cascaded_small", (16, 32), 25),
+        ("cascaded_tiny", (16, 16), 9),
+        ("cascaded_micro", (16, 16), 9),
+    ],
 )
 def test_the_sizes_of_the_cascade(name: str, widths: tuple[int, int], taps: int) -> None:
     model = create_model(name)
     assert tuple(part.heads[0].in_channels for part in (model.first, model.second)) == widths
-    assert [head.out_channels for head in model.second.heads] == [taps + 3] * 3
+    # Of half the resolution, a feature stands for two by two pixels.
+    finest = 4 if name == "cascaded_micro" else 1
+    assert [head.out_channels for head in model.second.heads] == [finest * (taps + 3), taps + 3, taps + 3]
 
 
 def test_the_width_of_the_kernel_network_can_be_set() -> None:
@@ -326,13 +335,29 @@ def test_the_width_of_the_kernel_network_can_be_set() -> None:
     assert widths(name="cascaded_small", width=8, kernel_width=None) == (8, 8)
 
 
-@pytest.mark.parametrize("levels", [4, 5])
-def test_unet_gives_three_scales_of_any_size(levels: int) -> None:
-    unet = UNet(5, 4, levels)
+@pytest.mark.parametrize(("levels", "half"), [(4, False), (5, False), (3, True), (4, True)])
+def test_unet_gives_three_scales_of_any_size(levels: int, half: bool) -> None:
+    unet = UNet(5, 4, levels, coarse_width=6, half=half)
     for height, width in ((1, 1), (7, 9), (16, 32)):
         features = unet(torch.rand(2, 5, height, width))
+        sizes = [(-(-height // s), -(-width // s)) for s in ((2, 2, 4) if half else (1, 2, 4))]
+        widths = (4, 4, 6) if half else (4, 6, 6)
+        assert [tuple(f.shape) for f in features] == [(2, w, *size) for w, size in zip(widths, sizes, strict=True)]
         sizes = [(-(-height // s), -(-width // s)) for s in (1, 2, 4)]
-        assert [tuple(f.shape) for f in features] == [(2, 4, *size) for size in sizes]
+        for scale, (feature, size) in enumerate(zip(features, sizes, strict=True)):
+            assert Head(unet, scale, 3)(feature, size).shape == (2, 3, *size)
+
+
+def test_a_head_predicts_the_pixels_that_a_feature_of_half_the_resolution_stands_for() -> None:
+    unet = UNet(1, 2, 3, half=True)
+    head = Head(unet, 0, 1)
+    with torch.no_grad():
+        for parameter in head.parameters():
+            parameter.zero_()
+        # The middle of the kernel: each of two by two pixels is a multiple of the first feature.
+        head.weight[:, 0, 1, 1] = torch.tensor([1.0, 2.0, 3.0, 4.0])
+    predicted = head(torch.tensor([[[[1.0, 10.0]], [[7.0, 7.0]]]]), (2, 3))
+    assert predicted.tolist() == [[[[1, 2, 10], [3, 4, 30]]]]
 
 
 def test_unet_sees_what_it_is_given_at_coarser_scales() -> None:
@@ -359,10 +384,10 @@ def test_a_pixel_network_is_given_the_means_of_its_image_at_coarser_scales() -> 
         torch.testing.assert_close(mean[whole], torch.log1p(expected))
 
 
-@pytest.mark.parametrize("levels", [0, 2, 3])
-def test_unet_needs_a_decoder_level_for_each_scale(levels: int) -> None:
-    with pytest.raises(ValueError, match=f"levels: expected at least 4, found {levels}"):
-        UNet(5, 4, levels)
+@pytest.mark.parametrize(("levels", "half", "lowest"), [(0, False, 4), (2, False, 4), (3, False, 4), (2, True, 3)])
+def test_unet_needs_a_decoder_level_for_each_scale(levels: int, half: bool, lowest: int) -> None:
+    with pytest.raises(ValueError, match=f"levels: expected at least {lowest}, found {levels}"):
+        UNet(5, 4, levels, half=half)
 
 
 # Parts of an image
@@ -378,7 +403,7 @@ def half_known(name: str, top: int, left: int) -> tuple[Cascade, tuple[Tensor, .
     return model, frame, Known(mask, frame[0] * 0.7, frame[0] * 0.6)
 
 
-@pytest.mark.parametrize("name", ["cascaded", "cascaded_tiny", "kernel_pixel", "kernel", "pixel"])
+@pytest.mark.parametrize("name", ["cascaded", "cascaded_tiny", "cascaded_micro", "kernel_pixel", "kernel", "pixel"])
 @pytest.mark.parametrize(("top", "left"), [(0, 0), (100, 131), (170, 250)])
 @torch.inference_mode()
 def test_a_part_of_an_image_is_that_of_the_whole(name: str, top: int, left: int) -> None:
@@ -420,7 +445,7 @@ def distance(results: Denoised, expected: Denoised) -> float:
 
 
 @pytest.mark.parametrize("side", [32, 96, 128])
-@pytest.mark.parametrize("name", ["cascaded", "cascaded_tiny", "kernel"])
+@pytest.mark.parametrize("name", ["cascaded", "cascaded_tiny", "cascaded_micro", "kernel"])
 @torch.inference_mode()
 def test_tiles_are_the_whole_image(name: str, side: int, monkeypatch: pytest.MonkeyPatch) -> None:
     model, frame, known = half_known(name, 100, 131)
@@ -765,6 +790,7 @@ def test_overview() -> None:
     cost = {name: entry.kmacs_per_pixel / entries["cascaded"].kmacs_per_pixel for name, entry in entries.items()}
     assert cost["cascaded_small"] == pytest.approx(0.41, abs=0.005)
     assert cost["cascaded_tiny"] == pytest.approx(0.18, abs=0.005)
+    assert cost["cascaded_micro"] == pytest.approx(0.08, abs=0.005)
 
 
 def test_the_cost_of_the_pixel_network_written_out() -> None:
