@@ -29,6 +29,7 @@ _CUT_SHARE = 0.05
 # What a mirror or glass shows does not move as its surface does: a long history would smear it.
 _SPECULAR_LENGTH = 2
 _STILL = 0.05  # pixels
+_CUT = "cut"
 _NO_WAY = "no motion, and no position with a previous camera"
 # Of the shorter history that the long one is compared with: four frames have half the noise of one.
 _RECENT_ALPHA = 0.25
@@ -88,10 +89,32 @@ def _lag(lag: HistoryLag, history: Tensor, recent: Tensor, variance: Tensor) -> 
     return share[..., :height, :width]
 
 
-def _takes_light(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None) -> bool:
-    """Whether most of an image would lose much of its light; not told of images of a few blocks."""
+def _entering(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None, compared: bool) -> Tensor:
+    """Color without albedo and fireflies; for the test for lag also what that compares."""
+    reach = clamp.kernel_size // 2
+    if albedo is not None:
+        color = by_rows(lambda *rows: clamp(demodulate(*rows)), color, albedo, reach=reach)
+    else:
+        color = by_rows(clamp, color, reach=reach)
+    color = color.to(torch.promote_types(color.dtype, torch.float32))
+    if not compared:
+        return color
+    mean = _compressed(color)
+    return torch.cat([color, mean, mean.square()], 1)
+
+
+def _entering_numba(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None, compared: bool) -> Tensor:
+    """As :func:`_entering`, in one pass."""
+    from mcdenoise.ops._fast import history as fast
+
+    entering: Tensor = fast.incoming(color, albedo, clamp.limit, clamp.kernel_size, compared)
+    return entering
+
+
+def _takes_light(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None) -> list[bool]:
+    """Of each image, whether most of it would lose much of its light; not told of images of a few lit blocks."""
     rows = -(-color.shape[-2] // _BLOCK)
-    lost = []
+    shares = []
     for top in range(0, color.shape[-2], _BLOCK * -(-rows // _STRIPS)):
         light = color[..., top : top + _BLOCK, :]
         if albedo is not None:
@@ -101,9 +124,12 @@ def _takes_light(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None) ->
             F.avg_pool2d(image.mean(1, keepdim=True), _BLOCK, ceil_mode=True, count_include_pad=False)
             for image in (light, clamp(light))
         )
-        lost.append(1 - after[before > 0] / before[before > 0])
-    found = torch.cat(lost)
-    return found.numel() >= _LEAST_BLOCKS and bool(found.median() > _LOST)
+        # Not a number where there is no light to lose.
+        shares.append((1 - after / before).flatten(1))
+    lost = torch.cat(shares, 1)
+    enough = (~lost.isnan()).sum(1) >= _LEAST_BLOCKS
+    found: list[bool] = (enough & (lost.nanmedian(1).values > _LOST)).tolist()
+    return found
 
 
 def _equal(a: Tensor | None, b: Tensor | None) -> bool:
@@ -181,12 +207,12 @@ class History:
     to the next starts anew.
 
     Before it is accumulated, a frame loses its fireflies. Where most of the image would lose more than a tenth of its
-    light to that (the median block of 32x32 pixels of the first frame after a :meth:`reset` or a change of size; at a
-    cut the limit stays, and one holds for all images of a batch), these are no fireflies but caustics, and only what is
-    120 times as bright as its lit neighbours is clamped. Where nothing diffuse is seen (no albedo in any
-    channel: mirrors, glass) and the image moves by more than 0.05 pixels, the past counts for no more than 2 frames,
-    since reflections do not move with the surface. Emitters and background have no albedo either and are treated alike;
-    they have little noise to lose. A frame without an albedo buffer says nothing of mirrors, and its past is kept.
+    light to that (the median block of 32x32 pixels of the first frame of a shot; of each image of a batch by itself),
+    these are no fireflies but caustics, and only what is 120 times as bright as its lit neighbours is clamped. Where
+    nothing diffuse is seen (no albedo in any channel: mirrors, glass) and the image moves by more than 0.05 pixels, the
+    past counts for no more than 2 frames, since reflections do not move with the surface. Emitters and background have
+    no albedo either and are treated alike; they have little noise to lose. A frame without an albedo buffer says
+    nothing of mirrors, and its past is kept.
 
     Where a light is switched or moves, or a reflection moves over a glossy surface, the past is wrong although every
     surface is still there, and would fade in some 40 frames. It is given up where local means say so
@@ -224,8 +250,9 @@ class History:
         if not specular_length >= 0:
             raise ValueError(f"specular_length: expected at least 0, found {specular_length}")
         self.accumulate = Accumulate() if accumulate is None else accumulate
-        self._chooses = fireflies is None
-        self.fireflies = ClampFireflies() if fireflies is None else fireflies
+        self.fireflies = fireflies
+        # Of each image of a shot, or one for all.
+        self._clamps: list[ClampFireflies] = []
         self.specular_length = specular_length
         anti_lag = HistoryLag() if anti_lag is None else anti_lag
         self.anti_lag = None if math.isinf(anti_lag.threshold) else anti_lag
@@ -266,38 +293,41 @@ class History:
         before = () if state is None or not state.fits(frame.color) else (state.color, state.length)
         images = (frame.color, *(image for _, image in frame.items()), *before)
         backend = choose_backend(self.accumulate.backend, *images, differentiable=False, forms=("torch", "numba"))
-        if self._chooses and not before:
-            strict = ClampFireflies()
-            caustic = _takes_light(strict, frame.color, frame.albedo if demodulates else None)
-            self.fireflies = ClampFireflies(CAUSTICS) if caustic else strict
+        albedo = frame.albedo if demodulates else None
+        if not before:
+            self._clamps = self._chosen(frame.color, albedo)
         # What has no past and will be none is compared with nothing.
         compared = self.anti_lag is not None and (keeps or state is not None)
-        entering = (self._entering_numba if backend == "numba" else self._entering)(
-            frame.color, frame.albedo if demodulates else None, compared
-        )
+        entering = self._entering(frame.color, albedo, compared, backend)
         past = self._blend(frame, entering, reprojects, backend)
+        if past.reset == _CUT:
+            # Another shot may be of another light, which is seen only now.
+            before_cut, self._clamps = self._clamps, self._chosen(frame.color, albedo)
+            if [clamp.limit for clamp in self._clamps] != [clamp.limit for clamp in before_cut]:
+                entering = self._entering(frame.color, albedo, compared, backend)
+                past = _no_past(entering, _CUT)
         surface = Surface(frame.position, frame.normal, frame.depth)
         self._state = _State(past.color, past.length, surface, frame.view_projection) if keeps else None
         return Accumulated(past.color[:, _COLOR], entering[:, _COLOR], past.length, past.reset)
 
-    def _entering(self, color: Tensor, albedo: Tensor | None, compared: bool) -> Tensor:
+    def _chosen(self, color: Tensor, albedo: Tensor | None) -> list[ClampFireflies]:
+        """How the fireflies of the shot are clamped that begins with this frame."""
+        if self.fireflies is not None:
+            return [self.fireflies]
+        strict = ClampFireflies()
+        caustics = _takes_light(strict, color, albedo)
+        if len(set(caustics)) > 1:
+            return [ClampFireflies(CAUSTICS) if each else strict for each in caustics]
+        return [ClampFireflies(CAUSTICS) if any(caustics) else strict]
+
+    def _entering(self, color: Tensor, albedo: Tensor | None, compared: bool, backend: Backend) -> Tensor:
         """The frame as it is accumulated: all channels of a :class:`_State` but the recent ones, which are the same."""
-        reach = self.fireflies.kernel_size // 2
-        if albedo is not None:
-            color = by_rows(lambda *rows: self.fireflies(demodulate(*rows)), color, albedo, reach=reach)
-        else:
-            color = by_rows(self.fireflies, color, reach=reach)
-        color = color.to(torch.promote_types(color.dtype, torch.float32))
-        if not compared:
-            return color
-        mean = _compressed(color)
-        return torch.cat([color, mean, mean.square()], 1)
-
-    def _entering_numba(self, color: Tensor, albedo: Tensor | None, compared: bool) -> Tensor:
-        from mcdenoise.ops._fast import history as fast
-
-        entering: Tensor = fast.incoming(color, albedo, self.fireflies.limit, self.fireflies.kernel_size, compared)
-        return entering
+        entering = _entering_numba if backend == "numba" else _entering
+        if len(self._clamps) == 1:
+            return entering(self._clamps[0], color, albedo, compared)
+        colors = color.split(1)
+        albedos = [None] * len(colors) if albedo is None else albedo.split(1)
+        return torch.cat([entering(*each, compared) for each in zip(self._clamps, colors, albedos, strict=True)])
 
     def _blend(self, frame: Frame, entering: Tensor, reprojects: bool, backend: Backend) -> _Past:
         """The frame with its past."""
@@ -313,7 +343,7 @@ class History:
             if motion is None:
                 return _no_past(entering, _NO_WAY)
         blended = (self._blended_numba if backend == "numba" else self._blended)(frame, entering, motion, state)
-        return _no_past(entering, "cut") if blended is None else _Past(*blended, "")
+        return _no_past(entering, _CUT) if blended is None else _Past(*blended, "")
 
     def _blended(
         self, frame: Frame, entering: Tensor, motion: Tensor | None, state: _State

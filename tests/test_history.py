@@ -14,6 +14,7 @@ from mcdenoise.buffers import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.history import History
 from mcdenoise.ops import Accumulate, ClampFireflies, HistoryLag, accumulate, demodulate, remodulate
+from mcdenoise.ops._backend import Backend
 
 HEIGHT, WIDTH = 5, 6
 
@@ -279,6 +280,31 @@ def test_where_fireflies_are_much_of_the_light_they_are_caustics(share: float, k
     assert torch.equal(history.update(caustics(0.1)).current, caustics(0.1).color) is kept
     history.reset()
     assert not torch.equal(history.update(caustics(0.1)).current, caustics(0.1).color)
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_each_image_of_a_batch_and_each_shot_has_its_own_caustics(backend: Backend) -> None:
+    """As if every image were alone; at a cut, which positions tell, the first frame of the next shot counts."""
+    few, many = caustics(0.1), caustics(0.3)
+
+    def shot(*images: Frame, x: float = 0.0) -> Frame:
+        position = constant(3, 1.0, (128, 160)).repeat(len(images), 1, 1, 1) + x
+        camera = torch.eye(4).repeat(len(images), 1, 1)
+        return Frame(torch.cat([image.color for image in images]), position=position, view_projection=camera)
+
+    history = History(Accumulate(backend=backend))
+    past = history.update(shot(few, many))
+    for image, kept in ((few, False), (many, True)):
+        alone = History(Accumulate(backend=backend)).update(shot(image)).current
+        assert torch.equal(alone, image.color) is kept
+        torch.testing.assert_close(past.current[int(kept)][None], alone, rtol=0, atol=0)
+    past = history.update(shot(many, few, x=1000.0))
+    assert past.reset == "cut"
+    assert [torch.equal(*both) for both in zip(past.current, (many.color[0], few.color[0]), strict=True)] == [
+        True,
+        False,
+    ]
+    torch.testing.assert_close(past.color, past.current, rtol=0, atol=0)
 
 
 def test_one_firefly_is_no_caustic_however_bright() -> None:
