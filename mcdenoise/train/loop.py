@@ -175,7 +175,8 @@ class Trainer:
         torch.manual_seed(self.config.seed * 1_000_003 + step)
         clip = clip.to(self.fabric.device)
         initial, final = denoise_clip(self.model, clip)
-        loss = cascade_loss(initial, final, clip.reference, temporal_weight=self.config.temporal_weight)
+        weights = {"temporal_weight": self.config.temporal_weight, "mean_weight": self.config.mean_weight}
+        loss = cascade_loss(initial, final, clip.reference, **weights)
         self.stepper.zero_grad()
         self.fabric.backward(loss)
         norm = self.fabric.clip_gradients(
