@@ -27,7 +27,7 @@ from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.errors import InputError
 from mcdenoise.history import History
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import describe_weights, load_weights
+from mcdenoise.models import Cascade, describe_weights, load_weights
 from mcdenoise.ops import Accumulate, remodulate
 
 pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
@@ -170,6 +170,31 @@ def test_bfloat16_learns_float32_weights(small_sequence: Path, tmp_path: Path) -
     saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["parts"][0]
     assert {tensor.dtype for tensor in saved.values()} == {torch.float32}
     assert all(torch.isfinite(tensor).all() for tensor in saved.values())
+
+
+def test_a_step_has_as_many_resolutions_as_are_drawn(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[bool, int]] = []
+    forward = Cascade.forward
+
+    def spy(self: Cascade, *arguments: Any, **named: Any) -> Any:
+        seen.append((self.training, self.resolutions))
+        return forward(self, *arguments, **named)
+
+    monkeypatch.setattr(Cascade, "forward", spy)
+    settings = {**SMALL, "steps": 12}
+    train(TrainConfig(**settings, draw_resolutions=True), [small_sequence], tmp_path / "drawn")
+    drawn = [resolutions for training, resolutions in seen if training]
+    assert set(drawn) == {1, 2, 3}
+    assert {resolutions for training, resolutions in seen if not training} == {3}
+    # The same again: a run goes on as if it had not been stopped.
+    seen.clear()
+    train(TrainConfig(**settings, draw_resolutions=True), [small_sequence], tmp_path / "again")
+    assert [resolutions for training, resolutions in seen if training] == drawn
+    seen.clear()
+    train(TrainConfig(**settings), [small_sequence], tmp_path / "all")
+    assert {resolutions for _, resolutions in seen} == {3}
 
 
 def test_frames_held_back_are_not_trained_on(small_sequence: Path, tmp_path: Path) -> None:

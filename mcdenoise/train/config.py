@@ -36,6 +36,9 @@ class TrainConfig:
         gradient_norm: largest norm of a step's gradient; 0 does not limit it.
         ema: decay of an exponential moving average of the weights, such as 0.999, below it in the first steps; the
             average is what is validated and what the run ends with. 0 takes the weights themselves.
+        draw_resolutions: a cascade of several resolutions has, in each step, from one to all of them. With all in every
+            step, the low frequencies of a larger one are never learnt from, since those of the smaller one take their
+            place, and drift.
         alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
         start_every: a shot also starts at every n-th frame, to train on short histories.
         keep_fireflies: every n-th realisation of the noise keeps its fireflies as if they were caustics, see
@@ -62,6 +65,7 @@ class TrainConfig:
     mean_weight: float = 0.0
     gradient_norm: float = 0.0
     ema: float = 0.0
+    draw_resolutions: bool = False
     alpha_min: float = 0.1
     start_every: int = 4
     keep_fireflies: int = 0

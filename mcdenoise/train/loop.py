@@ -6,7 +6,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from mcdenoise.data.clips import Clip
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
 from mcdenoise.losses import cascade_loss
-from mcdenoise.models import create_model, describe_weights, save_weights
+from mcdenoise.models import Cascade, create_model, describe_weights, save_weights
 from mcdenoise.run_folder import Provenance, RunFolder, about_weights, source_commit
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.data import DataFolders, TrainingData
@@ -171,10 +171,11 @@ class Trainer:
         Raises:
             InputError: one of them is not finite; nothing has been learnt from it then.
         """
-        # The clips have seeds of their own; this one is for a network that draws numbers itself.
+        # The clips have seeds of their own; this one is the same in all processes.
         torch.manual_seed(self.config.seed * 1_000_003 + step)
         clip = clip.to(self.fabric.device)
-        initial, final = denoise_clip(self.model, clip)
+        with _drawn_resolutions(self.network) if self.config.draw_resolutions else nullcontext():
+            initial, final = denoise_clip(self.model, clip)
         weights = {"temporal_weight": self.config.temporal_weight, "mean_weight": self.config.mean_weight}
         loss = cascade_loss(initial, final, clip.reference, **weights)
         self.stepper.zero_grad()
@@ -195,6 +196,20 @@ class Trainer:
         if self.average is not None:
             self.average.update_parameters(self.network)
         return found["loss"], found["gradient"]
+
+
+@contextmanager
+def _drawn_resolutions(network: nn.Module) -> Iterator[None]:
+    """As many resolutions as are drawn, and then all of them again; a network that knows none stays as it is."""
+    if not isinstance(network, Cascade):
+        yield
+        return
+    every = network.resolutions
+    network.resolutions = int(torch.randint(1, every + 1, ()))
+    try:
+        yield
+    finally:
+        network.resolutions = every
 
 
 def _moving_average(network: nn.Module, decay: float) -> AveragedModel:
