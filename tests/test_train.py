@@ -541,7 +541,6 @@ def test_a_frame_that_is_damaged_leaves_no_run(small_sequence: Path, tmp_path: P
         ("batch", 0, "batch: expected at least 1, found 0"),
         ("crop", 0, "crop: expected at least 1, found 0"),
         ("start_every", 0, "start_every: expected at least 1, found 0"),
-        ("mean_weight", -0.5, "mean_weight: expected at least 0, found -0.5"),
         ("keep_fireflies", -1, "keep_fireflies: expected at least 0, found -1"),
         ("validation_frames", -1, "validation_frames: expected at least 0, found -1"),
         ("temporal_weight", float("nan"), "temporal_weight: expected at least 0, found nan"),

@@ -176,8 +176,7 @@ class Trainer:
         clip = clip.to(self.fabric.device)
         with _drawn_resolutions(self.network) if self.config.draw_resolutions else nullcontext():
             initial, final = denoise_clip(self.model, clip)
-        weights = {"temporal_weight": self.config.temporal_weight, "mean_weight": self.config.mean_weight}
-        loss = cascade_loss(initial, final, clip.reference, **weights)
+        loss = cascade_loss(initial, final, clip.reference, temporal_weight=self.config.temporal_weight)
         self.stepper.zero_grad()
         self.fabric.backward(loss)
         norm = self.fabric.clip_gradients(

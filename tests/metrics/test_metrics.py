@@ -279,32 +279,6 @@ def test_the_loss_is_equation_11() -> None:
     assert without.item() == pytest.approx(spatial(r1) + spatial(r2), rel=1e-12)
 
 
-def test_the_loss_of_local_means() -> None:
-    """Blocks of 16x16 pixels, and what is left of them at the edge."""
-    torch.manual_seed(0)
-    initial, final, reference = torch.rand(3, 1, 2, 3, 18, 16, dtype=torch.float64)
-    expected = cascade_loss(initial, final, reference).item()
-    for image in (initial, final):
-        terms = []
-        for frame in range(2):
-            for channel in range(3):
-                for rows in (slice(0, 16), slice(16, 18)):
-                    x, y = (float(clip[0, frame, channel, rows].mean()) for clip in (image, reference))
-                    terms.append(abs(x - y) / (x + y + 1e-2))
-        expected += 2 * sum(terms) / len(terms)
-    assert cascade_loss(initial, final, reference, mean_weight=2).item() == pytest.approx(expected, rel=1e-12)
-
-
-def test_sparse_light_is_learnt_at_its_mean_where_blocks_are_compared() -> None:
-    """One pixel of four has all the light: the best constant of the pixels is black, that of the blocks their mean."""
-    truth = torch.zeros(1, 2, 3, 32, 32)
-    truth[..., ::2, ::2] = 4.0
-    levels = [torch.full_like(truth, level) for level in (0.0, 0.5, 1.0, 2.0, 4.0)]
-    for weight, best in ((0.0, 0), (10.0, 2)):
-        losses = [cascade_loss(level, level, truth, temporal_weight=0, mean_weight=weight).item() for level in levels]
-        assert losses.index(min(losses)) == best
-
-
 def values(nested: object) -> list[float]:
     return torch.tensor(nested, dtype=torch.float64).flatten().tolist()
 
@@ -316,7 +290,7 @@ def test_the_gradient_of_the_loss() -> None:
     reference = 1 + frames + torch.rand(1, 3, 3, 2, 3, dtype=torch.float64) * 0.1
     initial = (3 * reference + torch.rand_like(reference) * 0.1).requires_grad_()
     final = (0.4 * reference + torch.rand_like(reference) * 0.01).requires_grad_()
-    assert gradcheck(lambda a, b: cascade_loss(a, b, reference, mean_weight=0.5), (initial, final))
+    assert gradcheck(lambda a, b: cascade_loss(a, b, reference), (initial, final))
 
 
 def test_the_loss_of_one_frame() -> None:
