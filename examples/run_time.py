@@ -69,7 +69,7 @@ def interleaved(calls: dict[str, Callable[[], object]], rounds: int) -> dict[str
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--models", nargs="+", default=["cascaded", "cascaded_small", "cascaded_tiny"], metavar="MODEL")
+    parser.add_argument("--models", nargs="+", default=models.pretrained_models(), metavar="MODEL")
     parser.add_argument("--size", default="1280x720", metavar="WxH")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=7)

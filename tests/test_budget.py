@@ -18,7 +18,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.models import pretrained_models
 from mcdenoise.results import Cell, Machine, Results
 
-TIMES = {"cascaded": 300.0, "cascaded_small": 170.0, "cascaded_tiny": 80.0}
+TIMES = {"cascaded": 300.0, "cascaded_small": 170.0, "cascaded_tiny": 80.0, "cascaded_micro": 50.0}
 
 
 @pytest.fixture(autouse=True)
@@ -85,7 +85,8 @@ def test_the_choice(sequence: Sequence, results: Path, limits: dict[str, float],
 def test_what_nothing_meets_is_told_in_one_line(sequence: Sequence, results: Path) -> None:
     message = refused(lambda: choose_model(sequence, budget=10))
     assert message == (
-        "--budget-ms: expected a model that takes at most 10 ms, found at best cascaded_tiny, bfloat16: 48.0 ms a frame"
+        "--budget-ms: expected a model that takes at most 10 ms, "
+        "found at best cascaded_micro, bfloat16: 30.0 ms a frame"
     )
     message = refused(lambda: choose_model(sequence, budget=100, max_error=0.01, results=results))
     assert message.endswith("at most 0.01 in 100 ms, found at best cascaded_tiny: 80.0 ms a frame, SMAPE 0.08")
@@ -100,7 +101,7 @@ def test_what_nothing_meets_is_told_in_one_line(sequence: Sequence, results: Pat
 
 def test_errors_come_from_the_references(sequence: Sequence) -> None:
     choice = choose_model(sequence, max_error=0.9)
-    assert choice.name == "cascaded_tiny, bfloat16"
+    assert choice.name == "cascaded_micro, bfloat16"
     assert choice.error is not None
     assert 0.01 < choice.error < 0.9
     stricter = choose_model(sequence, budget=1000)
@@ -134,9 +135,9 @@ def test_the_command_line(small_sequence: Path, tmp_path: Path, capsys: pytest.C
     with pytest.raises(SystemExit) as stop:
         main([*command, "--max-error", "0.9"])
     assert stop.value.code == 0
-    assert "picked cascaded_tiny, bfloat16: 48.0 ms a frame, SMAPE 0." in capsys.readouterr().out
+    assert "picked cascaded_micro, bfloat16: 30.0 ms a frame, SMAPE 0." in capsys.readouterr().out
     report = json.loads((tmp_path / "out" / "denoise.json").read_text())
-    assert (report["model"], report["precision"]) == ("cascaded_tiny", "bfloat16")
+    assert (report["model"], report["precision"]) == ("cascaded_micro", "bfloat16")
     with pytest.raises(SystemExit) as stop:
         main([*command, "--budget-ms", "1"])
     assert stop.value.code == 2

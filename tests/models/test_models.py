@@ -756,7 +756,7 @@ def test_a_damaged_tensor_and_an_infinite_weight_are_refused(tmp_path: Path) -> 
 
 
 def test_the_cascades_have_weights() -> None:
-    assert pretrained_models() == ["cascaded", "cascaded_small", "cascaded_tiny"]
+    assert pretrained_models() == ["cascaded", "cascaded_micro", "cascaded_small", "cascaded_tiny"]
 
 
 @pytest.mark.parametrize("name", pretrained_models())
