@@ -19,8 +19,8 @@ class UNet(nn.Module):
 
     Each level is two 3x3 convolutions with ReLU; 2x2 max-pooling goes down, a 2x2 transposed convolution goes up, and
     the encoder's features of the same scale are concatenated before the decoder's convolutions (Ronneberger et al.
-    2015; the paper's Sec. 3.2 and Fig. 2). Any image size: the image is padded to a multiple of ``2 ** (levels - 1)``
-    by repeating its edge, and the features are cropped.
+    2015; the paper's Sec. 3.2 and Fig. 2). Any image size: the image is padded to whole pixels of the coarsest level
+    (``2 ** (levels - 1)``, with ``half`` twice as many) by repeating its edge, and the features are cropped.
 
     With ``half``, it has no level at full resolution, where most of the time goes: the first convolution is a 4x4 one
     with a stride of 2, and a :class:`Head` predicts two by two pixels from each feature (``F.pixel_shuffle``, Shi et
