@@ -297,11 +297,11 @@ def mcdenoise(*arguments: object, processes: int = 1) -> list[str]:
 
 
 def options(config: TrainConfig) -> list[str]:
-    return [
-        text
-        for name, value in dataclasses.asdict(config).items()
-        for text in (f"--{name.replace('_', '-')}", str(value))
-    ]
+    found = []
+    for field, value in dataclasses.asdict(config).items():
+        name = field.replace("_", "-")
+        found += [f"--{'' if value else 'no-'}{name}"] if isinstance(value, bool) else [f"--{name}", str(value)]
+    return found
 
 
 ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -358,7 +358,8 @@ def test_a_run_killed_while_it_saves_keeps_the_checkpoint_before(small_sequence:
 
 
 def test_two_processes_learn_what_one_does(small_sequence: Path, tmp_path: Path) -> None:
-    config = TrainConfig(**{**SMALL, "batch": 4, "steps": 4, "ema": 0.9}, gradient_norm=0.5, lamps=0.5, exposure=1.0)
+    settings = {**SMALL, "batch": 4, "steps": 4, "ema": 0.9, "draw_resolutions": True}
+    config = TrainConfig(**settings, gradient_norm=0.5, lamps=0.5, exposure=1.0)
     weights = []
     # Both with one thread a process: with more, sums are taken in another order again.
     for run, processes in ((tmp_path / "one", 1), (tmp_path / "two", 2)):
