@@ -316,9 +316,8 @@ class History:
             return [self.fireflies]
         strict = ClampFireflies()
         caustics = _takes_light(strict, color, albedo)
-        if len(set(caustics)) > 1:
-            return [ClampFireflies(CAUSTICS) if each else strict for each in caustics]
-        return [ClampFireflies(CAUSTICS) if any(caustics) else strict]
+        alike = len(set(caustics)) < 2
+        return [ClampFireflies(CAUSTICS) if each else strict for each in ([any(caustics)] if alike else caustics)]
 
     def _entering(self, color: Tensor, albedo: Tensor | None, compared: bool, backend: Backend) -> Tensor:
         """The frame as it is accumulated: all channels of a :class:`_State` but the recent ones, which are the same."""

@@ -168,8 +168,9 @@ class PixelPredictor(nn.Module):
         scales = [logs]
         for _ in levels[1:]:
             scales.append(downsample(scales[-1]))
-        sizes = [scale.shape[-2:] for scale in scales]
-        residuals = [head(*both) for head, *both in zip(self.heads, levels, sizes, strict=True)]
+        residuals = [
+            head(level, scale.shape[-2:]) for head, level, scale in zip(self.heads, levels, scales, strict=True)
+        ]
         return _fuse(scales, residuals, self.fusions, top)
 
 
