@@ -37,6 +37,10 @@ _RECENT_ALPHA = 0.25
 _RECENT_FRAMES = 7
 # Light of more than this share, in the median block, is no firefly's; a shot whose light is caustics has another limit.
 _LOST, CAUSTICS = 0.1, 120.0
+# A light that is seen: the side of a block in pixels, how far their compressed radiance may differ, how bright they are
+# beside the mean of a window, and how far they may vary over the past. Smaller blocks are often alike by chance where
+# one of a few lights is drawn for each pixel, and some of the light is lost to that.
+_LIGHT_BLOCK, _EVEN, _BRIGHTER, _LIGHT_WINDOW, _STEADY = 3, 0.03, 1.2, 9, 0.1
 # Side of a block in pixels; rows of blocks that are looked at; and how few blocks say nothing.
 _BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
 
@@ -109,6 +113,30 @@ def _entering_numba(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None,
 
     entering: Tensor = fast.incoming(color, albedo, clamp.limit, clamp.kernel_size, compared)
     return entering
+
+
+def _lights(root: Tensor) -> Tensor:
+    """Where, by one frame, a light is seen: 1 in blocks of 3x3 pixels that are alike and brighter than what is around.
+
+    Args:
+        root: ``(B, 1, H, W)`` compressed radiance.
+    """
+    size = _LIGHT_BLOCK
+    if min(root.shape[-2:]) < size:
+        return torch.zeros_like(root)
+    largest, smallest = F.max_pool2d(root, size, 1), -F.max_pool2d(-root, size, 1)
+    even = (largest - smallest <= _EVEN * largest).to(root.dtype)
+    some = F.max_pool2d(F.pad(even, [size - 1] * 4), size, 1)
+    around = F.avg_pool2d(root, _LIGHT_WINDOW, 1, _LIGHT_WINDOW // 2, count_include_pad=False)
+    return some * (root > _BRIGHTER * around)
+
+
+def _lights_numba(root: Tensor) -> Tensor:
+    """As :func:`_lights`, in one pass."""
+    from mcdenoise.ops._fast import history as fast
+
+    found: Tensor = fast.lights(root, _EVEN, _BRIGHTER, _LIGHT_WINDOW)
+    return found
 
 
 def _takes_light(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None) -> list[bool]:
@@ -191,6 +219,11 @@ class _Past(NamedTuple):
     length: Tensor
     reset: str
 
+    def steady(self) -> Tensor:
+        """Where the compressed radiance has hardly varied."""
+        mean = self.color[:, _MEAN]
+        return self.color[:, _SQUARE] - mean.square() <= (_STEADY * mean).square()
+
 
 def _no_past(entering: Tensor, reset: str) -> _Past:
     return _Past(_with_recent(entering), torch.ones_like(entering[:, :1]), reset)
@@ -220,6 +253,13 @@ class History:
     current frame, and the long one with that. Compared are means of the fourth root of the radiance (channel mean,
     demodulated, without fireflies); their noise is what the same root varied by over the past. The decision has no
     derivative.
+
+    A lamp in the plane of a ceiling, with its albedo, is the same surface by all tests, and bilinear taps would carry
+    its light over its edge, a little further with every frame. So pixels that see a light take their past from pixels
+    that saw one, and all others from the others, where both are among the taps. A light is seen in blocks of 3x3 pixels
+    whose compressed radiance differs by less than 3 % and is 1.2 times the mean of a 9x9 window or more (twice, in
+    radiance); it was seen where that is so and the compressed radiance varied by less than a tenth over the past. A
+    light that is narrower than three pixels bleeds still. Without the test for lag this is not looked for either.
 
     Half-precision frames are accumulated in float32, which holds 10,000 frames as well as ten.
 
@@ -299,15 +339,22 @@ class History:
         # What has no past and will be none is compared with nothing.
         compared = self.anti_lag is not None and (keeps or state is not None)
         entering = self._entering(frame.color, albedo, compared, backend)
-        past = self._blend(frame, entering, reprojects, backend)
+        lights = None
+        if compared:
+            find = _lights_numba if backend == "numba" else partial(by_rows, _lights, reach=_LIGHT_WINDOW // 2)
+            lights = find(entering[:, _MEAN])
+        past = self._blend(frame, entering, lights, reprojects, backend)
         if past.reset == _CUT:
             # Another shot may be of another light, which is seen only now.
             before_cut, self._clamps = self._clamps, self._chosen(frame.color, albedo)
             if [clamp.limit for clamp in self._clamps] != [clamp.limit for clamp in before_cut]:
                 entering = self._entering(frame.color, albedo, compared, backend)
                 past = _no_past(entering, _CUT)
-        surface = Surface(frame.position, frame.normal, frame.depth)
-        self._state = _State(past.color, past.length, surface, frame.view_projection) if keeps else None
+        self._state = None
+        if keeps:
+            label = None if lights is None else lights * past.steady()
+            surface = Surface(frame.position, frame.normal, frame.depth, label)
+            self._state = _State(past.color, past.length, surface, frame.view_projection)
         return Accumulated(past.color[:, _COLOR], entering[:, _COLOR], past.length, past.reset)
 
     def _chosen(self, color: Tensor, albedo: Tensor | None) -> list[ClampFireflies]:
@@ -328,7 +375,9 @@ class History:
         albedos = [None] * len(colors) if albedo is None else albedo.split(1)
         return torch.cat([entering(*each, compared) for each in zip(self._clamps, colors, albedos, strict=True)])
 
-    def _blend(self, frame: Frame, entering: Tensor, reprojects: bool, backend: Backend) -> _Past:
+    def _blend(
+        self, frame: Frame, entering: Tensor, lights: Tensor | None, reprojects: bool, backend: Backend
+    ) -> _Past:
         """The frame with its past."""
         state = self._state
         if state is None:
@@ -341,15 +390,16 @@ class History:
             motion = motion_to_previous(frame, state.view_projection)
             if motion is None:
                 return _no_past(entering, _NO_WAY)
-        blended = (self._blended_numba if backend == "numba" else self._blended)(frame, entering, motion, state)
+        blend = self._blended_numba if backend == "numba" else self._blended
+        blended = blend(frame, surface_before(frame)._replace(label=lights), entering, motion, state)
         return _no_past(entering, _CUT) if blended is None else _Past(*blended, "")
 
     def _blended(
-        self, frame: Frame, entering: Tensor, motion: Tensor | None, state: _State
+        self, frame: Frame, surface: Surface, entering: Tensor, motion: Tensor | None, state: _State
     ) -> tuple[Tensor, Tensor] | None:
         """Color and length of the frame with its past, ``None`` at a cut."""
         color = _with_recent(entering)
-        past, length = self.accumulate(color, state.color, state.length, motion, surface_before(frame), state.surface)
+        past, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
         if int((length > 1).sum()) < _CUT_SHARE * length.numel():
             return None
         if frame.albedo is not None and motion is not None:
@@ -363,7 +413,7 @@ class History:
         return past, length
 
     def _blended_numba(
-        self, frame: Frame, entering: Tensor, motion: Tensor | None, state: _State
+        self, frame: Frame, surface: Surface, entering: Tensor, motion: Tensor | None, state: _State
     ) -> tuple[Tensor, Tensor] | None:
         """As :meth:`_blended`, with one pass over the images for all but the test for lag, which is in three."""
         from mcdenoise.ops._fast import history as fast
@@ -371,7 +421,7 @@ class History:
         rule = self.accumulate
         recent_alpha = max(rule.alpha_min, _RECENT_ALPHA)
         past, length, kept = accumulate_numba(
-            *(entering, state.color, state.length, motion, surface_before(frame), state.surface),
+            *(entering, state.color, state.length, motion, surface, state.surface),
             *(rule.alpha_min, rule.rule, rule.position_limit, rule.normal_limit),
             Shorter(recent_alpha, frame.albedo, self.specular_length + 1, _STILL),
         )

@@ -416,6 +416,56 @@ def test_a_past_of_negative_length_is_refused(length: float) -> None:
         History(specular_length=length)
 
 
+# Lights in the plane of what is around them
+
+
+def seen_in_passing(number: int, size: tuple[int, int] = (48, 64)) -> Frame:
+    """A wall of uniform noise that moves by fractions of a pixel, without color."""
+    height, width = size
+    shift = torch.tensor([0.37, 0.21], dtype=torch.float64)
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    position = torch.stack([columns + shift[0] * number, rows + shift[1] * number, torch.full_like(rows, 50.0)])[None]
+    return Frame(
+        color=torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(number)),
+        position=position.float(),
+        normal=torch.tensor([0.0, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, height, width),
+        depth=torch.full((1, 1, height, width), 50.0),
+        motion=shift.float().reshape(1, 2, 1, 1).expand(1, 2, height, width),
+    )
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_a_lamp_does_not_bleed_into_the_ceiling_around_it(backend: Backend) -> None:
+    """Same plane, no albedo: only their light tells one from the other."""
+    history, without = History(Accumulate(backend=backend)), History(anti_lag=HistoryLag(math.inf))
+    for number in range(12):
+        frame = seen_in_passing(number)
+        assert frame.position is not None
+        offset = (frame.position[:, :2] - torch.tensor([34.0, 27.0]).reshape(1, 2, 1, 1)).abs()
+        lamp = (offset[:, :1] < 9) & (offset[:, 1:] < 5)
+        frame = frame.replace(color=torch.where(lamp, 40.0, frame.color))
+        past, bled = history.update(frame), without.update(frame)
+        assert (past.color * ~lamp).max() <= 1
+        assert ((past.color - 40) * lamp).abs().max() < 1e-3
+    # Nor does it cost any of the past.
+    assert past.length[..., 12:-12, 12:-12].min() > 11.9
+    assert (bled.color * ~lamp).max() > 5
+
+
+@pytest.mark.parametrize("share", [0.1, 0.25, 0.5, 0.75])
+def test_samples_of_one_brightness_are_no_lights(share: float) -> None:
+    """One of a few small lights is drawn: beside each other there are often alike samples, and no light may be lost."""
+    history, means = History(fireflies=ClampFireflies(math.inf)), []
+    for number in range(24):
+        frame = seen_in_passing(number, (96, 128))
+        lit = frame.color[:, :1] < share
+        past = history.update(frame.replace(color=torch.where(lit, 1.0, 0.02).expand_as(frame.color)))
+        means.append(past.color[..., 16:-16, 16:-16].mean().item())
+    expected = share + 0.02 * (1 - share)
+    assert sum(means[12:]) / 12 == pytest.approx(expected, rel=0.01)
+    assert all(mean == pytest.approx(expected, rel=0.05) for mean in means)
+
+
 # What a scene does not need
 
 

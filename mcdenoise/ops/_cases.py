@@ -413,7 +413,8 @@ def _surface(g: Generator, batch: int, height: int, width: int) -> dict[str, Ten
     normal = facing[wall].movedim(-1, 1) + 0.02 * _uniform(g, batch, 3, height, width, low=-1)
     depth = 5 + 5 * wall[:, None] + 0.03 * _uniform(g, batch, 1, height, width, low=-1)
     position = torch.cat([0.03 * _uniform(g, batch, 2, height, width, low=-1), depth], 1)
-    return {"position": position, "normal": normal / normal.norm(dim=1, keepdim=True), "depth": depth}
+    label = torch.randint(0, 2, (batch, 1, height, width), generator=g).double()
+    return {"position": position, "normal": normal / normal.norm(dim=1, keepdim=True), "depth": depth, "label": label}
 
 
 def _history_cases(accumulating: bool) -> tuple[Case, ...]:
@@ -486,6 +487,8 @@ def _history_cases(accumulating: bool) -> tuple[Case, ...]:
         case("relative, depth", "ordinary", (1, 1, 3, 4), ("depth",)),
         case("relative, position and depth", "ordinary", (1, 1, 3, 3), ("position", "depth"), position_limit=0.03),
         case("relative, normal", "ordinary", (1, 1, 3, 3), ("normal",), normal_limit=0.3),
+        case("labels", "ordinary", (1, 1, 3, 4), ("label",)),
+        case("relative, all buffers, labels", "ordinary", (1, 3, 3, 3), (*everything, "label")),
         case("bmfr", "ordinary", (1, 3, 3, 3), ("position", "normal"), position_limit=0.5, normal_limit=0.25, **bmfr),
         case("one row, 5 channels", "ordinary", (1, 5, 1, 5), ("depth",)),
         case("one pixel", "ordinary", (1, 3, 1, 1)),

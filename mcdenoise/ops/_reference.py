@@ -267,16 +267,19 @@ def reproject(
         qx, qy = x + moved[b][0][y][x], y + moved[b][1][y][x]
         if not (math.isfinite(qx) and math.isfinite(qy)):
             continue
+        current = _at(here, b, y, x)
+        kept = [
+            ((1 - abs(qx - column)) * (1 - abs(qy - row)), row, column, _at(there, b, row, column))
+            for row in (math.floor(qy), math.floor(qy) + 1)
+            for column in (math.floor(qx), math.floor(qx) + 1)
+            if 0 <= row < height and 0 <= column < width
+        ]
+        kept = [tap for tap in kept if _same_surface(current, tap[3], rule, position_limit, normal_limit)]
+        alike = [tap for tap in kept if current[3] is not None and current[3] == tap[3][3]]
+        if sum(bilinear for bilinear, *_ in alike) > 1e-3:
+            kept = alike
         total, sums = 0.0, [0.0] * channels
-        for row, column in itertools.product(
-            (math.floor(qy), math.floor(qy) + 1), (math.floor(qx), math.floor(qx) + 1)
-        ):
-            if not (0 <= row < height and 0 <= column < width):
-                continue
-            current, tap = _at(here, b, y, x), _at(there, b, row, column)
-            if not _same_surface(current, tap, rule, position_limit, normal_limit):
-                continue
-            bilinear = (1 - abs(qx - column)) * (1 - abs(qy - row))
+        for bilinear, row, column, _ in kept:
             total += bilinear
             for c in range(channels):
                 sums[c] += bilinear * source[b][c][row][column]
@@ -358,7 +361,7 @@ def _surface(surface: Surface | None) -> tuple[Image | None, ...]:
 
 
 def _at(surface: tuple[Image | None, ...], b: int, y: int, x: int) -> list[list[float] | None]:
-    """Position, normal and depth of one pixel, each a vector or ``None``."""
+    """Position, normal, depth and label of one pixel, each a vector or ``None``."""
     return [None if part is None else [channel[y][x] for channel in part[b]] for part in surface]
 
 
@@ -371,7 +374,7 @@ def _same_surface(
 ) -> bool:
     # What one of the two surfaces lacks cannot be compared.
     both = [(a, b) if a is not None and b is not None else None for a, b in zip(here, tap, strict=True)]
-    positions, normals, depths = both
+    positions, normals, depths, _ = both
     if rule == "bmfr":
         limits = ((positions, position_limit), (normals, normal_limit))
         return all(pair is None or limit is None or _squared_distance(*pair) < limit for pair, limit in limits)

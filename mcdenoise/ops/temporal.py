@@ -18,6 +18,8 @@ PLANE_LIMIT = 0.02
 DEPTH_LIMIT = 0.1
 # Of two unit normals: |difference|^2 < 0.5 allows an angle of 41 degrees.
 NORMAL_LIMIT_SQUARED = 0.5
+# What taps of a pixel's own label must weigh to be enough; a tap in the pixel itself, which stands still, weighs 1.
+LABEL_WEIGHT = 1e-3
 
 
 class Surface(NamedTuple):
@@ -27,11 +29,13 @@ class Surface(NamedTuple):
         position: ``(B, 3, H, W)`` world-space hit points, scene units.
         normal: ``(B, 3, H, W)`` world-space unit normals.
         depth: ``(B, 1, H, W)`` distance along the view axis, scene units, ``inf`` where nothing was hit.
+        label: ``(B, 1, H, W)`` a number for each kind of what is seen, such as the index of an object.
     """
 
     position: Tensor | None = None
     normal: Tensor | None = None
     depth: Tensor | None = None
+    label: Tensor | None = None
 
 
 def motion_from_position(
@@ -117,6 +121,9 @@ def reproject(
     - ``rule="bmfr"``: ``|P_k - P|^2 < position_limit`` and ``|N_k - N|^2 < normal_limit``, squared limits in scene
       units, which the scene must supply; positions and normals are needed.
 
+    A label is a preference: of the taps that pass, those of the pixel's own label are kept if they weigh more than
+    0.001 together, else all of them. So a label that is wrong now and then shortens no history.
+
     Args:
         previous: ``(B, C, H, W)`` anything of the previous frame.
         motion: ``(B, 2, H, W)`` pixels, ``previous position = current position + motion``; a non-finite value means
@@ -171,28 +178,40 @@ def reproject(
     x0, y0 = base[:, :1].long(), base[:, 1:].long()
     fx, fy = fraction[:, :1], fraction[:, 1:]
 
-    values = torch.zeros_like(previous, dtype=dtype)
-    weight = torch.zeros_like(fx)
-    # One gather a tap fetches all there is to compare and to sum.
-    tested = [x for x in there if x is not None]
-    stack = torch.cat([previous.to(dtype), *(x.to(dtype) for x in tested)], 1).flatten(2)
+    # One gather a tap fetches all there is to compare, and one all there is to sum.
+    tested = [x.to(dtype) for x in there if x is not None]
+    stack = torch.cat(tested, 1).flatten(2) if tested else None
+    taps: list[tuple[Tensor, Tensor, Tensor]] = []
+    alike = []
     for dy in (0, 1):
         for dx in (0, 1):
             x, y = x0 + dx, y0 + dy
             kept = known & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            index = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
-            tap = stack.gather(2, index.flatten(2).expand(-1, stack.shape[1], -1)).reshape(
-                *stack.shape[:2], height, width
-            )
-            parts = iter(torch.split(tap, [previous.shape[1], *(t.shape[1] for t in tested)], 1))
-            value = next(parts)
-            tap_surface = Surface(*(None if x is None else next(parts) for x in there))
+            index = (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)).flatten(2)
+            tap_surface = Surface()
+            if stack is not None:
+                tap = stack.gather(2, index.expand(-1, stack.shape[1], -1)).reshape(*stack.shape[:2], height, width)
+                parts = iter(torch.split(tap, [x.shape[1] for x in tested], 1))
+                tap_surface = Surface(*(None if x is None else next(parts) for x in there))
             kept = kept & test(here, tap_surface, position_limit, normal_limit)
             bilinear = (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
-            bilinear = torch.where(kept, bilinear, 0)
-            # A tap that is left out may hold anything, NaN too.
-            values = values + bilinear * torch.where(kept, value, 0)
-            weight = weight + bilinear
+            if here.label is not None:
+                alike.append(kept & (tap_surface.label == here.label.to(dtype)))
+            taps.append((index, kept, torch.where(kept, bilinear, 0)))
+    if alike:
+        enough = sum(torch.where(own, tap[2], 0) for own, tap in zip(alike, taps, strict=True)) > LABEL_WEIGHT
+        taps = [
+            (index, kept & (own | ~enough), torch.where(own | ~enough, bilinear, 0))
+            for own, (index, kept, bilinear) in zip(alike, taps, strict=True)
+        ]
+    values = torch.zeros_like(previous, dtype=dtype)
+    weight = torch.zeros_like(fx)
+    source = previous.to(dtype).flatten(2)
+    for index, kept, bilinear in taps:
+        value = source.gather(2, index.expand(-1, source.shape[1], -1)).reshape(values.shape)
+        # A tap that is left out may hold anything, NaN too.
+        values = values + bilinear * torch.where(kept, value, 0)
+        weight = weight + bilinear
     found = weight > 0
     values = torch.where(found, values / torch.where(found, weight, 1), 0)
     return values.to(previous.dtype), weight.to(previous.dtype)
@@ -410,7 +429,7 @@ def _comparable(surface: Surface | None, previous: Surface | None, like: Tensor)
     if surface is None or previous is None:
         return Surface(), Surface()
     pairs: list[tuple[Tensor | None, Tensor | None]] = []
-    for name, channels, a, b in zip(Surface._fields, (3, 3, 1), surface, previous, strict=True):
+    for name, channels, a, b in zip(Surface._fields, (3, 3, 1, 1), surface, previous, strict=True):
         if a is None or b is None:
             pairs.append((None, None))
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -12,10 +13,10 @@ from plain_form import channels_last, every_other_column, slice_of_pixels, trans
 from torch import Tensor
 
 from mcdenoise.buffers import Frame
-from mcdenoise.history import Accumulated, History
+from mcdenoise.history import Accumulated, History, _lights
 from mcdenoise.ops import Accumulate, ClampFireflies, HistoryLag, clamp_fireflies, demodulate
 from mcdenoise.ops._fast import _numba_filter
-from mcdenoise.ops._fast.history import give_up_lag, incoming
+from mcdenoise.ops._fast.history import give_up_lag, incoming, lights
 from mcdenoise.ops._fast.temporal import accumulate, motion_from_position
 
 SIZE = (37, 23)
@@ -41,7 +42,7 @@ def camera(shift: float) -> Tensor:
 def shot(
     *without: str, size: tuple[int, int] = SIZE, batch: int = 1, speed: float = 0.07, dtype: torch.dtype = torch.float64
 ) -> list[Frame]:
-    """A rough wall before a sky, partly without albedo, seen in passing; on the left the light goes down."""
+    """A rough wall before a sky, partly without albedo, with a lamp, seen in passing; and left the light goes down."""
     g = torch.Generator().manual_seed(0)
     height, width = size
     rows, columns = torch.meshgrid(
@@ -58,8 +59,9 @@ def shot(
         position = torch.cat([depth * columns + x, depth * rows, depth], 1)
         noise = -torch.log(draw(3).clamp_min(1e-6)) * torch.where(draw(1) < 0.01, 500, 1)
         sky = (rows < -0.7).expand_as(depth)
+        lamp = ((position[:, :1] - 0.6).abs() < 0.4) & (rows.abs() < 0.3)
         buffers = {
-            "albedo": (0.1 + 0.9 * draw(3)) * (draw(1) > 0.2),
+            "albedo": torch.where(lamp, 0.5, (0.1 + 0.9 * draw(3)) * (draw(1) > 0.2)),
             "normal": torch.nn.functional.normalize(draw(3) * 0.4 + torch.tensor([0.0, 0, -1]).reshape(1, 3, 1, 1)),
             "depth": torch.where(sky, torch.inf, depth),
             "position": torch.where(sky, 0, position),
@@ -67,7 +69,8 @@ def shot(
             "motion": 2 * draw(2) - 1,
             "view_projection": camera(x).expand(batch, 4, 4),
         }
-        frame = Frame(color=light * noise, **{name: value for name, value in buffers.items() if name not in without})
+        color = torch.where(lamp, 300.0, light * noise)
+        frame = Frame(color=color, **{name: value for name, value in buffers.items() if name not in without})
         frames.append(frame.to(dtype))
     return frames
 
@@ -236,16 +239,44 @@ def test_any_exposure(scale: float) -> None:
         torch.testing.assert_close(dark.color / scale, past.color, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("size", [(3, 3), (2, 9), (1, 1), (9, 40), (31, 5)])
+def test_lights(size: tuple[int, int]) -> None:
+    """Against the rule written out, pixel by pixel."""
+    height, width = size
+    generator = torch.Generator().manual_seed(height)
+    root = torch.rand(2, 1, *size, generator=generator, dtype=torch.float64)
+    root[0, :, : height // 2, : width // 2] = 1.5 + 0.04 * root[0, :, : height // 2, : width // 2]
+    root[1, :, height // 3 :, width // 3 :] = 2.0
+    root[1, :, -3:, :2] = 0.0
+    expected = torch.zeros_like(root)
+    for b, y, x in itertools.product(range(2), range(height), range(width)):
+        image = root[b, 0]
+        window = image[max(y - 4, 0) : y + 5, max(x - 4, 0) : x + 5]
+        blocks = (
+            image[top : top + 3, left : left + 3]
+            for top in range(y - 2, y + 1)
+            for left in range(x - 2, x + 1)
+            if 0 <= top <= height - 3 and 0 <= left <= width - 3
+        )
+        alike = any(block.max() - block.min() <= 0.03 * block.max() for block in blocks)
+        expected[b, 0, y, x] = alike and image[y, x] > 1.2 * window.mean()
+    assert expected.any() == (min(size) > 4)
+    for strided in (root, transposed(root), every_other_column(root)):
+        assert torch.equal(lights(strided, 0.03, 1.2, 9), expected)
+    assert torch.equal(_lights(root), expected)
+
+
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_they_are_what_their_schemas_say() -> None:
     frame = WAYS["motion"][0]
     image, length = torch.rand(2, 1, 9, *SIZE), torch.full((1, 1, *SIZE), 5.0)
-    surface = [frame.position, frame.normal, frame.depth]
+    surface = [frame.position, frame.normal, frame.depth, length.round()]
     blended = (image[0, :, :5], image[1], length, frame.motion, surface, surface, 0.1, False, 0.02, 0.5, 0.25)
     for operator, arguments in (
         (incoming, (frame.color, frame.albedo, 30.0, 7, True)),
         (motion_from_position, (frame.position, frame.view_projection)),
         (accumulate, (*blended, frame.albedo, 3.0, 0.05)),
+        (lights, (image[0, :, 3:4], 0.03, 1.2, 9)),
         (give_up_lag, (image[0], length, image[1, :, :5].contiguous(), 2.0, 5, 0.25, 7.0)),
     ):
         torch.library.opcheck(operator._overload, arguments, test_utils=("test_schema", "test_faketensor"))

@@ -173,10 +173,11 @@ class TestEachTap:
         position=vectors([[(0.0, 0.0, 5.0), (1.0, 0.0, 5.0)], [(0.0, 1.0, 5.0), (1.0, 1.0, 5.0)]]),
         normal=vectors([[(0.0, 0.0, -1.0)] * 2] * 2),
         depth=image([[5.0] * 2] * 2),
+        label=image([[7.0] * 2] * 2),
     )
 
     def other(self, **changes: float) -> Surface:
-        parts = {name: part.clone() for name, part in self.plane._asdict().items()}
+        parts = {name: part.clone() for name, part in self.plane._asdict().items() if part is not None}
         for name, value in changes.items():
             parts[name][0, -1, 1, 1] = value
         return Surface(**parts)
@@ -186,7 +187,9 @@ class TestEachTap:
         value, weight = reproject(self.previous, self.motion, self.plane, self.plane)
         assert (value[0, 0, 0, 0].item(), weight[0, 0, 0, 0].item()) == (26.5, 1.0)
 
-    @pytest.mark.parametrize("change", [{"position": 5.11}, {"position": 4.89}, {"normal": 1.0}, {"depth": INF}])
+    @pytest.mark.parametrize(
+        "change", [{"position": 5.11}, {"position": 4.89}, {"normal": 1.0}, {"depth": INF}, {"label": 8.0}]
+    )
     @pytest.mark.parametrize("content", [100.0, NAN, INF])
     def test_one_on_another_surface_is_left_out(self, change: dict[str, float], content: float) -> None:
         previous = self.previous.clone()
@@ -201,6 +204,23 @@ class TestEachTap:
     def test_one_within_the_limits_is_kept(self, change: dict[str, float]) -> None:
         _, weight = reproject(self.previous, self.motion, self.plane, self.other(**change))
         assert weight[0, 0, 0, 0].item() == 1.0
+
+    def test_without_one_of_its_own_label_all_are_kept(self) -> None:
+        unknown = self.plane._replace(label=image([[9.0] * 2] * 2))
+        value, weight = reproject(self.previous, self.motion, unknown, self.other(label=8.0))
+        assert (value[0, 0, 0, 0].item(), weight[0, 0, 0, 0].item()) == (26.5, 1.0)
+
+    def test_one_of_its_own_label_in_which_it_hardly_lies_is_not_enough(self) -> None:
+        for share, expected in ((1e-4, 1.01), (0.01, 100.0)):
+            motion = torch.tensor([share, 1.0], dtype=torch.float64).reshape(1, 2, 1, 1).expand(1, 2, 2, 2)
+            own = self.plane._replace(label=image([[8.0] * 2] * 2))
+            value, _ = reproject(image([[0.0, 0.0], [1.0, 100.0]]), motion, own, self.other(label=8.0))
+            assert value[0, 0, 0, 0].item() == pytest.approx(expected, rel=1e-2)
+
+    def test_another_surface_of_its_own_label_is_left_out(self) -> None:
+        own = self.plane._replace(label=image([[8.0] * 2] * 2))
+        value, weight = reproject(self.previous, self.motion, own, self.other(label=8.0, position=50.0))
+        assert (value[0, 0, 0, 0].item(), weight[0, 0, 0, 0].item()) == (2.0, 0.75)
 
     def test_limits_can_be_set(self) -> None:
         arguments = (self.previous, self.motion, self.plane, self.other(position=5.09))

@@ -170,6 +170,72 @@ def _incoming(
 
 
 @custom_op(
+    "mcdenoise::lights",
+    device_types="cpu",
+    schema="(Tensor root, float even, float brighter, int window) -> Tensor",
+)
+def lights(root: Tensor, even: float, brighter: float, window: int) -> Tensor:
+    """Where a light is seen: 1 in blocks of 3x3 pixels that are alike and brighter than what is around.
+
+    Args:
+        root: ``(B, 1, H, W)`` compressed radiance, float32 or float64.
+        even: how far the pixels of a block may differ, relative to the brightest of them.
+        brighter: how bright a pixel is beside the mean of its window.
+        window: its side in pixels, odd, at least 5.
+    """
+    found = root.new_zeros(root.shape)
+    if min(root.shape[-2:]) > 2 and len(root):
+        arguments = (found.numpy(), source(root), *root.new_tensor([even, brighter]).numpy(), window // 2)
+        share_rows(root, lambda *rows: _lights(*arguments, *rows))
+    return found
+
+
+@lights.register_fake
+def _(root: Tensor, *_: Any) -> Tensor:
+    return root.new_empty(root.shape)
+
+
+@compiled
+def _lights(found: Any, root: Any, even: float, brighter: float, radius: int, b: int, first: int, last: int) -> None:
+    _, _, height, width = found.shape
+    number, strides = found.dtype.type, root[1]
+    one, zero = number(1), number(0)
+    size = 2 * radius + 1
+    # The rows of the window, and what is brightest and darkest of three pixels of them, by the last of these.
+    ring, brightest, darkest = np.empty((3, size, width), found.dtype)
+    alike, column = np.zeros(width + 2, found.dtype), np.zeros(width + 2 * radius, found.dtype)
+    middle, total = column[radius : radius + width], np.empty(width, found.dtype)
+    for ahead in range(max(first - radius, 0), last + radius):
+        if ahead < height:
+            values, high, low = ring[ahead % size], brightest[ahead % size], darkest[ahead % size]
+            _copy_row(values, root, b * strides[0] + ahead * strides[2], strides[3])
+            for x in range(2, width):
+                high[x] = max(values[x - 2], max(values[x - 1], values[x]))
+                low[x] = min(values[x - 2], min(values[x - 1], values[x]))
+        y = ahead - radius
+        if y < first:
+            continue
+        top, bottom = max(y - radius, 0), min(y + radius + 1, height)
+        middle[:], total[:] = zero, zero
+        for row in range(top, bottom):
+            _add(middle, ring[row % size])
+        for d in range(size):
+            _add(total, column[d : d + width])
+        here, out = ring[y % size], found[b, 0, y]
+        for start in range(max(y - 2, 0), min(y + 1, height - 2)):
+            r0, r1, r2 = start % size, (start + 1) % size, (start + 2) % size
+            for x in range(2, width):
+                largest = max(brightest[r0, x], max(brightest[r1, x], brightest[r2, x]))
+                smallest = min(darkest[r0, x], min(darkest[r1, x], darkest[r2, x]))
+                alike[x] = one if largest - smallest <= even * largest else zero
+            for x in range(width):
+                out[x] = max(out[x], max(alike[x], max(alike[x + 1], alike[x + 2])))
+        for x in range(width):
+            count = number((bottom - top) * (min(x + radius + 1, width) - max(x - radius, 0)))
+            out[x] = out[x] if here[x] * count > brighter * total[x] else zero
+
+
+@custom_op(
     "mcdenoise::give_up_lag",
     device_types="cpu",
     schema="(Tensor(a!) past, Tensor(b!) length, Tensor color, float threshold, int kernel_size, float recent_alpha, "

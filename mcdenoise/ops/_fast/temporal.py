@@ -16,6 +16,7 @@ from torch import Tensor
 from mcdenoise.ops._fast._numba_filter import compiled, share_rows, source
 from mcdenoise.ops._fast._operator import custom_op
 from mcdenoise.ops.demodulation import NO_ALBEDO
+from mcdenoise.ops.temporal import LABEL_WEIGHT
 
 # Pixels whose taps are held at a time: they stay in the first-level cache.
 _CHUNK = 128
@@ -111,7 +112,7 @@ def accumulate(
         )
         # In the dtype of the sums: a number in double precision would make the sums so.
         limits = accumulated.new_tensor(
-            [alpha_min, position_limit, normal_limit, recent_alpha, NO_ALBEDO, longest, still]
+            [alpha_min, position_limit, normal_limit, LABEL_WEIGHT, recent_alpha, NO_ALBEDO, longest, still]
         ).numpy()
         arguments = (accumulated.numpy(), length.numpy(), kept.numpy(), *images, *surfaces, *limits, bmfr)
         share_rows(color, lambda *rows: _accumulate(*arguments, *rows))
@@ -139,6 +140,7 @@ def _accumulate(
     alpha_min: float,
     position_limit: float,
     normal_limit: float,
+    label_weight: float,
     recent_alpha: float,
     no_albedo: float,
     longest: float,
@@ -157,13 +159,14 @@ def _accumulate(
     _, channels, height, width = accumulated.shape
     (new, new_strides, fresh), (old, old_strides, _), (old_length, length_strides, _) = color, previous, previous_length
     moved, motion_strides, moves = motion
-    (p, p_strides, positions), (n, n_strides, normals), (d, d_strides, depths) = here
-    (tap_p, tap_p_strides, _), (tap_n, tap_n_strides, _), (tap_d, tap_d_strides, _) = there
+    (p, p_strides, positions), (n, n_strides, normals), (d, d_strides, depths), (k, k_strides, labels) = here
+    (tap_p, tap_p_strides, _), (tap_n, tap_n_strides, _), (tap_d, tap_d_strides, _), (tap_k, tap_k_strides, _) = there
     tint, tint_strides, tints = albedo
     taps = 4 if moves else 1
     number = accumulated.dtype.type
     one, zero, half, least = number(1), number(0), number(0.5), number(1e-6)
     weights, places = np.empty((_CHUNK, 4), accumulated.dtype), np.empty((_CHUNK, 4), np.uint64)
+    own = np.empty(4, np.bool_)
     sums, values = np.empty((channels, _CHUNK), accumulated.dtype), np.empty(_CHUNK, accumulated.dtype)
     # Weight of the frame, and that in the recent past.
     alphas = np.empty((2, _CHUNK), accumulated.dtype)
@@ -191,7 +194,8 @@ def _accumulate(
                 reachable = -1 < qx < width and -1 < qy < height
                 left, top = (np.int64(qx) - (qx < 0), np.int64(qy) - (qy < 0)) if reachable else (0, 0)
                 fx, fy = qx - number(left), qy - number(top)
-                weight = length = zero
+                label = k[b * k_strides[0] + y * k_strides[2] + x * k_strides[3]] if labels else zero
+                weight = length = own_weight = own_length = zero
                 kept = 0
                 for tap in range(taps if reachable else 0):
                     row, column = top + tap // 2, left + tap % 2
@@ -227,14 +231,28 @@ def _accumulate(
                                 if not distance <= position_limit * depth:
                                     continue
                     bilinear = (fx if tap % 2 else one - fx) * (fy if tap // 2 else one - fy)
-                    weight += bilinear
-                    length += (
+                    past = (
                         bilinear
                         * old_length[b * length_strides[0] + row * length_strides[2] + column * length_strides[3]]
                     )
+                    weight += bilinear
+                    length += past
+                    if labels:
+                        at_label = b * tap_k_strides[0] + row * tap_k_strides[2] + column * tap_k_strides[3]
+                        own[kept] = tap_k[at_label] == label
+                        if own[kept]:
+                            own_weight += bilinear
+                            own_length += past
                     weights[i, kept] = bilinear
                     places[i, kept] = b * old_strides[0] + row * old_strides[2] + column * old_strides[3]
                     kept += 1
+                if own_weight > label_weight:
+                    found, kept = kept, 0
+                    for tap in range(found):
+                        if own[tap]:
+                            weights[i, kept], places[i, kept] = weights[i, tap], places[i, tap]
+                            kept += 1
+                    weight, length = own_weight, own_length
                 # What is left out may hold anything: beside the others, one of them stands once more, weightless.
                 for tap in range(kept, 4):
                     weights[i, tap] = zero
