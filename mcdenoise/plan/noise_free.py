@@ -15,7 +15,7 @@ from mcdenoise.ops import NO_ALBEDO
 _SMOOTH = 0.02
 _CELL = 8
 # Of the 576 pixels of nine cells.
-_LEAST_WITNESSES = 100
+_LEAST_WITNESSES, _MANY = 100, 1000
 
 
 def noise_free(inspected: Inspected) -> Tensor | None:
@@ -40,19 +40,34 @@ def noise_free(inspected: Inspected) -> Tensor | None:
         kinds.append(frame.depth == torch.inf)
     if frame.albedo is not None and ranges["albedo"][0] < NO_ALBEDO:
         kinds.append((_combined(torch.maximum, frame.albedo) < NO_ALBEDO) & (brightness > 0))
-    plain = kinds[0] if len(kinds) == 1 else kinds[0] | kinds[1] if kinds else None
-    if plain is None or not plain.any():
+    if not kinds:
         return None
-    rough = torch.zeros_like(brightness)
+    known = kinds[0] if len(kinds) == 1 else kinds[0] | kinds[1]
+    rows = known.any(-1).flatten(0, -2).any(0).nonzero()
+    if not len(rows):
+        return None
+    # Whole cells: what is above and below them has no such pixel.
+    band = slice(int(rows[0]) // _CELL * _CELL, (int(rows[-1]) // _CELL + 1) * _CELL)
+    plain, brightness = known[..., band, :], brightness[..., band, :]
+    # What is of no such kind is less and more than nothing.
+    plainly = torch.where(plain, brightness, torch.nan)
+    lowest = plainly * ((1 + _SMOOTH / 2) / (1 - _SMOOTH / 2))
+    rough = torch.zeros_like(plain)
     for dim in (-2, -1):
-        rough.narrow(dim, 0, rough.shape[dim] - 1).add_(_jumps(brightness, plain, dim))
-    clean = F.max_pool2d(_cells(rough, F.max_pool2d), 3, 1, 1) == 0
-    witnesses = F.avg_pool2d(_cells(plain.to(rough.dtype), F.avg_pool2d), 3, 1, 1) * (9 * _CELL**2)
-    cells = clean & (witnesses >= _LEAST_WITNESSES)
+        (here, there), (here_lowest, there_lowest) = (_neighbours(image, dim) for image in (plainly, lowest))
+        rough.narrow(dim, 0, here.shape[dim]).logical_or_((here > there_lowest) | (there > here_lowest))
+    # Both in one sum: a difference counts for more than all witnesses.
+    counted = plain.to(brightness.dtype).add_(rough, alpha=_MANY)
+    height, width = counted.shape[-2:]
+    sums = F.avg_pool2d(F.pad(counted, (0, -width % _CELL, 0, -height % _CELL)), _CELL)
+    witnesses = (F.avg_pool2d(sums, 3, 1, 1) * (9 * _CELL**2)).round()
+    cells = (witnesses >= _LEAST_WITNESSES) & (witnesses < _MANY)
     if not cells.any():
         return None
     wide = cells.repeat_interleave(_CELL, -2).repeat_interleave(_CELL, -1)
-    return plain & wide[..., : plain.shape[-2], : plain.shape[-1]]
+    found = torch.zeros_like(known)
+    found[..., band, :] = plain & wide[..., : plain.shape[-2], : plain.shape[-1]]
+    return found
 
 
 def _combined(operator: Callable[[Tensor, Tensor], Tensor], image: Tensor) -> Tensor:
@@ -60,14 +75,7 @@ def _combined(operator: Callable[[Tensor, Tensor], Tensor], image: Tensor) -> Te
     return operator(operator(image[:, :1], image[:, 1:2]), image[:, 2:])
 
 
-def _jumps(brightness: Tensor, plain: Tensor, dim: int) -> Tensor:
-    """Where a pixel and the next along an axis are both of the kind, and differ."""
-    count = brightness.shape[dim] - 1
-    here, there = brightness.narrow(dim, 0, count), brightness.narrow(dim, 1, count)
-    both = plain.narrow(dim, 0, count) & plain.narrow(dim, 1, count)
-    return ((here - there).abs() > _SMOOTH / 2 * (here + there)) & both
-
-
-def _cells(image: Tensor, pool: Callable[..., Tensor]) -> Tensor:
-    height, width = image.shape[-2:]
-    return pool(F.pad(image, (0, -width % _CELL, 0, -height % _CELL)), _CELL)
+def _neighbours(image: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    """The pixels that have a next one along an axis, and the next ones."""
+    count = image.shape[dim] - 1
+    return image.narrow(dim, 0, count), image.narrow(dim, 1, count)

@@ -202,7 +202,7 @@ class Plan:
         return needed
 
     def _note_pixels(self, name: str, pixels: Tensor | None, reason: str, *, exact: bool) -> None:
-        share = 0.0 if pixels is None else float(pixels.float().mean())
+        share = 0.0 if pixels is None else int(pixels.count_nonzero()) / pixels.numel()
         self._note(name, reason if share else "there are none", left_out=share, exact=exact)
 
     def _note(self, name: str, reason: str, *, left_out: float, exact: bool = True) -> None:
