@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import nn
 
-from mcdenoise.data import read_exr
+from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.models import create_model, save_weights
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -234,6 +234,28 @@ def test_error_vs_runtime_draws_what_it_prints(small_sequence: Path, tmp_path: P
     assert drawn.startswith("<?xml")
     assert {"noisy", "accumulated", "cascaded_tiny"} <= printed.keys()
     assert all(name in drawn for name in printed)
+
+
+# Scenes
+
+
+@pytest.mark.parametrize("folder", sorted((EXAMPLES / "scenes").iterdir()), ids=lambda folder: folder.name)
+def test_a_scene_renders(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    command = [sys.executable, "-m", "mcdenoise", "render", str(folder / "scene.xml"), "-o", str(tmp_path / "out")]
+    command += ["--camera-path", str(folder / "camera_path.json"), "--frames", "2", "--size", "32x18"]
+    command += ["--variant", "scalar_rgb"]
+    subprocess.run(command, check=True, timeout=SECONDS, capture_output=True)
+    found = open_sequence(tmp_path / "out")
+    assert len(found) == 2
+    for number in range(2):
+        frame = found.frame(number)
+        frame.validate()
+        # Something is lit, and something is seen of the scene.
+        assert (frame.color > 0).float().mean() > 0.2
+        depth = frame.with_depth().depth
+        assert depth is not None
+        assert depth.isfinite().float().mean() > 0.5
 
 
 # The paper's tables
