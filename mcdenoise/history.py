@@ -37,10 +37,10 @@ _RECENT_ALPHA = 0.25
 _RECENT_FRAMES = 7
 # Light of more than this share, in the median block, is no firefly's; a shot whose light is caustics has another limit.
 _LOST, CAUSTICS = 0.1, 120.0
-# A light that is seen: the side of a block in pixels, how far their compressed radiance may differ, how bright they are
-# beside the mean of a window, and how far they may vary over the past. Smaller blocks are often alike by chance where
-# one of a few lights is drawn for each pixel, and some of the light is lost to that.
-_LIGHT_BLOCK, _EVEN, _BRIGHTER, _LIGHT_WINDOW, _STEADY = 3, 0.03, 1.2, 9, 0.1
+# A light that is seen: how far the compressed radiance of 3x3 pixels may differ, how bright they are beside the mean of
+# a window, and how far they may vary over the past. Fewer pixels are often alike by chance where one of a few lights is
+# drawn for each, and some of the light is lost to that.
+_EVEN, _BRIGHTER, _LIGHT_WINDOW, _STEADY = 0.03, 1.2, 9, 0.1
 # Side of a block in pixels; rows of blocks that are looked at; and how few blocks say nothing.
 _BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
 
@@ -121,12 +121,11 @@ def _lights(root: Tensor) -> Tensor:
     Args:
         root: ``(B, 1, H, W)`` compressed radiance.
     """
-    size = _LIGHT_BLOCK
-    if min(root.shape[-2:]) < size:
+    if min(root.shape[-2:]) < 3:
         return torch.zeros_like(root)
-    largest, smallest = F.max_pool2d(root, size, 1), -F.max_pool2d(-root, size, 1)
+    largest, smallest = F.max_pool2d(root, 3, 1), -F.max_pool2d(-root, 3, 1)
     even = (largest - smallest <= _EVEN * largest).to(root.dtype)
-    some = F.max_pool2d(F.pad(even, [size - 1] * 4), size, 1)
+    some = F.max_pool2d(F.pad(even, (2, 2, 2, 2)), 3, 1)
     around = F.avg_pool2d(root, _LIGHT_WINDOW, 1, _LIGHT_WINDOW // 2, count_include_pad=False)
     return some * (root > _BRIGHTER * around)
 

@@ -179,7 +179,7 @@ def reproject(
     fx, fy = fraction[:, :1], fraction[:, 1:]
 
     # One gather a tap fetches all there is to compare, and one all there is to sum.
-    tested = [x.to(dtype) for x in there if x is not None]
+    tested = [buffer.to(dtype) for buffer in there if buffer is not None]
     stack = torch.cat(tested, 1).flatten(2) if tested else None
     taps: list[tuple[Tensor, Tensor, Tensor]] = []
     alike = []
@@ -191,8 +191,8 @@ def reproject(
             tap_surface = Surface()
             if stack is not None:
                 tap = stack.gather(2, index.expand(-1, stack.shape[1], -1)).reshape(*stack.shape[:2], height, width)
-                parts = iter(torch.split(tap, [x.shape[1] for x in tested], 1))
-                tap_surface = Surface(*(None if x is None else next(parts) for x in there))
+                parts = iter(torch.split(tap, [buffer.shape[1] for buffer in tested], 1))
+                tap_surface = Surface(*(None if buffer is None else next(parts) for buffer in there))
             kept = kept & test(here, tap_surface, position_limit, normal_limit)
             bilinear = (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
             if here.label is not None:

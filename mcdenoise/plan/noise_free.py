@@ -49,7 +49,7 @@ def noise_free(inspected: Inspected) -> Tensor | None:
     # Whole cells: what is above and below them has no such pixel.
     band = slice(int(rows[0]) // _CELL * _CELL, (int(rows[-1]) // _CELL + 1) * _CELL)
     plain, brightness = known[..., band, :], brightness[..., band, :]
-    # What is of no such kind is less and more than nothing.
+    # NaN is neither more nor less than its neighbours.
     plainly = torch.where(plain, brightness, torch.nan)
     lowest = plainly * ((1 + _SMOOTH / 2) / (1 - _SMOOTH / 2))
     rough = torch.zeros_like(plain)
