@@ -42,7 +42,7 @@ def camera(shift: float) -> Tensor:
 def shot(
     *without: str, size: tuple[int, int] = SIZE, batch: int = 1, speed: float = 0.07, dtype: torch.dtype = torch.float64
 ) -> list[Frame]:
-    """A rough wall before a sky, partly without albedo, with a lamp, seen in passing; and left the light goes down."""
+    """A rough wall with a lamp before a sky, partly without albedo, seen in passing; left the light goes down."""
     g = torch.Generator().manual_seed(0)
     height, width = size
     rows, columns = torch.meshgrid(

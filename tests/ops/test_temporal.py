@@ -177,7 +177,7 @@ class TestEachTap:
     )
 
     def other(self, **changes: float) -> Surface:
-        parts = {name: part.clone() for name, part in self.plane._asdict().items() if part is not None}
+        parts = {name: part.clone() for name, part in self.plane._asdict().items()}
         for name, value in changes.items():
             parts[name][0, -1, 1, 1] = value
         return Surface(**parts)
