@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.history import History
 from mcdenoise.metrics import psnr_srgb, smape_linear

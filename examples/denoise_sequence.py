@@ -5,7 +5,7 @@
 
 Writes out/denoised0.exr, out/denoised1.exr, ... (scene-linear), and out/last.png: the last frame before and after, as a
 display shows it. A denoiser remembers: give it the frames in order, one `Denoiser` for each shot. With frames from
-somewhere else than a folder, build `mcdenoise.buffers.Frame(color=..., albedo=..., ...)` and pass that.
+somewhere else than a folder, build `mcdenoise.frame.Frame(color=..., albedo=..., ...)` and pass that.
 """
 
 import argparse

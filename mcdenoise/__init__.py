@@ -3,7 +3,7 @@
 from importlib.metadata import version
 
 from mcdenoise import ops
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.models import create_model, list_models

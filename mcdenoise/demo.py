@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.benchmark import Settings, choose_candidates, run_benchmark
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
 from mcdenoise.demo_scene import demo_cameras, demo_scene

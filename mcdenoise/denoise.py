@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.data import Sequence, write_exr
 from mcdenoise.data.files import write_text
 from mcdenoise.denoiser import Denoiser, FrameReport, Images

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.buffers import OF_THE_PAST, Frame, Inspected
+from mcdenoise.frame import OF_THE_PAST, Frame, Inspected
 from mcdenoise.errors import InputError
 from mcdenoise.history import Accumulated, History
 from mcdenoise.models import Denoised, Known, Region, create_model
@@ -153,7 +153,7 @@ class Denoiser:
 
         Args:
             buffers: names of the buffers that every frame of the shot will have, where that is known. Those that only
-                serve a past (:meth:`mcdenoise.buffers.Frame.without_past`) are not counted where there will be none.
+                serve a past (:meth:`mcdenoise.frame.Frame.without_past`) are not counted where there will be none.
             frames: how many frames there will be, where that is known.
             size: their height and width, where that and the buffers are known. Then ``has_room_ahead`` says whether
                 there is memory to read the next frame while one is denoised.

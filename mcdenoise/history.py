@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.ops import (
     NO_ALBEDO,
     Accumulate,
@@ -323,7 +323,7 @@ class History:
         """Add a frame.
 
         Args:
-            frame: the next frame; its values must be valid (:meth:`mcdenoise.buffers.Frame.validate`).
+            frame: the next frame; its values must be valid (:meth:`mcdenoise.frame.Frame.validate`).
             demodulates: divide by the albedo; not needed where :func:`mcdenoise.ops.demodulate` would divide by one.
             reprojects: look for each pixel's past where it was; not needed for a frame that :meth:`is_still`.
             keeps: remember the frame; not needed for the last one.

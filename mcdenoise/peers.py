@@ -17,7 +17,7 @@ import torch
 from kornia.filters import joint_bilateral_blur
 from torch import Tensor
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.denoiser import Images
 from mcdenoise.errors import InputError
 from mcdenoise.history import History
@@ -81,7 +81,7 @@ class Peer(Protocol):
         """Denoise the next frame of a shot.
 
         Args:
-            frame: its features guide; their values are valid (:meth:`mcdenoise.buffers.Frame.validate`).
+            frame: its features guide; their values are valid (:meth:`mcdenoise.frame.Frame.validate`).
             images: the noisy and the accumulated image are what a peer may start from.
 
         Returns:

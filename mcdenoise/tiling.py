@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import torch
 
-from mcdenoise.buffers import BUFFERS
+from mcdenoise.frame import BUFFERS
 from mcdenoise.errors import InputError
 from mcdenoise.models import Region
 

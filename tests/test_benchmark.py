@@ -30,7 +30,7 @@ from mcdenoise.benchmark.operators import backends
 from mcdenoise.benchmark.run import kept_frames
 from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import fit_line, measure_sizes, synthetic_frame
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.cli import main
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.camera_matrices import read_camera_matrices, write_camera_matrices

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.history import History
 from mcdenoise.ops import Accumulate, ClampFireflies, HistoryLag, accumulate, demodulate, remodulate

@@ -12,7 +12,7 @@ from kornia.filters import joint_bilateral_blur
 from torch import Tensor
 
 import mcdenoise.peers
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.denoiser import Images
 from mcdenoise.errors import InputError

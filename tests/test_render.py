@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.cli import main
 from mcdenoise.data.exr import read_exr
 from mcdenoise.data.sequences import open_sequence

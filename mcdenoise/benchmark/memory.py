@@ -15,7 +15,7 @@ import torch
 
 from mcdenoise.benchmark.machine import fix_threads
 from mcdenoise.benchmark.methods import Candidate, Runner
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 
 Frames = Callable[[], list[Frame]]
 

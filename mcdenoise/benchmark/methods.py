@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.benchmark.machine import Moment, Stopwatch
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.denoiser import PRECISIONS, Denoiser, Images, Precision
 from mcdenoise.errors import InputError
 from mcdenoise.history import History
@@ -46,7 +46,7 @@ class Runner(Protocol):
         """Denoise the next frame.
 
         Args:
-            frame: valid values (:meth:`mcdenoise.buffers.Frame.validate`), on the device.
+            frame: valid values (:meth:`mcdenoise.frame.Frame.validate`), on the device.
 
         Returns:
             ``(1, 3, H, W)`` float32 scene-linear radiance with albedo, on the device.

@@ -20,7 +20,7 @@ from mcdenoise.benchmark.methods import Candidate, ModelRunner, Runner, one_line
 from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import Size, measure_sizes
 from mcdenoise.benchmark.tables import write_csv
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.data import Sequence, open_sequence, write_exr
 from mcdenoise.data.files import new_folder
 from mcdenoise.data.sequences import with_unique_names

@@ -11,7 +11,7 @@ import torch
 from mcdenoise.benchmark.machine import Stopwatch, available_memory
 from mcdenoise.benchmark.memory import Peaks
 from mcdenoise.benchmark.methods import Candidate, Runner, one_line
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.errors import InputError
 from mcdenoise.results import Cost, Fit, Spread
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import BUFFERS, Frame
+from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.data.camera_matrices import Array, CameraMatrices, read_camera_matrices
 from mcdenoise.data.exr import LARGEST_HALF, Metadata, MetadataValue, read_exr, read_exr_header, write_exr
 from mcdenoise.data.files import write_text

@@ -24,8 +24,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mcdenoise import buffers, history
-from mcdenoise.buffers import Frame
+from mcdenoise import frame, history
+from mcdenoise.frame import Frame
 from mcdenoise.data import bmfr, camera_matrices, exr
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.data.bmfr import find_frames, open_bmfr
 from mcdenoise.data.exr import Metadata
 from mcdenoise.errors import InputError

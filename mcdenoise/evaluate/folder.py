@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.data import Sequence, read_exr
 from mcdenoise.data.color_space import to_rec709
 from mcdenoise.data.exr import read_exr_header

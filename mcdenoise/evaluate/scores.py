@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.data import Sequence
 from mcdenoise.denoise import denoised_frames
 from mcdenoise.denoiser import Denoiser, Images

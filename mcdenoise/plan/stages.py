@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import Inspected
+from mcdenoise.frame import Inspected
 from mcdenoise.errors import InputError
 from mcdenoise.ops import NO_ALBEDO
 from mcdenoise.plan.noise_free import noise_free

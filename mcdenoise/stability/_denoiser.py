@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import Frame, replace_invalid
+from mcdenoise.frame import Frame, replace_invalid
 from mcdenoise.denoiser import Denoiser, Precision
 from mcdenoise.errors import InputError
 from mcdenoise.stability._check import DTYPES, Check, name_of

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.history import History
 from mcdenoise.ops import Accumulate, HistoryLag, accumulate
 from mcdenoise.stability._check import DTYPES, name_of

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.bmfr import realisation_folder, write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, read_camera_matrices, write_camera_matrices

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.denoiser import Denoiser, Images
 from mcdenoise.errors import InputError

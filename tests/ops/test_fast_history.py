@@ -12,7 +12,7 @@ import torch
 from plain_form import channels_last, every_other_column, slice_of_pixels, transposed
 from torch import Tensor
 
-from mcdenoise.buffers import Frame
+from mcdenoise.frame import Frame
 from mcdenoise.history import Accumulated, History, _lights
 from mcdenoise.ops import Accumulate, ClampFireflies, HistoryLag, clamp_fireflies, demodulate
 from mcdenoise.ops._fast import _numba_filter

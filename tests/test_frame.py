@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import BUFFERS, Frame, replace_invalid
+from mcdenoise.frame import BUFFERS, Frame, replace_invalid
 from mcdenoise.errors import InputError
 
 NAN, INF = float("nan"), float("inf")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
 from mcdenoise.ops._rows import by_rows
@@ -53,7 +54,19 @@ BUFFERS: dict[str, BufferSpec] = {
     "previous_position": BufferSpec(
         3, -_UNBOUNDED, _UNBOUNDED, "where the surface point seen now was in the previous frame, world space"
     ),
+    "diffuse": BufferSpec(3, 0.0, _UNBOUNDED, "noisy radiance that the camera sees by diffuse reflection, with albedo"),
+    "specular": BufferSpec(3, 0.0, _UNBOUNDED, "noisy radiance that the camera sees by specular reflection"),
+    "specular_albedo": BufferSpec(3, 0.0, 1.0, "specular reflectance, linear RGB", slack=1.0),
+    "roughness": BufferSpec(1, 0.0, 1.0, "perceptual roughness: 0 is a mirror"),
+    "hit_distance": BufferSpec(
+        1, 0.0, _UNBOUNDED, "length of the first bounce, scene units; inf where it hit nothing", infinite=True
+    ),
+    "emission": BufferSpec(3, 0.0, _UNBOUNDED, "radiance sent out by the surface itself, without noise"),
+    "variance": BufferSpec(3, 0.0, _UNBOUNDED, "variance of the mean that color is, of each channel"),
+    "alpha": BufferSpec(1, 0.0, 1.0, "coverage: 0 where only background is seen"),
     "reference": BufferSpec(3, 0.0, _UNBOUNDED, "converged radiance, scene-linear RGB"),
+    "current": BufferSpec(3, 0.0, _UNBOUNDED, "radiance of this frame alone, where color is accumulated"),
+    "length": BufferSpec(1, 0.0, _UNBOUNDED, "history length of an accumulated color, in frames"),
 }
 
 
@@ -61,6 +74,34 @@ BUFFERS: dict[str, BufferSpec] = {
 OF_THE_PAST = frozenset({"position", "motion", "previous_position"})
 
 _MATRIX = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "world-to-clip matrix")
+_MATRIX_NAME = "view_projection"
+_ANYTHING = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "anything", infinite=True)
+
+
+class Hints(NamedTuple):
+    """What is known of a frame besides its pixels. Nothing of it changes an image by more than a tolerance.
+
+    Args:
+        still: nothing moves in the image since the frame before.
+        last: no frame follows, so that nothing needs to be remembered.
+        stages: the images on the way to the result are asked for, too.
+    """
+
+    still: bool = False
+    last: bool = False
+    stages: bool = True
+
+
+class Skip(NamedTuple):
+    """Pixels that need no computing, because their result is known.
+
+    Args:
+        mask: ``(B, 1, H, W)`` bool, true where the result is known.
+        images: ``(B, 3, H, W)`` results by stage, ``"image"`` for the last; finite everywhere, used where ``mask`` is.
+    """
+
+    mask: Tensor
+    images: Mapping[str, Tensor]
 
 
 # eq=False: comparing tensors has no single truth value, so frames are equal only to themselves.
@@ -69,7 +110,7 @@ class Frame:
     """One frame of a renderer's outputs: every buffer is ``(B, C, H, W)``, all of the same batch, size and device.
 
     Only ``color`` is required. Constructing a frame checks shapes, dtypes and devices (cheap); :meth:`validate` also
-    looks at every value.
+    looks at every value. A frame is a pytree: ``torch.func``, ``torch.export`` and ``torch.compile`` take it apart.
 
     Args:
         color: ``(B, 3, H, W)`` noisy radiance, scene-linear, non-negative, unclamped.
@@ -83,7 +124,23 @@ class Frame:
             seen now; equal to ``position`` where nothing moves. The normal that this point had then is not kept: what
             compares normals across frames compares the current one, as if objects only moved and did not turn.
         view_projection: ``(B, 4, 4)`` row-vector world-to-clip matrix, ``clip = [x y z 1] @ M``; clip y points down.
+        diffuse: ``(B, 3, H, W)`` noisy radiance by diffuse reflection.
+        specular: ``(B, 3, H, W)`` noisy radiance by specular reflection.
+        specular_albedo: ``(B, 3, H, W)`` specular reflectance in [0, 1].
+        roughness: ``(B, 1, H, W)`` in [0, 1]; 0 is a mirror.
+        hit_distance: ``(B, 1, H, W)`` length of the first bounce in scene units.
+        emission: ``(B, 3, H, W)`` radiance of the surface itself, without noise.
+        variance: ``(B, 3, H, W)`` variance of the mean of the samples that ``color`` is.
+        alpha: ``(B, 1, H, W)`` coverage in [0, 1].
+        samples: ``(B, S, C, H, W)`` single samples; the first three channels are radiance.
         reference: ``(B, 3, H, W)`` converged radiance of the same pixels.
+        current: ``(B, 3, H, W)`` radiance of this frame alone, where ``color`` is accumulated: added by the wrapper
+            :class:`mcdenoise.models.Accumulated`.
+        length: ``(B, 1, H, W)`` history length of ``color`` in frames, at least 1; added likewise.
+        extra: further ``(B, C, H, W)`` buffers by name.
+        statistics: what is computed of the whole image before it is cut to tiles, ``(B, N, 1, 1)`` by name.
+        skip: pixels whose result is known, see :class:`Skip`.
+        hints: see :class:`Hints`.
 
     Raises:
         InputError: a buffer has the wrong type, number of channels, size, dtype or device. The message names it.
@@ -106,7 +163,22 @@ class Frame:
     motion: Tensor | None = None
     previous_position: Tensor | None = None
     view_projection: Tensor | None = None
+    diffuse: Tensor | None = None
+    specular: Tensor | None = None
+    specular_albedo: Tensor | None = None
+    roughness: Tensor | None = None
+    hit_distance: Tensor | None = None
+    emission: Tensor | None = None
+    variance: Tensor | None = None
+    alpha: Tensor | None = None
+    samples: Tensor | None = None
     reference: Tensor | None = None
+    current: Tensor | None = None
+    length: Tensor | None = None
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
+    statistics: Mapping[str, Tensor] = field(default_factory=dict)
+    skip: Skip | None = None
+    hints: Hints = Hints()
 
     def __post_init__(self) -> None:
         _check_buffer("color", self.color)
@@ -119,31 +191,58 @@ class Frame:
                 raise InputError(
                     f"buffer '{name}': expected on {self.color.device} like 'color', found on {value.device}"
                 )
-            spec = BUFFERS.get(name)
-            expected = (batch, spec.channels, height, width) if spec else (batch, 4, 4)
-            if tuple(value.shape) != expected:
-                raise InputError(f"buffer '{name}': expected shape {expected} like 'color', found {tuple(value.shape)}")
+            shape: tuple[int, ...] = (batch, 4, 4)
+            if name != "view_projection":
+                channels = BUFFERS[name].channels if name in BUFFERS else value.shape[-3] if value.ndim > 2 else 1
+                samples = value.shape[1:2] if name == "samples" and value.ndim > 1 else ()
+                shape = (batch, *samples, channels, height, width)
+            if tuple(value.shape) != shape:
+                raise InputError(f"buffer '{name}': expected shape {shape} like 'color', found {tuple(value.shape)}")
 
     @property
     def size(self) -> tuple[int, int]:
         """Height and width in pixels."""
         return self.color.shape[2], self.color.shape[3]
 
-    def items(self) -> Iterator[tuple[str, Tensor]]:
-        """Name and tensor of every buffer that is present."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is not None:
-                yield field.name, value
+    @property
+    def buffers(self) -> frozenset[str]:
+        """Names of the buffers that are present."""
+        return frozenset(name for name, _ in self.items())
 
-    def replace(self, **changes: Tensor | None) -> Frame:
-        """The same frame with some buffers changed."""
-        buffers: dict[str, Any] = dict(self.items()) | changes
-        return Frame(**buffers)
+    def items(self) -> Iterator[tuple[str, Tensor]]:
+        """Name and tensor of every buffer that is present, those of ``extra`` last."""
+        for name in _NAMES:
+            value = getattr(self, name)
+            if value is not None:
+                yield name, value
+        yield from self.extra.items()
+
+    def buffer(self, name: str) -> Tensor | None:
+        """A buffer of the vocabulary or of ``extra`` by its name; ``None`` where the frame has none."""
+        found: Tensor | None = getattr(self, name) if name in _NAMES else self.extra.get(name)
+        return found
+
+    def replace(self, **changes: Any) -> Frame:
+        """The same frame with some fields changed."""
+        return replace(self, **changes)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Frame:
+        """The same frame with a function applied to every buffer."""
+        changed = {name: function(value) for name, value in self.items() if name in _NAMES}
+        extra = {name: function(value) for name, value in self.extra.items()}
+        return replace(self, **changed, extra=extra)
 
     def to(self, target: torch.device | torch.dtype | str) -> Frame:
         """Every buffer moved to a device or converted to a dtype."""
-        return Frame(**{name: value.to(target) for name, value in self.items()})
+        return self.map(lambda value: value.to(target))
+
+    def crop(self, rows: slice, columns: slice) -> Frame:
+        """A rectangle of the frame, as views. Its statistics stay those of the whole image; nothing of it is skipped."""
+        cropped = {
+            name: value[..., rows, columns] for name, value in self.items() if name in _NAMES and name != _MATRIX_NAME
+        }
+        extra = {name: value[..., rows, columns] for name, value in self.extra.items()}
+        return replace(self, **cropped, extra=extra, skip=None)
 
     def with_depth(self) -> Frame:
         """The same frame; without a depth but with positions and a camera, its depth is the clip w of the positions."""
@@ -185,6 +284,42 @@ class Frame:
                 if clean is not value:
                     changes[name] = clean
         return Inspected(self.replace(**changes) if changes else self, replaced, ranges)
+
+
+_OF_HOSTS = ("extra", "statistics", "skip")
+_NAMES = tuple(each.name for each in fields(Frame) if each.name not in (*_OF_HOSTS, "hints"))
+
+
+def _flatten(frame: Frame) -> tuple[list[Any], tuple[tuple[str, ...], Hints]]:
+    present = tuple(name for name in (*_NAMES, *_OF_HOSTS) if getattr(frame, name) is not None)
+    values = (getattr(frame, name) for name in present)
+    return [dict(value) if isinstance(value, Mapping) else value for value in values], (present, frame.hints)
+
+
+def _flatten_with_keys(frame: Frame) -> tuple[list[tuple[Any, Any]], tuple[tuple[str, ...], Hints]]:
+    children, context = _flatten(frame)
+    return [(pytree.GetAttrKey(name), child) for name, child in zip(context[0], children, strict=True)], context
+
+
+def _unflatten(children: Any, context: Any) -> Frame:
+    # A tree of anything, such as shapes or gradients: nothing of it is checked.
+    present, hints = context
+    values: dict[str, Any] = dict.fromkeys((*_NAMES, *_OF_HOSTS)) | dict(zip(present, children, strict=True))
+    frame = object.__new__(Frame)
+    for name, value in (values | {"hints": Hints(*hints)}).items():
+        object.__setattr__(frame, name, value)
+    return frame
+
+
+pytree.register_pytree_node(
+    Frame,
+    _flatten,
+    _unflatten,
+    flatten_with_keys_fn=_flatten_with_keys,
+    serialized_type_name="mcdenoise.Frame",
+    to_dumpable_context=lambda context: [list(context[0]), list(context[1])],
+    from_dumpable_context=lambda context: (tuple(context[0]), Hints(*context[1])),
+)
 
 
 class Inspected(NamedTuple):
@@ -243,7 +378,7 @@ def _check_buffer(name: str, value: object) -> None:
 
 def _check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]]:
     """The values, clamped, and their extremes."""
-    spec = BUFFERS.get(name, _MATRIX)
+    spec = _MATRIX if name == _MATRIX_NAME else BUFFERS.get(name, _ANYTHING)
     low, high = (float(extreme) for extreme in torch.aminmax(value))
     # A NaN comes through the extremes and fails the comparison; only then is it worth to look at every value again.
     if not -_UNBOUNDED < low <= high < _UNBOUNDED:

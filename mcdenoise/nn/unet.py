@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.ops._autograd import Function
+from mcdenoise.nn._cpu import ConvBlock, ReLU, Upsampling, layout_of, max_pool
 
 
 class UNet(nn.Module):
@@ -61,7 +59,7 @@ class UNet(nn.Module):
         strides = [self.stride] + [1] * (levels - 1)
         self.encoder = nn.ModuleList(_block(*each) for each in zip(entering, self.widths, strides, strict=True))
         upwards = list(itertools.pairwise(self.widths[::-1]))
-        self.up = nn.ModuleList(_Upsampling(coarser, finer, 2, stride=2) for coarser, finer in upwards)
+        self.up = nn.ModuleList(Upsampling(coarser, finer, 2, stride=2) for coarser, finer in upwards)
         self.decoder = nn.ModuleList(_block(2 * finer, finer) for _, finer in upwards)
 
     def level(self, scale: int) -> int:
@@ -94,9 +92,9 @@ class UNet(nn.Module):
         skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):
             if level:
-                x = _max_pool(x)
+                x = max_pool(x)
             if level and coarse:
-                given = coarse[level - 1].to(x.dtype, memory_format=_layout(x))
+                given = coarse[level - 1].to(x.dtype, memory_format=layout_of(x))
                 x = torch.cat([x, _padded(given, x.shape[-2:])], 1)
             x = block(x)
             skips.append(x)
@@ -141,136 +139,18 @@ class Head(nn.Conv2d):
         return predicted if self.side == 1 else F.pixel_shuffle(predicted, self.side)[..., : size[0], : size[1]]
 
 
-def _layout(x: Tensor) -> torch.memory_format:
-    """Channels of several layouts are concatenated number by number."""
-    channels_last = x.is_contiguous(memory_format=torch.channels_last)
-    return torch.channels_last if channels_last else torch.contiguous_format
-
-
 def _padded(x: Tensor, size: Sequence[int]) -> Tensor:
     """``x``, its last row and column repeated up to ``size``."""
     missing = (0, size[1] - x.shape[-1], 0, size[0] - x.shape[-2])
     return F.pad(x, missing, mode="replicate") if any(missing) else x
 
 
-class _Block(nn.Sequential):
-    """Convolutions and ReLUs in turn, which are one step where no derivative is asked for."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        fused = _plain_inference(x)
-        for layer in self:
-            if not fused:
-                x = layer(x)
-            elif isinstance(layer, nn.Conv2d):
-                x = _convolved_with_relu(x, layer)
-        return x
-
-
-def _convolved_with_relu(x: Tensor, layer: nn.Conv2d) -> Tensor:
-    """A convolution and ReLU, in one where oneDNN can: torch has this for what it compiles only."""
-    dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
-    if not _has_fused_convolution(dtype):
-        return F.relu_(layer(x))
-    weight, bias = (parameter.to(dtype) for parameter in layer.parameters())
-    result: Tensor = torch.ops.mkldnn._convolution_pointwise(
-        x.to(dtype), weight, bias, layer.padding, layer.stride, layer.dilation, 1, "relu", [], ""
-    )
-    return result
-
-
-@functools.cache
-def _has_fused_convolution(dtype: torch.dtype) -> bool:
-    try:
-        onednn = torch.ops.mkldnn
-        supported = {torch.float32: True, torch.bfloat16: onednn._is_mkldnn_bf16_supported()}
-        return supported.get(dtype, False) and hasattr(onednn, "_convolution_pointwise")
-    except AttributeError:
-        # Built without oneDNN.
-        return False
-
-
-class _Upsampling(nn.ConvTranspose2d):
-    """A transposed convolution whose bias learns in a twentieth of the time."""
-
-    def forward(self, x: Tensor, output_size: list[int] | None = None) -> Tensor:
-        if self.bias is None or not torch.is_grad_enabled():
-            return super().forward(x, output_size)
-        return _Biased.apply(F.conv_transpose2d(x, self.weight, self.bias.detach(), self.stride), self.bias)
-
-
-class _Biased(Function):
-    """A result that a bias is in already, with its derivative in the bias: a plain sum.
-
-    On a CPU torch takes four times as long for that as for all other derivatives of a transposed convolution together.
-    """
-
-    @staticmethod
-    def forward(result: Tensor, bias: Tensor) -> Tensor:
-        return result
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        ctx.dtype = inputs[1].dtype
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        return gradient, gradient.sum((0, 2, 3)).to(ctx.dtype)
-
-
-class _ReLU(nn.Module):
-    """ReLU in place: neither the convolution before it nor its own derivative needs what it overwrites."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        if x.dtype == torch.bfloat16 and x.device.type == "cpu" and not torch.compiler.is_compiling():
-            return _ReLUOfBits.apply(x)
-        return F.relu(x, inplace=True)
-
-
-class _ReLUOfBits(Function):
-    """ReLU of bfloat16 in place.
-
-    The sign of a bfloat16 is that of its bits as an integer, which a CPU clamps and compares many times as fast.
-    """
-
-    @staticmethod
-    def forward(x: Tensor) -> Tensor:
-        x.view(torch.int16).clamp_min_(0)
-        return x
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
-        ctx.mark_dirty(*inputs)
-        ctx.save_for_backward(output)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        result: Tensor = ctx.saved_tensors[0]
-        if torch.is_grad_enabled():
-            return torch.where(result > 0, gradient, 0)
-        bits: Tensor = torch.ops.aten.threshold_backward(gradient.view(torch.int16), result.view(torch.int16), 0)
-        return bits.view(torch.bfloat16)
-
-
-def _max_pool(x: Tensor) -> Tensor:
-    """``F.max_pool2d(x, 2)`` of what is not negative, in less time where nobody asks which of the pixels it was."""
-    if not _plain_inference(x):
-        return F.max_pool2d(x, 2)
-    # Behind a ReLU, bfloat16 numbers are in the order of their bits as integers, which a CPU compares twice as fast.
-    values = x.view(torch.int16) if x.dtype == torch.bfloat16 else x
-    rows = torch.maximum(values[..., ::2, :], values[..., 1::2, :])
-    return torch.maximum(rows[..., ::2], rows[..., 1::2]).view(x.dtype)
-
-
-def _plain_inference(x: Tensor) -> bool:
-    return x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
-
-
 def _block(in_channels: int, out_channels: int, stride: int = 1) -> nn.Sequential:
-    block = _Block(
+    block = ConvBlock(
         nn.Conv2d(in_channels, out_channels, 2 + stride, stride, padding=1),
-        _ReLU(),
+        ReLU(),
         nn.Conv2d(out_channels, out_channels, 3, padding=1),
-        _ReLU(),
+        ReLU(),
     )
     for layer in block:
         if isinstance(layer, nn.Conv2d):

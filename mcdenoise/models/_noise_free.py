@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.buffers import Inspected
+from mcdenoise.frame import Inspected
 from mcdenoise.ops import NO_ALBEDO
 
 # Of the mean of two pixels; one sample of a path tracer differs from the next by ten times as much or more.

@@ -1,0 +1,47 @@
+"""A model that holds a model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TypeVar
+
+from torch import Tensor, nn
+
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+
+_Wanted = TypeVar("_Wanted")
+
+
+class Wrapper(nn.Module):
+    """A model that holds another one and changes what goes in or comes out.
+
+    Args:
+        inner: any :class:`mcdenoise.models.Model`.
+    """
+
+    inner: Model
+
+    def __init__(self, inner: Model) -> None:
+        super().__init__()
+        self.inner = inner
+
+    @property
+    def needs(self) -> Needs:
+        """Those of the model inside."""
+        return self.inner.needs
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """Those of the model inside, see :class:`mcdenoise.models.Model`."""
+        inner = getattr(self.inner, "statistics", None)
+        return {} if inner is None else inner(frame)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        return self.inner(frame, state)
+
+
+def parts_of(model: Model, kind: type[_Wanted]) -> Iterator[_Wanted]:
+    """The wrappers of a kind that a model wears, outermost first."""
+    if isinstance(model, nn.Module):
+        yield from (module for module in model.modules() if isinstance(module, kind))

@@ -1,0 +1,207 @@
+"""The family ``cascaded_v2``: the cascaded pixel-kernel network with a history, logarithms and three resolutions.
+
+What goes beyond the paper's network (:mod:`mcdenoise.models.cascaded`), each because it was measured to pay:
+
+- the networks see what the accumulation did: the current frame alone, and one over the history length;
+- the pixel network predicts the logarithm of the radiance on top of its input's, and is given means at coarser scales;
+- scales are fused as logarithms, and no pixel grows beyond the brightest of the input;
+- the pixel network also denoises the image at half and at a quarter of its size (:class:`CoarseToFine`).
+
+``cascaded_v2`` has the paper's width. ``cascaded_v2_small`` (widths 16 and 32, 0.41 of the multiply-adds) and
+``cascaded_v2_tiny`` (width 16, 3x3 kernels, 0.18 of them) are the same network for processors on which it is too slow,
+and ``cascaded_v2_micro`` (0.08 of them) is one whose U-Nets begin at half the resolution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.chain import Chain
+from mcdenoise.models.coarse_to_fine import CoarseToFine
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.skipping import TOLERANCE, Skipping
+from mcdenoise.models.tiled import Tiled
+from mcdenoise.nn.fusion import LogFusion
+from mcdenoise.nn.inputs import FEATURES, buffers_input, guides_of, image_statistics
+from mcdenoise.nn.unet import Head, UNet
+from mcdenoise.ops import cross_bilateral_filter, downsample
+from mcdenoise.ops._backend import choose_backend
+from mcdenoise.ops._fused import softplus
+
+SCALE_UNITS = (10.0, 1000.0, 1.0)  # of f1, f2, f3
+_USES = frozenset({"albedo", "normal", "depth", "current", "length"})
+
+
+class _Network(nn.Module):
+    """What both networks have in common: a U-Net, heads at three scales, and their fusion."""
+
+    def __init__(self, unet: UNet, channels: int, radius: int) -> None:
+        super().__init__()
+        self.unet = unet
+        self.heads = nn.ModuleList(Head(unet, scale, channels) for scale in range(UNet.scales))
+        self.fusions = nn.ModuleList(LogFusion() for _ in range(UNet.scales - 1))
+        self._radius = radius
+
+    @property
+    def needs(self) -> Needs:
+        """A pixel for each head and fusion and the radius of each filter, at their scales, behind the U-Net."""
+        heads = (max(1 << scale, self.unet.stride) for scale in range(UNet.scales))
+        ways = (self.unet.reach(scale) + head + (self._radius << scale) for scale, head in enumerate(heads))
+        reach = max(ways) + sum(1 << scale for scale in range(UNet.scales - 1))
+        return Needs(uses=_USES, reach=reach, stride=self.unet.multiple)
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """Exposure, depth scale, and the logarithm of the brightest pixel: that of this network's own input."""
+        found = image_statistics(frame)
+        return found | {"top": torch.log1p(frame.color.amax((1, 2, 3), keepdim=True) * found["exposure"])}
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: measured, in widths of the U-Net."""
+        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
+
+
+class PixelNetwork(_Network):
+    """P: predicts the image itself at three scales and fuses them, coarse to fine.
+
+    Beside what it makes of the noisy pixels itself, its U-Net is given the logarithm of their means at each coarser
+    scale: with one path a pixel most of the light of a dark surface is in few bright pixels, whose mean is easily taken
+    of radiance, but not of its logarithm or of what a maximum leaves of it.
+
+    Args:
+        width: feature channels of the U-Net.
+        half: whether it has no level at full resolution, and twice the width at all coarser ones than the finest.
+    """
+
+    def __init__(self, width: int, half: bool = False) -> None:
+        super().__init__(_unet(width, half, coarse_channels=3), 3, radius=0)
+        for head in self.heads:
+            nn.init.zeros_(head.weight)  # type: ignore[arg-type]
+            nn.init.zeros_(head.bias)  # type: ignore[arg-type]
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        statistics = frame.statistics or self.statistics(frame)
+        frame, exposure, top = frame.replace(statistics=statistics), statistics["exposure"], statistics["top"]
+        image = frame.color * exposure
+        logs = torch.log1p(image)
+        means: list[Tensor] = []
+        for _ in range(1, self.unet.stride):
+            image = downsample(image)
+        for _ in range(self.unet.levels - 1):
+            image = downsample(image)
+            means.append(torch.log1p(image))
+        levels = self.unet(buffers_input(frame, logs, logarithms=False), means)
+        # The heads predict the logarithm of the radiance, on top of the input's: a network at rest is the identity,
+        # and errors are relative, as the eye and the loss see them.
+        scales = [logs]
+        for _ in levels[1:]:
+            scales.append(downsample(scales[-1]))
+        fused = _at_least_float32(self.heads[-1](levels[-1], scales[-1].shape[-2:])) + scales[-1]
+        for scale in (1, 0):
+            residual = self.heads[scale](levels[scale], scales[scale].shape[-2:])
+            fused = self.fusions[1 - scale](scales[scale], fused, residual, None if scale else top)
+        return Output(fused / exposure), None
+
+
+class KernelNetwork(_Network):
+    """K: predicts kernels at three scales, filters the image's pyramid with them, and fuses, coarse to fine.
+
+    Each scale has ``K*K + 3`` channels: the kernel's logits and the scales f1 (normal), f2
+    (depth) and f3 (distance) of the paper's Eqs. 5-8, kept non-negative by a softplus and counted in units in which 1
+    is a plausible value: normals and depths in [0, 1] differ by much less than pixel coordinates.
+
+    Args:
+        width: feature channels of the U-Net.
+        kernel_size: K, 5 in the paper.
+        half: as of :class:`PixelNetwork`.
+    """
+
+    def __init__(self, width: int, kernel_size: int = 5, half: bool = False) -> None:
+        taps = kernel_size * kernel_size
+        super().__init__(_unet(width, half), taps + 3, radius=kernel_size // 2)
+        self.taps = taps
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        statistics = frame.statistics or self.statistics(frame)
+        frame, exposure, top = frame.replace(statistics=statistics), statistics["exposure"], statistics["top"]
+        image = frame.color * exposure
+        levels = self.unet(buffers_input(frame, image))
+        guides = guides_of(frame)
+        # One for all scales: a tile of an image must not be filtered otherwise than the whole.
+        backend = choose_backend(None, image, *levels)
+        undifferentiated = choose_backend(None, image, *levels, differentiable=False, forms=("torch", "numba"))
+        scales: list[Tensor] = []
+        for head, level in zip(self.heads, levels, strict=True):
+            prediction = head(level, image.shape[-2:])
+            logits, rest = prediction[:, : self.taps], prediction[:, self.taps :]
+            *falloffs, distance = softplus(rest, SCALE_UNITS, backend=undifferentiated).split(1, 1)
+            # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
+            filtered = cross_bilateral_filter(
+                image, logits, guides, falloffs, distance, border="renormalize", backend=backend
+            )
+            scales.append(filtered)
+            if len(scales) < len(levels):
+                image, guides = downsample(image), [downsample(guide) for guide in guides]
+        # Each scale is a weighted mean; their fusion could leave the range of the input.
+        fused = torch.log1p(scales[-1])
+        for scale in (1, 0):
+            fused = self.fusions[1 - scale](scales[scale], fused, None, None if scale else top, logarithms=True)
+        return Output(fused / exposure), None
+
+
+def _unet(width: int, half: bool, coarse_channels: int = 0) -> UNet:
+    if not half:
+        return UNet(3 + FEATURES, width, coarse_channels=coarse_channels)
+    return UNet(3 + FEATURES, width, 3, coarse_channels, coarse_width=2 * width, half=True)
+
+
+def _at_least_float32(tensor: Tensor) -> Tensor:
+    """Half precision as float32, float64 as it is: the shipped weights also run in float64, to measure what rounds."""
+    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+
+
+def _cascade(
+    width: int = 40,
+    kernel_width: int | None = None,
+    kernel_size: int = 5,
+    resolutions: int = 3,
+    half: bool = False,
+    *,
+    alpha_min: float = 0.1,
+    anti_lag: bool = True,
+    tolerance: float = TOLERANCE,
+) -> Model:
+    """The cascade with all that it wears.
+
+    Args:
+        width: feature channels of the pixel network.
+        kernel_width: of the kernel network; ``width`` by default.
+        kernel_size: K.
+        resolutions: how many sizes of the image the pixel network denoises; 1 in the paper.
+        half: whether the U-Nets begin at half the resolution.
+        alpha_min: see :class:`mcdenoise.models.Accumulated`.
+        anti_lag: likewise.
+        tolerance: see :class:`mcdenoise.models.Skipping`.
+    """
+    network = Chain(
+        initial=CoarseToFine(Tiled(PixelNetwork(width, half)), resolutions),
+        final=Tiled(KernelNetwork(kernel_width or width, kernel_size, half)),
+    )
+    return Demodulated(Accumulated(Skipping(network, tolerance), alpha_min=alpha_min, anti_lag=anti_lag))
+
+
+_PAPER = "the cascade with a history, logarithms and three resolutions"
+register_model("cascaded_v2", f"{_PAPER}, width 40, 5x5 kernels", width=40)(_cascade)
+register_model("cascaded_v2_small", f"{_PAPER}, widths 16 and 32, 5x5 kernels", width=16, kernel_width=32)(_cascade)
+register_model("cascaded_v2_tiny", f"{_PAPER}, width 16, 3x3 kernels", width=16, kernel_size=3)(_cascade)
+register_model(
+    "cascaded_v2_micro", f"{_PAPER}, width 16, 3x3 kernels, from half the resolution", width=16, kernel_size=3, half=True
+)(_cascade)

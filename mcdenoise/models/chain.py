@@ -1,0 +1,67 @@
+"""One method after another: each sees the image of the one before, and the same features."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.frame import Frame, Skip
+from mcdenoise.models._interface import Model, Needs, Output, State, prepared
+
+
+class Chain(nn.Module):
+    """One method after another, such as ``Chain(initial=P, final=K)`` of the paper's Eqs. 1 and 3.
+
+    The output of each but the last is a stage under its name. Statistics of the whole image that one method has found
+    are there for the next, which looks for those only that depend on its own input.
+
+    Args:
+        methods: by name, in order.
+    """
+
+    def __init__(self, **methods: Model) -> None:
+        super().__init__()
+        if not methods:
+            raise ValueError("methods: expected one at least, found none")
+        self._names = tuple(methods)
+        for name, method in methods.items():
+            setattr(self, name, method)
+
+    @property
+    def needs(self) -> Needs:
+        """What any of them needs; the reach is that of all in a row."""
+        every = [getattr(self, name).needs for name in self._names]
+        reaches = [needs.reach for needs in every]
+        return Needs(
+            frozenset().union(*(needs.buffers for needs in every)),
+            frozenset().union(*(needs.uses for needs in every)),
+            any(needs.trainable for needs in every),
+            None if None in reaches else sum(reach for reach in reaches if reach is not None),
+            max(needs.stride for needs in every),
+        )
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """Those of the first."""
+        return prepared(getattr(self, self._names[0]), frame).statistics
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        states: dict[str, Any] = dict.fromkeys(self._names) if state is None else dict(state)
+        stages: dict[str, Tensor] = {}
+        last, skip = self._names[-1], frame.skip
+        for name in self._names:
+            method: Model = getattr(self, name)
+            known = None if skip is None else skip.images.get("image" if name == last else name)
+            part = None if skip is None else Skip(skip.mask, {} if known is None else {"image": known})
+            output, states[name] = method(prepared(method, frame.replace(skip=part)), states[name])
+            image = output.image
+            if skip is not None and known is not None:
+                image = torch.where(skip.mask, known.to(image.dtype), image)
+            stages |= {f"{name}.{stage}": each for stage, each in output.stages.items()}
+            if name != last:
+                stages[name] = image
+            frame = frame.replace(color=image)
+        return Output(image, stages), states if any(each is not None for each in states.values()) else None

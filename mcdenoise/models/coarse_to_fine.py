@@ -1,0 +1,75 @@
+"""A method at several resolutions: each gives the next finer one its low frequencies."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.frame import BUFFERS, Frame, Skip
+from mcdenoise.models._interface import Model, Needs, Output, State, prepared
+from mcdenoise.models._wrapper import Wrapper, parts_of
+from mcdenoise.models.tiled import TILE, Tiled
+from mcdenoise.ops import downsample
+from mcdenoise.ops._fused import BLOCK, low_frequencies_of
+
+# Of the buffers, what a mean of 2x2 pixels is a buffer of.
+_IMAGES = tuple(name for name in BUFFERS if name not in ("motion", "reference"))
+
+
+class CoarseToFine(Wrapper):
+    """The same method, with the same weights, on an image at half its size, at a quarter, and so on.
+
+    Each size gives the next larger one its low frequencies (:func:`mcdenoise.ops._fused.low_frequencies_of`). A U-Net
+    sees no further than some 60 pixels; at one sample a pixel the mean of all of these is still noisy, and where light
+    is sparse most of them are black.
+
+    Args:
+        inner: a method without a state whose statistics have the ``exposure`` and the logarithm ``top`` of the largest
+            exposed radiance, such as :class:`mcdenoise.models.cascaded_v2.PixelNetwork`.
+        resolutions: how many sizes; with 1 the method is as it was.
+    """
+
+    def __init__(self, inner: Model, resolutions: int = 3) -> None:
+        super().__init__(inner)
+        self.resolutions = resolutions
+        for tiled in parts_of(self, Tiled):
+            # Means are interpolated between neighbouring blocks.
+            tiled.margin = BLOCK if resolutions > 1 else 0
+
+    @property
+    def needs(self) -> Needs:
+        """Those of the method at its coarsest size."""
+        needs, factor = self.inner.needs, 1 << (self.resolutions - 1)
+        reach = None if needs.reach is None else (needs.reach + BLOCK) * factor
+        return Needs(needs.buffers, needs.uses, needs.trainable, reach, needs.stride * factor)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        return Output(self._at(frame if frame.statistics else prepared(self.inner, frame), self.resolutions)), None
+
+    def _at(self, frame: Frame, resolutions: int) -> Tensor:
+        needed = frame.skip is None or torch.compiler.is_compiling() or not bool(frame.skip.mask.all())
+        coarse = self._at(_halved(frame), resolutions - 1) if resolutions > 1 and needed else None
+        fine = self.inner(frame)[0].image
+        if coarse is None:
+            return fine
+        return low_frequencies_of(fine, coarse, frame.statistics["top"], frame.statistics["exposure"])
+
+
+def _halved(frame: Frame) -> Frame:
+    """The frame at half its size, with the statistics of the whole image as they are."""
+    images = {name: downsample(image) for name, image in frame.items() if name in _IMAGES}
+    others = {name: None for name in frame.buffers if name not in images}
+    skip = None if frame.skip is None else Skip(_halved_mask(frame.skip.mask), {})
+    return frame.replace(**(others | images), extra={}, skip=skip)
+
+
+def _halved_mask(mask: Tensor) -> Tensor:
+    """Where nothing is needed at half the size: in tiles that none of the needed pixels, nor of those around, are in."""
+    height, width = mask.shape[-2:]
+    needed = F.pad((~mask).float(), (0, -width % TILE, 0, -height % TILE))
+    tiles = F.max_pool2d(F.max_pool2d(needed, TILE), 3, 1, 1)
+    coarse = F.max_pool2d(tiles, 2, ceil_mode=True).bool()
+    wide = coarse.repeat_interleave(TILE, -2).repeat_interleave(TILE, -1)
+    return ~wide[..., : -(-height // 2), : -(-width // 2)]

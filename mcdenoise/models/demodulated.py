@@ -1,0 +1,70 @@
+"""A method on demodulated radiance: the albedo is divided out before, and multiplied back after."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._journal import note, timed
+from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
+from mcdenoise.ops._rows import by_rows
+
+
+class Demodulated(Wrapper):
+    """Divides the albedo out of the radiance, and multiplies it back into every image of the result.
+
+    That is skipped for a frame without an albedo, and where :func:`mcdenoise.ops.demodulate` would divide by one
+    everywhere.
+
+    Args:
+        inner: any method; it sees the radiance, that of the frame alone and their variance without albedo.
+    """
+
+    def __init__(self, inner: Model) -> None:
+        super().__init__(inner)
+
+    @property
+    def needs(self) -> Needs:
+        """As those inside; an albedo is of use."""
+        needs = self.inner.needs
+        return Needs(needs.buffers, needs.uses | {"albedo"}, needs.trainable, needs.reach, needs.stride)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        albedo, device = frame.albedo, frame.color.device
+        reason = "" if frame.hints.keep_all and albedo is not None else _why_not(albedo)
+        note("demodulate", reason or "albedo", float(reason != ""))
+        if albedo is None or reason:
+            return self.inner(frame, state)
+        with timed("accumulate", device):
+            changes = {
+                name: by_rows(demodulate, image, albedo)
+                for name, image in (("color", frame.color), ("current", frame.current))
+                if image is not None
+            }
+            if frame.variance is not None:
+                # That of a quotient is the variance over the square of the divisor.
+                changes["variance"] = demodulate(demodulate(frame.variance, albedo), albedo)
+        output, state = self.inner(frame.replace(**changes), state)
+        del frame, changes
+        with timed("remodulate", device):
+            # A network that ends with a convolution hands out its precision.
+            stages = {name: _with(albedo, image) for name, image in output.stages.items()}
+            return Output(_with(albedo, output.image), stages), state
+
+
+def _with(albedo: Tensor, image: Tensor) -> Tensor:
+    return by_rows(remodulate, image.to(albedo.dtype), albedo)
+
+
+def _why_not(albedo: Tensor | None) -> str:
+    """Why there is nothing to divide out; empty if there is."""
+    if albedo is None:
+        return "no albedo"
+    if torch.compiler.is_compiling():
+        return ""
+    low, high = (float(value) for value in torch.aminmax(albedo.detach()))
+    return "albedo is one everywhere" if low == high == 1 else "no albedo anywhere" if high < NO_ALBEDO else ""

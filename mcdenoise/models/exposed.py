@@ -1,0 +1,46 @@
+"""A method on exposed radiance: typical radiance is brought to a standard before, and back after."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from mcdenoise.frame import Frame, Skip
+from mcdenoise.models._interface import Output, State
+from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.nn.inputs import auto_exposure
+
+
+class Exposed(Wrapper):
+    """Multiplies the radiance by :func:`mcdenoise.nn.auto_exposure`, and divides every image of the result by it.
+
+    So a method does not depend on a scene's unit: ``model(s x) = s model(x)``.
+
+    Args:
+        inner: any method.
+    """
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """The exposure, and what the model inside finds of the exposed frame."""
+        exposure = auto_exposure(frame.color)
+        exposed = _scaled(frame, exposure).replace(statistics={**frame.statistics, "exposure": exposure})
+        return {**super().statistics(exposed), "exposure": exposure}
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        if "exposure" not in frame.statistics:
+            frame = frame.replace(statistics={**frame.statistics, **self.statistics(frame)})
+        exposure = frame.statistics["exposure"]
+        output, state = self.inner(_scaled(frame, exposure), state)
+        stages = {name: image / exposure for name, image in output.stages.items()}
+        return Output(output.image / exposure, stages), state
+
+
+def _scaled(frame: Frame, factor: Tensor) -> Frame:
+    current = None if frame.current is None else frame.current * factor
+    variance = None if frame.variance is None else frame.variance * factor.square()
+    skip = frame.skip
+    if skip is not None:
+        skip = Skip(skip.mask, {name: image * factor for name, image in skip.images.items()})
+    return frame.replace(color=frame.color * factor, current=current, variance=variance, skip=skip)

@@ -1,0 +1,196 @@
+"""A method in tiles: as small as memory wants them, and only where a result is asked for."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Output, State, prepared
+from mcdenoise.models._journal import note
+from mcdenoise.models._wrapper import Wrapper
+
+# Rectangles begin and end at multiples of this.
+TILE = 32
+# A method on more than this fraction of the image costs as much as on all of it.
+_WORTHWHILE = 0.9
+# Of a method that does not say: some 64 feature channels in float32.
+_BYTES_PER_PIXEL = 4 * 64 + 4 * 54
+
+
+class Tiled(Wrapper):
+    """A method on parts of the image, each with as much around it as its pixels depend on.
+
+    The result is that of the whole image, up to the rounding of convolutions, whose order of summation may depend on
+    the size of the image. Without a reason to divide the image, the method runs once on all of it.
+
+    Args:
+        inner: a method without a state. One that depends on the whole image (``needs.reach`` is ``None``) is never
+            divided.
+        side: longest side of a tile in pixels, a multiple of 32; ``None`` for no limit.
+        margin: how many pixels around those that are asked for have to be right, too.
+    """
+
+    def __init__(self, inner: Model, side: int | None = None, margin: int = 0) -> None:
+        super().__init__(inner)
+        self.side, self.margin = side, margin
+
+    @property
+    def halo(self) -> int | None:
+        """Margin around a tile without which its pixels would not be the same, in pixels."""
+        needs = self.inner.needs
+        if needs.reach is None or TILE % needs.stride:
+            return None
+        return -(-(needs.reach + self.margin) // needs.stride) * needs.stride
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a tile takes while it is computed, for each of its pixels with those around it.
+
+        Args:
+            bfloat16: whether convolutions are in bfloat16, else in float32.
+        """
+        own = getattr(self.inner, "bytes_per_pixel", None)
+        return float(_BYTES_PER_PIXEL if own is None else own(bfloat16=bfloat16))
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        parts = self._parts(frame)
+        if parts is None:
+            note("network", "on 100% of the pixels")
+            return self.inner(frame.replace(skip=None), state)
+        frame = frame if frame.statistics else prepared(self.inner, frame)
+        results: dict[str, Tensor] = {}
+        halo = self.halo or 0
+        for part in parts:
+            around, kept = part.grown(halo, frame.size), part.grown(self.margin, frame.size)
+            output, after = self.inner(frame.crop(*around.slices))
+            if after is not None:
+                raise TypeError("inner: expected a method without a state to compute in tiles, found one with a state")
+            for name, image in {"image": output.image, **output.stages}.items():
+                if name not in results:
+                    results[name] = _known(frame, name).to(image.dtype, copy=True)
+                kept.of(results[name]).copy_(kept.within(around).of(image))
+        computed = sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1])
+        note("network", f"on {computed:.0%} of the pixels", 1 - computed)
+        image = results.pop("image", None)
+        return Output(_known(frame, "image") if image is None else image, results), None
+
+    def _parts(self, frame: Frame) -> list[Region] | None:
+        """The tiles to compute; ``None`` for the whole image at once."""
+        whole = [Region(0, 0, *frame.size)]
+        if self.halo is None or torch.compiler.is_compiling():
+            return None
+        parts = whole if frame.skip is None else regions(~frame.skip.mask, self.halo)
+        if self.side is not None:
+            parts = [tile for part in parts for tile in part.split(self.side)]
+        return None if parts == whole else parts
+
+
+def _known(frame: Frame, stage: str) -> Tensor:
+    """What stands where nothing is computed: the known result, or the input."""
+    return frame.color if frame.skip is None else frame.skip.images.get(stage, frame.color)
+
+
+class Region(NamedTuple):
+    """A rectangle of an image, in pixels; ``bottom`` and ``right`` are outside."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Its rows and columns."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+    def of(self, image: Tensor) -> Tensor:
+        """That part of ``(..., H, W)``."""
+        return image[..., self.top : self.bottom, self.left : self.right]
+
+    def grown(self, margin: int, size: tuple[int, int]) -> Region:
+        """With a margin on all sides, as far as the image goes."""
+        height, width = size
+        return Region(
+            max(self.top - margin, 0),
+            max(self.left - margin, 0),
+            min(self.bottom + margin, height),
+            min(self.right + margin, width),
+        )
+
+    def within(self, around: Region) -> Region:
+        """The same pixels, counted from the corner of a larger rectangle."""
+        return Region(*(side - start for side, start in zip(self, (around.top, around.left) * 2, strict=True)))
+
+    def split(self, side: int) -> list[Region]:
+        """In tiles of about the same size, whose sides are multiples of 32 pixels, and no longer than ``side``.
+
+        Args:
+            side: a multiple of 32 pixels.
+        """
+        rows, columns = _steps(self.top, self.bottom, side), _steps(self.left, self.right, side)
+        return [Region(top, left, bottom, right) for top, bottom in pairwise(rows) for left, right in pairwise(columns)]
+
+    @property
+    def pixels(self) -> int:
+        """How many there are."""
+        return (self.bottom - self.top) * (self.right - self.left)
+
+
+def _steps(start: int, end: int, longest: int) -> list[int]:
+    count = -(-(end - start) // longest)
+    step = -(-(end - start) // (count * TILE)) * TILE
+    return [*range(start, end, step), end]
+
+
+def regions(needed: Tensor, halo: int) -> list[Region]:
+    """Rectangles that hold all pixels that are needed; the whole image where computing less would hardly pay.
+
+    Args:
+        needed: ``(B, 1, H, W)`` true where a result is asked for, in any image of the batch.
+        halo: how far around a rectangle the method has to look, in pixels.
+
+    Returns:
+        Rectangles that do not overlap, without the halo; none where nothing is needed.
+    """
+    size = height, width = needed.shape[-2], needed.shape[-1]
+    padded = F.pad(needed[:, 0], (0, -width % TILE, 0, -height % TILE))
+    # Pooling would be of floats, in twice the time.
+    tiles = padded.reshape(len(needed), padded.shape[1] // TILE, TILE, -1, TILE).any(2).any(3).any(0)
+    boxes = [
+        Region(top * TILE, left * TILE, min(bottom * TILE, height), min(right * TILE, width))
+        for top, left, bottom, right in _boxes(tiles, -(-2 * halo // TILE))
+    ]
+    cost = sum(box.grown(halo, size).pixels for box in boxes)
+    return [Region(0, 0, height, width)] if cost > _WORTHWHILE * height * width else boxes
+
+
+def _boxes(tiles: Tensor, gap: int) -> list[Region]:
+    """Boxes around groups of tiles; groups whose halos touch are one."""
+    boxes = [Region(y, x, y + 1, x + 1) for y, x in tiles.nonzero().tolist()]
+    merged = True
+    while merged:
+        merged, left = False, boxes
+        boxes = []
+        for box in left:
+            near = next((i for i, other in enumerate(boxes) if _near(box, other, gap)), None)
+            if near is None:
+                boxes.append(box)
+                continue
+            other, merged = boxes[near], True
+            boxes[near] = Region(
+                min(box.top, other.top),
+                min(box.left, other.left),
+                max(box.bottom, other.bottom),
+                max(box.right, other.right),
+            )
+    return boxes
+
+
+def _near(a: Region, b: Region, gap: int) -> bool:
+    rows = a.top <= b.bottom + gap and b.top <= a.bottom + gap
+    return rows and a.left <= b.right + gap and b.left <= a.right + gap

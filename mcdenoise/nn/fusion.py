@@ -1,0 +1,66 @@
+"""Fusion modules: how much of a fine image's low frequencies a coarse image takes the place of, learnt."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.ops import laplacian_fusion, upsample
+from mcdenoise.ops._fused import gated_fusion
+
+
+class FusionModule(nn.Module):
+    """FM of the paper's Fig. 2: predicts the blending weight of Eq. 2 from both images, and blends.
+
+    ``alpha = sigmoid(conv3x3([i_f, U i_c]))``, ``o = i_f - alpha U D i_f + alpha U i_c``. The paper names the module
+    and its input and leaves its layers open: it is one convolution here.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(6, 1, 3, padding=1)
+
+    def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
+        """Fuse two scales.
+
+        Args:
+            fine: ``(B, 3, H, W)`` i_f, radiance.
+            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` i_c, radiance.
+        """
+        both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)
+        return laplacian_fusion(fine, coarse, torch.sigmoid(self.conv(both)))
+
+
+class LogFusion(nn.Module):
+    """:class:`FusionModule` of logarithms of radiance.
+
+    In linear radiance the low frequencies of a lamp, exchanged between scales, would drag the pixels beside it far
+    below zero.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(6, 1, 3, padding=1)
+
+    def forward(
+        self,
+        fine: Tensor,
+        coarse: Tensor,
+        residual: Tensor | None = None,
+        top: Tensor | None = None,
+        logarithms: bool = False,
+    ) -> Tensor:
+        """Fuse two scales.
+
+        Args:
+            fine: ``(B, 3, H, W)`` logarithms of radiance.
+            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` likewise.
+            residual: ``(B, 3, H, W)`` to be added to the fine image; none by default.
+            top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result. With it, the result is radiance.
+            logarithms: whether to take those of the fine image, which then is radiance.
+
+        Returns:
+            ``(B, 3, H, W)`` logarithms of radiance, or radiance.
+        """
+        weight, bias = self.conv.parameters()
+        return gated_fusion(fine, coarse, weight, bias, residual=residual, top=top, logarithms=logarithms)

@@ -1,0 +1,97 @@
+"""What networks see of a frame: every buffer in a range from 0 to about 1, whatever the units of the scene."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.frame import Frame
+from mcdenoise.ops._fused import depth_scale, network_features, network_input, normalized_depth
+
+FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, one over the length 1
+
+
+def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
+    """The factor that brings an image's typical radiance to ``key``, so that no network depends on a scene's unit.
+
+    ``key / exp(mean(log(blocks)))`` over the means of 16x16-pixel blocks: a block mean is hardly moved by the noise,
+    the logarithm by a lamp in view.
+
+    Args:
+        color: ``(B, C, H, W)`` radiance up to 1e35; what is below 1e-30 counts as that.
+        key: radiance that the typical block is brought to.
+
+    Returns:
+        ``(B, 1, 1, 1)`` positive factor; 1 for a black image. The factor has no gradient.
+    """
+    # Half precision as float32, float64 as it is.
+    luminance = color.detach().to(torch.promote_types(color.dtype, torch.float32)).mean(1, keepdim=True)
+    blocks = F.avg_pool2d(luminance, 16, ceil_mode=True, count_include_pad=False)
+    mean = blocks.mean((1, 2, 3), keepdim=True)
+    lit = mean > 0
+    # Of the mean, so that the logarithms are small numbers at any exposure. Black blocks count as a thousandth of it.
+    fractions = (blocks / torch.where(lit, mean, 1)).clamp_min(1e-3)
+    typical = (mean * torch.exp(torch.log(fractions).mean((1, 2, 3), keepdim=True))).clamp_min(1e-30)
+    return torch.where(lit, key / typical, 1).to(color.dtype)
+
+
+def normalize_depth(depth: Tensor) -> Tensor:
+    """Depth in [0, 1), whatever the scene's unit: ``d / (d + typical d)``, and 1 where nothing was hit.
+
+    Args:
+        depth: ``(B, 1, H, W)`` distance, scene units, ``inf`` where nothing was hit.
+
+    Returns:
+        ``(B, 1, H, W)`` in [0, 1]. The typical depth is the image's geometric mean over what was hit.
+    """
+    return normalized_depth(depth, *depth_scale(depth))
+
+
+def features_of(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+    """Albedo, normal and depth of a frame; one that it lacks is constant, which guides nothing."""
+    color = frame.color
+    albedo = torch.ones_like(color) if frame.albedo is None else frame.albedo
+    normal = torch.zeros_like(color) if frame.normal is None else frame.normal
+    return albedo, normal, torch.ones_like(color[:, :1]) if frame.depth is None else frame.depth
+
+
+def image_statistics(frame: Frame) -> dict[str, Tensor]:
+    """Exposure and depth scale of a whole image, if the frame does not have them already.
+
+    Returns:
+        ``exposure`` ``(B, 1, 1, 1)``, see :func:`auto_exposure`; ``depth_scale`` ``(B, 2, 1, 1)``, the largest finite
+        depth, and the typical one as a fraction of it. A second network takes what the first one found.
+    """
+    found = {name: frame.statistics[name] for name in ("exposure", "depth_scale") if name in frame.statistics}
+    if "exposure" not in found:
+        found["exposure"] = auto_exposure(frame.color)
+    if "depth_scale" not in found:
+        depth = frame.color.new_ones(len(frame.color), 1, 1, 1) if frame.depth is None else frame.depth
+        found["depth_scale"] = torch.cat(depth_scale(depth), 1)
+    return found
+
+
+def buffers_input(frame: Frame, image: Tensor, *, logarithms: bool = True) -> Tensor:
+    """A network's input: the logarithm of an image, and the features of a frame.
+
+    Args:
+        frame: with the statistics of :func:`image_statistics`.
+        image: ``(B, 3, H, W)`` exposed radiance, or its logarithm already.
+        logarithms: whether to take it.
+
+    Returns:
+        ``(B, 14, H, W)``: ``log1p(image)``, albedo, normal and depth in [0, 1], ``log1p`` of the exposed radiance of
+        the frame alone, and one over the history length.
+    """
+    current = frame.color if frame.current is None else frame.current
+    exposure, scale = frame.statistics["exposure"], frame.statistics["depth_scale"].split(1, 1)
+    features = network_features(*features_of(frame), current, frame.length, exposure, (scale[0], scale[1]))
+    return network_input(image, features, logarithms=logarithms)
+
+
+def guides_of(frame: Frame) -> list[Tensor]:
+    """Normal and depth in [0, 1], which guide bilateral weights."""
+    _, normal, depth = features_of(frame)
+    largest, typical = frame.statistics["depth_scale"].split(1, 1)
+    return [normal * 0.5 + 0.5, normalized_depth(depth, largest, typical)]
