@@ -20,7 +20,8 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.unet import Head, UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
 from mcdenoise.ops._backend import choose_backend
-from mcdenoise.ops._fused import (
+from mcdenoise.ops._rows import by_rows
+from mcdenoise.ops._steps.network import (
     BLOCK,
     depth_scale,
     gated_fusion,
@@ -30,7 +31,6 @@ from mcdenoise.ops._fused import (
     normalized_depth,
     softplus,
 )
-from mcdenoise.ops._rows import by_rows
 
 FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, its share 1
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of f1, f2, f3
