@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -12,7 +11,6 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.ops import (
-    NO_ALBEDO,
     Accumulate,
     ClampFireflies,
     HistoryLag,
@@ -20,27 +18,18 @@ from mcdenoise.ops import (
     demodulate,
     motion_from_position,
 )
-from mcdenoise.ops._backend import Backend, choose_backend
-from mcdenoise.ops._rows import by_rows
-from mcdenoise.ops.temporal import Shorter, accumulate_numba
+from mcdenoise.ops._steps.history import COLOR, MEAN, SQUARE, blend, incoming, lights, without_history
 
 # A cut leaves a few accidental matches; a fast pan keeps far more than this share of the image.
 _CUT_SHARE = 0.05
 # What a mirror or glass shows does not move as its surface does: a long history would smear it.
 _SPECULAR_LENGTH = 2
-_STILL = 0.05  # pixels
 _CUT = "cut"
 _NO_WAY = "no motion, and no position with a previous camera"
-# Of the shorter history that the long one is compared with: four frames have half the noise of one.
-_RECENT_ALPHA = 0.25
-# As many equally weighted frames have the noise of that history, once it is full: (2 - alpha) / alpha.
-_RECENT_FRAMES = 7
 # Light of more than this share, in the median block, is no firefly's; a shot whose light is caustics has another limit.
 _LOST, CAUSTICS = 0.1, 120.0
-# A light that is seen: how far the compressed radiance of 3x3 pixels may differ, how bright they are beside the mean of
-# a window, and how far they may vary over the past. Fewer pixels are often alike by chance where one of a few lights is
-# drawn for each, and some of the light is lost to that.
-_EVEN, _BRIGHTER, _LIGHT_WINDOW, _STEADY = 0.03, 1.2, 9, 0.1
+# How far the compressed radiance of a light that is seen may vary over the past.
+_STEADY = 0.1
 # Side of a block in pixels; rows of blocks that are looked at; and how few blocks say nothing.
 _BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
 
@@ -73,69 +62,6 @@ def motion_to_previous(frame: Frame, previous_view_projection: Tensor | None) ->
 def _thinned(image: Tensor) -> Tensor:
     """One pixel in 64: enough to see most of what moves."""
     return image[..., ::8, ::8]
-
-
-def _compressed(color: Tensor) -> Tensor:
-    """What the test for lag compares means of: the fourth root of the radiance, in which a firefly hides little.
-
-    Any power keeps the ratio of a difference to its noise at any exposure; a logarithm would need a unit.
-    """
-    return color.detach().mean(1, keepdim=True).clamp_min(0).sqrt().sqrt()
-
-
-def _lag(lag: HistoryLag, history: Tensor, recent: Tensor, variance: Tensor) -> Tensor:
-    """The test in half the resolution, for a quarter of the time: a window holds as many pixels, in blocks of four."""
-    height, width = history.shape[-2:]
-    halves = (
-        F.avg_pool2d(image, 2, ceil_mode=True, count_include_pad=False) for image in (history, recent, variance / 4)
-    )
-    share: Tensor = lag(*halves).repeat_interleave(2, -2).repeat_interleave(2, -1)
-    return share[..., :height, :width]
-
-
-def _entering(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None, compared: bool) -> Tensor:
-    """Color without albedo and fireflies; for the test for lag also what that compares."""
-    reach = clamp.kernel_size // 2
-    if albedo is not None:
-        color = by_rows(lambda *rows: clamp(demodulate(*rows)), color, albedo, reach=reach)
-    else:
-        color = by_rows(clamp, color, reach=reach)
-    color = color.to(torch.promote_types(color.dtype, torch.float32))
-    if not compared:
-        return color
-    mean = _compressed(color)
-    return torch.cat([color, mean, mean.square()], 1)
-
-
-def _entering_numba(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None, compared: bool) -> Tensor:
-    """As :func:`_entering`, in one pass."""
-    from mcdenoise.ops._fast import history as fast
-
-    entering: Tensor = fast.incoming(color, albedo, clamp.limit, clamp.kernel_size, compared)
-    return entering
-
-
-def _lights(root: Tensor) -> Tensor:
-    """Where, by one frame, a light is seen: 1 in blocks of 3x3 pixels that are alike and brighter than what is around.
-
-    Args:
-        root: ``(B, 1, H, W)`` compressed radiance.
-    """
-    if min(root.shape[-2:]) < 3:
-        return torch.zeros_like(root)
-    largest, smallest = F.max_pool2d(root, 3, 1), -F.max_pool2d(-root, 3, 1)
-    even = (largest - smallest <= _EVEN * largest).to(root.dtype)
-    some = F.max_pool2d(F.pad(even, (2, 2, 2, 2)), 3, 1)
-    around = F.avg_pool2d(root, _LIGHT_WINDOW, 1, _LIGHT_WINDOW // 2, count_include_pad=False)
-    return some * (root > _BRIGHTER * around)
-
-
-def _lights_numba(root: Tensor) -> Tensor:
-    """As :func:`_lights`, in one pass."""
-    from mcdenoise.ops._fast import history as fast
-
-    found: Tensor = fast.lights(root, _EVEN, _BRIGHTER, _LIGHT_WINDOW)
-    return found
 
 
 def _takes_light(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None) -> list[bool]:
@@ -202,15 +128,6 @@ class _State(NamedTuple):
         return self.length.shape == color[:, :1].shape and self.length.device == color.device
 
 
-# The channels of a state.
-_COLOR, _MEAN, _SQUARE, _RECENT, _RECENT_MEAN = slice(0, 3), slice(3, 4), slice(4, 5), slice(5, 9), slice(8, 9)
-
-
-def _with_recent(entering: Tensor) -> Tensor:
-    """All channels of a :class:`_State`."""
-    return torch.cat([entering, entering[:, : _SQUARE.start]], 1) if entering.shape[1] > _SQUARE.start else entering
-
-
 class _Past(NamedTuple):
     """A frame with its past: the first two of the next :class:`_State`, and why there is no more past, or ``""``."""
 
@@ -220,12 +137,12 @@ class _Past(NamedTuple):
 
     def steady(self) -> Tensor:
         """Where the compressed radiance has hardly varied."""
-        mean = self.color[:, _MEAN]
-        return self.color[:, _SQUARE] - mean.square() <= (_STEADY * mean).square()
+        mean = self.color[:, MEAN]
+        return self.color[:, SQUARE] - mean.square() <= (_STEADY * mean).square()
 
 
 def _no_past(entering: Tensor, reset: str) -> _Past:
-    return _Past(_with_recent(entering), torch.ones_like(entering[:, :1]), reset)
+    return _Past(without_history(entering), torch.ones_like(entering[:, :1]), reset)
 
 
 class History:
@@ -329,32 +246,26 @@ class History:
             keeps: remember the frame; not needed for the last one.
         """
         frame, state = frame.with_depth(), self._state
-        before = () if state is None or not state.fits(frame.color) else (state.color, state.length)
-        images = (frame.color, *(image for _, image in frame.items()), *before)
-        backend = choose_backend(self.accumulate.backend, *images, differentiable=False, forms=("torch", "numba"))
         albedo = frame.albedo if demodulates else None
-        if not before:
+        if state is None or not state.fits(frame.color):
             self._clamps = self._chosen(frame.color, albedo)
         # What has no past and will be none is compared with nothing.
         compared = self.anti_lag is not None and (keeps or state is not None)
-        entering = self._entering(frame.color, albedo, compared, backend)
-        lights = None
-        if compared:
-            find = _lights_numba if backend == "numba" else partial(by_rows, _lights, reach=_LIGHT_WINDOW // 2)
-            lights = find(entering[:, _MEAN])
-        past = self._blend(frame, entering, lights, reprojects, backend)
+        entering = self._entering(frame.color, albedo, compared)
+        seen = lights(entering[:, MEAN], backend=self.accumulate.backend) if compared else None
+        past = self._blend(frame, entering, seen, reprojects)
         if past.reset == _CUT:
             # Another shot may be of another light, which is seen only now.
             before_cut, self._clamps = self._clamps, self._chosen(frame.color, albedo)
             if [clamp.limit for clamp in self._clamps] != [clamp.limit for clamp in before_cut]:
-                entering = self._entering(frame.color, albedo, compared, backend)
+                entering = self._entering(frame.color, albedo, compared)
                 past = _no_past(entering, _CUT)
         self._state = None
         if keeps:
-            label = None if lights is None else lights * past.steady()
+            label = None if seen is None else seen * past.steady()
             surface = Surface(frame.position, frame.normal, frame.depth, label)
             self._state = _State(past.color, past.length, surface, frame.view_projection)
-        return Accumulated(past.color[:, _COLOR], entering[:, _COLOR], past.length, past.reset)
+        return Accumulated(past.color[:, COLOR], entering[:, COLOR], past.length, past.reset)
 
     def _chosen(self, color: Tensor, albedo: Tensor | None) -> list[ClampFireflies]:
         """How the fireflies of the shot are clamped that begins with this frame."""
@@ -365,18 +276,14 @@ class History:
         alike = len(set(caustics)) < 2
         return [ClampFireflies(CAUSTICS) if each else strict for each in ([any(caustics)] if alike else caustics)]
 
-    def _entering(self, color: Tensor, albedo: Tensor | None, compared: bool, backend: Backend) -> Tensor:
+    def _entering(self, color: Tensor, albedo: Tensor | None, compared: bool) -> Tensor:
         """The frame as it is accumulated: all channels of a :class:`_State` but the recent ones, which are the same."""
-        entering = _entering_numba if backend == "numba" else _entering
-        if len(self._clamps) == 1:
-            return entering(self._clamps[0], color, albedo, compared)
-        colors = color.split(1)
-        albedos = [None] * len(colors) if albedo is None else albedo.split(1)
-        return torch.cat([entering(*each, compared) for each in zip(self._clamps, colors, albedos, strict=True)])
+        limits = [clamp.limit for clamp in self._clamps]
+        limit = limits[0] if len(limits) == 1 else torch.tensor(limits, device=color.device).reshape(-1, 1, 1, 1)
+        window = self._clamps[0].kernel_size
+        return incoming(color, albedo, limit, window, compared=compared, backend=self.accumulate.backend)
 
-    def _blend(
-        self, frame: Frame, entering: Tensor, lights: Tensor | None, reprojects: bool, backend: Backend
-    ) -> _Past:
+    def _blend(self, frame: Frame, entering: Tensor, seen: Tensor | None, reprojects: bool) -> _Past:
         """The frame with its past."""
         state = self._state
         if state is None:
@@ -389,78 +296,18 @@ class History:
             motion = motion_to_previous(frame, state.view_projection)
             if motion is None:
                 return _no_past(entering, _NO_WAY)
-        blend = self._blended_numba if backend == "numba" else self._blended
-        blended = blend(frame, surface_before(frame)._replace(label=lights), entering, motion, state)
-        return _no_past(entering, _CUT) if blended is None else _Past(*blended, "")
-
-    def _blended(
-        self, frame: Frame, surface: Surface, entering: Tensor, motion: Tensor | None, state: _State
-    ) -> tuple[Tensor, Tensor] | None:
-        """Color and length of the frame with its past, ``None`` at a cut."""
-        color = _with_recent(entering)
-        past, length = self.accumulate(color, state.color, state.length, motion, surface, state.surface)
-        if int((length > 1).sum()) < _CUT_SHARE * length.numel():
-            return None
-        if frame.albedo is not None and motion is not None:
-            both = by_rows(self._shortened, color, past, length, frame.albedo, motion)
-            past, length = both[:, :-1], both[:, -1:]
-        if self.anti_lag is not None:
-            # Pairs of rows stay together.
-            reach = 2 * (self.anti_lag.kernel_size // 2)
-            both = by_rows(partial(self._without_lag, self.anti_lag), color, past, length, reach=reach)
-            past, length = both[:, :-1], both[:, -1:]
-        return past, length
-
-    def _blended_numba(
-        self, frame: Frame, surface: Surface, entering: Tensor, motion: Tensor | None, state: _State
-    ) -> tuple[Tensor, Tensor] | None:
-        """As :meth:`_blended`, with one pass over the images for all but the test for lag, which is in three."""
-        from mcdenoise.ops._fast import history as fast
-
-        rule = self.accumulate
-        recent_alpha = max(rule.alpha_min, _RECENT_ALPHA)
-        past, length, kept = accumulate_numba(
-            *(entering, state.color, state.length, motion, surface, state.surface),
-            *(rule.alpha_min, rule.rule, rule.position_limit, rule.normal_limit),
-            Shorter(recent_alpha, frame.albedo, self.specular_length + 1, _STILL),
+        rule, lag = self.accumulate, self.anti_lag
+        color, length, kept = blend(
+            *(entering, state.color, state.length, motion),
+            *(surface_before(frame)._replace(label=seen), state.surface),
+            alpha_min=rule.alpha_min,
+            rule=rule.rule,
+            position_limit=rule.position_limit,
+            normal_limit=rule.normal_limit,
+            albedo=frame.albedo,
+            specular_length=self.specular_length,
+            lag_threshold=math.inf if lag is None else lag.threshold,
+            lag_kernel_size=HistoryLag().kernel_size if lag is None else lag.kernel_size,
+            backend=rule.backend,
         )
-        if int(kept.sum()) < _CUT_SHARE * length.numel():
-            return None
-        if self.anti_lag is not None:
-            settings = (self.anti_lag.threshold, self.anti_lag.kernel_size, recent_alpha, _RECENT_FRAMES)
-            fast.give_up_lag(past, length, entering, *settings)
-        return past, length
-
-    def _without_lag(self, lag: HistoryLag, color: Tensor, past: Tensor, length: Tensor) -> Tensor:
-        """Color and length of what still holds: of the recent past by the frame, of the long one by the recent one."""
-        mean, square = past[:, _MEAN], past[:, _SQUARE]
-        counted = length.clamp_min(2)
-        variance = (square - mean.square()).clamp_min(0) * (counted / (counted - 1))
-        # Accumulated with the long one's share of the frame, which is the smaller one.
-        alpha_min = max(self.accumulate.alpha_min, _RECENT_ALPHA)
-        share = self._share_of_past(length, alpha_min) / self._share_of_past(length).clamp_min(1e-6)
-        recent = torch.lerp(color[:, _RECENT], past[:, _RECENT], share)
-        recent = torch.lerp(recent, color[:, _RECENT], _lag(lag, recent[:, 3:], color[:, _RECENT_MEAN], variance))
-        share = _lag(lag, mean, recent[:, 3:], variance / length.clamp_max(_RECENT_FRAMES))
-        shorter = torch.cat([recent, recent[:, 3:].square() + variance], 1)
-        longer = torch.lerp(past[:, : _RECENT.start], shorter, share)
-        return torch.cat([longer, recent, torch.lerp(length, length.clamp_max(1 / alpha_min), share)], 1)
-
-    def _shortened(self, color: Tensor, accumulated: Tensor, length: Tensor, albedo: Tensor, motion: Tensor) -> Tensor:
-        """Color and length if the past of mirrors and glass that move is no longer than ``specular_length``.
-
-        Which pixels those are is known in this frame, the past's length in the previous one. So the past is shortened
-        after it was blended in: ``lerp(color, past, p)`` with a smaller ``p`` lies on the way back to ``color``.
-        """
-        longest = self.specular_length + 1
-        # A reduction over the channels takes a hundred times as long.
-        moves = torch.hypot(motion[:, :1], motion[:, 1:]) > _STILL
-        specular = albedo.amax(1, keepdim=True) < NO_ALBEDO
-        too_long = moves & specular & (length > longest)
-        share = self._share_of_past(length.clamp_max(longest)) / self._share_of_past(length).clamp_min(1e-6)
-        shortened = torch.lerp(color, accumulated, share.to(color.dtype))
-        return torch.cat([torch.where(too_long, shortened, accumulated), torch.where(too_long, longest, length)], 1)
-
-    def _share_of_past(self, length: Tensor, alpha_min: float | None = None) -> Tensor:
-        """The weight of the past in a result of history length ``length``, see :func:`mcdenoise.ops.accumulate`."""
-        return 1 - (1 / length).clamp_min(self.accumulate.alpha_min if alpha_min is None else alpha_min)
+        return _no_past(entering, _CUT) if float(kept.mean()) < _CUT_SHARE else _Past(color, length, "")

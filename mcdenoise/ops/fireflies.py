@@ -16,7 +16,7 @@ LIMIT = 15.0
 KERNEL_SIZE = 7
 
 
-def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = KERNEL_SIZE) -> Tensor:
+def clamp_fireflies(image: Tensor, *, limit: float | Tensor = LIMIT, kernel_size: int = KERNEL_SIZE) -> Tensor:
     """Scale down every pixel that is brighter than ``limit`` times the mean of its lit neighbours, and keep its hue.
 
     With ``y`` the mean over the channels and ``n[p]`` the mean of ``y`` over the other pixels of the window around
@@ -30,7 +30,8 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
 
     Args:
         image: ``(B, C, H, W)`` noisy radiance, finite and non-negative, any unit; usually demodulated.
-        limit: how many times as bright as its neighbours' mean a pixel may be, above 0; infinity changes nothing.
+        limit: how many times as bright as its neighbours' mean a pixel may be, above 0; infinity changes nothing. A
+            number, or ``(B, 1, 1, 1)`` of each image, whose values are not checked.
         kernel_size: side of the window in pixels, odd, at least 3.
 
     Returns:
@@ -53,8 +54,14 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
         [15.0, 15.0, 15.0]
     """
     check_shapes(image=(image, "B C H W"))
-    _check_settings(limit, kernel_size)
-    if limit == math.inf or image.numel() == 0:
+    if isinstance(limit, Tensor):
+        check_shapes(image=(image, "B C H W"), limit=(limit, "B 1 1 1"))
+        _check_settings(LIMIT, kernel_size)
+    else:
+        _check_settings(limit, kernel_size)
+        if limit == math.inf:
+            return image
+    if image.numel() == 0:
         return image
     source = image.to(accumulator_dtype(image.dtype))
     # Of the brightness only ratios matter, so it is scaled to where no sum overflows: by a power of two, which rounds
@@ -69,8 +76,11 @@ def clamp_fireflies(image: Tensor, *, limit: float = LIMIT, kernel_size: int = K
     around, lit = _neighbours(brightness, radius), _neighbours((brightness > 0).to(source.dtype), radius)
     # Finite in the dtype: infinity times dark neighbours, or times a derivative of zero, would be NaN.
     largest = torch.finfo(source.dtype).max
-    highest = (around * (min(limit, largest) / lit.clamp_min(1))).clamp_max(largest)
+    bound = limit.to(source.dtype).clamp_max(largest) if isinstance(limit, Tensor) else min(limit, largest)
+    highest = (around * (lit.clamp_min(1).reciprocal() * bound)).clamp_max(largest)
     bright = (brightness > highest) & (lit > 0)
+    if isinstance(limit, Tensor):
+        bright = bright & (limit < math.inf)
     # Divided first: the ratio of the limit to a very bright pixel, and of that its derivative, is too small a number.
     clamped = source / torch.where(bright, brightness, 1) * highest
     return torch.where(bright, clamped, source).to(image.dtype)

@@ -281,8 +281,7 @@ def accumulate(
         previous=(previous, "B C H W"),
         previous_length=(previous_length, "B 1 H W"),
     )
-    if not 0 < alpha_min <= 1:
-        raise ValueError(f"alpha_min: expected in (0, 1], found {alpha_min}")
+    check_alpha(alpha_min)
     images = (color, previous, previous_length)
     surfaces = (*(surface or ()), *(previous_surface or ()))
     if choose_backend(backend, *images, motion, *surfaces, differentiable=False, forms=("torch", "numba")) == "numba":
@@ -311,7 +310,7 @@ def accumulate(
 
 
 class Shorter(NamedTuple):
-    """Where the past is to be shorter, see :class:`mcdenoise.history.History`.
+    """Where the past is to be shorter, see :func:`mcdenoise.ops._steps.history.blend`.
 
     Args:
         recent_alpha: smallest weight of the current frame in a second, shorter past of the first channels.
@@ -439,6 +438,12 @@ def _comparable(surface: Surface | None, previous: Surface | None, like: Tensor)
         )
         pairs.append((a.detach(), b.detach()))
     return Surface(*(a for a, _ in pairs)), Surface(*(b for _, b in pairs))
+
+
+def check_alpha(alpha_min: float) -> None:
+    """``ValueError`` for a weight outside (0, 1]."""
+    if not 0 < alpha_min <= 1:
+        raise ValueError(f"alpha_min: expected in (0, 1], found {alpha_min}")
 
 
 def _check_known(rule: str) -> None:

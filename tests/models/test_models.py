@@ -39,7 +39,7 @@ from mcdenoise.models._regions import halved, regions
 from mcdenoise.models.cascaded import FEATURES, auto_exposure, normalize_depth
 from mcdenoise.ops import cross_bilateral_weights, downsample, kernel_conv
 from mcdenoise.ops._backend import preferred
-from mcdenoise.ops._fused import low_frequencies_of
+from mcdenoise.ops._steps.network import low_frequencies_of
 
 SHIPPED = Path(__file__).parents[2] / "mcdenoise" / "models" / "weights"
 WIDTH = 8

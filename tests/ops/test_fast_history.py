@@ -13,11 +13,12 @@ from plain_form import channels_last, every_other_column, slice_of_pixels, trans
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.history import Accumulated, History, _lights
-from mcdenoise.ops import Accumulate, ClampFireflies, HistoryLag, clamp_fireflies, demodulate
+from mcdenoise.history import Accumulated, History
+from mcdenoise.ops import Accumulate, ClampFireflies, HistoryLag, Surface, clamp_fireflies, demodulate
 from mcdenoise.ops._fast import _numba_filter
-from mcdenoise.ops._fast.history import give_up_lag, incoming, lights
+from mcdenoise.ops._fast import history as fast
 from mcdenoise.ops._fast.temporal import accumulate, motion_from_position
+from mcdenoise.ops._steps import history as steps
 
 SIZE = (37, 23)
 FRAMES = 9
@@ -223,7 +224,26 @@ def test_what_enters_is_demodulated_and_clamped(limit: float, with_albedo: bool)
     assert frame.albedo is not None
     color = demodulate(frame.color, frame.albedo) if with_albedo else frame.color
     expected = clamp_fireflies(color, limit=limit)
-    found = incoming(frame.color, frame.albedo if with_albedo else None, limit, 7, True)
+    given = frame.albedo if with_albedo else None
+    for limits in (limit, torch.full((1, 1, 1, 1), limit)):
+        for backend in ("numba", "torch"):
+            found = steps.incoming(frame.color, given, limits, 7, backend=backend)
+            assert_enters(found, expected)
+
+
+def test_every_image_has_its_own_limit_of_fireflies() -> None:
+    frame = WAYS["two images"][0]
+    limits = torch.tensor([2.0, math.inf]).reshape(-1, 1, 1, 1)
+    alone = [
+        clamp_fireflies(image, limit=limit) for image, limit in zip(frame.color.split(1), (2.0, math.inf), strict=True)
+    ]
+    assert not torch.equal(alone[0], frame.color[:1])
+    assert torch.equal(clamp_fireflies(frame.color, limit=limits), torch.cat(alone))
+    for backend in ("numba", "torch"):
+        assert_enters(steps.incoming(frame.color, None, limits, 7, backend=backend), torch.cat(alone))
+
+
+def assert_enters(found: Tensor, expected: Tensor) -> None:
     torch.testing.assert_close(found[:, :3], expected, rtol=1e-14, atol=0)
     torch.testing.assert_close(found[:, 3:4], expected.mean(1, keepdim=True) ** 0.25, rtol=1e-14, atol=0)
     torch.testing.assert_close(found[:, 4:], expected.mean(1, keepdim=True) ** 0.5, rtol=1e-14, atol=0)
@@ -262,8 +282,59 @@ def test_lights(size: tuple[int, int]) -> None:
         expected[b, 0, y, x] = alike and image[y, x] > 1.2 * window.mean()
     assert expected.any() == (min(size) > 4)
     for strided in (root, transposed(root), every_other_column(root)):
-        assert torch.equal(lights(strided, 0.03, 1.2, 9), expected)
-    assert torch.equal(_lights(root), expected)
+        for backend in ("numba", "torch"):
+            assert torch.equal(steps.lights(strided, backend=backend), expected)
+
+
+def step(
+    color: Tensor,
+    albedo: Tensor,
+    limit: Tensor,
+    history: Tensor,
+    length: Tensor,
+    motion: Tensor,
+    position: Tensor,
+    normal: Tensor,
+    depth: Tensor,
+) -> tuple[Tensor, ...]:
+    """One frame of a history, with itself as the surface before."""
+    entering = steps.incoming(color, albedo, limit)
+    surface = Surface(position, normal, depth, steps.lights(entering[:, steps.MEAN]))
+    settings = {"albedo": albedo, "specular_length": 2, "lag_threshold": 2.0}
+    return tuple(steps.blend(entering, history, length, motion, surface, surface, **settings))
+
+
+class Step(torch.nn.Module):
+    def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
+        return step(*images)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_step_is_traced_without_a_break() -> None:
+    frames = [frame.to(torch.float32) for frame in WAYS["two images"]]
+    history = steps.without_history(steps.incoming(frames[3].color, frames[3].albedo))
+    names = ("motion", "position", "normal", "depth")
+    buffers = [getattr(frames[4], name) for name in names]
+    limit, length = torch.tensor([15.0, 120.0]).reshape(2, 1, 1, 1), torch.full_like(history[:, :1], 5.0)
+    images = (frames[4].color, frames[4].albedo, limit, history, length, *buffers)
+    expected = step(*images)
+    assert expected[1].unique().numel() > 2
+    torch.compiler.reset()
+    exported = torch.export.export(Step(), images).module()
+    for traced in (torch.compile(step, fullgraph=True, backend="aot_eager"), exported):
+        for result, plain in zip(traced(*images), expected, strict=True):
+            torch.testing.assert_close(result, plain)
+
+
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+def test_pixels_that_found_their_surface_are_counted_image_by_image(backend: Any) -> None:
+    color = torch.ones(2, 3, 10, 10)
+    depth = torch.ones(2, 1, 10, 10)
+    before = depth.clone()
+    before[1, :, :3] = 5.0
+    surfaces = (Surface(depth=depth), Surface(depth=before))
+    blended = steps.blend(color, color, depth, None, *surfaces, backend=backend)
+    torch.testing.assert_close(blended.kept, torch.tensor([1.0, 0.7]))
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -273,10 +344,10 @@ def test_they_are_what_their_schemas_say() -> None:
     surface = [frame.position, frame.normal, frame.depth, length.round()]
     blended = (image[0, :, :5], image[1], length, frame.motion, surface, surface, 0.1, False, 0.02, 0.5, 0.25)
     for operator, arguments in (
-        (incoming, (frame.color, frame.albedo, 30.0, 7, True)),
+        (fast.incoming, (frame.color, frame.albedo, length.new_full((1,), 30.0), 7, True)),
         (motion_from_position, (frame.position, frame.view_projection)),
         (accumulate, (*blended, frame.albedo, 3.0, 0.05)),
-        (lights, (image[0, :, 3:4], 0.03, 1.2, 9)),
-        (give_up_lag, (image[0], length, image[1, :, :5].contiguous(), 2.0, 5, 0.25, 7.0)),
+        (fast.lights, (image[0, :, 3:4], 0.03, 1.2, 9)),
+        (fast.give_up_lag, (image[0], length, image[1, :, :5].contiguous(), 2.0, 5, 0.25, 7.0)),
     ):
         torch.library.opcheck(operator._overload, arguments, test_utils=("test_schema", "test_faketensor"))

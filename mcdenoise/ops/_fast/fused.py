@@ -25,7 +25,7 @@ from mcdenoise.ops._fast._numba_filter import (
     source,
 )
 from mcdenoise.ops._fast._operator import custom_op
-from mcdenoise.ops._fused import BLOCK
+from mcdenoise.ops._steps.network import BLOCK
 from mcdenoise.ops._window import accumulator_dtype
 
 # Pixels whose channels are gathered at a time: they stay in the second-level cache.
@@ -38,7 +38,7 @@ _CHUNK = 1024
     schema="(Tensor image, Tensor features, bool logarithms, ScalarType dtype) -> Tensor",
 )
 def network_input(image: Tensor, features: Tensor, logarithms: bool, dtype: torch.dtype) -> Tensor:
-    """See :func:`mcdenoise.ops._fused.network_input`."""
+    """See :func:`mcdenoise.ops._steps.network.network_input`."""
     result = _empty_input(image, features, logarithms, dtype)
     if result.numel():
         sums = torch.promote_types(dtype, torch.float32)
@@ -75,6 +75,138 @@ def _stack(
                 _round(bits[c, :n], rows[c])
             start = b * strides[0] + y * strides[2] + x0 * strides[3]
             _interleave(memory[start : start + n * channels], bits)
+
+
+@custom_op(
+    "mcdenoise::buffers_input",
+    device_types="cpu",
+    schema="(Tensor image, Tensor albedo, Tensor normal, Tensor depth, Tensor current, Tensor? length, "
+    "Tensor exposure, Tensor largest, Tensor typical, Tensor? image_factor, bool logarithms, ScalarType dtype) "
+    "-> Tensor",
+)
+def buffers_input(
+    image: Tensor,
+    albedo: Tensor,
+    normal: Tensor,
+    depth: Tensor,
+    current: Tensor,
+    length: Tensor | None,
+    exposure: Tensor,
+    largest: Tensor,
+    typical: Tensor,
+    image_factor: Tensor | None,
+    logarithms: bool,
+    dtype: torch.dtype,
+) -> Tensor:
+    """See :func:`mcdenoise.ops._steps.network.buffers_input`."""
+    batch, _, height, width = image.shape
+    result = torch.empty((batch, 14, height, width), dtype=dtype, memory_format=torch.channels_last)
+    if result.numel():
+        sums = torch.promote_types(dtype, torch.float32)
+        nothing = source(torch.empty((0, 0, 0, 0), dtype=sums))
+        images = tuple(source(_readable(buffer, sums)) for buffer in (image, albedo, normal, depth, current))
+        lengths = nothing if length is None else source(_readable(length, sums))
+        factor = torch.ones_like(exposure) if image_factor is None else image_factor
+        factors = torch.cat([each.to(sums).expand(batch, 1, 1, 1) for each in (exposure, largest, typical, factor)], 1)
+        buffer = np.empty((14, _CHUNK), factors.numpy().dtype)
+        arguments = (source(result), images, lengths, factors.flatten(1).numpy(), logarithms)
+        share_rows(image, lambda *rows: _stack_buffers(*arguments, np.empty_like(buffer), width, *rows))
+    return result
+
+
+@buffers_input.register_fake
+def _(image: Tensor, *arguments: Any) -> Tensor:
+    batch, _, height, width = image.shape
+    shape = (batch, 14, height, width)
+    return torch.empty(shape, dtype=arguments[-1], device=image.device, memory_format=torch.channels_last)
+
+
+@compiled
+def _stack_buffers(
+    out: Any,
+    images: Any,
+    length: Any,
+    factors: Any,
+    logarithms: bool,
+    rows: Any,
+    width: int,
+    b: int,
+    first: int,
+    last: int,
+) -> None:
+    image, albedo, normal, depth, current = images
+    memory, strides, channels = out
+    exposure, largest, typical, factor = factors[b]
+    half, one = rows.dtype.type(0.5), rows.dtype.type(1)
+    bits = np.empty((channels, rows.shape[1]), memory.dtype)
+    for y in range(first, last):
+        for x0 in range(0, width, rows.shape[1]):
+            n = min(rows.shape[1], width - x0)
+            for c in range(3):
+                row = rows[c, :n]
+                _read_row(row, image, b, c, y, x0)
+                if logarithms:
+                    _to_logarithms(row, factor)
+                else:
+                    for x in range(n):
+                        row[x] *= factor
+                _read_row(rows[3 + c, :n], albedo, b, c, y, x0)
+                row = rows[6 + c, :n]
+                _read_row(row, normal, b, c, y, x0)
+                for x in range(n):
+                    row[x] = row[x] * half + half
+                row = rows[10 + c, :n]
+                _read_row(row, current, b, c, y, x0)
+                _to_logarithms(row, exposure)
+            row = rows[9, :n]
+            _read_row(row, depth, b, 0, y, x0)
+            _normalize(row, largest, typical)
+            row = rows[13, :n]
+            if length[2]:
+                _read_row(row, length, b, 0, y, x0)
+                for x in range(n):
+                    row[x] = one / row[x]
+            else:
+                row[:] = one
+            for c in range(channels):
+                _round(bits[c, :n], rows[c])
+            start = b * strides[0] + y * strides[2] + x0 * strides[3]
+            _interleave(memory[start : start + n * channels], bits)
+
+
+@custom_op(
+    "mcdenoise::network_guides",
+    device_types="cpu",
+    schema="(Tensor normal, Tensor depth, Tensor largest, Tensor typical) -> Tensor",
+)
+def network_guides(normal: Tensor, depth: Tensor, largest: Tensor, typical: Tensor) -> Tensor:
+    """See :func:`mcdenoise.ops._steps.network.network_guides`."""
+    result = _empty_guides(normal)
+    if result.numel():
+        images = tuple(source(image.to(result.dtype)) for image in (normal, depth))
+        factors = torch.cat([each.to(result.dtype).expand(len(normal), 1, 1, 1) for each in (largest, typical)], 1)
+        scales = factors.flatten(1).numpy()
+        share_rows(normal, lambda *rows: _guide(result.numpy(), *images, scales, *rows))
+    return result
+
+
+@network_guides.register_fake
+def _empty_guides(normal: Tensor, *_: Any) -> Tensor:
+    return normal.new_empty((normal.shape[0], 4, *normal.shape[2:]))
+
+
+@compiled
+def _guide(out: Any, normal: Any, depth: Any, scales: Any, b: int, first: int, last: int) -> None:
+    half = out.dtype.type(0.5)
+    largest, typical = scales[b]
+    for y in range(first, last):
+        for c in range(3):
+            row = out[b, c, y]
+            _read_row(row, normal, b, c, y, 0)
+            for x in range(row.size):
+                row[x] = row[x] * half + half
+        _read_row(out[b, 3, y], depth, b, 0, y, 0)
+        _normalize(out[b, 3, y], largest, typical)
 
 
 @compiled
@@ -123,7 +255,7 @@ def network_features(
     largest: Tensor,
     typical: Tensor,
 ) -> Tensor:
-    """See :func:`mcdenoise.ops._fused.network_features`."""
+    """See :func:`mcdenoise.ops._steps.network.network_features`."""
     result = _empty_features(albedo)
     if result.numel():
         nothing = source(torch.empty((0, 0, 0, 0), dtype=result.dtype))
@@ -177,7 +309,7 @@ def _normalize(depths: Any, largest: Any, typical: Any) -> None:
 
 @custom_op("mcdenoise::depth_scale", device_types="cpu", schema="(Tensor depth) -> (Tensor, Tensor)")
 def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
-    """See :func:`mcdenoise.ops._fused.depth_scale`."""
+    """See :func:`mcdenoise.ops._steps.network.depth_scale`."""
     batch, _, height, _ = depth.shape
     dtype = accumulator_dtype(depth.dtype)
     image = source(_readable(depth, dtype))
@@ -226,7 +358,7 @@ def _logarithms_of_rows(out: Any, depth: Any, width: int, largest: Any, b: int, 
 
 @custom_op("mcdenoise::softplus", device_types="cpu", schema="(Tensor x, float[] units) -> Tensor")
 def softplus(x: Tensor, units: list[float]) -> Tensor:
-    """See :func:`mcdenoise.ops._fused.softplus`."""
+    """See :func:`mcdenoise.ops._steps.network.softplus`."""
     result = _empty_planes(x)
     if result.numel():
         arguments = (result.numpy(), source(_readable(x, result.dtype)), result.new_tensor(units).numpy())
@@ -297,7 +429,7 @@ def gated_fusion(
     top: Tensor | None,
     logarithms: bool,
 ) -> Tensor:
-    """See :func:`mcdenoise.ops._fused.gated_fusion`."""
+    """See :func:`mcdenoise.ops._steps.network.gated_fusion`."""
     result = _empty_planes(fine)
     dtype = result.dtype
     if result.numel():
@@ -454,7 +586,7 @@ def _to_radiance(values: Any, top: Any) -> None:
     schema="(Tensor fine, Tensor means, Tensor coarse, Tensor most, float dark) -> Tensor",
 )
 def low_frequencies_of(fine: Tensor, means: Tensor, coarse: Tensor, most: Tensor, dark: float) -> Tensor:
-    """See :func:`mcdenoise.ops._fused.low_frequencies_of`; ``means`` and ``coarse`` are of blocks already."""
+    """See :func:`mcdenoise.ops._steps.network.low_frequencies_of`; ``means`` and ``coarse`` are of blocks already."""
     result = _empty_planes(fine)
     dtype = result.dtype
     if result.numel():

@@ -1,4 +1,4 @@
-"""What :class:`mcdenoise.history.History` does before and after accumulation, as torch operators without derivatives.
+"""What happens to a history before and after accumulation, as torch operators without derivatives.
 
 What takes plain torch dozens of passes over the image takes one row after the other here, while it is in the cache.
 """
@@ -21,38 +21,25 @@ from mcdenoise.ops.lag import SMALLEST
 @custom_op(
     "mcdenoise::incoming",
     device_types="cpu",
-    schema="(Tensor color, Tensor? albedo, float limit, int kernel_size, bool roots) -> Tensor",
+    schema="(Tensor color, Tensor? albedo, Tensor limits, int kernel_size, bool roots) -> Tensor",
 )
-def incoming(color: Tensor, albedo: Tensor | None, limit: float, kernel_size: int, roots: bool) -> Tensor:
-    """Color without albedo and fireflies; for the test for lag also what that compares.
-
-    Args:
-        color: ``(B, 3, H, W)`` radiance.
-        albedo: ``(B, 3, H, W)``, to be divided by; see :func:`mcdenoise.ops.demodulate`.
-        limit: see :func:`mcdenoise.ops.clamp_fireflies`.
-        kernel_size: likewise.
-        roots: whether two more channels are wanted: the fourth root of the channels' mean, and its square.
-
-    Returns:
-        ``(B, 3 or 5, H, W)``, at least float32.
-    """
-    dtype = torch.promote_types(color.dtype, torch.float32)
+def incoming(color: Tensor, albedo: Tensor | None, limits: Tensor, kernel_size: int, roots: bool) -> Tensor:
+    """See :func:`mcdenoise.ops._steps.history.incoming`; with the limit of each image, in the dtype of the result."""
+    dtype = limits.dtype
     batch, channels, height, width = color.shape
     out = torch.empty((batch, channels + 2 * roots, height, width), dtype=dtype)
     nothing = torch.empty((0, 0, 0, 0), dtype=dtype)
     images = (source((nothing if image is None else image).to(dtype)) for image in (color, albedo))
-    clamps = limit < math.inf
-    settings = out.new_tensor([FLOOR, NO_ALBEDO, min(limit, torch.finfo(dtype).max)]).numpy()
-    arguments = (out.numpy(), *images, *settings, clamps, kernel_size // 2, roots)
+    settings = out.new_tensor([FLOOR, NO_ALBEDO]).numpy()
+    arguments = (out.numpy(), *images, *settings, limits.detach().contiguous().numpy(), kernel_size // 2, roots)
     share_rows(color, lambda *rows: _incoming(*arguments, *rows))
     return out
 
 
 @incoming.register_fake
-def _(color: Tensor, albedo: Tensor | None, limit: float, kernel_size: int, roots: bool) -> Tensor:
+def _(color: Tensor, albedo: Tensor | None, limits: Tensor, kernel_size: int, roots: bool) -> Tensor:
     batch, channels, height, width = color.shape
-    dtype = torch.promote_types(color.dtype, torch.float32)
-    return color.new_empty((batch, channels + 2 * roots, height, width), dtype=dtype)
+    return color.new_empty((batch, channels + 2 * roots, height, width), dtype=limits.dtype)
 
 
 @compiled
@@ -87,8 +74,7 @@ def _incoming(
     albedo: Any,
     floor: float,
     no_albedo: float,
-    limit: float,
-    clamps: bool,
+    limits: Any,
     radius: int,
     roots: bool,
     b: int,
@@ -98,7 +84,9 @@ def _incoming(
     """Rows ``first`` to ``last``; those around a row wait in a ring as long as its windows need them."""
     _, _, height, width = out.shape
     channels, size = color[2], 2 * radius + 1
-    number, reach = out.dtype.type, radius if clamps else 0
+    number, limit = out.dtype.type, limits[b]
+    clamps = limit < number(np.inf)
+    reach = radius if clamps else 0
     one, zero = number(1), number(0)
     ring, divisor = np.empty((size, channels, width), out.dtype), np.empty((channels + 1, width), out.dtype)
     # Brightness and whether there is any, with a margin; the sums of them beside each pixel, and those with the pixel.
@@ -175,10 +163,10 @@ def _incoming(
     schema="(Tensor root, float even, float brighter, int window) -> Tensor",
 )
 def lights(root: Tensor, even: float, brighter: float, window: int) -> Tensor:
-    """Where a light is seen: 1 in blocks of 3x3 pixels that are alike and brighter than what is around.
+    """See :func:`mcdenoise.ops._steps.history.lights`.
 
     Args:
-        root: ``(B, 1, H, W)`` compressed radiance, float32 or float64.
+        root: ``(B, 1, H, W)``, float32 or float64.
         even: how far the pixels of a block may differ, relative to the brightest of them.
         brighter: how bright a pixel is beside the mean of its window.
         window: its side in pixels, odd, at least 5.

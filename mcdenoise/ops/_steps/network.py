@@ -1,7 +1,4 @@
-"""What networks do between their convolutions, each step in one pass over the image.
-
-Not part of the ops that users compose: each is a few of those, or of torch's, in a row, as its plain form says.
-"""
+"""What networks do between their convolutions."""
 
 from __future__ import annotations
 
@@ -46,6 +43,78 @@ def network_input(
 
     result: Tensor = fast.network_input(image, features, logarithms, dtype)
     return result
+
+
+def buffers_input(
+    image: Tensor,
+    albedo: Tensor,
+    normal: Tensor,
+    depth: Tensor,
+    current: Tensor,
+    length: Tensor | None,
+    exposure: Tensor,
+    scale: tuple[Tensor, Tensor],
+    *,
+    logarithms: bool = True,
+    image_factor: Tensor | None = None,
+    backend: Backend | None = None,
+) -> Tensor:
+    """An image and its buffers as a convolution takes them: channels-last, precision of autocast.
+
+    ``network_input(image * image_factor, network_features(albedo, normal, ...))``, without the features on the way.
+
+    Args:
+        image: ``(B, 3, H, W)`` radiance; or logarithms of radiance already.
+        albedo: see :func:`network_features`.
+        normal: see :func:`network_features`.
+        depth: see :func:`network_features`.
+        current: see :func:`network_features`.
+        length: see :func:`network_features`.
+        exposure: see :func:`network_features`.
+        scale: see :func:`network_features`.
+        logarithms: whether to take those of the image.
+        image_factor: ``(B, 1, 1, 1)`` factor of the image, before any logarithm; 1 by default.
+        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
+
+    Returns:
+        ``(B, 14, H, W)``: the image, then the features. The plain form leaves layout and precision to the convolution.
+    """
+    buffers = (albedo, normal, depth, current, length, exposure, *scale)
+    given = (image, *buffers, image_factor)
+    chosen = choose_backend(backend, *given, differentiable=False, forms=_FORMS)
+    device = image.device.type
+    dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else image.dtype
+    if chosen == "torch" or torch.float16 in (image.dtype, albedo.dtype, dtype):
+        features = network_features(albedo, normal, depth, current, length, exposure, scale, backend="torch")
+        image = image if image_factor is None else image * image_factor
+        return network_input(image, features, logarithms=logarithms, backend="torch")
+    from mcdenoise.ops._fast import fused as fast
+
+    result: Tensor = fast.buffers_input(image, *buffers, image_factor, logarithms, dtype)
+    return result
+
+
+def network_guides(
+    normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor], *, backend: Backend | None = None
+) -> Tensor:
+    """Normal and depth as :func:`network_features` has them, to guide a filter.
+
+    Args:
+        normal: ``(B, 3, H, W)`` in [-1, 1].
+        depth: ``(B, 1, H, W)`` distance, ``inf`` where nothing was hit.
+        scale: of :func:`depth_scale`.
+        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
+
+    Returns:
+        ``(B, 4, H, W)``: ``normal / 2 + 1 / 2``, and :func:`normalized_depth`.
+    """
+    chosen = choose_backend(backend, normal, depth, *scale, differentiable=False, forms=_FORMS)
+    if chosen != "torch" and normal.dtype in (torch.float32, torch.float64):
+        from mcdenoise.ops._fast import fused as fast
+
+        result: Tensor = fast.network_guides(normal, depth, *scale)
+        return result
+    return torch.cat([normal * 0.5 + 0.5, normalized_depth(depth, *scale)], 1)
 
 
 def depth_scale(depth: Tensor, *, backend: Backend | None = None) -> tuple[Tensor, Tensor]:

@@ -10,8 +10,9 @@ import torch
 from plain_form import channels_last, every_other_column, slice_of_pixels, transposed
 from torch import Tensor
 
-from mcdenoise.ops import _fused, downsample
+from mcdenoise.ops import downsample
 from mcdenoise.ops._fast import _numba_filter
+from mcdenoise.ops._steps import network
 
 # Of the largest number in a result: a few roundings of sums of up to 54 products.
 TOLERANCE = {dtype: 32 * torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
@@ -55,20 +56,28 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
     depth = draw(4, batch, 1, height, width, dtype).exp() * 20
     depth[..., 0, -1] = torch.inf
     depth = layout(depth)
-    scale = _fused.depth_scale(depth, backend="torch")
+    scale = network.depth_scale(depth, backend="torch")
     exposure = top * 0.7
     buffers = [some(5, 3), some(6, 3), depth, radiance]
     calls: list[Call] = [
-        (_fused.low_frequencies_of, [radiance, coarse.abs(), 2 * top], {}),
-        (_fused.gated_fusion, [some(7, 3), coarse, weight, bias], {}),
-        (_fused.gated_fusion, [some(7, 3), coarse, weight, bias], {"residual": some(8, 3), "top": top}),
-        (_fused.gated_fusion, [some(7, 3).abs(), coarse, weight, bias], {"logarithms": True}),
-        (_fused.softplus, [some(9, 3) * 30, (10.0, 1000.0, 1.0)], {}),
-        (_fused.network_input, [radiance, some(10, 11)], {}),
-        (_fused.network_input, [some(11, 3), some(10, 11)], {"logarithms": False}),
-        (_fused.depth_scale, [depth], {}),
-        (_fused.network_features, [*buffers, 1 + some(12, 1).abs(), exposure, scale], {}),
-        (_fused.network_features, [*buffers, None, exposure, scale], {}),
+        (network.low_frequencies_of, [radiance, coarse.abs(), 2 * top], {}),
+        (network.gated_fusion, [some(7, 3), coarse, weight, bias], {}),
+        (network.gated_fusion, [some(7, 3), coarse, weight, bias], {"residual": some(8, 3), "top": top}),
+        (network.gated_fusion, [some(7, 3).abs(), coarse, weight, bias], {"logarithms": True}),
+        (network.softplus, [some(9, 3) * 30, (10.0, 1000.0, 1.0)], {}),
+        (network.network_input, [radiance, some(10, 11)], {}),
+        (network.network_input, [some(11, 3), some(10, 11)], {"logarithms": False}),
+        (network.depth_scale, [depth], {}),
+        (network.network_features, [*buffers, 1 + some(12, 1).abs(), exposure, scale], {}),
+        (network.network_features, [*buffers, None, exposure, scale], {}),
+        (network.network_guides, [some(6, 3), depth, scale], {}),
+        (network.buffers_input, [radiance, *buffers, 1 + some(12, 1).abs(), exposure, scale], {}),
+        (network.buffers_input, [radiance, *buffers, None, exposure, scale], {"image_factor": 3 * exposure}),
+        (
+            network.buffers_input,
+            [some(14, 3), *buffers, None, exposure, scale],
+            {"image_factor": top, "logarithms": False},
+        ),
         (downsample, [some(13, 3)], {}),
     ]
     return calls
@@ -91,7 +100,7 @@ def assert_same(actual: list[Tensor], expected: list[Tensor], tolerance: float) 
 def test_fast_is_plain(size: tuple[int, int, int], dtype: torch.dtype) -> None:
     for call in calls(size, dtype):
         # The plain softplus is the number itself from 20 on.
-        tolerance = max(TOLERANCE[dtype], 1e-9 if call[0] is _fused.softplus else 0)
+        tolerance = max(TOLERANCE[dtype], 1e-9 if call[0] is network.softplus else 0)
         assert_same(results(call, "numba"), results(call, "torch"), tolerance)
 
 
@@ -122,8 +131,8 @@ def test_predictions_in_bfloat16_are_read_as_they_are(size: tuple[int, int, int]
     prediction = channels_last(draw(3, batch, 12, height, width, torch.bfloat16))
     weight, bias = draw(4, 1, 6, 3, 3, torch.float32), torch.zeros(1)
     read: list[Call] = [
-        (_fused.gated_fusion, [fine, coarse, weight, bias], {"residual": prediction[:, 9:]}),
-        (_fused.softplus, [prediction[:, 9:], (1.0, 2.0, 3.0)], {}),
+        (network.gated_fusion, [fine, coarse, weight, bias], {"residual": prediction[:, 9:]}),
+        (network.softplus, [prediction[:, 9:], (1.0, 2.0, 3.0)], {}),
     ]
     for call in read:
         assert_same(results(call, "numba"), results(call, "torch"), TOLERANCE[torch.float32])
@@ -139,8 +148,8 @@ def test_the_input_of_a_network_has_the_precision_of_autocast(size: tuple[int, i
     image, features = (draw(seed, batch, count, height, width, torch.float32) for seed, count in ((1, 3), (2, 11)))
     for logarithms in (False, True):
         with torch.autocast("cpu", torch.bfloat16):
-            found = _fused.network_input(image.exp(), features, logarithms=logarithms, backend="numba")
-        plain = _fused.network_input(image.exp(), features, logarithms=logarithms, backend="torch")
+            found = network.network_input(image.exp(), features, logarithms=logarithms, backend="numba")
+        plain = network.network_input(image.exp(), features, logarithms=logarithms, backend="torch")
         assert found.dtype == torch.bfloat16
         assert found.is_contiguous(memory_format=torch.channels_last)
         if logarithms:
@@ -148,6 +157,25 @@ def test_the_input_of_a_network_has_the_precision_of_autocast(size: tuple[int, i
             torch.testing.assert_close(found.float(), plain, rtol=2**-8, atol=0)
         else:
             assert torch.equal(found, plain.bfloat16())
+
+
+@every_size
+@pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16], ids=str)
+def test_the_input_from_buffers_is_that_of_their_features(size: tuple[int, int, int], precision: torch.dtype) -> None:
+    for call in calls(size, torch.float32):
+        if call[0] is not network.buffers_input:
+            continue
+        (image, *buffers), settings = call[1], dict(call[2])
+        factor = settings.pop("image_factor", None)
+        with torch.autocast("cpu", torch.bfloat16, enabled=precision == torch.bfloat16):
+            found = results(call, "numba")[0]
+            features = network.network_features(*buffers, backend="numba")
+            image = image if factor is None else image * factor
+            expected = network.network_input(image, features, **settings, backend="numba")
+        assert torch.equal(found, expected)
+        assert found.stride() == expected.stride()
+        guides = network.network_guides(buffers[1], buffers[2], buffers[-1], backend="numba")
+        assert torch.equal(guides, features[:, 3:7])
 
 
 def test_alpha_under_autocast_is_that_of_float32() -> None:
@@ -163,13 +191,13 @@ def test_numbers_of_any_size() -> None:
     image = torch.tensor([0, 1e-40, 1e-30, 1e-8, 0.3, 0.5, 1, 7, 3e5, 1e20, 1e38, torch.inf, torch.nan])
     image = image.reshape(1, 1, 1, -1).expand(1, 3, 2, -1)
     nothing = torch.zeros(1, 0, 2, image.shape[-1])
-    found = _fused.network_input(image, nothing, backend="numba")
+    found = network.network_input(image, nothing, backend="numba")
     torch.testing.assert_close(found, torch.log1p(image), rtol=4e-7, atol=0, equal_nan=True)
     # And back again, where a fusion changes nothing: alpha is 0.
     logs = torch.log1p(image.nan_to_num(0, 1e38))
     weight, bias, top = torch.zeros(1, 6, 3, 3), torch.tensor([-1e4]), torch.full((1, 1, 1, 1), 80.0)
     given = (logs, downsample(logs), weight, bias)
-    fast, plain = (_fused.gated_fusion(*given, top=top, backend=name) for name in ("numba", "torch"))
+    fast, plain = (network.gated_fusion(*given, top=top, backend=name) for name in ("numba", "torch"))
     torch.testing.assert_close(fast, plain, rtol=1e-5, atol=0)
     torch.testing.assert_close(fast[..., :10], image[..., :10], rtol=1e-5, atol=1e-37)
 
@@ -178,7 +206,7 @@ def test_nan_stays_where_it_is_and_below_zero_is_zero() -> None:
     fine = torch.full((1, 3, 6, 9), -1.0)
     fine[..., 2, 4] = torch.nan
     weight, bias, top = torch.zeros(1, 6, 3, 3), torch.tensor([-1e4]), torch.ones(1, 1, 1, 1)
-    fused = _fused.gated_fusion(fine, torch.zeros(1, 3, 3, 5), weight, bias, top=top, backend="numba")
+    fused = network.gated_fusion(fine, torch.zeros(1, 3, 3, 5), weight, bias, top=top, backend="numba")
     assert fused[..., 2, 4].isnan().all()
     assert fused[..., 3:, 6:].unique().tolist() == [0]
 
@@ -186,7 +214,7 @@ def test_nan_stays_where_it_is_and_below_zero_is_zero() -> None:
 def test_where_nothing_was_hit_there_is_no_depth() -> None:
     depth = torch.full((2, 1, 3, 4), torch.inf)
     depth[1, 0, 1] = torch.tensor([1.0, 4.0, torch.inf, 2.0])
-    largest, typical = (part.flatten().tolist() for part in _fused.depth_scale(depth, backend="numba"))
+    largest, typical = (part.flatten().tolist() for part in network.depth_scale(depth, backend="numba"))
     assert largest == pytest.approx([1e-30, 4])
     assert typical == pytest.approx([1, 0.5])
 
@@ -204,7 +232,7 @@ def test_where_derivatives_are_asked_for_it_is_plain() -> None:
 def test_an_empty_batch() -> None:
     for function, arguments, settings in calls((1, 4, 6), torch.float32):
         empty = [x[:0] if isinstance(x, Tensor) and x.ndim == 4 and x.shape[1] != 6 else x for x in arguments]
-        if function in (_fused.softplus, _fused.network_input, downsample):
+        if function in (network.softplus, network.network_input, downsample):
             assert 0 in function(*empty, **settings, backend="numba").shape
 
 

@@ -1,0 +1,314 @@
+"""What happens to a history from frame to frame: what enters it, where lights are seen, and the blend."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.ops._backend import Backend, choose_backend
+from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._rows import by_rows
+from mcdenoise.ops.demodulation import NO_ALBEDO, demodulate
+from mcdenoise.ops.fireflies import KERNEL_SIZE, LIMIT, clamp_fireflies
+from mcdenoise.ops.lag import KERNEL_SIZE as LAG_KERNEL_SIZE
+from mcdenoise.ops.lag import history_lag
+from mcdenoise.ops.temporal import Rule, Shorter, Surface, accumulate, accumulate_numba, check_alpha
+
+# The channels of a history in which lag is looked for: color, mean of the compressed radiance and of its square, and
+# color and compressed radiance of a second, shorter history. A frame enters with the first five.
+COLOR, MEAN, SQUARE, RECENT, RECENT_MEAN = slice(0, 3), slice(3, 4), slice(4, 5), slice(5, 9), slice(8, 9)
+# Smallest weight of a frame in the shorter history: four frames have half the noise of one.
+_RECENT_ALPHA = 0.25
+# As many equally weighted frames have the noise of that history, once it is full: (2 - alpha) / alpha.
+_RECENT_FRAMES = 7
+# What moves by no more stands still, in pixels.
+_STILL = 0.05
+# A light that is seen: how far the compressed radiance of 3x3 pixels may differ, and how bright they are beside the
+# mean of a window. Fewer pixels are often alike by chance where one of a few lights is drawn for each, and some of the
+# light is lost to that.
+_EVEN, _BRIGHTER, _LIGHT_WINDOW = 0.03, 1.2, 9
+_FORMS: tuple[Backend, ...] = ("torch", "numba")
+
+
+def incoming(
+    color: Tensor,
+    albedo: Tensor | None = None,
+    limit: float | Tensor = LIMIT,
+    kernel_size: int = KERNEL_SIZE,
+    *,
+    compared: bool = True,
+    backend: Backend | None = None,
+) -> Tensor:
+    """A frame as it enters a history: without albedo and fireflies.
+
+    ``clamp_fireflies(demodulate(color, albedo))``, and for the test for lag the fourth root ``r`` of the mean over its
+    channels, in which a firefly hides little, and ``r^2``. Any power keeps the ratio of a difference to its noise at
+    any exposure; a logarithm would need a unit.
+
+    Args:
+        color: ``(B, 3, H, W)`` radiance, finite and non-negative.
+        albedo: ``(B, 3, H, W)`` to divide by, see :func:`mcdenoise.ops.demodulate`; nothing is divided by default.
+        limit: see :func:`mcdenoise.ops.clamp_fireflies`; a number, or ``(B, 1, 1, 1)`` of each image.
+        kernel_size: see :func:`mcdenoise.ops.clamp_fireflies`.
+        compared: whether the two channels for the test for lag are wanted; they have no derivative.
+        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
+
+    Returns:
+        ``(B, 5, H, W)``, or ``(B, 3, H, W)`` without the two; at least float32, in which half precision is computed.
+    """
+    images = {"color": (color, "B 3 H W")} | ({} if albedo is None else {"albedo": (albedo, "B 3 H W")})
+    given = {"limit": (limit, "B 1 1 1")} if isinstance(limit, Tensor) else {}
+    check_shapes(**images, **given)
+    tensors = [tensor for tensor, _ in (images | given).values()]
+    if choose_backend(backend, *tensors, differentiable=False, forms=_FORMS) == "numba":
+        from mcdenoise.ops._fast import history as fast
+
+        dtype = torch.promote_types(color.dtype, torch.float32)
+        if isinstance(limit, Tensor):
+            limits = limit.to(dtype).flatten()
+        else:
+            limits = color.new_full((len(color),), limit, dtype=dtype)
+        result: Tensor = fast.incoming(color, albedo, limits, kernel_size, compared)
+        return result
+
+    def clamped(color: Tensor, albedo: Tensor | None = None) -> Tensor:
+        color = color.to(torch.promote_types(color.dtype, torch.float32))
+        color = color if albedo is None else demodulate(color, albedo)
+        return clamp_fireflies(color, limit=limit, kernel_size=kernel_size)
+
+    color = by_rows(clamped, color, *(() if albedo is None else (albedo,)), reach=kernel_size // 2)
+    if not compared:
+        return color
+    root = color.detach().mean(1, keepdim=True).clamp_min(0).sqrt().sqrt()
+    return torch.cat([color, root, root.square()], 1)
+
+
+def lights(root: Tensor, *, backend: Backend | None = None) -> Tensor:
+    """Where, by one frame, a light is seen: in blocks of 3x3 pixels that are alike and brighter than what is around.
+
+    A block is alike if its fourth roots of radiance differ by at most 3 % of the largest; a pixel is bright if its own
+    is above 1.2 times the mean of the 9x9 window around it (twice, in radiance).
+
+    Args:
+        root: ``(B, 1, H, W)`` fourth root of the radiance, as :func:`incoming` has it; non-negative.
+        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
+
+    Returns:
+        ``(B, 1, H, W)`` of 0 and 1 in the dtype of ``root``; no derivative.
+    """
+    check_shapes(root=(root, "B 1 H W"))
+    root = root.detach()
+    if choose_backend(backend, root, differentiable=False, forms=_FORMS) == "numba":
+        from mcdenoise.ops._fast import history as fast
+
+        result: Tensor = fast.lights(root, _EVEN, _BRIGHTER, _LIGHT_WINDOW)
+        return result
+    return by_rows(_lights, root, reach=_LIGHT_WINDOW // 2)
+
+
+def _lights(root: Tensor) -> Tensor:
+    if min(root.shape[-2:]) < 3 or root.numel() == 0:
+        return torch.zeros_like(root)
+    largest, smallest = F.max_pool2d(root, 3, 1), -F.max_pool2d(-root, 3, 1)
+    even = (largest - smallest <= _EVEN * largest).to(root.dtype)
+    some = F.max_pool2d(F.pad(even, (2, 2, 2, 2)), 3, 1)
+    around = F.avg_pool2d(root, _LIGHT_WINDOW, 1, _LIGHT_WINDOW // 2, count_include_pad=False)
+    return some * (root > _BRIGHTER * around)
+
+
+class Blended(NamedTuple):
+    """A frame with its history.
+
+    Args:
+        color: ``(B, C, H, W)``, the channels of a history.
+        length: ``(B, 1, H, W)`` of the history with this frame, in frames.
+        kept: ``(B,)`` fraction of each image's pixels that found their surface in the previous frame, float32.
+    """
+
+    color: Tensor
+    length: Tensor
+    kept: Tensor
+
+
+def without_history(entering: Tensor) -> Tensor:
+    """All channels of a history of this one frame.
+
+    Args:
+        entering: ``(B, 3 or 5, H, W)`` of :func:`incoming`.
+
+    Returns:
+        ``(B, 3 or 9, H, W)``.
+    """
+    return torch.cat([entering, entering[:, : SQUARE.start]], 1) if entering.shape[1] > SQUARE.start else entering
+
+
+def blend(
+    entering: Tensor,
+    previous: Tensor,
+    previous_length: Tensor,
+    motion: Tensor | None,
+    surface: Surface | None = None,
+    previous_surface: Surface | None = None,
+    *,
+    alpha_min: float = 0.1,
+    rule: Rule = "relative",
+    position_limit: float | None = None,
+    normal_limit: float | None = None,
+    albedo: Tensor | None = None,
+    specular_length: float = math.inf,
+    lag_threshold: float = math.inf,
+    lag_kernel_size: int = LAG_KERNEL_SIZE,
+    backend: Backend | None = None,
+) -> Blended:
+    """Accumulate a frame, with a shorter history where that is known to be wrong.
+
+    1. :func:`mcdenoise.ops.accumulate`.
+    2. Where nothing diffuse is seen (no channel of the albedo reaches 1e-4: mirrors, glass) and the motion is longer
+       than 0.05 pixels, the history is shortened to ``specular_length`` frames and this one. Which pixels those are is
+       known in this frame, the history's length in the previous one; so it is shortened after it was blended in:
+       ``lerp(color, history, p)`` with a smaller ``p`` lies on the way back to ``color``.
+    3. With a finite ``lag_threshold``, histories are given up for shorter ones as far as
+       :func:`mcdenoise.ops.history_lag` says, of the fourth roots of radiance, in half the resolution: a second
+       history of about four frames for the current frame, and the long one for that. The variance of the noise is what
+       the root varied by over the history. The decision has no derivative.
+
+    Args:
+        entering: ``(B, 5, H, W)`` of :func:`incoming`; any number of channels without a test for lag.
+        previous: ``(B, 9, H, W)`` history of the previous frame, ``color`` of an earlier result or
+            :func:`without_history`; the channels of ``entering`` without a test for lag.
+        previous_length: ``(B, 1, H, W)`` its length.
+        motion: see :func:`mcdenoise.ops.accumulate`; ``None`` also shortens no history of mirrors.
+        surface: see :func:`mcdenoise.ops.reproject`.
+        previous_surface: see :func:`mcdenoise.ops.reproject`.
+        alpha_min: see :func:`mcdenoise.ops.accumulate`.
+        rule: see :func:`mcdenoise.ops.reproject`.
+        position_limit: see :func:`mcdenoise.ops.reproject`.
+        normal_limit: see :func:`mcdenoise.ops.reproject`.
+        albedo: ``(B, 3, H, W)``, which says where mirrors and glass are; without it no history is shortened for them.
+        specular_length: in frames, at least 0.
+        lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test.
+        lag_kernel_size: see :func:`mcdenoise.ops.history_lag`, in half the resolution.
+        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
+
+    Returns:
+        See :class:`Blended`; the dtypes of ``entering`` and of ``previous_length``.
+
+    Raises:
+        TypeError: as :func:`mcdenoise.ops.accumulate`.
+        ValueError: as :func:`mcdenoise.ops.accumulate`.
+    """
+    tests = not math.isinf(lag_threshold)
+    _check_blend(entering, previous, previous_length, motion, albedo, tests)
+    check_alpha(alpha_min)
+    images = (entering, previous, previous_length)
+    surfaces = (*(surface or ()), *(previous_surface or ()))
+    chosen = choose_backend(backend, *images, motion, albedo, *surfaces, differentiable=False, forms=_FORMS)
+    recent_alpha = max(alpha_min, _RECENT_ALPHA)
+    pixels = max(previous_length.shape[-2] * previous_length.shape[-1], 1)
+    if chosen == "numba":
+        from mcdenoise.ops._fast import history as fast
+
+        color, length, counts = accumulate_numba(
+            *(*images, motion, surface, previous_surface, alpha_min, rule, position_limit, normal_limit),
+            Shorter(recent_alpha, albedo, specular_length + 1, _STILL),
+        )
+        if tests:
+            fast.give_up_lag(color, length, entering, lag_threshold, lag_kernel_size, recent_alpha, _RECENT_FRAMES)
+        return Blended(color, length, counts.sum(1) / pixels)
+    both = without_history(entering) if tests else entering
+    color, length = accumulate(
+        *(both, previous, previous_length, motion, surface, previous_surface),
+        alpha_min=alpha_min,
+        rule=rule,
+        position_limit=position_limit,
+        normal_limit=normal_limit,
+        backend="torch",
+    )
+    kept = (length > 1).sum((1, 2, 3)) / pixels
+    if albedo is not None and motion is not None and specular_length < math.inf:
+        shorten = partial(_shortened, specular_length + 1, alpha_min)
+        result = by_rows(shorten, both, color, length, albedo, motion)
+        color, length = result[:, :-1], result[:, -1:]
+    if tests:
+        # Pairs of rows stay together.
+        give_up = partial(_without_lag, lag_threshold, lag_kernel_size, alpha_min, recent_alpha)
+        result = by_rows(give_up, both, color, length, reach=2 * (lag_kernel_size // 2))
+        color, length = result[:, :-1], result[:, -1:]
+    return Blended(color, length.to(previous_length.dtype), kept)
+
+
+def _check_blend(
+    entering: Tensor,
+    previous: Tensor,
+    previous_length: Tensor,
+    motion: Tensor | None,
+    albedo: Tensor | None,
+    tests: bool,
+) -> None:
+    channels = ("5", str(RECENT.stop)) if tests else ("C", "C")
+    images = {"motion": (motion, "B 2 H W"), "albedo": (albedo, "B 3 H W")}
+    check_shapes(
+        entering=(entering, f"B {channels[0]} H W"),
+        previous=(previous, f"B {channels[1]} H W"),
+        previous_length=(previous_length, "B 1 H W"),
+        **{name: (image, axes) for name, (image, axes) in images.items() if image is not None},
+    )
+
+
+def _weight_of_history(length: Tensor, alpha_min: float) -> Tensor:
+    """In a result of that length, see :func:`mcdenoise.ops.accumulate`."""
+    return 1 - (1 / length).clamp_min(alpha_min)
+
+
+def _shortened(
+    longest: float, alpha_min: float, color: Tensor, blended: Tensor, length: Tensor, albedo: Tensor, motion: Tensor
+) -> Tensor:
+    """Color and length if the history of mirrors and glass that move is no longer than that."""
+    # A reduction over the channels takes a hundred times as long.
+    moves = torch.hypot(motion[:, :1], motion[:, 1:]) > _STILL
+    specular = albedo.amax(1, keepdim=True) < NO_ALBEDO
+    too_long = moves & specular & (length > longest)
+    weight = _weight_of_history(length.clamp_max(longest), alpha_min)
+    weight = weight / _weight_of_history(length, alpha_min).clamp_min(1e-6)
+    shortened = torch.lerp(color, blended, weight.to(color.dtype))
+    return torch.cat([torch.where(too_long, shortened, blended), torch.where(too_long, longest, length)], 1)
+
+
+def _without_lag(
+    threshold: float,
+    kernel_size: int,
+    alpha_min: float,
+    recent_alpha: float,
+    color: Tensor,
+    blended: Tensor,
+    length: Tensor,
+) -> Tensor:
+    """Color and length of what still holds: of the recent history by the frame, of the long one by the recent one."""
+    mean, square = blended[:, MEAN], blended[:, SQUARE]
+    counted = length.clamp_min(2)
+    variance = (square - mean.square()).clamp_min(0) * (counted / (counted - 1))
+    # Accumulated with the long one's weight of the frame, which is the smaller one.
+    weight = _weight_of_history(length, recent_alpha) / _weight_of_history(length, alpha_min).clamp_min(1e-6)
+    recent = torch.lerp(color[:, RECENT], blended[:, RECENT], weight)
+    lag = partial(_lag, threshold, kernel_size)
+    recent = torch.lerp(recent, color[:, RECENT], lag(recent[:, 3:], color[:, RECENT_MEAN], variance))
+    given_up = lag(mean, recent[:, 3:], variance / length.clamp_max(_RECENT_FRAMES))
+    shorter = torch.cat([recent, recent[:, 3:].square() + variance], 1)
+    longer = torch.lerp(blended[:, : RECENT.start], shorter, given_up)
+    return torch.cat([longer, recent, torch.lerp(length, length.clamp_max(1 / recent_alpha), given_up)], 1)
+
+
+def _lag(threshold: float, kernel_size: int, history: Tensor, recent: Tensor, variance: Tensor) -> Tensor:
+    """The test in half the resolution, for a quarter of the time: a window holds as many pixels, in blocks of four."""
+    height, width = history.shape[-2:]
+    halves = (
+        F.avg_pool2d(image.detach(), 2, ceil_mode=True, count_include_pad=False)
+        for image in (history, recent, variance / 4)
+    )
+    lag = history_lag(*halves, threshold=threshold, kernel_size=kernel_size)
+    return lag.repeat_interleave(2, -2).repeat_interleave(2, -1)[..., :height, :width]
