@@ -2,146 +2,115 @@
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.utils import _pytree as pytree
 
-from mcdenoise.frame import OF_THE_PAST, Frame, Inspected
 from mcdenoise.errors import InputError
-from mcdenoise.history import Accumulated, History
-from mcdenoise.models import Denoised, Known, Region, create_model
-from mcdenoise.ops import Accumulate, HistoryLag, remodulate
-from mcdenoise.ops._rows import by_rows
-from mcdenoise.plan import Plan, Shortcut, Stage, Steps
-from mcdenoise.tiling import GB, Frames, Memory, Network, Tiling, check_side, describe
+from mcdenoise.frame import MOTION, Frame, Hints
+from mcdenoise.models import DEFAULT, Journal, Model, Output, State, Tiled, create_model, listening, parts_of, timed
+from mcdenoise.models._adapter import as_model
+from mcdenoise.models._memory import GB, Frames, Memory, Network, Tiling, check_side, describe
 
 Precision = Literal["float32", "bfloat16"]
 PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
 
 
 @dataclass
-class FrameReport:
+class FrameReport(Journal):
     """What happened to one frame.
 
     Args:
-        reset: why the history was thrown away, or ``""`` where it was used.
-        replaced_pixels: pixels of the noisy color that were NaN, infinite or negative.
-        missing: features that the network takes and the frame has not; it sees a constant instead.
-        milliseconds: run time of each stage: validate, plan, accumulate, network, remodulate; of a sequence also of
-            waiting for the disk, to have read this frame and to have written the last one.
+        replaced_pixels: pixels of the noisy color that were NaN, infinite, negative or beyond the largest radiance.
+        missing: buffers that the method is better with and the frame has not.
         beside: milliseconds of what is done while another frame is denoised: read, write.
-        stages: what was left out of them, and why.
-        tiles: the parts of the image on which the network ran, and why those.
     """
 
-    reset: str = ""
     replaced_pixels: int = 0
     missing: list[str] = field(default_factory=list)
-    milliseconds: dict[str, float] = field(default_factory=dict)
     beside: dict[str, float] = field(default_factory=dict)
-    stages: list[Stage] = field(default_factory=list)
-    tiles: str = ""
-
-
-@dataclass
-class Images:
-    """What a denoiser knows of one frame, all ``(B, 3, H, W)`` scene-linear radiance with albedo.
-
-    Args:
-        noisy: the frame's color, with invalid pixels replaced.
-        accumulated: with the history blended in.
-        initial: result of the cascade's first network.
-        denoised: the final image.
-    """
-
-    noisy: Tensor
-    accumulated: Tensor
-    initial: Tensor
-    denoised: Tensor
 
 
 class Denoiser:
-    """Denoises the frames of a shot one after the other: accumulate, demodulate, network, remodulate.
+    """Denoises the frames of a shot one after the other: checks each, keeps the state of the method, and measures.
 
     Args:
-        model: a model's name in the zoo (its shipped weights are loaded), or a module that takes demodulated color,
-            albedo, normal and depth and returns :class:`mcdenoise.models.Denoised`; with an attribute ``takes_history``
-            that is true, it also gets ``current`` and ``length`` of :class:`mcdenoise.history.Accumulated`, and with
-            ``takes_plan``, ``guides``, ``known`` and ``parts``, see :class:`mcdenoise.models.Cascade`, whose ``halo``,
-            ``parts`` and ``bytes_per_pixel`` it has, too. A module of yours is moved to the device, made channels-last
-            and put into evaluation mode.
+        model: a model's name in the zoo (its shipped weights are loaded), ``path/to/file.py:factory`` or
+            ``package.module:factory`` of your own, a :class:`mcdenoise.models.Model`, or a module or function that takes
+            images by the names of buffers, see :class:`mcdenoise.models.FromBuffers`. A module of yours is moved to the
+            device, made channels-last and put into evaluation mode.
         weights: a safetensors file of other weights for a model given by name.
         device: where to run; frames may come from anywhere and images stay here.
-        alpha_min: smallest weight of the current frame in the accumulation, see :func:`mcdenoise.ops.accumulate`.
-        anti_lag: give up the past where the light has changed, see :class:`mcdenoise.history.History`.
-        precision: ``"bfloat16"`` runs the network's convolutions in bfloat16, which is about twice as fast on
-            processors that have it; everything else stays in float32.
-        plan: what to leave out of a scene that does not need it; ``Plan(keep_all=True)`` leaves nothing out.
-        tile: run the network on tiles of at most so many pixels a side, a multiple of 32 from 64 on. The result is that
-            of the whole image, up to the rounding of convolutions; the margins that tiles share cost time. By default
-            they are as large as memory allows, and an image is in one piece where that takes no more than 2 GB (on a
-            GPU: 0.4 of its memory) for the network's features, whatever is free: the same frames give the same images.
+        precision: ``"bfloat16"`` runs convolutions in bfloat16, which is about twice as fast on processors that have
+            it; everything else stays in float32.
+        keep_all: skip nothing, whether a scene needs it or not.
+        tile: compute tiles of at most so many pixels a side, a multiple of 32 from 64 on. The result is that of the
+            whole image, up to the rounding of convolutions; the margins that tiles share cost time. By default they are
+            as large as memory allows, and an image is in one piece where that takes no more than 2 GB (on a GPU: 0.4 of
+            its memory) for a network's features, whatever is free: the same frames give the same images.
         max_memory: of the process on a CPU, or else of what torch holds on the device, in GB of 1e9 bytes. Tiles are
             so small that all keeps below it: what is there when the denoiser is made, the images of a frame and those
-            of the past. Frames that you keep, beside the one that is denoised, are your own.
+            of the history. Frames that you keep, beside the one that is denoised, are your own.
+        differentiable: keep the graph, through the state too, so that ``backward`` reaches every earlier frame of the
+            shot; decisions, such as which pixels have a history, are held fixed. The images are the same.
+        settings: for the model's constructor, such as ``alpha_min=0.2``; see the model's own page.
 
     Raises:
-        InputError: the model is unknown, has no weights, the device is not there, the precision is unknown, the tiles
-            or the memory are no such number, or the model computes no parts.
+        InputError: the model is unknown, has no weights or no such setting, the device is not there, the precision is
+            unknown, the tiles or the memory are no such number, or the model computes no tiles.
 
     Example:
-        >>> denoiser = Denoiser("cascaded")
+        >>> denoiser = Denoiser("cascaded_v2_micro")
         >>> frame = Frame(color=torch.rand(1, 3, 24, 32), depth=torch.ones(1, 1, 24, 32))
         >>> denoiser(frame).shape
         torch.Size([1, 3, 24, 32])
         >>> denoiser.report.missing
-        ['albedo', 'normal']
+        ['albedo', 'motion', 'normal']
     """
 
     def __init__(
         self,
-        model: str | nn.Module = "cascaded",
+        model: str | Model | nn.Module = DEFAULT,
         *,
         weights: Path | str | None = None,
         device: torch.device | str = "cpu",
-        alpha_min: float = 0.1,
-        anti_lag: bool = True,
         precision: Precision = "float32",
-        plan: Plan | None = None,
+        keep_all: bool = False,
         tile: int | None = None,
         max_memory: float | None = None,
+        differentiable: bool = False,
+        **settings: Any,
     ) -> None:
         self.device = _device(device)
         if precision not in PRECISIONS:
             raise InputError(f"precision: expected one of {', '.join(PRECISIONS)}, found '{precision}'")
-        self.precision = precision
+        self.precision, self.keep_all, self.differentiable = precision, keep_all, differentiable
         if isinstance(model, str):
-            model = create_model(model, pretrained=weights is None, weights=weights)
-        # Channels-last convolutions are about 1.5 times faster on a CPU.
-        model.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.model = model.eval()
-        self._takes_history = bool(getattr(model, "takes_history", False))
-        self._takes_plan = bool(getattr(model, "takes_plan", False))
-        self.plan = Plan() if plan is None else plan
-        self.history = History(Accumulate(alpha_min), anti_lag=None if anti_lag else HistoryLag(math.inf))
+            model = create_model(model, pretrained=weights is None, weights=weights, **settings)
+        elif settings or weights is not None:
+            raise InputError(f"{', '.join([*settings, *(['weights'] if weights else [])])}: expected a model's name, found a model")
+        if isinstance(model, nn.Module):
+            # Channels-last convolutions are about 1.5 times faster on a CPU.
+            model.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+        self.model = as_model(model)
         self.report = FrameReport()
+        self._tiled = [tiled for tiled in parts_of(self.model, Tiled) if tiled.halo is not None]
         if tile is not None:
             check_side(tile)
             if max_memory is not None:
                 raise InputError("tile, max_memory: expected one of them, found both; max_memory chooses the tiles")
-        if not self._takes_plan and (tile, max_memory) != (None, None):
-            raise InputError("tile, max_memory: expected a model that computes parts of an image, found one without")
+        if not self._tiled and (tile, max_memory) != (None, None):
+            raise InputError("tile, max_memory: expected a model that computes tiles of an image, found one without")
         self.tile = tile
         self._memory = Memory(None if max_memory is None else max_memory * GB, self.device)
         self._tilings: dict[Frames, Tiling] = {}
-        self.has_room_ahead = False
+        self.reset()
 
     def reset(
         self,
@@ -149,11 +118,10 @@ class Denoiser:
         frames: int | None = None,
         size: tuple[int, int] | None = None,
     ) -> None:
-        """Forget the past: the next frame is the first of a shot. A cut and a change of size do so by themselves.
+        """Forget the history: the next frame is the first of a shot. A cut and a change of size do so by themselves.
 
         Args:
-            buffers: names of the buffers that every frame of the shot will have, where that is known. Those that only
-                serve a past (:meth:`mcdenoise.frame.Frame.without_past`) are not counted where there will be none.
+            buffers: names of the buffers that every frame of the shot will have, where that is known.
             frames: how many frames there will be, where that is known.
             size: their height and width, where that and the buffers are known. Then ``has_room_ahead`` says whether
                 there is memory to read the next frame while one is denoised.
@@ -161,15 +129,20 @@ class Denoiser:
         Raises:
             InputError: frames of this size cannot be denoised within ``max_memory``; the message says with what.
         """
-        self.history.reset()
-        self.plan.reset(buffers, frames)
+        self._state: State = None
+        self._count, self._frames = 0, frames
         # Of one frame there is nothing ahead.
         self.has_room_ahead = size is not None and frames != 1
-        if buffers is not None and size is not None and self._takes_plan:
-            streaming = self.plan.has_past(buffers)
-            shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else OF_THE_PAST), streaming)
+        if buffers is not None and size is not None and self._tiled:
+            streaming = self.has_history(buffers)
+            shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else MOTION), streaming)
             self._tiling(shot)
-            self.has_room_ahead = self.has_room_ahead and self._memory.has_room_ahead(shot, self._needs())
+            self.has_room_ahead = self.has_room_ahead and self._memory.has_room_ahead(shot, self._network())
+
+    def has_history(self, buffers: Collection[str]) -> bool:
+        """Whether a frame with these buffers may have a history, or be one: else what tells motion is of no use."""
+        can_move = "motion" in buffers or {"position", "view_projection"} <= set(buffers)
+        return self.keep_all or (self._frames != 1 and can_move)
 
     def __call__(self, frame: Frame) -> Tensor:
         """Denoise the next frame of the shot.
@@ -179,135 +152,118 @@ class Denoiser:
                 and counted.
 
         Returns:
-            ``(B, 3, H, W)`` float32 scene-linear radiance on the denoiser's device; ``report`` says what was done.
+            ``(B, 3, H, W)`` float32 scene-linear radiance on the denoiser's device, a tensor of its own; ``report``
+            says what was done.
 
         Raises:
-            InputError: a feature buffer holds NaN, an illegal infinity or a value far out of range; or there is too
-                little memory, see :meth:`reset`.
+            InputError: a buffer that the model needs is missing, another holds NaN, an illegal infinity or a value far
+                out of range; the result is no image; or there is too little memory, see :meth:`reset`.
         """
-        frame, past, steps, result = self._network(frame)
-        final = result.final
-        # Of a large frame each image is much: what is not needed any more goes first.
-        del past, result
-        return self._remodulated(frame, steps, final)[0]
+        return self._step(frame, stages=False).image
 
-    def images(self, frame: Frame) -> Images:
-        """As calling the denoiser, with the images on the way to the result."""
-        frame, past, steps, result = self._network(frame)
-        return Images(frame.color, *self._remodulated(frame, steps, past.color, result.initial, result.final))
+    def output(self, frame: Frame) -> Output:
+        """As calling the denoiser, with the images on the way to the result: ``noisy`` first."""
+        return self._step(frame, stages=True)
 
-    @torch.inference_mode()
-    def _network(self, frame: Frame) -> tuple[Frame, Accumulated, Steps, Denoised]:
-        """The valid frame, its accumulated color, and what the network makes of it."""
+    def _step(self, frame: Frame, *, stages: bool) -> Output:
         self.report = report = FrameReport()
-        with self._timed("validate"):
-            inspected = frame.to(self.device).to(torch.float32).inspect()
-            inspected = inspected._replace(frame=inspected.frame.with_depth())
-        frame, report.replaced_pixels, _ = inspected
-        with self._timed("plan"):
-            steps = self.plan.begin(inspected, self.history.is_still(frame))
-        with self._timed("accumulate"):
-            past = self.history.update(
-                frame, demodulates=steps.demodulates, reprojects=steps.reprojects, keeps=steps.keeps
-            )
-        report.reset = past.reset
-        with self._timed("plan"):
-            known, parts = self._shortcut(inspected, past)
-            tiling = self._tiling(self._shot(frame))
-            if tiling.side is not None:
-                parts = [tile for part in parts for tile in part.split(tiling.side)]
-            report.tiles = tiling.reason
         bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
-        with self._timed("network"), bfloat16:
-            result = self._result(self._inputs(frame, past), past, steps, known, parts)
-        with self._timed("plan"):
-            self.plan.finish(*result, sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1]))
-        report.stages = self.plan.stages
-        return frame, past, steps, result
+        with listening(report), nullcontext() if self.differentiable else torch.no_grad():
+            with timed("validate", self.device):
+                given, hints = frame, Hints(last=self._is_last(), stages=stages, keep_all=self.keep_all)
+                frame, report.replaced_pixels, _ = frame.to(self.device).to(torch.float32).inspect()
+                frame = frame.with_depth().replace(hints=hints)
+                report.missing = self._missing(frame)
+                report.tiles = self._divide(frame)
+            noisy = frame.color
+            with bfloat16:
+                output, state = self.model(frame, self._state)
+            with timed("validate", self.device):
+                self._check(output, frame, state)
+                # A renderer may write its next frame into the same buffers, and a user change an image in place.
+                state = _owned(state, [given, noisy])
+                if stages:
+                    output = output._replace(stages={"noisy": noisy, **output.stages})
+                output = _owned(Output(output.image.float(), output.stages), [given, noisy, state])
+        # Only now: a frame that was refused leaves no trace.
+        self._state, self._count = state, self._count + 1
+        return output
 
-    def _shot(self, frame: Frame) -> Frames:
-        """What matters of a frame and those after it."""
-        buffers = frozenset(name for name, _ in frame.items())
-        return Frames(frame.size, buffers, self.plan.has_past(buffers), self.has_room_ahead, frame.color.shape[0])
+    def _is_last(self) -> bool:
+        return self._frames is not None and self._count + 1 >= self._frames
 
-    def _needs(self) -> Network:
-        return Network(self.model.halo, self.model.bytes_per_pixel(bfloat16=self.precision == "bfloat16"))  # type: ignore
+    def _missing(self, frame: Frame) -> list[str]:
+        """Buffers that the model is better with, sorted; refuses a frame without one that it needs."""
+        needs = self.model.needs
+        if absent := needs.missing(frame):
+            raise InputError(
+                f"buffer '{absent[0]}': the model needs it, found only {', '.join(sorted(frame.buffers))}; render it, or "
+                "take another model, see `mcdenoise models`"
+            )
+        missing = needs.uses - frame.buffers - {"previous_position", "position", "view_projection"}
+        return sorted(missing - ({"motion"} if {"position", "view_projection"} <= frame.buffers else frozenset()))
+
+    def _divide(self, frame: Frame) -> str:
+        """Choose the tiles; says which, and why."""
+        if not self._tiled:
+            return "whole frames: the model computes no tiles"
+        streaming = self.has_history(frame.buffers)
+        batch = frame.color.shape[0]
+        tiling = self._tiling(Frames(frame.size, frame.buffers, streaming, self.has_room_ahead, batch))
+        for tiled in self._tiled:
+            tiled.side = tiling.side
+        return tiling.reason
+
+    def _network(self) -> Network:
+        halo = max(tiled.halo or 0 for tiled in self._tiled)
+        return Network(halo, max(each.bytes_per_pixel(bfloat16=self.precision == "bfloat16") for each in self._tiled))
 
     def _tiling(self, frames: Frames) -> Tiling:
-        """The parts of these frames on which the network runs."""
+        """The tiles of these frames."""
         if frames not in self._tilings:
-            if not self._takes_plan:
-                tiling = Tiling(None, "whole frames: the model computes no parts")
-            elif self.tile is not None:
+            if self.tile is not None:
                 tiling = Tiling(self.tile, f"{describe(frames.size, self.tile)}: as asked for")
             else:
-                tiling = self._memory.choose(frames, self._needs())
+                tiling = self._memory.choose(frames, self._network())
             self._tilings[frames] = tiling
         return self._tilings[frames]
 
-    def _shortcut(self, inspected: Inspected, past: Accumulated) -> tuple[Shortcut | None, list[Region]]:
-        """What is known of the result, and the parts of the image to run the network on."""
-        alpha_min = self.history.accumulate.alpha_min
-        known = self.plan.known(inspected, past.color, past.current, past.length, past.reset, alpha_min)
-        whole = [Region(0, 0, *inspected.frame.size)]
-        if known is None or self.plan.keep_all:
-            return known, whole
-        if self._takes_plan:
-            return known, self.model.parts(known.mask)  # type: ignore[operator]
-        return known, [] if known.mask.all() else whole
+    def _check(self, output: Any, frame: Frame, state: State) -> None:
+        """Refuse what is no image of this frame, or no state."""
+        image = output.image if isinstance(output, Output) else None
+        if not isinstance(image, Tensor) or image.shape != frame.color.shape:
+            found = type(output).__name__ if not isinstance(image, Tensor) else f"an image of {tuple(image.shape)}"
+            raise InputError(f"model: expected an Output with an image of {tuple(frame.color.shape)}, found {found}")
+        if image.device != frame.color.device:
+            raise InputError(f"model: expected an image on {frame.color.device}, found one on {image.device}")
+        low, high = torch.aminmax(image.detach())
+        if not (low > -torch.inf and high < torch.inf):
+            raise InputError("model: expected a finite image, found NaN or infinite values; the frame is not kept")
+        for leaf in pytree.tree_leaves(state):
+            if leaf is not None and not isinstance(leaf, Tensor):
+                raise InputError(f"model: expected a state of tensors, found {type(leaf).__name__} in it")
+        if self._state is not None and not _alike(self._state, state):
+            raise InputError("model: expected a state of the same structure as for the frame before, found another")
 
-    def _result(
-        self,
-        inputs: tuple[Tensor, Tensor, Tensor, Tensor],
-        past: Accumulated,
-        steps: Steps,
-        known: Shortcut | None,
-        parts: list[Region],
-    ) -> Denoised:
-        # A module of your own may do with the paper's four.
-        history = {"current": past.current, "length": past.length} if self._takes_history else {}
-        if self._takes_plan:
-            given = None if known is None else Known(*known)
-            return Denoised(*self.model(*inputs, **history, guides=steps.guides, known=given, parts=parts))
-        if known is None:
-            return Denoised(*self.model(*inputs, **history))
-        result = Denoised(*self.model(*inputs, **history)) if parts else Denoised(known.initial, known.final)
-        return Denoised(*(torch.where(known.mask, *pair) for pair in zip(known[1:], result, strict=True)))
 
-    @torch.inference_mode()
-    def _remodulated(self, frame: Frame, steps: Steps, *images: Tensor) -> list[Tensor]:
-        with self._timed("remodulate"):
-            # A network that ends with a convolution hands out its precision.
-            full = [image.float() for image in images]
-            if frame.albedo is None or not steps.demodulates:
-                return full
-            return [by_rows(remodulate, image, frame.albedo) for image in full]
+def _alike(a: State, b: State) -> bool:
+    """Whether two states have the same structure; what is not there is like anything."""
+    if a is None or b is None:
+        return True
+    (children, spec), (others, other) = (pytree.tree_flatten(each, is_leaf=lambda x: x is not each) for each in (a, b))
+    if isinstance(a, Tensor) or isinstance(b, Tensor):
+        return isinstance(a, Tensor) and isinstance(b, Tensor) and a.ndim == b.ndim
+    return spec == other and all(_alike(*pair) for pair in zip(children, others, strict=True))
 
-    def _inputs(self, frame: Frame, past: Accumulated) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The network's inputs; a feature that the frame lacks is constant, which guides nothing."""
-        color = past.color
-        features = {"albedo": frame.albedo, "normal": frame.normal, "depth": frame.depth}
-        self.report.missing = [name for name, value in features.items() if value is None]
-        albedo, normal, depth = features.values()
-        return (
-            color,
-            torch.ones_like(color) if albedo is None else albedo,
-            torch.zeros_like(color) if normal is None else normal,
-            torch.ones_like(color[:, :1]) if depth is None else depth,
-        )
 
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = self._clock()
-        yield
-        before = self.report.milliseconds.get(stage, 0.0)
-        self.report.milliseconds[stage] = before + self._clock() - start
+def _owned(tree: Any, others: Any) -> Any:
+    """A tree with copies of those tensors that share memory with others."""
+    taken = {leaf.untyped_storage().data_ptr() for leaf in pytree.tree_leaves(others) if isinstance(leaf, Tensor)}
 
-    def _clock(self) -> float:
-        """Milliseconds, after the device has finished."""
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        return time.perf_counter() * 1e3
+    def own(tensor: Tensor) -> Tensor:
+        return tensor.clone() if tensor.untyped_storage().data_ptr() in taken else tensor
+
+    return pytree.tree_map_only(Tensor, own, tree)
 
 
 def _device(device: torch.device | str) -> torch.device:

@@ -70,8 +70,8 @@ BUFFERS: dict[str, BufferSpec] = {
 }
 
 
-# What says where a pixel was in the frame before, and nothing else: of no use to a frame without one.
-OF_THE_PAST = frozenset({"position", "motion", "previous_position"})
+# The buffers that say where a pixel was in the frame before, and nothing else: of no use without a history.
+MOTION = frozenset({"position", "motion", "previous_position"})
 
 _MATRIX = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "world-to-clip matrix")
 _MATRIX_NAME = "view_projection"
@@ -85,11 +85,13 @@ class Hints(NamedTuple):
         still: nothing moves in the image since the frame before.
         last: no frame follows, so that nothing needs to be remembered.
         stages: the images on the way to the result are asked for, too.
+        keep_all: nothing is to be skipped, whether the scene needs it or not.
     """
 
     still: bool = False
     last: bool = False
     stages: bool = True
+    keep_all: bool = False
 
 
 class Skip(NamedTuple):
@@ -97,11 +99,16 @@ class Skip(NamedTuple):
 
     Args:
         mask: ``(B, 1, H, W)`` bool, true where the result is known.
-        images: ``(B, 3, H, W)`` results by stage, ``"image"`` for the last; finite everywhere, used where ``mask`` is.
+        images: ``(B, 3, H, W)`` results by stage, ``"image"`` for the last, which stands for those that are not there;
+            finite everywhere, used where ``mask`` is.
     """
 
     mask: Tensor
     images: Mapping[str, Tensor]
+
+    def of(self, stage: str) -> Tensor | None:
+        """The known result of a stage."""
+        return self.images.get(stage, self.images.get("image"))
 
 
 # eq=False: comparing tensors has no single truth value, so frames are equal only to themselves.
@@ -254,7 +261,7 @@ class Frame:
 
     def without_past(self) -> Frame:
         """The same frame without the buffers that only a frame with a past needs."""
-        return self.replace(**dict.fromkeys(OF_THE_PAST))
+        return self.replace(**dict.fromkeys(MOTION))
 
     def validate(self) -> tuple[Frame, int]:
         """Look at every value: repair what is a renderer's daily bread, refuse what would spoil the result.

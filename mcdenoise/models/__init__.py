@@ -1,40 +1,55 @@
-"""The zoo: denoisers assembled from the operators, by name."""
+"""The zoo: denoisers assembled from the operators, by name, and the wrappers that any method may wear."""
 
+from mcdenoise.models import cascaded_v2 as _cascaded_v2
+from mcdenoise.models._interface import Model, Needs, Output, State, prepared
+from mcdenoise.models._journal import Journal, Stage, listening, note, summarize, timed
 from mcdenoise.models._overview import ModelOverview, overview
-from mcdenoise.models._regions import Region
-from mcdenoise.models._registry import list_models, register_model
+from mcdenoise.models._registry import build_model, find_model, list_models, register_model
 from mcdenoise.models._weights import create_model, describe_weights, load_weights, pretrained_models, save_weights
-from mcdenoise.models.cascaded import (
-    Cascade,
-    Denoised,
-    FusionModule,
-    KernelPredictor,
-    Known,
-    PixelPredictor,
-    auto_exposure,
-    normalize_depth,
-)
-from mcdenoise.models.unet import Head, UNet
+from mcdenoise.models._wrapper import Wrapper, parts_of
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.chain import Chain
+from mcdenoise.models.coarse_to_fine import CoarseToFine
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.exposed import Exposed
+from mcdenoise.models.skipping import TOLERANCE, Skipping
+from mcdenoise.models.tiled import Region, Tiled
+
+DEFAULT = "cascaded_v2"
 
 __all__ = [
-    "Cascade",
-    "Denoised",
-    "FusionModule",
-    "Head",
-    "KernelPredictor",
-    "Known",
+    "DEFAULT",
+    "TOLERANCE",
+    "Accumulated",
+    "Chain",
+    "CoarseToFine",
+    "Demodulated",
+    "Exposed",
+    "Journal",
+    "Model",
     "ModelOverview",
-    "PixelPredictor",
+    "Needs",
+    "Output",
     "Region",
-    "UNet",
-    "auto_exposure",
+    "Skipping",
+    "Stage",
+    "State",
+    "Tiled",
+    "Wrapper",
+    "build_model",
     "create_model",
     "describe_weights",
+    "find_model",
     "list_models",
+    "listening",
     "load_weights",
-    "normalize_depth",
+    "note",
     "overview",
+    "parts_of",
+    "prepared",
     "pretrained_models",
     "register_model",
     "save_weights",
+    "summarize",
+    "timed",
 ]

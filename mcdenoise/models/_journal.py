@@ -6,9 +6,11 @@ Methods are pure; what they report goes beside their results to whoever listens,
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 
@@ -36,13 +38,13 @@ class Journal:
 
     Args:
         milliseconds: run time of each stage.
-        stages: what was skipped of them, and why.
+        stages: what was skipped of them, and why, by name.
         reset: why the history was not used; empty where it was.
         tiles: the parts of the image that were computed, and why those.
     """
 
     milliseconds: dict[str, float] = field(default_factory=dict)
-    stages: list[Stage] = field(default_factory=list)
+    stages: dict[str, Stage] = field(default_factory=dict)
     reset: str = ""
     tiles: str = ""
 
@@ -66,9 +68,9 @@ def journal() -> Journal | None:
 
 
 def note(name: str, reason: str, skipped: float = 0.0, *, exact: bool = True) -> None:
-    """Report a :class:`Stage`."""
+    """Report a :class:`Stage`; the last word on each counts."""
     if (found := journal()) is not None:
-        found.stages.append(Stage(name, float(skipped), reason, exact))
+        found.stages[name] = Stage(name, float(skipped), reason, exact)
 
 
 def timed(stage: str, device: torch.device) -> AbstractContextManager[None]:
@@ -90,3 +92,24 @@ def _clock(device: torch.device) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter() * 1e3
+
+
+def summarize(frames: list[list[Stage]]) -> list[dict[str, Any]]:
+    """What was skipped in a shot.
+
+    Args:
+        frames: the stages of each frame.
+
+    Returns:
+        For each stage, in order: ``stage``; ``kept``, false if all of it was skipped in all frames; ``skipped``, the
+        mean fraction, from 0 to 1; ``reason``, the most frequent one for skipping it, or else for keeping it; and
+        ``exact``.
+    """
+    rows = []
+    for name in dict.fromkeys(stage.name for stages in frames for stage in stages):
+        found = [stage for stages in frames for stage in stages if stage.name == name]
+        fraction = sum(stage.skipped for stage in found) / len(frames)
+        telling = [stage for stage in found if stage.skipped > 0] or found
+        reason = Counter(stage.reason for stage in telling).most_common(1)[0][0]
+        rows.append({"stage": name, "kept": fraction < 1, "skipped": fraction, "reason": reason, "exact": found[0].exact})
+    return rows

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.frame import Inspected
+from mcdenoise.frame import Frame
 from mcdenoise.ops import NO_ALBEDO
 
 # Of the mean of two pixels; one sample of a path tracer differs from the next by ten times as much or more.
@@ -18,7 +18,7 @@ _CELL = 8
 _LEAST_WITNESSES, _MANY = 100, 1000
 
 
-def noise_free(inspected: Inspected) -> Tensor | None:
+def noise_free(frame: Frame) -> Tensor | None:
     """Pixels whose radiance has no noise to remove.
 
     Nothing was hit there, or what was hit has no albedo and is bright. And in the cell of 8x8 pixels and those around
@@ -27,27 +27,29 @@ def noise_free(inspected: Inspected) -> Tensor | None:
     background of detail, such as stars, which has no noise but cannot be told from it.
 
     Args:
-        inspected: a frame with its depth. Without a depth, nothing is known to be background; without an albedo,
-            nothing to be an emitter.
+        frame: with a depth, else nothing is known to be background; with an albedo, else nothing to be an emitter. The
+            radiance of the frame alone is looked at; its albedo may have been divided out.
 
     Returns:
         ``(B, 1, H, W)`` bool, or ``None`` where there is no such pixel.
     """
-    frame, _, ranges = inspected
-    brightness = _combined(torch.add, frame.color)
     kinds = []
-    if frame.depth is not None and ranges.get("depth", (0.0, torch.inf))[1] == torch.inf:
+    current = frame.color if frame.current is None else frame.current
+    brightness = _combined(torch.add, current.detach())
+    if frame.depth is not None:
         kinds.append(frame.depth == torch.inf)
-    if frame.albedo is not None and ranges["albedo"][0] < NO_ALBEDO:
-        kinds.append((_combined(torch.maximum, frame.albedo) < NO_ALBEDO) & (brightness > 0))
+    if frame.albedo is not None:
+        kinds.append((_combined(torch.maximum, frame.albedo.detach()) < NO_ALBEDO) & (brightness > 0))
     if not kinds:
         return None
     known = kinds[0] if len(kinds) == 1 else kinds[0] | kinds[1]
-    rows = known.any(-1).flatten(0, -2).any(0).nonzero()
-    if not len(rows):
-        return None
-    # Whole cells: what is above and below them has no such pixel.
-    band = slice(int(rows[0]) // _CELL * _CELL, (int(rows[-1]) // _CELL + 1) * _CELL)
+    band = slice(None)
+    if not torch.compiler.is_compiling():
+        rows = known.any(-1).flatten(0, -2).any(0).nonzero()
+        if not len(rows):
+            return None
+        # Whole cells: what is above and below them has no such pixel.
+        band = slice(int(rows[0]) // _CELL * _CELL, (int(rows[-1]) // _CELL + 1) * _CELL)
     plain, brightness = known[..., band, :], brightness[..., band, :]
     # NaN is neither more nor less than its neighbours.
     plainly = torch.where(plain, brightness, torch.nan)
@@ -62,7 +64,7 @@ def noise_free(inspected: Inspected) -> Tensor | None:
     sums = F.avg_pool2d(F.pad(counted, (0, -width % _CELL, 0, -height % _CELL)), _CELL)
     witnesses = (F.avg_pool2d(sums, 3, 1, 1) * (9 * _CELL**2)).round()
     cells = (witnesses >= _LEAST_WITNESSES) & (witnesses < _MANY)
-    if not cells.any():
+    if not torch.compiler.is_compiling() and not cells.any():
         return None
     wide = cells.repeat_interleave(_CELL, -2).repeat_interleave(_CELL, -1)
     found = torch.zeros_like(known)

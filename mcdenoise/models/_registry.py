@@ -1,42 +1,170 @@
-"""The zoo's register: names to constructors."""
+"""The zoo's register: names to constructors, and where a model that is not in it comes from."""
 
 from __future__ import annotations
 
+import functools
+import importlib
+import importlib.util
+import inspect
+import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from fnmatch import fnmatch
+from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
-from torch import nn
-
 from mcdenoise.errors import InputError
+from mcdenoise.models._adapter import as_model
+from mcdenoise.models._interface import Model
 
-_MODELS: dict[str, Callable[..., nn.Module]] = {}
+GROUP = "mcdenoise.models"
 
 
-def register_model(name: str) -> Callable[[Callable[..., nn.Module]], Callable[..., nn.Module]]:
-    """Decorator that enters a model's constructor under ``name``."""
+@dataclass(frozen=True)
+class Entry:
+    """A registered model.
 
-    def enter(constructor: Callable[..., nn.Module]) -> Callable[..., nn.Module]:
+    Args:
+        construct: makes it, with fresh weights.
+        settings: what ``construct`` is given under this name.
+        description: one line.
+    """
+
+    construct: Callable[..., Any]
+    settings: dict[str, Any]
+    description: str
+
+    @property
+    def architecture(self) -> dict[str, Any]:
+        """The settings that weights are of, with their defaults: the constructor's positional arguments."""
+        parameters = inspect.signature(self.construct).parameters.values()
+        own = {each.name: each.default for each in parameters if each.kind is each.POSITIONAL_OR_KEYWORD}
+        return own | {name: value for name, value in self.settings.items() if name in own}
+
+
+_MODELS: dict[str, Entry] = {}
+
+
+def register_model(
+    name: str, description: str = "", **settings: Any
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator that enters a model's constructor under ``name``.
+
+    The constructor's positional arguments are what weights are of (sizes), its keyword-only ones are not (how histories
+    are kept, what is skipped).
+
+    Args:
+        name: in the register.
+        description: one line; the first one of the constructor's docstring by default.
+        settings: for the constructor, under this name.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+
+    def enter(constructor: Callable[..., Any]) -> Callable[..., Any]:
         if name in _MODELS:
             raise ValueError(f"model '{name}' is registered twice")
-        _MODELS[name] = constructor
+        about = description or (constructor.__doc__ or "").strip().partition("\n")[0]
+        _MODELS[name] = Entry(constructor, settings, about)
         return constructor
 
     return enter
 
 
 def list_models(pattern: str = "*") -> list[str]:
-    """Names of all registered models that match a shell-style pattern, sorted."""
-    return sorted(name for name in _MODELS if fnmatch(name, pattern))
+    """Names of all registered models that match a shell-style pattern, sorted; those of installed packages as well."""
+    return sorted(name for name in {*_MODELS, *_installed()} if fnmatch(name, pattern))
 
 
-def build_model(name: str, **settings: Any) -> nn.Module:
-    """A registered model with fresh weights."""
-    if name not in _MODELS:
-        raise InputError(f"model '{name}': expected one of {', '.join(list_models())}; see `mcdenoise models`")
-    return _MODELS[name](**settings)
+def find_model(name: str) -> Entry:
+    """The entry of a registered model, one that an installed package offers, or somebody's own.
+
+    Args:
+        name: of :func:`list_models`; or ``path/to/file.py:factory`` or ``package.module:factory``, whose factory is
+            called for the model.
+
+    Raises:
+        InputError: there is no such model, file, module or factory.
+    """
+    if name in _MODELS:
+        return _MODELS[name]
+    if name in _installed():
+        return _of_factory(name, _loaded_entry_point(name))
+    if ":" in name:
+        return _of_factory(name, _own(name))
+    raise InputError(
+        f"model '{name}': expected one of {', '.join(list_models())}, or path/to/file.py:factory, or "
+        "package.module:factory; see `mcdenoise models`"
+    )
+
+
+def build_model(name: str, **settings: Any) -> Model:
+    """A model with fresh weights.
+
+    Raises:
+        InputError: there is no such model, or it has no such setting.
+    """
+    entry = find_model(name)
+    try:
+        inspect.signature(entry.construct).bind(**{**entry.settings, **settings})
+    except TypeError as error:
+        known = ", ".join(inspect.signature(entry.construct).parameters) or "no settings"
+        raise InputError(f"model '{name}': {error}; it takes {known}") from error
+    return as_model(entry.construct(**{**entry.settings, **settings}))
 
 
 def describe_model(name: str) -> str:
-    """The first line of the docstring of a registered model's constructor."""
-    return (_MODELS[name].__doc__ or "").strip().partition("\n")[0]
+    """One line on a registered model."""
+    return find_model(name).description
+
+
+def _of_factory(name: str, factory: Any) -> Entry:
+    if not callable(factory):
+        raise InputError(f"model '{name}': expected a factory that can be called, found {type(factory).__name__}")
+    return Entry(factory, {}, (factory.__doc__ or "").strip().partition("\n")[0])
+
+
+@functools.cache
+def _installed() -> dict[str, Any]:
+    """Entry points of installed packages in the group ``mcdenoise.models``."""
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def _loaded_entry_point(name: str) -> Any:
+    try:
+        return _installed()[name].load()
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"model '{name}': its package offers it and cannot load it: {error}") from error
+
+
+def _own(name: str) -> Any:
+    """What ``path/to/file.py:factory`` or ``package.module:factory`` names."""
+    place, _, attribute = name.rpartition(":")
+    try:
+        module = _module_of_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
+    except InputError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"model '{name}': {place} cannot be imported: {type(error).__name__}: {reason}") from error
+    if not hasattr(module, attribute):
+        offered = ", ".join(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
+        raise InputError(f"model '{name}': expected a factory '{attribute}' in {place}, found {offered or 'none'}")
+    return getattr(module, attribute)
+
+
+def _module_of_file(path: Path) -> Any:
+    if not path.is_file():
+        raise InputError(f"{path}: expected a Python file with a factory of a model, found no such file")
+    # Its own name, so that a file beside it that is called alike is another module.
+    module_name = f"mcdenoise_own_{path.stem}_{abs(hash(path.resolve()))}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"{path}: expected a Python file, found something else")
+    module = importlib.util.module_from_spec(spec)
+    # Dataclasses and the like look their module up.
+    sys.modules[module_name] = module
+    spec.loader.exec_module(module)
+    return module

@@ -10,22 +10,22 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import nn
+from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
-from mcdenoise.models._registry import build_model
+from mcdenoise.models._interface import Model
+from mcdenoise.models._registry import build_model, find_model
 
 _SHIPPED = Path(__file__).parent / "weights"
 
 
-def create_model(
-    name: str, *, pretrained: bool = False, weights: Path | str | None = None, **settings: Any
-) -> nn.Module:
-    """A model of the zoo.
+def create_model(name: str, *, pretrained: bool = False, weights: Path | str | None = None, **settings: Any) -> Model:
+    """A model of the zoo, or somebody's own.
 
     Args:
-        name: one of :func:`mcdenoise.models.list_models`.
-        pretrained: load the weights that are shipped with the package.
+        name: one of :func:`mcdenoise.models.list_models`, ``path/to/file.py:factory`` or ``package.module:factory``.
+        pretrained: load the weights that are shipped with the package. A model without weights, and one of somebody's
+            own, comes as it is made.
         weights: a safetensors file written by :func:`save_weights`; its settings are used for the model.
         settings: for the model's constructor, such as ``width=32``.
 
@@ -35,15 +35,16 @@ def create_model(
     Raises:
         InputError: the name is unknown, there are no shipped weights for it, or the file does not fit.
     """
-    if weights is None and pretrained:
-        weights = _SHIPPED / f"{name}.safetensors"
-        if not weights.is_file():
-            build_model(name)
-            have = ", ".join(pretrained_models()) or "none"
-            raise InputError(f"model '{name}': expected shipped weights, found them only for: {have}; train it first")
-    if weights is None:
-        return build_model(name, **settings).eval()
-    return load_weights(Path(weights), name, **settings)
+    if weights is not None:
+        return load_weights(Path(weights), name, **settings)
+    shipped = _SHIPPED / f"{name}.safetensors"
+    if pretrained and shipped.is_file():
+        return load_weights(shipped, name, **settings)
+    model = build_model(name, **settings)
+    if pretrained and model.needs.trainable and ":" not in name:
+        have = ", ".join(pretrained_models()) or "none"
+        raise InputError(f"model '{name}': expected shipped weights, found them only for: {have}; train it first")
+    return model.eval() if isinstance(model, nn.Module) else model
 
 
 def pretrained_models() -> list[str]:
@@ -51,31 +52,32 @@ def pretrained_models() -> list[str]:
     return sorted(path.stem for path in _SHIPPED.glob("*.safetensors"))
 
 
-def load_weights(path: Path, name: str | None = None, **settings: Any) -> nn.Module:
+def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
     """The model that a weights file describes, with these weights.
 
     Args:
         path: a file written by :func:`save_weights`.
-        name: the model it must be; any by default.
+        name: the model it must be, or somebody's own that it must fit; by default the one that the file names.
         settings: override the settings in the file.
 
     Raises:
-        InputError: no such file, not safetensors, another model, or tensors that do not fit; names the first of them.
+        InputError: no such file, not safetensors, another model, tensors that do not fit (the first of them is named),
+            or that are not finite.
     """
     description = describe_weights(path)
     found = description["architecture"]
-    if name is not None and found != name:
+    if name is not None and found != name and ":" not in name:
         raise InputError(f"{path}: expected weights of model '{name}', found those of '{found}'")
     settings = {**description["settings"], **settings}
     try:
-        model = build_model(found, **settings)
-    except InputError:
-        raise
+        model = build_model(name or found, **settings)
     except (TypeError, ValueError, RuntimeError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: expected settings of model '{found}', found {settings}") from error
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - a safetensors handle is no dict
-    own = model.state_dict()
+    own = _named(model)
     for key in sorted(own.keys() | tensors.keys()):
         expected = tuple(own[key].shape) if key in own else "no such layer"
         actual = tuple(tensors[key].shape) if key in tensors else "no such layer"
@@ -83,8 +85,12 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> nn.Mod
             raise InputError(f"{path}: layer '{key}': model '{found}' expects {expected}, found {actual}")
     if description.get("sha256") != _digest(tensors):
         raise InputError(f"{path}: expected tensors that match the header's sha256, found others; the file is damaged")
-    model.load_state_dict({key: tensor.float() for key, tensor in tensors.items()})
-    return model.eval()
+    for key, tensor in tensors.items():
+        if not tensor.isfinite().all():
+            raise InputError(f"{path}: layer '{key}': expected finite weights, found NaN or infinite ones")
+        with torch.no_grad():
+            own[key].copy_(tensor)
+    return model.eval() if isinstance(model, nn.Module) else model
 
 
 def describe_weights(path: Path) -> dict[str, Any]:
@@ -111,13 +117,14 @@ def describe_weights(path: Path) -> dict[str, Any]:
     }
 
 
-def save_weights(model: nn.Module, architecture: str, settings: dict[str, Any], about: dict[str, str]) -> bytes:
+def save_weights(model: Model, architecture: str, settings: dict[str, Any], about: dict[str, str]) -> bytes:
     """A model's weights as the bytes of a safetensors file, half precision.
 
     Args:
         model: the model.
         architecture: the name under which it is registered.
-        settings: what its constructor was given.
+        settings: what its constructor was given besides what is registered with the name. The file holds every setting
+            that weights are of, so that the code alone never decides what a file means.
         about: how the weights came to be: config, data, steps, commit, licence; texts.
 
     Returns:
@@ -126,16 +133,31 @@ def save_weights(model: nn.Module, architecture: str, settings: dict[str, Any], 
     Raises:
         InputError: a weight is not finite in half precision.
     """
-    tensors = {key: value.detach().cpu().to(torch.float16).contiguous() for key, value in model.state_dict().items()}
+    tensors = {key: value.detach().cpu().to(torch.float16).contiguous() for key, value in _named(model).items()}
     for key, tensor in tensors.items():
         if not tensor.isfinite().all():
             raise InputError(f"layer '{key}': expected weights that fit half precision, found NaN or infinite ones")
-    header = {"architecture": architecture, "settings": json.dumps(settings), **about, "sha256": _digest(tensors)}
-    return save(tensors, header)
+    known = find_model(architecture).architecture
+    every = json.dumps({**known, **{name: value for name, value in settings.items() if name in known}})
+    return save(tensors, {"architecture": architecture, "settings": every, **about, "sha256": _digest(tensors)})
 
 
-def _digest(tensors: dict[str, torch.Tensor]) -> str:
+def _named(model: Model) -> dict[str, Tensor]:
+    """The weights of a model by name; what it wears does not count, so that a file fits it with and without."""
+    if not isinstance(model, nn.Module):
+        return {}
+    own = {
+        ".".join(part for part in key.split(".") if part not in ("inner", "function")): value
+        for key, value in model.state_dict().items()
+    }
+    if len(own) < len(model.state_dict()):
+        raise InputError("model: expected weights that differ by name without 'inner', found two of one name")
+    return own
+
+
+def _digest(tensors: dict[str, Tensor]) -> str:
     digest = hashlib.sha256()
     for key in sorted(tensors):
-        digest.update(key.encode() + tensors[key].contiguous().numpy().tobytes())
+        # numpy knows no bfloat16.
+        digest.update(key.encode() + tensors[key].contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()

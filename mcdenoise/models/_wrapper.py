@@ -8,6 +8,7 @@ from typing import TypeVar
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
+from mcdenoise.models._adapter import as_model
 from mcdenoise.models._interface import Model, Needs, Output, State
 
 _Wanted = TypeVar("_Wanted")
@@ -17,14 +18,15 @@ class Wrapper(nn.Module):
     """A model that holds another one and changes what goes in or comes out.
 
     Args:
-        inner: any :class:`mcdenoise.models.Model`.
+        inner: any :class:`mcdenoise.models.Model`, or a module or function of images, see
+            :class:`mcdenoise.models.FromBuffers`.
     """
 
     inner: Model
 
     def __init__(self, inner: Model) -> None:
         super().__init__()
-        self.inner = inner
+        self.inner = as_model(inner)
 
     @property
     def needs(self) -> Needs:

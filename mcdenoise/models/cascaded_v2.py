@@ -14,6 +14,7 @@ and ``cascaded_v2_micro`` (0.08 of them) is one whose U-Nets begin at half the r
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -29,11 +30,12 @@ from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.fusion import LogFusion
-from mcdenoise.nn.inputs import FEATURES, buffers_input, guides_of, image_statistics
+from mcdenoise.nn.inputs import FEATURES, input_of, guides_of, image_statistics
 from mcdenoise.nn.unet import Head, UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
 from mcdenoise.ops._backend import choose_backend
-from mcdenoise.ops._fused import softplus
+from mcdenoise.ops._steps.network import softplus
+from mcdenoise.ops.lag import THRESHOLD
 
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of f1, f2, f3
 _USES = frozenset({"albedo", "normal", "depth", "current", "length"})
@@ -97,7 +99,7 @@ class PixelNetwork(_Network):
         for _ in range(self.unet.levels - 1):
             image = downsample(image)
             means.append(torch.log1p(image))
-        levels = self.unet(buffers_input(frame, logs, logarithms=False), means)
+        levels = self.unet(input_of(frame, logs, logarithms=False), means)
         # The heads predict the logarithm of the radiance, on top of the input's: a network at rest is the identity,
         # and errors are relative, as the eye and the loss see them.
         scales = [logs]
@@ -133,7 +135,7 @@ class KernelNetwork(_Network):
         statistics = frame.statistics or self.statistics(frame)
         frame, exposure, top = frame.replace(statistics=statistics), statistics["exposure"], statistics["top"]
         image = frame.color * exposure
-        levels = self.unet(buffers_input(frame, image))
+        levels = self.unet(input_of(frame, image))
         guides = guides_of(frame)
         # One for all scales: a tile of an image must not be filtered otherwise than the whole.
         backend = choose_backend(None, image, *levels)
@@ -195,7 +197,9 @@ def _cascade(
         initial=CoarseToFine(Tiled(PixelNetwork(width, half)), resolutions),
         final=Tiled(KernelNetwork(kernel_width or width, kernel_size, half)),
     )
-    return Demodulated(Accumulated(Skipping(network, tolerance), alpha_min=alpha_min, anti_lag=anti_lag))
+    return Demodulated(
+        Accumulated(Skipping(network, tolerance, alpha_min), alpha_min=alpha_min, lag_threshold=THRESHOLD if anti_lag else math.inf)
+    )
 
 
 _PAPER = "the cascade with a history, logarithms and three resolutions"

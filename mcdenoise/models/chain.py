@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame, Skip
+from mcdenoise.models._adapter import as_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 
 
@@ -28,7 +29,7 @@ class Chain(nn.Module):
             raise ValueError("methods: expected one at least, found none")
         self._names = tuple(methods)
         for name, method in methods.items():
-            setattr(self, name, method)
+            setattr(self, name, as_model(method))
 
     @property
     def needs(self) -> Needs:
@@ -54,9 +55,10 @@ class Chain(nn.Module):
         last, skip = self._names[-1], frame.skip
         for name in self._names:
             method: Model = getattr(self, name)
-            known = None if skip is None else skip.images.get("image" if name == last else name)
+            known = None if skip is None else skip.of("image" if name == last else name)
             part = None if skip is None else Skip(skip.mask, {} if known is None else {"image": known})
-            output, states[name] = method(prepared(method, frame.replace(skip=part)), states[name])
+            frame = prepared(method, frame)
+            output, states[name] = method(frame.replace(skip=part), states[name])
             image = output.image
             if skip is not None and known is not None:
                 image = torch.where(skip.mask, known.to(image.dtype), image)

@@ -11,7 +11,7 @@ from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.models.tiled import TILE, Tiled
 from mcdenoise.ops import downsample
-from mcdenoise.ops._fused import BLOCK, low_frequencies_of
+from mcdenoise.ops._steps.network import BLOCK, low_frequencies_of
 
 # Of the buffers, what a mean of 2x2 pixels is a buffer of.
 _IMAGES = tuple(name for name in BUFFERS if name not in ("motion", "reference"))
@@ -20,7 +20,7 @@ _IMAGES = tuple(name for name in BUFFERS if name not in ("motion", "reference"))
 class CoarseToFine(Wrapper):
     """The same method, with the same weights, on an image at half its size, at a quarter, and so on.
 
-    Each size gives the next larger one its low frequencies (:func:`mcdenoise.ops._fused.low_frequencies_of`). A U-Net
+    Each size gives the next larger one its low frequencies (:func:`mcdenoise.ops._steps.network.low_frequencies_of`). A U-Net
     sees no further than some 60 pixels; at one sample a pixel the mean of all of these is still noisy, and where light
     is sparse most of them are black.
 

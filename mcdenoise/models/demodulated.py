@@ -48,11 +48,12 @@ class Demodulated(Wrapper):
             if frame.variance is not None:
                 # That of a quotient is the variance over the square of the divisor.
                 changes["variance"] = demodulate(demodulate(frame.variance, albedo), albedo)
+        wanted = frame.hints.stages
         output, state = self.inner(frame.replace(**changes), state)
         del frame, changes
         with timed("remodulate", device):
             # A network that ends with a convolution hands out its precision.
-            stages = {name: _with(albedo, image) for name, image in output.stages.items()}
+            stages = {name: _with(albedo, image) for name, image in output.stages.items() if wanted}
             return Output(_with(albedo, output.image), stages), state
 
 

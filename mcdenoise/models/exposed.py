@@ -33,7 +33,7 @@ class Exposed(Wrapper):
             frame = frame.replace(statistics={**frame.statistics, **self.statistics(frame)})
         exposure = frame.statistics["exposure"]
         output, state = self.inner(_scaled(frame, exposure), state)
-        stages = {name: image / exposure for name, image in output.stages.items()}
+        stages = {name: image / exposure for name, image in output.stages.items() if frame.hints.stages}
         return Output(output.image / exposure, stages), state
 
 

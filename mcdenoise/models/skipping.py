@@ -25,6 +25,12 @@ _STRIDE = 4
 # Tiles on each side that count for a network. Its lowest resolution sees twice as far, but what changes there moves a
 # result by no more than what it does to the exposure of the whole image.
 _SEEN = 4
+# A tile that is passed through comes back only when it is noisier than it had to be by this factor.
+_NOISE_HYSTERESIS = 2.0
+# Relative difference between a frame and the accumulated image below which it says nothing of the noise.
+_LEAST_RESIDUAL = 1e-4
+# Frames from which the noise can be told.
+_LEAST_LENGTH = 8
 # A tile may change by this fraction of the tolerance from frame to frame before it is reused, and in all by the
 # tolerance.
 _HYSTERESIS = 0.25
@@ -39,7 +45,8 @@ class Remembered(NamedTuple):
         images: results by stage, ``"image"`` the last, ``(B, 3, H, W)``.
         color: ``(B, 3, H, W)`` radiance of which each tile was computed.
         weight: ``(B, 1, H, W)`` of the current frame in it: one over the history length.
-        reused: ``(1, 1, h, w)`` bool, tiles that were reused.
+        passed: ``(1, 1, h, w)`` bool, tiles whose accumulated image was passed through.
+        reused: ``(1, 1, h, w)`` bool, tiles whose last result was reused.
         marks: means of the features over each tile, which tell one content from another; ``None`` until they are
             needed.
     """
@@ -47,6 +54,7 @@ class Remembered(NamedTuple):
     images: Mapping[str, Tensor]
     color: Tensor
     weight: Tensor
+    passed: Tensor
     reused: Tensor
     marks: Tensor | None
 
@@ -55,25 +63,28 @@ class Skipping(Wrapper):
     """Skips what a scene does not need of a method.
 
     Exactly: pixels without noise (:func:`mcdenoise.models._noise_free.noise_free`) are copied from the frame. Up to a
-    tolerance, while nothing moves in the image (``frame.hints.still``): tiles of 32x32 pixels that have changed by less
-    since they were last computed, and four tiles around them too, are not computed again. A tile is reused only when it
-    changes by less than a quarter of the tolerance from frame to frame, so that it does not switch to and fro.
+    tolerance, while nothing moves in the image (``frame.hints.still``): tiles of 32x32 pixels whose accumulated noise
+    has fallen below it are passed through; tiles that have changed by less since they were last computed, and four
+    tiles around them too, are not computed again. Neither switches to and fro: a tile that is passed through comes back
+    only at twice the noise, and one is reused only when it changes by less than a quarter of the tolerance from frame
+    to frame.
 
     Args:
         inner: a method; where it is :class:`mcdenoise.models.Tiled`, or a chain of such, it computes no more than the
             tiles that are left.
-        tolerance: largest change, relative to the tile's mean, of a tile that is not computed again; 0 computes every
-            tile that has noise.
+        tolerance: largest noise (root mean square, relative to the tile's mean) of a tile that is passed through, and
+            largest change of one that is not computed again; 0 computes every tile that has noise.
+        alpha_min: of the accumulation whose noise is estimated, see :class:`mcdenoise.models.Accumulated`.
 
     Raises:
         InputError: the tolerance is negative or not finite.
     """
 
-    def __init__(self, inner: Model, tolerance: float = TOLERANCE) -> None:
+    def __init__(self, inner: Model, tolerance: float = TOLERANCE, alpha_min: float = 0.1) -> None:
         super().__init__(inner)
         if not 0 <= tolerance < math.inf:
             raise InputError(f"tolerance: expected a finite number of at least 0, found {tolerance:g}")
-        self.tolerance = tolerance
+        self.tolerance, self._alpha_min = tolerance, alpha_min
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
@@ -83,10 +94,13 @@ class Skipping(Wrapper):
         with timed("plan", current.device):
             free = noise_free(frame)
             _note("noise-free pixels", free, "background and emitters are copied", exact=True)
-            kept = self._unchanged(frame, before) if still else None
-            reused = None if kept is None or before is None else _pixels(kept.reused, frame.size)
+            kept = self._decided(frame, current, before) if still else None
+            passed = None if kept is None else _pixels(kept.passed, frame.size)
+            reused = None if kept is None else _pixels(kept.reused, frame.size)
+            _note("converged tiles", passed, f"noise below {self.tolerance:g}", exact=False)
             _note("unchanged tiles", reused, f"change below {self.tolerance:g}", exact=False)
-            skip = _skip(free, reused, current, {} if before is None else before.images)
+            images = {} if before is None else before.images
+            skip = _skip(free, passed, reused, current, frame.color, images)
         with timed("network", current.device):
             output, inner = self.inner(frame.replace(skip=skip), inner)
             if skip is not None:
@@ -96,53 +110,81 @@ class Skipping(Wrapper):
             kept = kept._replace(images={**output.stages, "image": output.image})
         return output, None if kept is None and inner is None else (kept, inner)
 
-    def _unchanged(self, frame: Frame, before: Remembered | None) -> Remembered:
-        """Which tiles, as far as a network sees, have changed by less than the tolerance since they were computed."""
-        weight = torch.ones_like(frame.color[:, :1]) if frame.length is None else 1 / frame.length
+    def _decided(self, frame: Frame, current: Tensor, before: Remembered | None) -> Remembered:
+        """What is to be kept of a frame, without its images: which tiles need no network in it."""
+        length = torch.ones_like(frame.color[:, :1]) if frame.length is None else frame.length
+        passed = self._converged(frame.color, current, length, None if before is None else before.passed)
+        weight = 1 / length
         if before is None:
-            sides = (-(-side // TILE) for side in frame.size)
-            nothing = torch.zeros((1, 1, *sides), dtype=torch.bool, device=weight.device)
-            return Remembered({}, frame.color, weight, nothing, None)
+            return Remembered({}, frame.color, weight, passed, torch.zeros_like(passed), None)
+        reused, marks = self._unchanged(frame, weight, before)
+        reused = reused & ~passed
+        pixels = _pixels(reused, frame.size)
+        color, weight = torch.where(pixels, before.color, frame.color), torch.where(pixels, before.weight, weight)
+        return Remembered({}, color, weight, passed, reused, marks)
+
+    def _converged(self, color: Tensor, current: Tensor, length: Tensor, before: Tensor | None) -> Tensor:
+        """Tiles whose estimated noise is below the tolerance.
+
+        The residual ``c - a`` of a frame ``c`` and the accumulated ``a = alpha c + (1 - alpha) h`` has the variance
+        ``(1 - alpha)^2 (1 + s') sigma^2``, with ``s'`` the sum of squared weights in ``h``; ``a`` has ``s sigma^2``.
+        """
+        color, current, length = (_thinned(image) for image in (color, current, length))
+        alpha = (1 / length).clamp_min(self._alpha_min)
+        factor = self._squared_weights(length) / ((1 - alpha).square() * (1 + self._squared_weights(length - 1)))
+        factor = torch.where(length >= _LEAST_LENGTH, factor, torch.inf)
+        squares = (current - color).square().mean(1, keepdim=True)
+        variance, residual = (_means(image, TILE // _STRIDE) for image in (squares * factor, squares))
+        mean = _means(color.mean(1, keepdim=True), TILE // _STRIDE)
+        # Where nothing differs, either there is no noise, or a renderer at rest repeats it: nothing can be told. What
+        # is black so far may still be hit by light.
+        noise = torch.where(residual.sqrt() > _LEAST_RESIDUAL * mean, variance.sqrt() / mean, torch.inf)
+        stays = self.tolerance * _NOISE_HYSTERESIS
+        limit = self.tolerance if before is None else torch.where(before, stays, self.tolerance)
+        return (noise <= limit).all(0, keepdim=True)
+
+    def _squared_weights(self, length: Tensor) -> Tensor:
+        """Sum of the squared weights of the frames in an accumulated image: an average at first, a window later."""
+        alpha, longest = self._alpha_min, 1 / self._alpha_min
+        window = alpha / (2 - alpha)
+        later = window + (alpha - window) * (1 - alpha) ** (2 * (length - longest).clamp_min(0))
+        return torch.where(length <= longest, 1 / length.clamp_min(1), later)
+
+    def _unchanged(self, frame: Frame, weight: Tensor, before: Remembered) -> tuple[Tensor, Tensor | None]:
+        """Tiles that, as far as a network sees, have changed by less than the tolerance since they were computed.
+
+        Returns:
+            The tiles, and the marks of this frame if they were needed.
+        """
         limit = torch.where(before.reused, self.tolerance, self.tolerance * _HYSTERESIS)
         thin = (_thinned(image) for image in (frame.color, weight, before.color, before.weight))
         calm = _change(*thin, TILE // _STRIDE) <= limit
         if not calm.any():
-            return Remembered({}, frame.color, weight, calm, None)
+            return calm, None
         marks = _marks(frame)
         if before.marks is None:
-            return Remembered({}, frame.color, weight, torch.zeros_like(calm), marks)
+            return torch.zeros_like(calm), marks
         same = (marks == before.marks).all(1, keepdim=True).all(0, keepdim=True)
         changed = ~(same & (_change(frame.color, weight, before.color, before.weight, TILE) <= limit))
-        reused = F.max_pool2d(changed.float(), 2 * _SEEN + 1, 1, _SEEN) == 0
-        pixels = _pixels(reused, frame.size)
-        color, weight = torch.where(pixels, before.color, frame.color), torch.where(pixels, before.weight, weight)
-        return Remembered({}, color, weight, reused, marks)
+        return F.max_pool2d(changed.float(), 2 * _SEEN + 1, 1, _SEEN) == 0, marks
 
 
 def _skip(
-    free: Tensor | None, reused: Tensor | None, current: Tensor, images: Mapping[str, Tensor]
+    free: Tensor | None,
+    passed: Tensor | None,
+    reused: Tensor | None,
+    current: Tensor,
+    color: Tensor,
+    images: Mapping[str, Tensor],
 ) -> Skip | None:
-    """Pixels whose result is known, and that result at every stage."""
-    if reused is not None and (torch.compiler.is_compiling() or reused.any()):
-        mask = reused.expand_as(current[:, :1])
-        if free is None:
-            return Skip(mask, images)
-        return Skip(mask | free, {name: torch.where(free, current, image) for name, image in images.items()})
-    # Whatever stages there are: a noise-free pixel is the same in all of them.
-    return None if free is None else Skip(free, _Everywhere(current))
-
-
-class _Everywhere(dict[str, Tensor]):
-    """The same image for every stage."""
-
-    def __init__(self, image: Tensor) -> None:
-        super().__init__(image=image)
-
-    def __missing__(self, name: str) -> Tensor:
-        return self["image"]
-
-    def get(self, name: str, default: object = None) -> Tensor:  # type: ignore[override]
-        return self[name]
+    """Pixels whose result is known, and that result: the last one, the accumulated radiance, or that of the frame."""
+    if passed is None or reused is None or not (passed.any() or reused.any()):
+        return None if free is None else Skip(free, {"image": current})
+    known = {name: torch.where(passed, color, image) for name, image in (images or {"image": color}).items()}
+    mask = (passed | reused).expand_as(current[:, :1])
+    if free is None:
+        return Skip(mask, known)
+    return Skip(mask | free, {name: torch.where(free, current, image) for name, image in known.items()})
 
 
 def _note(name: str, pixels: Tensor | None, reason: str, *, exact: bool) -> None:

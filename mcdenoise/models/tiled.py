@@ -92,7 +92,8 @@ class Tiled(Wrapper):
 
 def _known(frame: Frame, stage: str) -> Tensor:
     """What stands where nothing is computed: the known result, or the input."""
-    return frame.color if frame.skip is None else frame.skip.images.get(stage, frame.color)
+    known = None if frame.skip is None else frame.skip.of(stage)
+    return frame.color if known is None else known
 
 
 class Region(NamedTuple):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.ops import laplacian_fusion, upsample
-from mcdenoise.ops._fused import gated_fusion
+from mcdenoise.ops._steps.network import gated_fusion
 
 
 class FusionModule(nn.Module):

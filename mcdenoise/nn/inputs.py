@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.ops._fused import depth_scale, network_features, network_input, normalized_depth
+from mcdenoise.ops._steps.network import buffers_input, depth_scale, network_guides, normalized_depth
 
 FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, one over the length 1
 
@@ -72,7 +72,7 @@ def image_statistics(frame: Frame) -> dict[str, Tensor]:
     return found
 
 
-def buffers_input(frame: Frame, image: Tensor, *, logarithms: bool = True) -> Tensor:
+def input_of(frame: Frame, image: Tensor, *, logarithms: bool = True) -> Tensor:
     """A network's input: the logarithm of an image, and the features of a frame.
 
     Args:
@@ -85,13 +85,13 @@ def buffers_input(frame: Frame, image: Tensor, *, logarithms: bool = True) -> Te
         the frame alone, and one over the history length.
     """
     current = frame.color if frame.current is None else frame.current
-    exposure, scale = frame.statistics["exposure"], frame.statistics["depth_scale"].split(1, 1)
-    features = network_features(*features_of(frame), current, frame.length, exposure, (scale[0], scale[1]))
-    return network_input(image, features, logarithms=logarithms)
+    exposure, (largest, typical) = frame.statistics["exposure"], frame.statistics["depth_scale"].split(1, 1)
+    features = (*features_of(frame), current, frame.length, exposure, (largest, typical))
+    return buffers_input(image, *features, logarithms=logarithms)
 
 
 def guides_of(frame: Frame) -> list[Tensor]:
     """Normal and depth in [0, 1], which guide bilateral weights."""
     _, normal, depth = features_of(frame)
     largest, typical = frame.statistics["depth_scale"].split(1, 1)
-    return [normal * 0.5 + 0.5, normalized_depth(depth, largest, typical)]
+    return list(network_guides(normal, depth, (largest, typical)).split([3, 1], 1))

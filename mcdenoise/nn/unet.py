@@ -11,6 +11,10 @@ from torch import Tensor, nn
 
 from mcdenoise.nn._cpu import ConvBlock, ReLU, Upsampling, layout_of, max_pool
 
+# Peak numbers for each pixel, measured: 4.5 widths inside the U-Net, and 54 of images and features around it, which
+# stay float32.
+_LIVE_WIDTHS, _LIVE_IMAGES = 4.5, 54
+
 
 class UNet(nn.Module):
     """A U-Net that hands out features of an image at full, half and quarter resolution: its last decoder levels.
@@ -74,6 +78,14 @@ class UNet(nn.Module):
         down, up = range(self.levels), range(self.level(scale), self.levels - 1)
         convolutions: int = sum(2 * self.stride << level for level in (*down, *up))
         return convolutions + self.multiple - 1
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that an image takes while it is computed, for each of its pixels, with what goes in and out.
+
+        Args:
+            bfloat16: whether convolutions are in bfloat16, else in float32.
+        """
+        return _LIVE_WIDTHS * self.width * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
 
     def forward(self, x: Tensor, coarse: Sequence[Tensor] = ()) -> list[Tensor]:
         """Features at full, half and quarter resolution.

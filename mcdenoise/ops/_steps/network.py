@@ -238,32 +238,42 @@ def gated_fusion(
     return fused if top is None else torch.expm1(torch.minimum(fused.clamp_min(0), top))
 
 
-def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor, *, backend: Backend | None = None) -> Tensor:
+def low_frequencies_of(
+    fine: Tensor,
+    coarse: Tensor,
+    top: Tensor,
+    exposure: Tensor | None = None,
+    *,
+    backend: Backend | None = None,
+) -> Tensor:
     """An image with the means of another in the place of its own, over blocks of 8x8 pixels.
 
     ``fine * (U m(coarse) + e) / (U m(fine) + e)`` with the means ``m`` of blocks, interpolated bilinearly by ``U``.
     Since it multiplies, and both means are interpolated alike, no light of a lamp gets on the dark wall beside it.
 
     Args:
-        fine: ``(B, C, H, W)`` radiance in units of a typical one, up to 1e35.
+        fine: ``(B, C, H, W)`` radiance, up to 1e35 in units of a typical one.
         coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` of the same unit and dtype.
-        top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result.
+        top: ``(B, 1, 1, 1)`` largest logarithm of the exposed radiance of the result.
+        exposure: ``(B, 1, 1, 1)`` factor that brings the radiance to units of a typical one; 1 by default.
         backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
-        ``(B, C, H, W)`` radiance, at most ``expm1(top)``.
+        ``(B, C, H, W)`` radiance, at most ``expm1(top) / exposure``.
     """
-    means = downsample(fine)
+    means, most = downsample(fine), torch.expm1(top)
     for _ in range(BLOCK.bit_length() - 2):
         means, coarse = downsample(means), downsample(coarse)
-    if choose_backend(backend, fine, means, coarse, top, differentiable=False, forms=_FORMS) != "torch":
+    if exposure is not None:
+        means, coarse, most = means * exposure, coarse * exposure, most / exposure
+    if choose_backend(backend, fine, means, coarse, most, differentiable=False, forms=_FORMS) != "torch":
         from mcdenoise.ops._fast import fused as fast
 
-        result: Tensor = fast.low_frequencies_of(fine, means, coarse, torch.expm1(top), _DARK)
+        result: Tensor = fast.low_frequencies_of(fine, means, coarse, most, _DARK)
         return result
     wide = F.interpolate(torch.cat([coarse, means], 1), scale_factor=BLOCK, mode="bilinear") + _DARK
     wanted, found = wide[..., : fine.shape[-2], : fine.shape[-1]].chunk(2, 1)
-    return torch.minimum(fine * (wanted / found), torch.expm1(top))
+    return torch.minimum(fine * (wanted / found), most)
 
 
 def softplus(x: Tensor, units: Sequence[float], *, backend: Backend | None = None) -> Tensor:

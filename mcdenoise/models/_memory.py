@@ -11,7 +11,7 @@ import torch
 
 from mcdenoise.frame import BUFFERS
 from mcdenoise.errors import InputError
-from mcdenoise.models import Region
+from mcdenoise.models.tiled import Region
 
 GB = 1e9
 LEAST_SIDE = 64

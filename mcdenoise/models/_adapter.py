@@ -1,0 +1,79 @@
+"""From a module that takes images and returns an image to a method."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+
+CONTRACT = (
+    "expected a model with `needs` that takes (frame, state) and returns (Output, state), or a module or function that "
+    "takes tensors by the names of buffers (color, albedo, normal, depth, ...) and returns an image (B, 3, H, W)"
+)
+
+
+class FromBuffers(nn.Module):
+    """A method without a state, made of a function of images.
+
+    Args:
+        function: takes ``(B, C, H, W)`` tensors whose names are those of the buffers that it gets, of the vocabulary or
+            of ``Frame.extra``; one with a default value gets the buffer only where the frame has it. It returns
+            ``(B, 3, H, W)`` radiance, or an :class:`mcdenoise.models.Output`.
+        reach: see :class:`mcdenoise.models.Needs`.
+
+    Raises:
+        InputError: the function takes no arguments by name.
+    """
+
+    def __init__(self, function: Any, reach: int | None = None) -> None:
+        super().__init__()
+        self.function = function
+        call = function.forward if isinstance(function, nn.Module) else function
+        required, optional = set(), set()
+        for parameter in inspect.signature(call).parameters.values():
+            if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD, parameter.POSITIONAL_ONLY):
+                continue
+            (required if parameter.default is parameter.empty else optional).add(parameter.name)
+        if not required | optional or "frame" in required:
+            raise InputError(f"model: {CONTRACT}; found {_name(function)}{inspect.signature(call)}")
+        trainable = isinstance(function, nn.Module) and any(True for _ in function.parameters())
+        self._needs = Needs(frozenset(required), frozenset(optional), trainable, reach)
+
+    @property
+    def needs(self) -> Needs:
+        """The buffers that the function takes."""
+        return self._needs
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        named = {name: frame.buffer(name) for name in sorted(self._needs.buffers | self._needs.uses)}
+        result = self.function(**{name: image for name, image in named.items() if image is not None})
+        if isinstance(result, Output):
+            return result, None
+        if not isinstance(result, Tensor):
+            raise InputError(f"model: {CONTRACT}; {_name(self.function)} returned {type(result).__name__}")
+        return Output(result), None
+
+
+def as_model(thing: Any) -> Model:
+    """A model as it is, and a module or function of images as one.
+
+    Raises:
+        InputError: it is neither.
+    """
+    if isinstance(getattr(thing, "needs", None), Needs):
+        model: Model = thing
+        return model
+    if isinstance(thing, type) or not callable(thing):
+        found = f"the class {thing.__name__}" if isinstance(thing, type) else type(thing).__name__
+        raise InputError(f"model: {CONTRACT}; found {found}")
+    return FromBuffers(thing)
+
+
+def _name(thing: Any) -> str:
+    return str(getattr(thing, "__name__", type(thing).__name__))

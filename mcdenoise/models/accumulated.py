@@ -1,0 +1,309 @@
+"""A method on accumulated radiance: the history of a shot, what is kept of it from frame to frame, and when it ends."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import MOTION, Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._journal import Journal, journal, note, timed
+from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.ops import Surface, clamp_fireflies, motion_from_position
+from mcdenoise.ops._steps.history import COLOR, MEAN, SQUARE, blend, incoming, lights, without_history
+from mcdenoise.ops.fireflies import LIMIT
+from mcdenoise.ops.lag import THRESHOLD
+from mcdenoise.ops.temporal import Rule
+
+# A cut leaves a few accidental matches; a fast pan keeps far more than this fraction of the image.
+_CUT_FRACTION = 0.05
+# What a mirror or glass shows does not move as its surface does: a long history would smear it.
+SPECULAR_LENGTH = 2.0
+# Where clamping would take more than this fraction of the light of the median block, the shot's light is caustics,
+# which have another limit.
+_LOST, CAUSTICS = 0.1, 120.0
+# Side of a block in pixels; rows of blocks that are looked at; and how few blocks say nothing.
+_BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
+# A light has hardly varied over the history: its compressed radiance by less than this fraction.
+_STEADY = 0.1
+_NO_WAY = "no motion, and no position with a previous camera"
+
+
+class History(NamedTuple):
+    """What is kept of a shot.
+
+    All of it zeros is the history of no frame, so that a graph that takes a history can begin with that.
+
+    Args:
+        color: ``(B, 3, H, W)``; where lag is looked for ``(B, 9, H, W)``, see
+            :func:`mcdenoise.ops._steps.history.blend`.
+        length: ``(B, 1, H, W)`` in frames.
+        surface: what was seen.
+        view_projection: ``(B, 4, 4)`` by which camera.
+        limit: ``(B, 1, 1, 1)`` of the fireflies of this shot, see :func:`mcdenoise.ops.clamp_fireflies`.
+    """
+
+    color: Tensor
+    length: Tensor
+    surface: Surface
+    view_projection: Tensor | None
+    limit: Tensor
+
+
+class Accumulated(Wrapper):
+    """Blends each frame with the reprojected history of its shot, and hands the method what came of it.
+
+    The method sees the accumulated radiance as ``color``, that of the frame alone as ``current``, and the ``length`` of
+    the history; whether nothing moves, as ``hints.still``; and no state at the beginning of a shot. A shot ends at a
+    cut (less than 5 % of the pixels find their surface in the previous frame), when the image's size changes, and where
+    a frame says nothing of motion. The accumulated image is the stage ``accumulated``.
+
+    Motion is the frame's own where it has one, else that of its previous positions (its positions, where it has none)
+    seen from the previous camera. Where positions and cameras say that nothing moved, the motion is zero, not the
+    rounding of a projection, which would blur a still image a little more with every frame. The consistency test
+    compares the previous frame's positions with the previous positions too, so that what moves keeps its history. It
+    compares the normals as they are: what turns by more than the normal limit from one frame to the next starts anew.
+
+    Fireflies are clamped before accumulation. Where clamping would remove more than 10 % of the light of the median
+    32x32 block of a shot's first frame (of each image of a batch by itself), the shot has caustics, and the limit is
+    120. How histories of mirrors and of changing light are shortened: :func:`mcdenoise.ops._steps.history.blend`.
+
+    A lamp in the plane of a ceiling, with its albedo, is the same surface by all tests, and bilinear taps would carry
+    its light over its edge, a little further with every frame. So pixels that see a light take their history from
+    pixels that saw one, and all others from the others, where both are among the taps. A light is seen where
+    :func:`mcdenoise.ops._steps.history.lights` says so, and its compressed radiance varied by less than a tenth over
+    the history. A light that is narrower than three pixels bleeds still. This needs the test for lag.
+
+    Half-precision frames are accumulated in float32, which holds 10,000 frames as well as ten.
+
+    Args:
+        inner: any method.
+        alpha_min: smallest weight of the current frame, in (0, 1], see :func:`mcdenoise.ops.accumulate`.
+        rule: ``"relative"``; or ``"bmfr"``, the published one, which needs positions and normals.
+        position_limit: see :func:`mcdenoise.ops.reproject`.
+        normal_limit: likewise.
+        firefly_limit: see :func:`mcdenoise.ops.clamp_fireflies`, infinity for none; by default chosen as above.
+        specular_length: the longest history of what is seen in mirrors and through glass while the image moves, in
+            frames, at least 0; infinity treats them as everything else.
+        lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test for changes of light.
+
+    Raises:
+        InputError: a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        inner: Model,
+        *,
+        alpha_min: float = 0.1,
+        rule: Rule = "relative",
+        position_limit: float | None = None,
+        normal_limit: float | None = None,
+        firefly_limit: float | None = None,
+        specular_length: float = SPECULAR_LENGTH,
+        lag_threshold: float = THRESHOLD,
+    ) -> None:
+        super().__init__(inner)
+        if not 0 < alpha_min <= 1:
+            raise InputError(f"alpha_min: expected in (0, 1], found {alpha_min}")
+        if not specular_length >= 0:
+            raise InputError(f"specular_length: expected at least 0, found {specular_length}")
+        self.alpha_min, self.rule, self.firefly_limit = alpha_min, rule, firefly_limit
+        self.position_limit, self.normal_limit = position_limit, normal_limit
+        self.specular_length, self.lag_threshold = specular_length, lag_threshold
+
+    @property
+    def needs(self) -> Needs:
+        """As those inside but for what is handed to it; whatever tells motion is of use."""
+        needs = self.inner.needs
+        given = frozenset({"current", "length"})
+        uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth", "albedo"}
+        return Needs(needs.buffers - given, uses, needs.trainable, None)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        history, inner = (None, None) if state is None else state
+        with timed("accumulate", frame.color.device):
+            accumulated, history, inner = self._accumulate(frame.with_depth(), history, inner)
+        output, inner = self.inner(accumulated, inner)
+        stages = {"accumulated": accumulated.color, **output.stages}
+        after = None if history is None and inner is None else (history, inner)
+        return output._replace(stages=stages), after
+
+    def _accumulate(
+        self, frame: Frame, history: History | None, inner: State
+    ) -> tuple[Frame, History | None, State]:
+        """The frame with its history, the history for the next one, and the state that the method inside may have."""
+        compiling = torch.compiler.is_compiling()
+        can_move = frame.motion is not None or (frame.position is not None and frame.view_projection is not None)
+        reset = "" if can_move else _NO_WAY
+        if self.rule == "bmfr" and (frame.position is None or frame.normal is None):
+            reset = reset or "no position and normal, which the rule compares"
+        if not reset:
+            reset = "first frame" if history is None else _misfit(history, frame)
+        keeps = can_move and not (frame.hints.last and not frame.hints.keep_all)
+        # What has no history and will be none is compared with nothing.
+        compared = math.isfinite(self.lag_threshold) and (keeps or not reset)
+        limit = self._chosen(frame.color) if reset or history is None else history.limit
+        if compiling and self.firefly_limit is None:
+            limit = torch.where(limit > 0, limit, self._chosen(frame.color))
+        entering = incoming(frame.color, None, limit, compared=compared)
+        seen = lights(entering[:, MEAN]) if compared else None
+        still: bool | Tensor = False
+        if not reset and history is not None:
+            still = is_still(frame, history)
+            color, length, kept = self._blend(frame, entering, seen, history, still)
+            cut = kept.mean() < _CUT_FRACTION
+            if compiling:
+                color = torch.where(cut, without_history(entering), color)
+                length = torch.where(cut, 1, length)
+                limit = torch.where(cut, 0, limit)
+                inner = pytree.tree_map_only(Tensor, lambda tensor: torch.where(cut, 0, tensor), inner)
+            elif cut:
+                reset = "cut"
+                # Another shot may be of another light, which is seen only now.
+                chosen = self._chosen(frame.color)
+                if not torch.equal(chosen, limit):
+                    limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
+        if reset:
+            color, length = without_history(entering), torch.ones_like(entering[:, :1])
+            inner, still = None, False
+        if (found := journal()) is not None:
+            self._report(found, frame, reset, still=bool(still), can_move=can_move, keeps=keeps)
+        after = None
+        if keeps:
+            label = None if seen is None else seen * _steady(color)
+            surface = Surface(frame.position, frame.normal, frame.depth, label)
+            after = History(color, length, surface, frame.view_projection, limit)
+        hints = frame.hints._replace(still=not compiling and bool(still))
+        accumulated = frame.replace(color=color[:, COLOR], current=entering[:, COLOR], length=length, hints=hints)
+        return accumulated, after, inner
+
+    def _blend(
+        self, frame: Frame, entering: Tensor, seen: Tensor | None, history: History, still: bool | Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Color and length of the frame with its history, and how many pixels of each image have one."""
+        motion = None
+        if isinstance(still, Tensor):
+            motion = torch.where(still, 0, motion_to_previous(frame, history.view_projection))
+        elif not still or (frame.hints.keep_all and frame.motion is not None):
+            motion = motion_to_previous(frame, history.view_projection)
+        return blend(
+            *(entering, history.color, history.length, motion),
+            *(surface_before(frame)._replace(label=seen), history.surface),
+            alpha_min=self.alpha_min,
+            rule=self.rule,
+            position_limit=self.position_limit,
+            normal_limit=self.normal_limit,
+            albedo=frame.albedo,
+            specular_length=self.specular_length,
+            lag_threshold=self.lag_threshold,
+        )
+
+    def _chosen(self, color: Tensor) -> Tensor:
+        """The limit of the fireflies of each image of a shot that begins with this frame."""
+        if self.firefly_limit is not None:
+            return torch.full_like(color[:, :1, :1, :1], self.firefly_limit, dtype=torch.float32)
+        return torch.where(_takes_light(color), CAUSTICS, LIMIT).reshape(-1, 1, 1, 1).to(torch.float32)
+
+    def _report(self, found: Journal, frame: Frame, reset: str, *, still: bool, can_move: bool, keeps: bool) -> None:
+        found.reset = reset
+        source = "motion" if frame.motion is not None else "positions and cameras"
+        alone = "" if can_move else "no motion, and no positions with cameras: single frames"
+        note("accumulate", alone or source, float(not can_move))
+        why = alone or ("nothing moves in the image" if still and not frame.hints.keep_all else "")
+        note("reproject", why or source, float(why != ""))
+        note("remember", "for the next frame" if keeps else alone or "last frame", float(not keeps))
+
+
+def surface_before(frame: Frame) -> Surface:
+    """What a frame shows, at the positions that it had in the frame before; its normals and depths are the current."""
+    before = frame.position if frame.previous_position is None else frame.previous_position
+    return Surface(before, frame.normal, frame.depth)
+
+
+def motion_to_previous(frame: Frame, previous_view_projection: Tensor | None) -> Tensor | None:
+    """Where each pixel's surface point was in the frame before, relative to where it is now.
+
+    Args:
+        frame: the current frame.
+        previous_view_projection: ``(B, 4, 4)`` of the frame before; needed where the frame has no motion of its own.
+
+    Returns:
+        ``(B, 2, H, W)`` pixels: the frame's own motion, else that of its previous positions (its positions, where it
+        has none) seen from the previous camera; ``None`` where it has neither.
+    """
+    if frame.motion is not None:
+        return frame.motion
+    position = surface_before(frame).position
+    if position is None or previous_view_projection is None:
+        return None
+    return motion_from_position(position, previous_view_projection)
+
+
+def is_still(frame: Frame, history: History) -> bool | Tensor:
+    """Whether every pixel of a frame shows what it showed in the frame before, as far as the frame tells.
+
+    Returns:
+        Whether its motion is zero everywhere, or else the camera is the same and no position differs from its previous
+        position; a tensor while a graph is recorded.
+    """
+    if frame.motion is not None:
+        if torch.compiler.is_compiling():
+            return ~frame.motion.any()
+        return not (_thinned(frame.motion).any() or frame.motion.any())
+    cameras = (history.view_projection, frame.view_projection)
+    pairs = [cameras] if frame.previous_position is None else [cameras, (frame.position, frame.previous_position)]
+    if frame.position is None or any(image is None for pair in pairs for image in pair):
+        return False
+    if torch.compiler.is_compiling():
+        return torch.stack([(a == b).all() for a, b in pairs]).all()  # type: ignore[operator, union-attr]
+    return all(_equal(a, b) for a, b in pairs)  # type: ignore[arg-type]
+
+
+def _equal(a: Tensor, b: Tensor) -> bool:
+    return a is b or (torch.equal(_thinned(a), _thinned(b)) and torch.equal(a, b))
+
+
+def _thinned(image: Tensor) -> Tensor:
+    """One pixel in 64: enough to see most of what moves."""
+    return image[..., ::8, ::8]
+
+
+def _misfit(history: History, frame: Frame) -> str:
+    """Why a history cannot be that of a frame; empty if it can."""
+    if history.length.shape != frame.color[:, :1].shape or history.length.device != frame.color.device:
+        return "size change"
+    return _NO_WAY if frame.motion is None and history.view_projection is None else ""
+
+
+def _steady(color: Tensor) -> Tensor:
+    """Where the compressed radiance of a history has hardly varied."""
+    mean = color[:, MEAN]
+    return color[:, SQUARE] - mean.square() <= (_STEADY * mean).square()
+
+
+def _takes_light(color: Tensor) -> Tensor:
+    """Of each image, whether clamping takes much of the light of most of it; not told of images of a few lit blocks."""
+    color = color.detach()
+    height = color.shape[-2]
+    step = _BLOCK * -(-height // (_BLOCK * _STRIPS))
+    # A graph for images of any size has no strips.
+    strips = [color] if torch.compiler.is_compiling() else [color[..., top : top + _BLOCK, :] for top in range(0, height, step)]
+    fractions = []
+    for strip in strips:
+        light = strip.to(torch.promote_types(color.dtype, torch.float32))
+        before, after = (
+            F.avg_pool2d(image.mean(1, keepdim=True), _BLOCK, ceil_mode=True, count_include_pad=False)
+            for image in (light, clamp_fireflies(light))
+        )
+        # Not a number where there is no light to lose.
+        fractions.append((1 - after / before).flatten(1))
+    lost = torch.cat(fractions, 1)
+    return ((~lost.isnan()).sum(1) >= _LEAST_BLOCKS) & (lost.nanmedian(1).values > _LOST)
