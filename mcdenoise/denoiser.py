@@ -94,7 +94,9 @@ class Denoiser:
         if isinstance(model, str):
             model = create_model(model, pretrained=weights is None, weights=weights, **settings)
         elif settings or weights is not None:
-            raise InputError(f"{', '.join([*settings, *(['weights'] if weights else [])])}: expected a model's name, found a model")
+            raise InputError(
+                f"{', '.join([*settings, *(['weights'] if weights else [])])}: expected a model's name, found a model"
+            )
         if isinstance(model, nn.Module):
             # Channels-last convolutions are about 1.5 times faster on a CPU.
             model.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
@@ -184,10 +186,10 @@ class Denoiser:
                 state = _owned(state, [given, noisy])
                 if stages:
                     output = output._replace(stages={"noisy": noisy, **output.stages})
-                output = _owned(Output(output.image.float(), output.stages), [given, noisy, state])
+                result: Output = _owned(Output(output.image.float(), output.stages), [given, noisy, state])
         # Only now: a frame that was refused leaves no trace.
         self._state, self._count = state, self._count + 1
-        return output
+        return result
 
     def _is_last(self) -> bool:
         return self._frames is not None and self._count + 1 >= self._frames

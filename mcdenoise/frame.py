@@ -235,7 +235,7 @@ class Frame:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Frame:
         """The same frame with a function applied to every buffer."""
-        changed = {name: function(value) for name, value in self.items() if name in _NAMES}
+        changed: dict[str, Any] = {name: function(value) for name, value in self.items() if name in _NAMES}
         extra = {name: function(value) for name, value in self.extra.items()}
         return replace(self, **changed, extra=extra)
 
@@ -244,8 +244,8 @@ class Frame:
         return self.map(lambda value: value.to(target))
 
     def crop(self, rows: slice, columns: slice) -> Frame:
-        """A rectangle of the frame, as views. Its statistics stay those of the whole image; nothing of it is skipped."""
-        cropped = {
+        """A rectangle of the frame, as views; its statistics stay those of the whole image, and nothing is skipped."""
+        cropped: dict[str, Any] = {
             name: value[..., rows, columns] for name, value in self.items() if name in _NAMES and name != _MATRIX_NAME
         }
         extra = {name: value[..., rows, columns] for name, value in self.extra.items()}

@@ -34,7 +34,8 @@ class FromBuffers(nn.Module):
         super().__init__()
         self.function = function
         call = function.forward if isinstance(function, nn.Module) else function
-        required, optional = set(), set()
+        required: set[str] = set()
+        optional: set[str] = set()
         for parameter in inspect.signature(call).parameters.values():
             if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD, parameter.POSITIONAL_ONLY):
                 continue

@@ -24,7 +24,7 @@ class Output(NamedTuple):
     """
 
     image: Tensor
-    stages: Mapping[str, Tensor] = {}  # noqa: RUF012 - a default of a tuple, which nobody changes
+    stages: Mapping[str, Tensor] = {}
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Needs:
         trainable: whether it learns; False for filters without weights and for programs of others.
         reach: how many pixels away its result depends on a buffer; ``None`` where that is the whole image, so that it
             is neither computed in tiles nor skipped in parts.
-        stride: a rectangle of the image has the same pixels as the whole where it begins at multiples of so many pixels,
-            such as the pixels of a U-Net's coarsest level.
+        stride: a rectangle of the image has the same pixels as the whole where it begins at multiples of so many
+            pixels, such as the pixels of a U-Net's coarsest level.
     """
 
     buffers: frozenset[str] = frozenset({"color"})

@@ -111,5 +111,7 @@ def summarize(frames: list[list[Stage]]) -> list[dict[str, Any]]:
         fraction = sum(stage.skipped for stage in found) / len(frames)
         telling = [stage for stage in found if stage.skipped > 0] or found
         reason = Counter(stage.reason for stage in telling).most_common(1)[0][0]
-        rows.append({"stage": name, "kept": fraction < 1, "skipped": fraction, "reason": reason, "exact": found[0].exact})
+        rows.append(
+            {"stage": name, "kept": fraction < 1, "skipped": fraction, "reason": reason, "exact": found[0].exact}
+        )
     return rows

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import torch
 
-from mcdenoise.frame import BUFFERS
 from mcdenoise.errors import InputError
+from mcdenoise.frame import BUFFERS
 from mcdenoise.models.tiled import Region
 
 GB = 1e9

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import nn
@@ -70,5 +71,7 @@ def overview() -> list[ModelOverview]:
 
 
 def _frame() -> Frame:
-    images = {name: torch.rand(1, BUFFERS[name].channels, _SIDE, _SIDE) for name in ("color", "albedo", "normal", "depth")}
+    images: dict[str, Any] = {
+        name: torch.rand(1, BUFFERS[name].channels, _SIDE, _SIDE) for name in ("color", "albedo", "normal", "depth")
+    }
     return Frame(**images, motion=torch.zeros(1, 2, _SIDE, _SIDE))

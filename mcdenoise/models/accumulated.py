@@ -136,9 +136,7 @@ class Accumulated(Wrapper):
         after = None if history is None and inner is None else (history, inner)
         return output._replace(stages=stages), after
 
-    def _accumulate(
-        self, frame: Frame, history: History | None, inner: State
-    ) -> tuple[Frame, History | None, State]:
+    def _accumulate(self, frame: Frame, history: History | None, inner: State) -> tuple[Frame, History | None, State]:
         """The frame with its history, the history for the next one, and the state that the method inside may have."""
         compiling = torch.compiler.is_compiling()
         can_move = frame.motion is not None or (frame.position is not None and frame.view_projection is not None)
@@ -191,7 +189,8 @@ class Accumulated(Wrapper):
         """Color and length of the frame with its history, and how many pixels of each image have one."""
         motion = None
         if isinstance(still, Tensor):
-            motion = torch.where(still, 0, motion_to_previous(frame, history.view_projection))
+            motion = motion_to_previous(frame, history.view_projection)
+            motion = None if motion is None else torch.where(still, 0, motion)
         elif not still or (frame.hints.keep_all and frame.motion is not None):
             motion = motion_to_previous(frame, history.view_projection)
         return blend(
@@ -258,13 +257,15 @@ def is_still(frame: Frame, history: History) -> bool | Tensor:
         if torch.compiler.is_compiling():
             return ~frame.motion.any()
         return not (_thinned(frame.motion).any() or frame.motion.any())
-    cameras = (history.view_projection, frame.view_projection)
-    pairs = [cameras] if frame.previous_position is None else [cameras, (frame.position, frame.previous_position)]
-    if frame.position is None or any(image is None for pair in pairs for image in pair):
+    pairs = [(history.view_projection, frame.view_projection)]
+    if frame.previous_position is not None:
+        pairs.append((frame.position, frame.previous_position))
+    known = [(a, b) for a, b in pairs if a is not None and b is not None]
+    if frame.position is None or len(known) < len(pairs):
         return False
     if torch.compiler.is_compiling():
-        return torch.stack([(a == b).all() for a, b in pairs]).all()  # type: ignore[operator, union-attr]
-    return all(_equal(a, b) for a, b in pairs)  # type: ignore[arg-type]
+        return torch.stack([torch.eq(a, b).all() for a, b in known]).all()
+    return all(_equal(a, b) for a, b in known)
 
 
 def _equal(a: Tensor, b: Tensor) -> bool:
@@ -295,7 +296,11 @@ def _takes_light(color: Tensor) -> Tensor:
     height = color.shape[-2]
     step = _BLOCK * -(-height // (_BLOCK * _STRIPS))
     # A graph for images of any size has no strips.
-    strips = [color] if torch.compiler.is_compiling() else [color[..., top : top + _BLOCK, :] for top in range(0, height, step)]
+    strips = (
+        [color]
+        if torch.compiler.is_compiling()
+        else [color[..., top : top + _BLOCK, :] for top in range(0, height, step)]
+    )
     fractions = []
     for strip in strips:
         light = strip.to(torch.promote_types(color.dtype, torch.float32))

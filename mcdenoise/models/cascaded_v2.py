@@ -30,7 +30,7 @@ from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.fusion import LogFusion
-from mcdenoise.nn.inputs import FEATURES, input_of, guides_of, image_statistics
+from mcdenoise.nn.inputs import FEATURES, guides_of, image_statistics, input_of
 from mcdenoise.nn.unet import Head, UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
 from mcdenoise.ops._backend import choose_backend
@@ -198,14 +198,18 @@ def _cascade(
         final=Tiled(KernelNetwork(kernel_width or width, kernel_size, half)),
     )
     return Demodulated(
-        Accumulated(Skipping(network, tolerance, alpha_min), alpha_min=alpha_min, lag_threshold=THRESHOLD if anti_lag else math.inf)
+        Accumulated(
+            Skipping(network, tolerance, alpha_min),
+            alpha_min=alpha_min,
+            lag_threshold=THRESHOLD if anti_lag else math.inf,
+        )
     )
 
 
-_PAPER = "the cascade with a history, logarithms and three resolutions"
-register_model("cascaded_v2", f"{_PAPER}, width 40, 5x5 kernels", width=40)(_cascade)
-register_model("cascaded_v2_small", f"{_PAPER}, widths 16 and 32, 5x5 kernels", width=16, kernel_width=32)(_cascade)
-register_model("cascaded_v2_tiny", f"{_PAPER}, width 16, 3x3 kernels", width=16, kernel_size=3)(_cascade)
-register_model(
-    "cascaded_v2_micro", f"{_PAPER}, width 16, 3x3 kernels, from half the resolution", width=16, kernel_size=3, half=True
-)(_cascade)
+for _name, _about, _settings in (
+    ("cascaded_v2", "width 40, 5x5 kernels", {"width": 40}),
+    ("cascaded_v2_small", "widths 16 and 32, 5x5 kernels", {"width": 16, "kernel_width": 32}),
+    ("cascaded_v2_tiny", "width 16, 3x3 kernels", {"width": 16, "kernel_size": 3}),
+    ("cascaded_v2_micro", "width 16, 3x3 kernels, half the resolution", {"width": 16, "kernel_size": 3, "half": True}),
+):
+    register_model(_name, f"P+K with history, logarithms, three resolutions: {_about}", **_settings)(_cascade)

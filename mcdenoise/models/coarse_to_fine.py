@@ -20,9 +20,9 @@ _IMAGES = tuple(name for name in BUFFERS if name not in ("motion", "reference"))
 class CoarseToFine(Wrapper):
     """The same method, with the same weights, on an image at half its size, at a quarter, and so on.
 
-    Each size gives the next larger one its low frequencies (:func:`mcdenoise.ops._steps.network.low_frequencies_of`). A U-Net
-    sees no further than some 60 pixels; at one sample a pixel the mean of all of these is still noisy, and where light
-    is sparse most of them are black.
+    Each size gives the next larger one its low frequencies
+    (:func:`mcdenoise.ops._steps.network.low_frequencies_of`). A U-Net sees no further than some 60 pixels; at one
+    sample a pixel the mean of all of these is still noisy, and where light is sparse most of them are black.
 
     Args:
         inner: a method without a state whose statistics have the ``exposure`` and the logarithm ``top`` of the largest
@@ -66,7 +66,7 @@ def _halved(frame: Frame) -> Frame:
 
 
 def _halved_mask(mask: Tensor) -> Tensor:
-    """Where nothing is needed at half the size: in tiles that none of the needed pixels, nor of those around, are in."""
+    """Where nothing is needed at half the size: in tiles far from all pixels that are needed."""
     height, width = mask.shape[-2:]
     needed = F.pad((~mask).float(), (0, -width % TILE, 0, -height % TILE))
     tiles = F.max_pool2d(F.max_pool2d(needed, TILE), 3, 1, 1)

@@ -157,8 +157,8 @@ class Skipping(Wrapper):
             The tiles, and the marks of this frame if they were needed.
         """
         limit = torch.where(before.reused, self.tolerance, self.tolerance * _HYSTERESIS)
-        thin = (_thinned(image) for image in (frame.color, weight, before.color, before.weight))
-        calm = _change(*thin, TILE // _STRIDE) <= limit
+        now, then = (tuple(map(_thinned, pair)) for pair in ((frame.color, weight), (before.color, before.weight)))
+        calm = _change(now[0], now[1], then[0], then[1], TILE // _STRIDE) <= limit
         if not calm.any():
             return calm, None
         marks = _marks(frame)

@@ -76,8 +76,8 @@ class Tiled(Wrapper):
                 kept.of(results[name]).copy_(kept.within(around).of(image))
         computed = sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1])
         note("network", f"on {computed:.0%} of the pixels", 1 - computed)
-        image = results.pop("image", None)
-        return Output(_known(frame, "image") if image is None else image, results), None
+        image = results.pop("image") if results else _known(frame, "image")
+        return Output(image, results), None
 
     def _parts(self, frame: Frame) -> list[Region] | None:
         """The tiles to compute; ``None`` for the whole image at once."""

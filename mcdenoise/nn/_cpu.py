@@ -132,5 +132,3 @@ def max_pool(x: Tensor) -> Tensor:
 
 def _plain_inference(x: Tensor) -> bool:
     return x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
-
-

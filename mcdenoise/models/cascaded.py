@@ -1,0 +1,194 @@
+"""The cascaded pixel-kernel network of the paper: a pixel network, and a kernel network that filters what it predicts.
+
+The paper is doi:10.1007/s00371-023-02951-6; equation numbers are its own. What it leaves open, and what is taken here:
+
+- the fusion module's layers: one 3x3 convolution of both scales and a sigmoid (:class:`mcdenoise.nn.FusionModule`);
+- how kernels are normalised: ``softmax(logits - f1 |dn|^2 - f2 dd^2 - f3 r^2)``, which is Eq. 5 of unnormalised weights
+  divided by their sum; ``normalize="none"`` is Eq. 5 to the letter;
+- f1, f2, f3 >= 0: a softplus;
+- the unit of radiance: typical radiance is brought to 0.5 (:class:`mcdenoise.models.Exposed`);
+- depth in [0, 1]: ``d / (d + typical depth)``;
+- accumulation (its Appendix 1): the published rule of Koskela et al. 2019 with alpha 0.2, on demodulated radiance; it
+  compares positions in scene units;
+- radiance below zero, which Eq. 2 allows: the result is cut off at 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._registry import register_model
+from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.chain import Chain
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.exposed import Exposed
+from mcdenoise.models.tiled import Tiled
+from mcdenoise.nn.fusion import FusionModule
+from mcdenoise.nn.inputs import features_of, image_statistics
+from mcdenoise.nn.unet import Head, UNet
+from mcdenoise.ops import cross_bilateral_filter, downsample
+from mcdenoise.ops._steps.network import normalized_depth
+
+Normalize = Literal["softmax", "none"]
+
+# The published limits of the BMFR scene "classroom", squared, in scene units (its world is in metres).
+POSITION_LIMIT, NORMAL_LIMIT = 0.01, 1.0
+
+
+class _Network(nn.Module):
+    """The U-Net of Fig. 2, and a head and a fusion module at the scales of its last three decoder layers."""
+
+    def __init__(self, width: int, channels: int, radius: int) -> None:
+        super().__init__()
+        self.unet = UNet(10, width)  # color 3, albedo 3, normal 3, depth 1
+        self.heads = nn.ModuleList(Head(self.unet, scale, channels) for scale in range(UNet.scales))
+        self.fusions = nn.ModuleList(FusionModule() for _ in range(UNet.scales - 1))
+        self._radius = radius
+
+    @property
+    def needs(self) -> Needs:
+        """A pixel for each head and fusion and the radius of each filter, at their scales, behind the U-Net."""
+        ways = (self.unet.reach(scale) + ((1 + self._radius) << scale) for scale in range(UNet.scales))
+        reach = max(ways) + sum(1 << scale for scale in range(UNet.scales - 1))
+        return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple)
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """The depth scale of the whole image."""
+        return image_statistics(frame)
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`."""
+        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
+
+    def features(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        """Auxiliary features f, normalised to the range from 0 to 1 (Sec. 4.2)."""
+        albedo, normal, depth = features_of(frame)
+        statistics = frame.statistics or self.statistics(frame)
+        largest, typical = statistics["depth_scale"].split(1, 1)
+        return albedo, normal * 0.5 + 0.5, normalized_depth(depth, largest, typical)
+
+    def fuse(self, images: list[Tensor]) -> Tensor:
+        """The scales of an image, finest first, in one."""
+        fused = images[-1]
+        for image, fusion in zip(images[-2::-1], self.fusions, strict=True):
+            fused = fusion(image, fused)  #                                                                     Eq. 2
+        return fused
+
+
+class PixelNetwork(_Network):
+    """P: predicts the image at three scales, and fuses them.
+
+    Args:
+        width: feature channels of every convolution, the paper's 40.
+    """
+
+    def __init__(self, width: int = 40) -> None:
+        super().__init__(width, 3, radius=0)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        features = self.features(frame)
+        levels = self.unet(torch.cat([frame.color, *features], 1))
+        images = [head(level, level.shape[-2:]) for head, level in zip(self.heads, levels, strict=True)]
+        return Output(self.fuse([image.to(frame.color.dtype) for image in images])), None  #                    Eq. 1
+
+
+class KernelNetwork(_Network):
+    """K: predicts a kernel for each pixel at three scales, adjusts it by the features, filters, and fuses.
+
+    Args:
+        width: feature channels of every convolution, the paper's 40.
+        kernel_size: k, the paper's 5; a head has k^2 channels, 28 with the three of the bilateral weights.
+        bilateral: whether features adjust the kernels (Sec. 3.3).
+        normalize: how the weights of a kernel are normalised.
+    """
+
+    def __init__(
+        self, width: int = 40, kernel_size: int = 5, bilateral: bool = True, normalize: Normalize = "softmax"
+    ) -> None:
+        super().__init__(width, kernel_size**2 + (3 if bilateral else 0), radius=kernel_size // 2)
+        self.taps, self.bilateral, self.normalize = kernel_size**2, bilateral, normalize
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        x, (albedo, normal, depth) = frame.color, self.features(frame)
+        levels = self.unet(torch.cat([x, albedo, normal, depth], 1))
+        images = []
+        for scale, (head, level) in enumerate(zip(self.heads, levels, strict=True)):
+            if scale:
+                x, normal, depth = downsample(x), downsample(normal), downsample(depth)
+            predicted = head(level, x.shape[-2:])  #                                                            Eq. 3
+            w, f = predicted[:, : self.taps], F.softplus(predicted[:, self.taps :].to(x.dtype))
+            guides = [normal, depth] if self.bilateral else []
+            f1, f2, f3 = f.split(1, 1) if self.bilateral else (None, None, None)
+            scales = [f1, f2] if f1 is not None and f2 is not None else []
+            images.append(cross_bilateral_filter(x, w, guides, scales, f3, normalize=self.normalize))  #    Eqs. 4-8
+        return Output(self.fuse(images)), None
+
+
+class _NonNegative(Wrapper):
+    """Cuts off radiance below zero."""
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        output, state = self.inner(frame, state)
+        return output._replace(image=output.image.clamp_min(0)), state
+
+
+@register_model("cascaded", "the paper's network to the letter: P+K, width 40, 5x5 kernels, bilateral weights")
+def cascaded(
+    width: int = 40,
+    kernel_size: int = 5,
+    cascade: str = "P+K",
+    bilateral: bool = True,
+    normalize: Normalize = "softmax",
+    *,
+    alpha_min: float = 0.2,
+    position_limit: float = POSITION_LIMIT,
+    normal_limit: float = NORMAL_LIMIT,
+) -> Model:
+    """The paper's network, and its ablations.
+
+    Args:
+        width: feature channels of every convolution; 40, for ``"K"`` and ``"P"`` alone 64.
+        kernel_size: k of the kernel network.
+        cascade: ``"P+K"``, the paper's; ``"K"``, ``"P"``, ``"K+P"``, ``"K+K"`` as in its Table 3.
+        bilateral: whether features adjust the kernels, see its Table 4.
+        normalize: see :class:`KernelNetwork`.
+        alpha_min: smallest weight of the current frame in the accumulation.
+        position_limit: squared distance in scene units below which two points are one, see
+            :func:`mcdenoise.ops.reproject`.
+        normal_limit: likewise for normals.
+
+    Raises:
+        InputError: there is no such cascade.
+    """
+    if cascade not in ("P", "K", "P+K", "K+P", "K+K"):
+        raise InputError(f"cascade: expected one of P, K, P+K, K+P, K+K, found '{cascade}'")
+    networks: list[Model] = [
+        Tiled(PixelNetwork(width) if part == "P" else KernelNetwork(width, kernel_size, bilateral, normalize))
+        for part in cascade.split("+")
+    ]
+    networks[-1] = _NonNegative(networks[-1])
+    chain = Chain(**dict(zip(("initial", "final")[-len(networks) :], networks, strict=True)))
+    return Demodulated(
+        Accumulated(
+            Exposed(chain),
+            alpha_min=alpha_min,
+            rule="bmfr",
+            position_limit=position_limit,
+            normal_limit=normal_limit,
+            firefly_limit=float("inf"),
+            specular_length=float("inf"),
+            lag_threshold=float("inf"),
+        )
+    )
