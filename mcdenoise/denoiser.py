@@ -42,9 +42,9 @@ class Denoiser:
 
     Args:
         model: a model's name in the zoo (its shipped weights are loaded), ``path/to/file.py:factory`` or
-            ``package.module:factory`` of your own, a :class:`mcdenoise.models.Model`, or a module or function that takes
-            images by the names of buffers, see :class:`mcdenoise.models.FromBuffers`. A module of yours is moved to the
-            device, made channels-last and put into evaluation mode.
+            ``package.module:factory`` of your own, a :class:`mcdenoise.models.Model`, or a module or function that
+            takes images by the names of buffers, see :class:`mcdenoise.models.FromBuffers`. A module of yours is moved
+            to the device, made channels-last and put into evaluation mode.
         weights: a safetensors file of other weights for a model given by name.
         device: where to run; frames may come from anywhere and images stay here.
         precision: ``"bfloat16"`` runs convolutions in bfloat16, which is about twice as fast on processors that have
@@ -199,8 +199,8 @@ class Denoiser:
         needs = self.model.needs
         if absent := needs.missing(frame):
             raise InputError(
-                f"buffer '{absent[0]}': the model needs it, found only {', '.join(sorted(frame.buffers))}; render it, or "
-                "take another model, see `mcdenoise models`"
+                f"buffer '{absent[0]}': the model needs it, found only {', '.join(sorted(frame.buffers))}; render it, "
+                "or take another model, see `mcdenoise models`"
             )
         missing = needs.uses - frame.buffers - {"previous_position", "position", "view_projection"}
         return sorted(missing - ({"motion"} if {"position", "view_projection"} <= frame.buffers else frozenset()))
@@ -252,7 +252,8 @@ def _alike(a: State, b: State) -> bool:
     """Whether two states have the same structure; what is not there is like anything."""
     if a is None or b is None:
         return True
-    (children, spec), (others, other) = (pytree.tree_flatten(each, is_leaf=lambda x: x is not each) for each in (a, b))
+    children, spec = pytree.tree_flatten(a, is_leaf=lambda x: x is not a)
+    others, other = pytree.tree_flatten(b, is_leaf=lambda x: x is not b)
     if isinstance(a, Tensor) or isinstance(b, Tensor):
         return isinstance(a, Tensor) and isinstance(b, Tensor) and a.ndim == b.ndim
     return spec == other and all(_alike(*pair) for pair in zip(children, others, strict=True))

@@ -94,6 +94,9 @@ class Hints(NamedTuple):
     keep_all: bool = False
 
 
+_NO_HINTS = Hints()
+
+
 class Skip(NamedTuple):
     """Pixels that need no computing, because their result is known.
 
@@ -185,7 +188,7 @@ class Frame:
     extra: Mapping[str, Tensor] = field(default_factory=dict)
     statistics: Mapping[str, Tensor] = field(default_factory=dict)
     skip: Skip | None = None
-    hints: Hints = Hints()
+    hints: Hints = _NO_HINTS
 
     def __post_init__(self) -> None:
         _check_buffer("color", self.color)

@@ -3,6 +3,7 @@
 import importlib
 import pkgutil
 
+from mcdenoise.models._adapter import FromBuffers, as_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._journal import Journal, Stage, listening, note, summarize, timed
 from mcdenoise.models._overview import ModelOverview, overview
@@ -32,6 +33,7 @@ __all__ = [
     "CoarseToFine",
     "Demodulated",
     "Exposed",
+    "FromBuffers",
     "Journal",
     "Model",
     "ModelOverview",
@@ -43,6 +45,7 @@ __all__ = [
     "State",
     "Tiled",
     "Wrapper",
+    "as_model",
     "build_model",
     "create_model",
     "describe_weights",
