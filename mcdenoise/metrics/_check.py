@@ -12,6 +12,10 @@ class UncomputableError(InputError):
 
 
 def check_images(image: Tensor, reference: Tensor) -> None:
+    """``ValueError`` for shapes that differ, ``TypeError`` for integers, which wrap around, and complex numbers."""
+    for name, tensor in (("image", image), ("reference", reference)):
+        if not tensor.is_floating_point():
+            raise TypeError(f"{name}: expected a floating-point dtype, found {tensor.dtype}")
     if image.shape != reference.shape or image.ndim < 3:
         raise ValueError(
             f"reference: expected the shape of image and (..., C, H, W), found {tuple(reference.shape)} "

@@ -47,6 +47,8 @@ def unpad(padded: Tensor, radius: int, border: Border) -> Tensor:
 
 def _fold_edges(padded: Tensor, radius: int, size: int, dim: int) -> Tensor:
     inner = padded.narrow(dim, radius, size)
+    if size == 0:
+        return inner
     before = padded.narrow(dim, 0, radius).sum(dim, keepdim=True)
     after = padded.narrow(dim, radius + size, radius).sum(dim, keepdim=True)
     rest = list(inner.shape)

@@ -211,9 +211,9 @@ class _Exponent(Function):
         pairs = _each(guides, scales, ctx.channels)
         to_distance = to_guides = to_scales = None
         if need_distance:
-            squares = [dy * dy + dx * dx for _, dy, dx in offsets(2 * radius + 1)]
-            weights = torch.tensor(squares, dtype=gradient.dtype, device=gradient.device)
-            to_distance = -torch.einsum("bthw,t->bhw", gradient, weights).unsqueeze(1)
+            to_distance = torch.zeros_like(gradient[:, :1])
+            for tap, dy, dx in offsets(2 * radius + 1):
+                to_distance = torch.sub(to_distance, gradient[:, tap : tap + 1], alpha=dy * dy + dx * dx)
         if need_guides:
             to_guides = torch.cat([_guide_gradient(gradient, padded, scale, radius) for padded, scale in pairs], 1)
         if need_scales:

@@ -80,7 +80,10 @@ def motion_from_position(
     # Where nothing was hit the position may be infinite, which would reach the matrix as a NaN gradient.
     hit = torch.isfinite(position).all(1, keepdim=True)
     point = torch.where(hit, position.to(dtype), 0)
-    clip = torch.einsum("bchw,bcd->bdhw", point, matrix[:, :3]) + matrix[:, 3, :, None, None]
+    # Products and sums: autocast would round those of a matrix product to half precision.
+    clip = matrix[:, 3, :, None, None]
+    for axis in range(3):
+        clip = clip + point[:, axis : axis + 1] * matrix[:, axis, :, None, None]
     w = clip[:, 3:]
     in_front = hit & (w > 0)
     scale = torch.tensor([width, height], dtype=dtype, device=position.device).reshape(1, 2, 1, 1)

@@ -34,12 +34,12 @@ CLIP_METRICS = [temporal_smape_linear, temporal_rmse_srgb]
 
 def image(*values: float) -> Tensor:
     """``(1, 3, 1, N)``: N gray pixels."""
-    return torch.tensor(values).expand(1, 3, 1, len(values))
+    return torch.tensor(values, dtype=torch.float32).expand(1, 3, 1, len(values))
 
 
 def clip(*values: float) -> Tensor:
     """``(1, T, 3, 1, 1)``: T frames of one gray pixel."""
-    return torch.tensor(values).reshape(1, -1, 1, 1, 1).expand(1, -1, 3, 1, 1)
+    return torch.tensor(values, dtype=torch.float32).reshape(1, -1, 1, 1, 1).expand(1, -1, 3, 1, 1)
 
 
 def test_smape_written_out() -> None:
@@ -238,6 +238,19 @@ def test_whatever_stands_before_the_image_is_a_batch(metric: Callable[[Tensor, T
 def test_no_error_is_zero(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
     images = torch.rand(2, 3, 4, 5) * 100
     assert metric(images, images).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.int64, torch.complex64], ids=str)
+@pytest.mark.parametrize("metric", [*IMAGE_METRICS, *CLIP_METRICS])
+def test_integers_and_complex_numbers_are_refused(
+    metric: Callable[[Tensor, Tensor], Tensor], dtype: torch.dtype
+) -> None:
+    """Differences of unsigned integers wrap around."""
+    image = torch.rand(1, 2, 3, 12, 12)
+    with pytest.raises(TypeError, match=f"image: expected a floating-point dtype, found {dtype}"):
+        metric(image.to(dtype), image)
+    with pytest.raises(TypeError, match=f"reference: expected a floating-point dtype, found {dtype}"):
+        metric(image, image.to(dtype))
 
 
 @pytest.mark.parametrize("metric", [*IMAGE_METRICS, *CLIP_METRICS])

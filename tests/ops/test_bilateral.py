@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mcdenoise.ops import cross_bilateral_weights, kernel_conv
+from mcdenoise.ops import cross_bilateral_filter, cross_bilateral_weights, kernel_conv
 
 BORDERS = ["replicate", "zeros", "renormalize"]
 every_border = pytest.mark.parametrize("border", BORDERS)
@@ -120,3 +120,26 @@ def test_guides_of_other_dtypes() -> None:
     assert weights.dtype == torch.float32
     assert guide.grad is not None
     assert guide.grad.dtype == torch.float64
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+@pytest.mark.parametrize("shape", [(0, 3, 4, 5), (1, 0, 4, 5), (1, 3, 0, 5), (1, 3, 4, 0)], ids=str)
+def test_empty_images_have_empty_results_and_derivatives(shape: tuple[int, ...], backend: Any) -> None:
+    image = torch.zeros(shape, requires_grad=True)
+    batch, _, *size = shape
+    kernel, guide, scale = (torch.ones(batch, count, *size, requires_grad=True) for count in (9, 3, 1))
+    result = cross_bilateral_filter(image, kernel, [guide], [scale], scale, backend=backend)
+    assert result.shape == shape
+    for gradient in torch.autograd.grad(result.sum(), (image, kernel, guide, scale)):
+        assert not gradient.any()
+
+
+def test_the_derivative_of_the_distance_scale_keeps_its_precision_under_autocast() -> None:
+    logits, upstream = torch.randn(1, 9, 6, 7), torch.randn(1, 9, 6, 7)
+    scale = torch.rand(1, 1, 6, 7, requires_grad=True)
+    gradients = []
+    for autocast in (False, True):
+        weights = cross_bilateral_weights(logits, distance_scale=scale)
+        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+            gradients += torch.autograd.grad(weights, scale, upstream)
+    assert torch.equal(*gradients)

@@ -167,3 +167,17 @@ def test_a_float32_kernel_of_a_half_image_keeps_its_gradient(op: Callable[..., T
         (gradient,) = torch.autograd.grad(op(image.to(dtype), weights), weights, upstream.to(dtype))
         results.append(gradient.double())
     torch.testing.assert_close(*results, rtol=1e-6, atol=0)
+
+
+@every_border
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+@pytest.mark.parametrize("shape", [(0, 3, 4, 5), (1, 0, 4, 5), (1, 3, 0, 5), (1, 3, 4, 0), (1, 3, 0, 0)], ids=str)
+def test_empty_images_have_empty_results_and_derivatives(shape: tuple[int, ...], backend: Any, border: Any) -> None:
+    image = torch.zeros(shape, requires_grad=True)
+    kernel = torch.ones(shape[0], 9, *shape[2:], requires_grad=True)
+    for function in (kernel_conv, kernel_splat):
+        result = function(image, kernel, border=border, backend=backend)
+        assert result.shape == shape
+        of_image, of_kernel = torch.autograd.grad(result.sum(), (image, kernel))
+        assert of_image.shape == shape
+        assert not of_kernel.any()

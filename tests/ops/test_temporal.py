@@ -389,3 +389,13 @@ class TestNothingMoves:
         slopes = [torch.autograd.grad(value.square().sum(), previous)[0] for value, _ in (results, expected)]
         assert torch.equal(*slopes)
         assert results[1].unique().tolist() == [0, 1]
+
+
+def test_motion_keeps_its_precision_under_autocast() -> None:
+    """Of a scene 100 units from the origin, where bfloat16 would be off by 64 pixels."""
+    position = 100 + torch.rand(1, 3, 36, 64)
+    matrix = torch.eye(4)[None] * 0.5
+    matrix[:, 3, 3] = 6
+    expected = motion_from_position(position, matrix, backend="torch")
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(motion_from_position(position, matrix, backend="torch"), expected)

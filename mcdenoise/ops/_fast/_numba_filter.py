@@ -119,7 +119,10 @@ def derivatives(
     planes = [image, *(guides if of_guides else ())]
     scattered = torch.empty((batch, sum(plane.shape[1] for plane in planes), height, width), dtype=dtype)
     slopes = torch.empty_like(kernel if of_kernel else kernel[:, :0], dtype=_readable(kernel, dtype).dtype)
-    if scattered.numel():
+    if not image.numel():
+        for result in (scattered, slopes, of_distance, *of_scales):
+            result.zero_()
+    elif scattered.numel():
         inputs = _inputs(dtype, image, kernel, guides, scales, distance_scale, log_domain, border)
         upstream = source(gradient.to(dtype))
         results = (

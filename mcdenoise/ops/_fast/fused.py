@@ -475,6 +475,7 @@ def _fuse(
     ring = np.zeros((4, 2 * channels, width + 2), dtype)
     alpha, change = np.empty(width, dtype), np.empty((channels, width), dtype)
     half = np.empty((width + 1) // 2, dtype)
+    above, below = np.empty(width, dtype), np.empty(width, dtype)
     begin = first // 2 * 2
     for y in range(begin, last, 2):
         for row in range(y - 1 if y == begin else y + 1, y + 3):
@@ -483,7 +484,18 @@ def _fuse(
             upper = ring[y % 4, c, 1 : width + 1]
             lower = ring[(y + 1 if y + 1 < height else y) % 4, c, 1 : width + 1]
             low = ring[y % 4, channels + c, 1 : width + 1]
-            _subtract_means(change[c], low, upper, lower)
+            if logarithms:
+                # Of the means of radiance, which is read once more.
+                _read_row(above, fine, b, c, y, 0)
+                _read_row(below, fine, b, c, min(y + 1, height - 1), 0)
+                _mean_of_blocks(half, above, below)
+                _to_logarithms(half, dtype.type(1))
+                _double(change[c], half)
+            else:
+                _mean_of_blocks(half, upper, lower)
+                _double(change[c], half)
+            for x in range(width):
+                change[c, x] = low[x] - change[c, x]
         for row in range(max(y, first), min(y + 2, last)):
             alpha[:] = bias[0]
             for dy in range(3):
@@ -540,15 +552,13 @@ def _double(row: Any, half: Any) -> None:
 
 
 @compiled
-def _subtract_means(change: Any, low: Any, upper: Any, lower: Any) -> None:
-    """``low`` without the means of the blocks of two rows, for each pixel of one of them."""
-    quarter, half, width = change.dtype.type(0.25), change.dtype.type(0.5), change.size
+def _mean_of_blocks(mean: Any, upper: Any, lower: Any) -> None:
+    """Of 2x2 pixels of two rows; of two where the width is odd."""
+    quarter, half, width = mean.dtype.type(0.25), mean.dtype.type(0.5), upper.size
     for x in range(width // 2):
-        mean = (upper[2 * x] + upper[2 * x + 1] + lower[2 * x] + lower[2 * x + 1]) * quarter
-        change[2 * x] = low[2 * x] - mean
-        change[2 * x + 1] = low[2 * x + 1] - mean
+        mean[x] = (upper[2 * x] + upper[2 * x + 1] + lower[2 * x] + lower[2 * x + 1]) * quarter
     if width % 2:
-        change[width - 1] = low[width - 1] - (upper[width - 1] + lower[width - 1]) * half
+        mean[width // 2] = (upper[width - 1] + lower[width - 1]) * half
 
 
 @compiled

@@ -204,14 +204,17 @@ def gated_fusion(
 ) -> Tensor:
     """Fuse two scales with an ``alpha`` that a convolution of both predicts.
 
-    ``laplacian_fusion(i, coarse, sigmoid(conv3x3([i, upsample(coarse)])))`` with ``i = fine + residual``.
+    ``laplacian_fusion(i, coarse, sigmoid(conv3x3([i, upsample(coarse)])))`` with ``i = fine + residual``. With
+    ``logarithms``, ``i = log1p(fine)``, and the low frequencies that are exchanged are logarithms of means,
+    ``i + alpha (U(coarse) - U(log1p(D(fine))))``: means of radiance on both sides, so that a coarse scale that agrees
+    with the fine one changes nothing, as in the paper's Eq. 2.
 
     Args:
         fine: ``(B, C, H, W)``, any unit; logarithms of radiance if there is a ``top``.
         coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` of the same unit and dtype.
         weight: ``(1, 2 C, 3, 3)``.
         bias: ``(1,)``.
-        residual: ``(B, C, H, W)`` to be added to ``fine``, any dtype; none by default.
+        residual: ``(B, C, H, W)`` to be added to ``fine``, any dtype; none by default, nor with ``logarithms``.
         top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result, which is then handed out as radiance:
             ``expm1`` of what is brought to the range from 0 to ``top``.
         logarithms: whether to take those of ``fine``, which then is radiance: ``log1p``.
@@ -220,7 +223,12 @@ def gated_fusion(
     Returns:
         ``(B, C, H, W)``, at least float32. The fast form computes ``alpha`` in the dtype of the result, also under
         autocast.
+
+    Raises:
+        ValueError: there are both a residual and ``logarithms``.
     """
+    if logarithms and residual is not None:
+        raise ValueError("residual: expected None where logarithms are taken, found a tensor")
     given = (fine, coarse, weight, bias, residual, top)
     chosen = choose_backend(backend, *given, differentiable=False, forms=_FORMS)
     if chosen != "torch":
@@ -228,13 +236,16 @@ def gated_fusion(
 
         result: Tensor = fast.gated_fusion(*given, logarithms)
         return result
-    if logarithms:
-        fine = torch.log1p(fine)
+    size = (fine.shape[-2], fine.shape[-1])
+    detail = torch.log1p(fine) if logarithms else fine
     if residual is not None:
-        fine = residual.to(accumulator_dtype(residual.dtype)) + fine
-    both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)
-    alpha = torch.sigmoid(F.conv2d(both, weight, bias, padding=1))
-    fused = laplacian_fusion(fine, coarse, alpha.to(fine.dtype))
+        detail = residual.to(accumulator_dtype(residual.dtype)) + detail
+    both = torch.cat([detail, upsample(coarse, size)], 1)
+    alpha = torch.sigmoid(F.conv2d(both, weight, bias, padding=1)).to(detail.dtype)
+    if logarithms:
+        fused = detail + alpha * upsample(coarse - torch.log1p(downsample(fine)), size)
+    else:
+        fused = laplacian_fusion(detail, coarse, alpha)
     return fused if top is None else torch.expm1(torch.minimum(fused.clamp_min(0), top))
 
 
