@@ -14,20 +14,12 @@ from golden_shots import FILE, MODELS, PRECISIONS, SHOTS, Shot, change, kept_pix
 from safetensors.torch import save_file
 from torch import Tensor
 
-from mcdenoise import Denoiser, Frame, create_model
+from mcdenoise import Frame, create_model
+from mcdenoise.models import Journal, listening
 
 _DRAWS = 3
 _PROBE = 32
 _FLOAT32 = torch.finfo(torch.float32).eps / 2
-
-
-class Exact(Frame):
-    """A frame that stays in float64, also where it is asked for in float32."""
-
-    def to(self, target: torch.device | torch.dtype | str) -> Frame:
-        """See :class:`Frame`."""
-        moved = super().to(torch.float64 if isinstance(target, torch.dtype) else target)
-        return Exact(**dict(moved.items()))
 
 
 def moved(tensor: Tensor, unit: float, seed: int) -> Tensor:
@@ -42,20 +34,21 @@ def images(shot: Shot, name: str, weights: float = 0.0, inputs: float = 0.0, see
     with torch.no_grad():
         for index, parameter in enumerate(model.parameters()):
             parameter.copy_(moved(parameter, weights, 1000 * seed + 100 + index))
-    denoiser = Denoiser(model)
-    found = []
+    found, state = [], None
     for number in range(shot.frames):
         # The same change in every frame: what stands still stands still.
         buffers = {
             key: moved(value, inputs, 1000 * seed + index)
             for index, (key, value) in enumerate(shot.frame(number).items())
         }
-        image = denoiser(Exact(**buffers))
+        journal = Journal()
+        with torch.no_grad(), listening(journal):
+            output, state = model(Frame(**buffers), state)
         if number in shot.kept:
-            found.append(kept_pixels(image))
+            found.append(kept_pixels(output.image))
             if not seed:
-                stages = {stage.name: round(stage.left_out, 3) for stage in denoiser.report.stages if stage.left_out}
-                print(f"  frame {number}: left out {stages}")
+                stages = {stage.name: round(stage.skipped, 3) for stage in journal.stages.values() if stage.skipped}
+                print(f"  frame {number}: skipped {stages}")
     return found
 
 
