@@ -1,0 +1,83 @@
+"""What the shipped models give for two shots, whatever happens to the code: whole, tiled, with less than all computed.
+
+The images are made by ``make.py``, in float64. The bounds come from how far these move by rounding, see
+``golden_shots.ALLOWED``; each also has a test that something small is beyond them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import pytest
+import torch
+from golden_shots import ALLOWED, MODELS, PRECISIONS, SHOTS, change, golden, kept_pixels
+from torch import Tensor
+
+from mcdenoise import Denoiser, create_model
+from mcdenoise.plan import Plan
+
+IMAGES, RESPONSES = golden()
+Precision = Literal["float32", "bfloat16"]
+
+
+def denoised(shot: str, denoiser: Denoiser) -> dict[int, Tensor]:
+    """What is in the file of each frame that is."""
+    found = {}
+    for number in range(SHOTS[shot].frames):
+        image = denoiser(SHOTS[shot].frame(number))
+        assert image.dtype == torch.float32
+        if number in SHOTS[shot].kept:
+            found[number] = kept_pixels(image)
+    return found
+
+
+def beyond(shot: str, model: str, precision: str, images: dict[int, Tensor]) -> list[str]:
+    """Where images are further from those of the file than rounding can lead."""
+    wrong = []
+    for index, (number, image) in enumerate(images.items()):
+        error = change(image, IMAGES[f"{shot}.{model}.{number}"])
+        response = RESPONSES[f"{shot}.{model}.{precision}"][index]
+        for what, factor in ALLOWED.items():
+            # Outside of the convolutions everything is in float32.
+            allowed = factor * max(response[what], torch.finfo(torch.float32).eps)
+            if not error[what] <= allowed:
+                wrong.append(f"frame {number}: {what} difference {error[what]:.3g}, expected at most {allowed:.3g}")
+    return wrong
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(
+    ("shot", "settings"),
+    [("moving", {}), ("moving", {"tile": 64}), ("still", {}), ("still", {"tile": 64})],
+    ids=["whole", "tiled", "skipped", "skipped and tiled"],
+)
+def test_images_are_those_of_the_file(shot: str, settings: dict[str, Any], model: str, precision: Precision) -> None:
+    denoiser = Denoiser(MODELS[model], precision=precision, **settings)
+    assert not beyond(shot, model, precision, denoised(shot, denoiser))
+
+
+def test_the_still_shot_is_one_of_which_not_all_is_computed() -> None:
+    model = "micro"
+    computed = denoised("still", Denoiser(MODELS[model], plan=Plan(keep_all=True)))
+    assert {message.partition(":")[0] for message in beyond("still", model, "float32", computed)} == {
+        "frame 9",
+        "frame 19",
+    }
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_a_weight_or_a_history_that_is_a_little_wrong_is_seen(precision: Precision) -> None:
+    model = "micro"
+    other = create_model(MODELS[model], pretrained=True)
+    with torch.no_grad():
+        for parameter in other.parameters():
+            parameter.mul_(1 + (1e-2 if precision == "bfloat16" else 1e-5))
+    assert beyond("moving", model, precision, denoised("moving", Denoiser(other, precision=precision)))
+    longer = Denoiser(MODELS[model], precision=precision, alpha_min=0.6)
+    assert beyond("moving", model, precision, denoised("moving", longer))
+
+
+def test_the_file_has_every_image_and_is_small() -> None:
+    assert set(IMAGES) == {f"{shot}.{model}.{n}" for shot, what in SHOTS.items() for n in what.kept for model in MODELS}
+    assert all(image.isfinite().all() and image.dtype == torch.float32 for image in IMAGES.values())
