@@ -176,14 +176,16 @@ class Denoiser:
 
         Args:
             frame: a renderer's outputs, any float dtype; NaN, infinite and negative pixels of ``color`` are replaced
-                and counted.
+                and counted. Nothing of it is kept, so that the next frame may be written into the same buffers.
 
         Returns:
-            ``(B, 3, H, W)`` float32 scene-linear radiance on the denoiser's device; ``report`` says what was done.
+            ``(B, 3, H, W)`` float32 scene-linear radiance on the denoiser's device, to keep or to change; ``report``
+            says what was done.
 
         Raises:
             InputError: a feature buffer holds NaN, an illegal infinity or a value far out of range; or there is too
-                little memory, see :meth:`reset`.
+                little memory, see :meth:`reset`. After this error, as after any other, the past is that of the frame
+                before.
         """
         frame, past, steps, result = self._network(frame)
         final = result.final
@@ -194,11 +196,22 @@ class Denoiser:
     def images(self, frame: Frame) -> Images:
         """As calling the denoiser, with the images on the way to the result."""
         frame, past, steps, result = self._network(frame)
-        return Images(frame.color, *self._remodulated(frame, steps, past.color, result.initial, result.final))
+        return Images(frame.color.clone(), *self._remodulated(frame, steps, past.color, result.initial, result.final))
 
-    @torch.inference_mode()
     def _network(self, frame: Frame) -> tuple[Frame, Accumulated, Steps, Denoised]:
         """The valid frame, its accumulated color, and what the network makes of it."""
+        history, plan = self.history.snapshot(), self.plan.snapshot()
+        try:
+            return self._remembered(frame)
+        except BaseException:
+            # Given again, the frame must not count twice.
+            self.history.restore(history)
+            self.plan.restore(plan)
+            raise
+
+    @torch.inference_mode()
+    def _remembered(self, frame: Frame) -> tuple[Frame, Accumulated, Steps, Denoised]:
+        """As :meth:`_network`; where it fails, history and plan may have the frame already."""
         self.report = report = FrameReport()
         with self._timed("validate"):
             inspected = frame.to(self.device).to(torch.float32).inspect()
@@ -274,13 +287,15 @@ class Denoiser:
         result = Denoised(*self.model(*inputs, **history)) if parts else Denoised(known.initial, known.final)
         return Denoised(*(torch.where(known.mask, *pair) for pair in zip(known[1:], result, strict=True)))
 
-    @torch.inference_mode()
+    # Not in inference mode, whose tensors nobody may change or differentiate through.
+    @torch.no_grad()
     def _remodulated(self, frame: Frame, steps: Steps, *images: Tensor) -> list[Tensor]:
         with self._timed("remodulate"):
             # A network that ends with a convolution hands out its precision.
             full = [image.float() for image in images]
             if frame.albedo is None or not steps.demodulates:
-                return full
+                # They may be what history and plan remember.
+                return [image.clone() for image in full]
             return [by_rows(remodulate, image, frame.albedo) for image in full]
 
     def _inputs(self, frame: Frame, past: Accumulated) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -202,6 +202,13 @@ class _State(NamedTuple):
         return self.length.shape == color[:, :1].shape and self.length.device == color.device
 
 
+class Snapshot(NamedTuple):
+    """A history as it was between two frames."""
+
+    state: _State | None
+    clamps: list[ClampFireflies]
+
+
 # The channels of a state.
 _COLOR, _MEAN, _SQUARE, _RECENT, _RECENT_MEAN = slice(0, 3), slice(3, 4), slice(4, 5), slice(5, 9), slice(8, 9)
 
@@ -262,6 +269,8 @@ class History:
 
     Half-precision frames are accumulated in float32, which holds 10,000 frames as well as ten.
 
+    What is kept of a frame are copies of its buffers, which may be written to as soon as it has been added.
+
     The past is thrown away by :meth:`reset`, when the image size changes, and at a cut (less than 5 % of the pixels
     find their surface in the previous frame).
 
@@ -300,6 +309,14 @@ class History:
     def reset(self) -> None:
         """Forget the past: the next frame is the first of a shot."""
         self._state = None
+
+    def snapshot(self) -> Snapshot:
+        """What :meth:`restore` needs to take back the frames that are added from now on; no image is copied."""
+        return Snapshot(self._state, self._clamps)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Take back every frame that was added since."""
+        self._state, self._clamps = snapshot
 
     def is_still(self, frame: Frame) -> bool:
         """Whether every pixel of the next frame shows what it showed in the frame before, as far as a frame tells.
@@ -352,8 +369,11 @@ class History:
         self._state = None
         if keeps:
             label = None if lights is None else lights * past.steady()
-            surface = Surface(frame.position, frame.normal, frame.depth, label)
-            self._state = _State(past.color, past.length, surface, frame.view_projection)
+            # Copies: a renderer may write the next frame into the same buffers.
+            kept = (frame.position, frame.normal, frame.depth, frame.view_projection)
+            position, normal, depth, matrix = (None if buffer is None else buffer.clone() for buffer in kept)
+            color = past.color.clone() if past.color.data_ptr() == frame.color.data_ptr() else past.color
+            self._state = _State(color, past.length, Surface(position, normal, depth, label), matrix)
         return Accumulated(past.color[:, _COLOR], entering[:, _COLOR], past.length, past.reset)
 
     def _chosen(self, color: Tensor, albedo: Tensor | None) -> list[ClampFireflies]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import Counter
 from collections.abc import Collection
@@ -112,6 +113,14 @@ class Plan:
         self._count = 0
         self._still = False
         self._tiles: Tiles | None = None
+
+    def snapshot(self) -> dict[str, Any]:
+        """What :meth:`restore` needs to take back the frames that are planned from now on; no image is copied."""
+        return {**vars(self), "_tiles": copy.copy(self._tiles)}
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Take back every frame that was planned since."""
+        vars(self).update(snapshot)
 
     def has_past(self, buffers: Collection[str]) -> bool:
         """Whether frames with these buffers may be accumulated."""
