@@ -123,7 +123,9 @@ def test_the_network_runs_on_what_is_not_sky() -> None:
     size = (320, 224)
     short, whole = pair()
     frame = sky(wall(0, size=size), 200)
-    assert torch.equal(short(frame), whole(frame))
+    image, expected = short(frame), whole(frame)
+    # Convolutions choose the order of their sums by the size of the image and the number of threads.
+    torch.testing.assert_close(image, expected, rtol=1e-5, atol=1e-5 * float(expected.mean()))
     # Down from row 192, a multiple of 32, and 64 rows above it that the network looks at.
     assert stage(short, "network").left_out == pytest.approx(192 / 320)
     assert stage(whole, "network").left_out == 0

@@ -29,6 +29,8 @@ _LOADED_LATER = 0.45 * GB
 _BYTES = 4
 # Channels of a history: a long and a recent past, what they are compared by, and the length.
 _KEPT = 10
+# Buffers of a frame that are kept beside them.
+_SURFACE = ("position", "normal", "depth")
 _STATM = Path("/proc/self/statm")
 
 
@@ -139,20 +141,23 @@ class Frames(NamedTuple):
     @property
     def held(self) -> int:
         """Bytes of whole images while a network runs."""
-        # Color, demodulated, and what is kept of it; the results of both networks.
-        return self._bytes(self._channels() + 3 + (_KEPT if self.streaming else 1) + 6)
+        # Color, demodulated, and what is kept of it and of the frame before, to which a failure leads back; the results
+        # of both networks.
+        kept = 2 * (_KEPT + self._channels(*_SURFACE)) if self.streaming else 1
+        return self._bytes(self._channels() + 3 + kept + 6)
 
     @property
     def held_elsewhere(self) -> int:
         """Bytes of whole images, at most, while none runs."""
         # One of the results also in other units.
-        after = self._channels() + 3 + (_KEPT if self.streaming else 1) + 9
+        kept = _KEPT + self._channels(*_SURFACE) if self.streaming else 1
+        after = self._channels() + 3 + kept + 9
         if not self.streaming:
             return self._bytes(after)
         # Color as it is and as it enters; the old past with the features it belongs to; the new one, long and short, as
         # accumulated and without lag.
         past = 12 + _KEPT + 2 * _KEPT
-        return self._bytes(max(after, self._channels() + self._channels("position", "normal", "depth") + past))
+        return self._bytes(max(after, self._channels() + 2 * self._channels(*_SURFACE) + past))
 
     def _channels(self, *names: str) -> int:
         return sum(BUFFERS[name].channels for name in names or BUFFERS if name in self.buffers)

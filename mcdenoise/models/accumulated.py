@@ -140,11 +140,10 @@ class Accumulated(Wrapper):
         """The frame with its history, the history for the next one, and the state that the method inside may have."""
         compiling = torch.compiler.is_compiling()
         can_move = frame.motion is not None or (frame.position is not None and frame.view_projection is not None)
-        reset = "" if can_move else _NO_WAY
+        reset = "" if history is None else _misfit(history, frame)
         if self.rule == "bmfr" and (frame.position is None or frame.normal is None):
             reset = reset or "no position and normal, which the rule compares"
-        if not reset:
-            reset = "first frame" if history is None else _misfit(history, frame)
+        reset = reset or (_NO_WAY if not can_move else "first frame" if history is None else "")
         keeps = can_move and not (frame.hints.last and not frame.hints.keep_all)
         # What has no history and will be none is compared with nothing.
         compared = math.isfinite(self.lag_threshold) and (keeps or not reset)

@@ -152,17 +152,71 @@ def test_weights_and_filter_in_one_give_the_same_image(
     assert len(calls) == 3
 
 
+def whole_numbers(parameter: Tensor, generator: torch.Generator) -> Tensor:
+    """Of the weights of a convolution, two are 1 or -1 for each result and all others 0; no bias."""
+    values = torch.zeros(parameter.shape)
+    if parameter.dim() > 1:
+        # Transposed convolutions have their results second, and one weight of each input for each of two by two.
+        outputs = values.transpose(0, 1) if parameter.shape[-1] == 2 else values
+        for output in range(outputs.shape[0]):
+            for place in torch.randperm(outputs[0].numel(), generator=generator)[:2].tolist():
+                sign = 1.0 if torch.rand((), generator=generator) < 0.7 else -1.0
+                outputs[(output, *np.unravel_index(place, outputs[0].shape))] = sign
+    return values
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
 def test_shortcuts_of_inference_change_no_feature(dtype: torch.dtype) -> None:
-    torch.manual_seed(0)
-    net = UNet(4, WIDTH).to(dtype=dtype, memory_format=torch.channels_last)
-    image = torch.randn(1, 4, 21, 34).to(dtype)
+    """Bit by bit, of a network whose sums have no rounding in whichever order a library takes them."""
+    net, generator = UNet(4, WIDTH), torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.copy_(whole_numbers(parameter, generator))
+    net = net.to(dtype=dtype, memory_format=torch.channels_last)
+    # Each of the 17 layers at most doubles them: whole numbers below 2^20, and float32, in which all sums are taken,
+    # holds those below 2^24. bfloat16 rounds the results only, before or after ReLU, which is the same.
+    image = torch.randint(-4, 5, (1, 4, 21, 34), generator=generator).to(dtype)
     trained = net(image)
     with torch.no_grad():
         inferred = net(image)
     for a, b in zip(trained, inferred, strict=True):
-        assert b.isfinite().all()
+        assert len(b.unique()) > 20
         assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+def test_shortcuts_of_inference_change_no_convolution_by_more_than_rounding(dtype: torch.dtype) -> None:
+    """Of ``n`` products, sums in two orders differ by ``2 gamma_n`` times the sum of their absolute values, at most.
+
+    ``gamma_n = n u / (1 - n u)`` with the ``u`` of float32 (Higham 2002, Sec. 3.1). What a first convolution differs by
+    the second one multiplies by its weights. A result in bfloat16 is rounded once more, by up to its ``u``.
+    """
+    torch.manual_seed(0)
+    net = UNet(4, WIDTH).to(dtype=dtype, memory_format=torch.channels_last)
+    entering: list[tuple[nn.Module, Tensor]] = []
+    blocks = [*net.encoder, *net.decoder]
+    for block in blocks:
+        block.register_forward_pre_hook(lambda block, inputs: entering.append((block, inputs[0].detach().clone())))
+    with torch.no_grad():
+        net(torch.randn(1, 4, 21, 34).to(dtype))
+    unit = torch.finfo(torch.float32).eps / 2
+    rounding = 0.0 if dtype == torch.float32 else torch.finfo(dtype).eps / 2
+    # The list grows while they are called again.
+    for block, x in entering[: len(blocks)]:
+        trained = block(x.clone()).detach()
+        with torch.no_grad():
+            inferred = block(x.clone())
+        magnitude, bound = x.double().abs(), torch.zeros_like(x, dtype=torch.float64)
+        for layer in block:
+            if isinstance(layer, nn.Conv2d):
+                weight, bias = layer.weight.detach().double().abs(), layer.bias.detach().double().abs()
+                gamma = (count := weight[0].numel() + 1) * unit / (1 - count * unit)
+                carried = nn.functional.conv2d(bound, weight, None, layer.stride, layer.padding)
+                # Of all absolute values: also an upper bound of the results.
+                magnitude = nn.functional.conv2d(magnitude + bound, weight, bias, layer.stride, layer.padding)
+                bound = carried + (2 * gamma + 2 * rounding) * magnitude
+        assert ((trained.double() - inferred.double()).abs() <= bound).all()
+        assert bound.max() < (1e-3 if dtype == torch.float32 else 2) * trained.max()
 
 
 def test_shortcuts_of_training_change_no_derivative(monkeypatch: pytest.MonkeyPatch) -> None:

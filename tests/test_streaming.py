@@ -1,0 +1,146 @@
+"""What a renderer may rely on that streams frames: nothing of its own is kept, nothing bad is remembered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from mcdenoise import Denoiser, Frame, create_model
+
+# With shipped weights, and fast.
+MODEL = "cascaded_micro"
+HEIGHT, WIDTH = 40, 72
+
+
+def scene(number: int, *, still: bool = False, without: tuple[str, ...] = (), sky: bool = False) -> Frame:
+    """A wall that a camera moves along, or stands before; noise in the left half only, so that tiles converge."""
+    g = torch.Generator().manual_seed(number)
+    eye = torch.tensor([0.0 if still else 0.03 * number, 0.0 if still else 0.02 * number, 0.0])
+    rows, columns = (torch.arange(n).float() for n in (HEIGHT, WIDTH))
+    ray = torch.ones(3, HEIGHT, WIDTH)
+    ray[0], ray[1] = (2 * columns + 1) / WIDTH - 1, ((2 * rows[:, None] + 1) / HEIGHT - 1) * HEIGHT / WIDTH
+    # The wall leans, so that depths and positions differ from pixel to pixel.
+    depth = 4 / (1 + 0.2 * ray[0])
+    position = eye[:, None, None] + ray * depth
+    albedo = 0.3 + 0.4 * (position - position.floor())
+    noise = torch.rand(1, 3, HEIGHT, WIDTH, generator=g)
+    color = albedo * torch.where(columns < 36, 2 * noise, 1 + 0.001 * (noise - 0.5))
+    matrix = torch.zeros(1, 4, 4)
+    matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 2, 2], matrix[:, 2, 3] = 1, WIDTH / HEIGHT, 1, 1
+    matrix[:, 3, :3] = -torch.stack([eye[0], eye[1] * WIDTH / HEIGHT, torch.tensor(0.1)])
+    frame = Frame(
+        color=color,
+        albedo=albedo[None],
+        normal=torch.tensor([-0.2, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH) / 1.04**0.5,
+        depth=depth[None, None],
+        position=position[None],
+        view_projection=matrix,
+    )
+    if sky:
+        frame = frame.replace(depth=torch.full((1, 1, HEIGHT, WIDTH), torch.inf), color=torch.ones_like(color))
+    return frame.replace(**dict.fromkeys(without))
+
+
+def with_motion(number: int) -> Frame:
+    """Its past is found by motion vectors alone."""
+    motion = torch.full((1, 2, HEIGHT, WIDTH), 0.4)
+    return scene(number, without=("position", "view_projection")).replace(motion=motion)
+
+
+SHOTS: dict[str, Callable[[int], Frame]] = {
+    "moving": scene,
+    "still": lambda number: scene(number, still=True),
+    "motion vectors": with_motion,
+    "without albedo": lambda number: scene(number, without=("albedo",)),
+    "still without albedo": lambda number: scene(number, still=True, without=("albedo",)),
+    "sky": lambda number: scene(number, still=True, sky=True),
+    "sky without albedo": lambda number: scene(number, still=True, sky=True, without=("albedo",)),
+    "color": lambda number: Frame(color=scene(number).color),
+}
+FRAMES = 11
+
+
+@pytest.fixture(params=SHOTS)
+def shot(request: pytest.FixtureRequest) -> list[Frame]:
+    return [SHOTS[request.param](number) for number in range(FRAMES)]
+
+
+def denoised(frames: list[Frame], denoiser: Denoiser | None = None) -> list[Tensor]:
+    denoiser = denoiser or Denoiser(MODEL)
+    return [denoiser(frame).clone() for frame in frames]
+
+
+def in_one_place(frames: list[Frame]) -> Iterator[Frame]:
+    """As a renderer hands them over that writes every frame into the same buffers."""
+    place = Frame(**{name: torch.empty_like(value) for name, value in frames[0].items()})
+    for frame in frames:
+        for (_, mine), (_, value) in zip(place.items(), frame.items(), strict=True):
+            mine.copy_(value)
+        yield place
+
+
+@pytest.mark.parametrize("anti_lag", [True, False])
+def test_a_renderer_may_write_every_frame_into_the_same_buffers(shot: list[Frame], anti_lag: bool) -> None:
+    expected = denoised(shot, Denoiser(MODEL, anti_lag=anti_lag))
+    denoiser = Denoiser(MODEL, anti_lag=anti_lag)
+    found = [denoiser(frame) for frame in in_one_place(shot)]
+    # Not cloned: what was handed out stays what it was, too.
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
+def test_an_image_may_be_changed_where_it_is(shot: list[Frame]) -> None:
+    expected, denoiser = denoised(shot), Denoiser(MODEL)
+    for frame, image in zip(shot, expected, strict=True):
+        found = denoiser(frame)
+        assert torch.equal(found, image)
+        found.fill_(1e6)
+
+
+def test_images_on_the_way_may_be_changed_where_they_are(shot: list[Frame]) -> None:
+    expected, denoiser = denoised(shot), Denoiser(MODEL)
+    for frame, image in zip(shot, expected, strict=True):
+        before = frame.color.clone()
+        images = denoiser.images(frame)
+        assert torch.equal(images.denoised, image)
+        for one in (images.noisy, images.accumulated, images.initial, images.denoised):
+            one.fill_(1e6)
+        assert torch.equal(frame.color, before)
+
+
+@pytest.mark.parametrize("without", [(), ("albedo",)])
+def test_an_image_is_an_ordinary_tensor(without: tuple[str, ...]) -> None:
+    denoiser = Denoiser(MODEL)
+    for number in range(2):
+        images = denoiser.images(scene(number, without=without))
+        for image in (denoiser(scene(number, without=without)), images.accumulated, images.initial, images.denoised):
+            assert not image.is_inference()
+            assert not image.requires_grad
+            image.clamp_(0, 1)
+            image *= 2
+            scale = torch.ones((), requires_grad=True)
+            (image * scale).mean().backward()
+            torch.testing.assert_close(scale.grad, image.mean())
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+@pytest.mark.parametrize("name", ["moving", "still", "motion vectors", "without albedo", "color"])
+def test_a_network_that_fails_leaves_the_past_as_it_was(name: str, error: type[BaseException]) -> None:
+    shot = [SHOTS[name](number) for number in range(FRAMES)]
+    expected, model = denoised(shot), create_model(MODEL, pretrained=True)
+    denoiser, fails = Denoiser(model), False
+
+    def fail(module: nn.Module, result: object) -> None:
+        if fails:
+            raise error("out of memory")
+
+    model.register_forward_pre_hook(fail)
+    for frame, image in zip(shot, expected, strict=True):
+        fails = True
+        for _ in range(2):
+            with pytest.raises(error):
+                denoiser(frame)
+        fails = False
+        assert torch.equal(denoiser(frame), image)
