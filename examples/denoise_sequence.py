@@ -24,7 +24,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("sequence", type=Path, help="folder of a renderer's frames")
     parser.add_argument("out", type=Path, help="folder to write to")
-    parser.add_argument("--model", default="cascaded", help="a name that `mcdenoise models` lists")
+    parser.add_argument("--model", default="cascaded_v2", help="a name that `mcdenoise models` lists")
     parser.add_argument("--weights", type=Path, help="weights of your own training; by default the shipped ones")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     options = parser.parse_args()

@@ -1,6 +1,6 @@
 """What a scene does not need is left out: how much time that saves, and what it does to the error.
 
-    python examples/leave_out.py path/to/scene path/to/another --model cascaded_tiny
+    python examples/leave_out.py path/to/scene path/to/another --model cascaded_v2_tiny
     python examples/leave_out.py path/to/scene --markdown --tolerance 0.01
 
 Five shots are made of each scene: the flythrough as it is; the same without albedo; the same with a sky over its upper
@@ -117,7 +117,7 @@ def measure(name: str, shot: str, frames: Iterator[Frame], denoisers: tuple[Deno
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("sequences", type=Path, nargs="+", metavar="SEQUENCE", help="folder of frames with references")
-    parser.add_argument("--model", default="cascaded")
+    parser.add_argument("--model", default="cascaded_v2")
     parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32")
     parser.add_argument("--tolerance", type=float, default=TOLERANCE)
     parser.add_argument("--frames", type=int, default=12, metavar="N", help="of each shot")

@@ -1,7 +1,7 @@
 """Time networks and Open Image Denoise side by side on one frame: what the image filter alone costs.
 
     python examples/run_time.py
-    python examples/run_time.py --models cascaded cascaded_tiny --size 1920x1080 --rounds 9 --json times.json
+    python examples/run_time.py --models cascaded_v2 cascaded_v2_tiny --size 1920x1080 --rounds 9 --json times.json
 
 Every round runs each of them once, one after the other, so that whatever else the machine does hits all alike; the
 first round warms up and is not counted. Prints the median and the quartiles, and the ratio to Open Image Denoise's

@@ -1,7 +1,7 @@
 """Time training steps with the fast forms of the operators and with the plain ones, on the same clips, taking turns.
 
     python examples/training_speed.py
-    python examples/training_speed.py SEQUENCE... --model cascaded_small --rounds 10 --json times.json
+    python examples/training_speed.py SEQUENCE... --model cascaded_v2_small --rounds 10 --json times.json
 
 A step is that of `mcdenoise train`: its clips are drawn, the network runs forward and backward, the optimiser and the
 averaged weights follow. Without a sequence the clips are noise. Every round makes one step in each way and precision,
@@ -76,7 +76,7 @@ def steps(config: TrainConfig, sampler: ClipSampler, plain: bool) -> Callable[[i
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("sequences", nargs="*", type=Path, metavar="SEQUENCE", help="folders with references")
-    parser.add_argument("--model", default="cascaded")
+    parser.add_argument("--model", default="cascaded_v2")
     parser.add_argument("--batch", type=int, default=2)
     parser.add_argument("--frames", type=int, default=4)
     parser.add_argument("--crop", type=int, default=128)

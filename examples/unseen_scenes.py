@@ -1,7 +1,7 @@
 """Compare every way to denoise on scenes of your choice: noisy, accumulated, a plain filter, OIDN, and the networks.
 
     python examples/unseen_scenes.py path/to/scene path/to/another --peers oidn --markdown
-    python examples/unseen_scenes.py path/to/scene --models cascaded --weights runs/mine/cascaded.safetensors
+    python examples/unseen_scenes.py path/to/scene --models cascaded_v2 --weights runs/mine/cascaded.safetensors
 
 Prints for every scene, and for the mean over the scenes, the mean over the frames with a reference of: SMAPE, relMSE
 and RMSE (scene-linear, lower is better), PSNR and SSIM (as displayed, higher is better), FLIP (as displayed, lower is
@@ -66,7 +66,7 @@ def table(scores: list[Score], markdown: bool) -> str:
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("sequences", type=Path, nargs="+", metavar="SEQUENCE", help="folder of frames with references")
-    parser.add_argument("--models", default="cascaded", metavar="NAMES", help="names that `mcdenoise models` lists")
+    parser.add_argument("--models", default="cascaded_v2", metavar="NAMES", help="names that `mcdenoise models` lists")
     parser.add_argument("--weights", type=Path, metavar="FILE", help="your own weights of the one model that is named")
     parser.add_argument(
         "--resolutions", type=int, metavar="N", help="sizes of the image that a first network denoises, not its own"
