@@ -32,7 +32,7 @@ class FrameReport:
 
     Args:
         reset: why the history was thrown away, or ``""`` where it was used.
-        replaced_pixels: pixels of the noisy color that were NaN, infinite or negative.
+        replaced_pixels: pixels of the noisy color that were NaN, infinite, negative or above 1e16.
         missing: features that the network takes and the frame has not; it sees a constant instead.
         milliseconds: run time of each stage: validate, plan, accumulate, network, remodulate; of a sequence also of
             waiting for the disk, to have read this frame and to have written the last one.
@@ -175,17 +175,18 @@ class Denoiser:
         """Denoise the next frame of the shot.
 
         Args:
-            frame: a renderer's outputs, any float dtype; NaN, infinite and negative pixels of ``color`` are replaced
-                and counted. Nothing of it is kept, so that the next frame may be written into the same buffers.
+            frame: a renderer's outputs, any float dtype; pixels of ``color`` that are NaN, infinite, negative or above
+                1e16 are replaced and counted. Nothing of it is kept, so that the next frame may be written into the
+                same buffers.
 
         Returns:
             ``(B, 3, H, W)`` float32 scene-linear radiance on the denoiser's device, to keep or to change; ``report``
             says what was done.
 
         Raises:
-            InputError: a feature buffer holds NaN, an illegal infinity or a value far out of range; or there is too
-                little memory, see :meth:`reset`. After this error, as after any other, the past is that of the frame
-                before.
+            InputError: a feature buffer holds NaN, an illegal infinity or a value far out of range; what the network
+                makes of the frame is NaN or infinite; or there is too little memory, see :meth:`reset`. After this
+                error, as after any other, the past is that of the frame before.
         """
         frame, past, steps, result = self._network(frame)
         final = result.final
@@ -224,6 +225,7 @@ class Denoiser:
                 frame, demodulates=steps.demodulates, reprojects=steps.reprojects, keeps=steps.keeps
             )
         report.reset = past.reset
+        _check_finite("accumulated", past.color)
         with self._timed("plan"):
             known, parts = self._shortcut(inspected, past)
             tiling = self._tiling(self._shot(frame))
@@ -233,6 +235,8 @@ class Denoiser:
         bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
         with self._timed("network"), bfloat16:
             result = self._result(self._inputs(frame, past), past, steps, known, parts)
+        _check_finite("initial", result.initial)
+        _check_finite("denoised", result.final)
         with self._timed("plan"):
             self.plan.finish(*result, sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1]))
         report.stages = self.plan.stages
@@ -323,6 +327,19 @@ class Denoiser:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         return time.perf_counter() * 1e3
+
+
+def _check_finite(name: str, image: Tensor) -> None:
+    """``InputError`` for an image with NaN or infinity."""
+    # A sum is the fastest way to see either, and only what is far beyond all radiance overflows it.
+    if image.sum().isfinite():
+        return
+    broken = int((~image.isfinite()).any(1).sum())
+    if broken:
+        raise InputError(
+            f"{name} image: expected finite radiance, found {broken} NaN or infinite pixels; the frame is not kept: "
+            "check the buffers for values far out of range and the network for weights that are"
+        )
 
 
 def _device(device: torch.device | str) -> torch.device:

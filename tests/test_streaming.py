@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from mcdenoise import Denoiser, Frame, create_model
+from mcdenoise import Denoiser, Frame, InputError, create_model
 
 # With shipped weights, and fast.
 MODEL = "cascaded_micro"
@@ -143,4 +143,58 @@ def test_a_network_that_fails_leaves_the_past_as_it_was(name: str, error: type[B
             with pytest.raises(error):
                 denoiser(frame)
         fails = False
+        assert torch.equal(denoiser(frame), image)
+
+
+def refused(action: Callable[[], object]) -> str:
+    with pytest.raises(InputError) as error:
+        action()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize("value", [3.4e38, 1e37, 1.1e16])
+def test_one_absurdly_bright_pixel_is_replaced_and_counted(shot: list[Frame], value: float, precision: str) -> None:
+    repaired, broken = list(shot), list(shot)
+    window = shot[1].color[0, :, 9:12, 19:22].reshape(3, 9)
+    for frames, pixel in ((repaired, window[:, [0, 1, 2, 3, 5, 6, 7, 8]].mean(1)), (broken, value)):
+        color = shot[1].color.clone()
+        color[0, :, 10, 20] = pixel
+        frames[1] = shot[1].replace(color=color)
+    # One channel is enough.
+    assert broken[1].color is not repaired[1].color
+    broken[1].color[0, 1:, 10, 20] = 1.0
+    expected = denoised(repaired, Denoiser(MODEL, precision=precision))
+    denoiser = Denoiser(MODEL, precision=precision)
+    for number, (frame, image) in enumerate(zip(broken, expected, strict=True)):
+        torch.testing.assert_close(denoiser(frame), image)
+        assert denoiser.report.replaced_pixels == (number == 1)
+
+
+@pytest.mark.parametrize("albedo", [None, 0.0, 1e-3, 0.04, 1.0])
+@pytest.mark.parametrize("where", [slice(10, 11), slice(10, 20), slice(None)])
+def test_the_largest_radiance_that_is_one_stays_finite(shot: list[Frame], where: slice, albedo: float | None) -> None:
+    denoiser = Denoiser(MODEL)
+    for frame in shot:
+        color = frame.color.clone()
+        color[..., where, where] = 1e16
+        dark = None if albedo is None else torch.full_like(color, albedo)
+        images = denoiser.images(frame.replace(color=color, albedo=dark))
+        assert denoiser.report.replaced_pixels == 0
+        for image in (images.accumulated, images.initial, images.denoised):
+            assert image.isfinite().all()
+            assert image.max() <= 1.01e16
+
+
+@pytest.mark.parametrize("name", ["moving", "still", "motion vectors", "without albedo", "color"])
+def test_what_is_not_finite_is_neither_handed_out_nor_remembered(name: str) -> None:
+    shot = [SHOTS[name](number) for number in range(FRAMES)]
+    expected, model = denoised(shot), create_model(MODEL, pretrained=True)
+    denoiser, weight = Denoiser(model), [*model.parameters()][-1].data.view(-1)[:1]
+    for frame, image in zip(shot, expected, strict=True):
+        right = weight.clone()
+        weight.fill_(torch.nan)
+        assert "image: expected finite radiance, found" in refused(lambda frame=frame: denoiser(frame))
+        weight.copy_(right)
         assert torch.equal(denoiser(frame), image)

@@ -530,6 +530,18 @@ def test_a_frame_that_is_damaged_leaves_no_run(small_sequence: Path, tmp_path: P
     assert [path.name for path in run.iterdir()] == ["cache"]
 
 
+@pytest.mark.parametrize("value", [3e38, 1e37, 1e16, 1e12])
+def test_an_absurdly_bright_pixel_does_not_stop_a_run(small_sequence: Path, tmp_path: Path, value: float) -> None:
+    """One of each 3x3 pixels, so that every clip has some."""
+    for number in range(4):
+        path = small_sequence / "inputs" / f"color{number}.exr"
+        image, channels, _ = read_exr(path)
+        image[::3, ::3] = value
+        write_exr(path, image, channels, half=False)
+    weights = train(TrainConfig(**SMALL), [small_sequence], tmp_path / "run")
+    assert all(tensor.isfinite().all() for tensor in load_file(weights).values())
+
+
 @pytest.mark.parametrize(
     ("setting", "value", "expected"),
     [

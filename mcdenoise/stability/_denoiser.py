@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mcdenoise.buffers import Frame, replace_invalid
+from mcdenoise.buffers import LARGEST_RADIANCE, Frame, replace_invalid
 from mcdenoise.denoiser import Denoiser, Precision
 from mcdenoise.errors import InputError
 from mcdenoise.stability._check import DTYPES, Check, name_of
@@ -35,7 +35,7 @@ def check_denoiser(model: str = "cascaded", dtypes: Sequence[torch.dtype] = DTYP
         denoiser = Denoiser(model, precision=precision)
         for name, frames in _shots(dtype).items():
             yield _valid(denoiser, name, frames, dtype)
-        for value in (torch.nan, torch.inf, -1.0):
+        for value in (torch.nan, torch.inf, -1.0, 3e38):
             yield _contained(denoiser, value, dtype)
         yield from (_refused(denoiser, name, dtype) for name in _REFUSED)
         yield from (_exposure(denoiser, exposure, dtype) for exposure in EXPOSURES)
@@ -79,9 +79,13 @@ def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
         return changed
 
     some = slice(3, 9)
-    shots = {f"radiance {value:g}": with_value("color", value) for value in (0.0, 1e-40, 1e-30, 65504.0, 1e6, 1e30)}
+    shots = {
+        f"radiance {value:g}": with_value("color", value)
+        for value in (0.0, 1e-40, 1e-30, 65504.0, 1e6, LARGEST_RADIANCE, 1e38)
+    }
     shots |= {
-        f"color {value:g} in some rows": with_value("color", value, some) for value in (torch.nan, torch.inf, -1.0)
+        f"color {value:g} in some rows": with_value("color", value, some)
+        for value in (torch.nan, torch.inf, -1.0, 3e38)
     }
     shots |= {"no valid color": with_value("color", torch.nan)}
     shots |= {f"albedo {value:g}": with_value("albedo", value) for value in (0.0, 1e-8, 1.0, 1.9)}
