@@ -79,7 +79,8 @@ class Denoiser:
             and put into evaluation mode.
         weights: a safetensors file of other weights for a model given by name.
         device: where to run; frames may come from anywhere and images stay here.
-        alpha_min: smallest weight of the current frame in the accumulation, see :func:`mcdenoise.ops.accumulate`.
+        alpha_min: smallest weight of the current frame in the accumulation, in (0, 1], see
+            :func:`mcdenoise.ops.accumulate`.
         anti_lag: give up the past where the light has changed, see :class:`mcdenoise.history.History`.
         precision: ``"bfloat16"`` runs the network's convolutions in bfloat16, which is about twice as fast on
             processors that have it; everything else stays in float32.
@@ -93,8 +94,8 @@ class Denoiser:
             of the past. Frames that you keep, beside the one that is denoised, are your own.
 
     Raises:
-        InputError: the model is unknown, has no weights, the device is not there, the precision is unknown, the tiles
-            or the memory are no such number, or the model computes no parts.
+        InputError: the model is unknown, has no weights, the device is not there, the precision is unknown,
+            ``alpha_min``, the tiles or the memory are no such number, or the model computes no parts.
 
     Example:
         >>> denoiser = Denoiser("cascaded")
@@ -122,6 +123,8 @@ class Denoiser:
         if precision not in PRECISIONS:
             raise InputError(f"precision: expected one of {', '.join(PRECISIONS)}, found '{precision}'")
         self.precision = precision
+        if not 0 < alpha_min <= 1:
+            raise InputError(f"alpha_min: expected in (0, 1], found {alpha_min:g}")
         if isinstance(model, str):
             model = create_model(model, pretrained=weights is None, weights=weights)
         # Channels-last convolutions are about 1.5 times faster on a CPU.

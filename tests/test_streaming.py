@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
 from mcdenoise import Denoiser, Frame, InputError, create_model
+from mcdenoise.cli import main
+from mcdenoise.data import open_sequence, read_exr
+from mcdenoise.data.bmfr import write_bmfr_frame, write_buffer
 
 # With shipped weights, and fast.
 MODEL = "cascaded_micro"
@@ -198,3 +204,45 @@ def test_what_is_not_finite_is_neither_handed_out_nor_remembered(name: str) -> N
         assert "image: expected finite radiance, found" in refused(lambda frame=frame: denoiser(frame))
         weight.copy_(right)
         assert torch.equal(denoiser(frame), image)
+
+
+@pytest.mark.parametrize("alpha_min", [0.0, -1.0, 2.0, 1.0001, torch.nan, torch.inf])
+def test_a_weight_of_the_frame_that_cannot_be_is_refused_at_once(alpha_min: float) -> None:
+    assert "alpha_min: expected in (0, 1]" in refused(lambda: Denoiser(MODEL, alpha_min=alpha_min))
+    assert Denoiser(MODEL, alpha_min=1.0)(scene(0)).isfinite().all()
+
+
+def run(sequence: Path, out: Path, frames: str) -> tuple[np.ndarray, str]:
+    """The last image of `mcdenoise denoise`, and what its report says of that frame's past."""
+    with pytest.raises(SystemExit) as stop:
+        main(["denoise", str(sequence), "-o", str(out), "--model", MODEL, "--frames", frames, "--full-float"])
+    assert stop.value.code == 0
+    number, done = list(json.loads((out / "denoise.json").read_text())["frames"].items())[-1]
+    return read_exr(out / f"denoised{number}.exr")[0], done["reset"]
+
+
+def test_motion_across_frames_that_were_not_chosen_is_not_followed(tmp_path: Path) -> None:
+    for number in range(5):
+        write_bmfr_frame(tmp_path / "motion" / "inputs", number, with_motion(number))
+    alone, _ = run(tmp_path / "motion", tmp_path / "alone", "4")
+    after_a_gap, why = run(tmp_path / "motion", tmp_path / "gap", "0-1,4")
+    assert why
+    assert np.array_equal(after_a_gap, alone)
+    followed, why = run(tmp_path / "motion", tmp_path / "followed", "0-1,3-4")
+    assert not why
+    assert not np.array_equal(followed, alone)
+
+
+def test_across_frames_that_were_not_chosen_positions_and_cameras_still_lead(
+    small_sequence: Path, tmp_path: Path
+) -> None:
+    expected, _ = run(small_sequence, tmp_path / "positions", "0,2")
+    sequence = open_sequence(small_sequence)
+    for number, frame in [(number, sequence.frame(number)) for number in sequence.numbers]:
+        moved = torch.full_like(frame.color[:, :2], 3.0)
+        write_buffer(small_sequence / "inputs", number, "motion", moved)
+        assert frame.position is not None
+        write_buffer(small_sequence / "inputs", number, "previous_position", frame.position + 0.5)
+    found, why = run(small_sequence, tmp_path / "motion", "0,2")
+    assert not why
+    assert np.array_equal(found, expected)

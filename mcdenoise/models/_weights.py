@@ -55,12 +55,13 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> nn.Mod
     """The model that a weights file describes, with these weights.
 
     Args:
-        path: a file written by :func:`save_weights`.
+        path: a file written by :func:`save_weights`, or one like it of any floating-point dtype.
         name: the model it must be; any by default.
         settings: override the settings in the file.
 
     Raises:
-        InputError: no such file, not safetensors, another model, or tensors that do not fit; names the first of them.
+        InputError: no such file, not safetensors, another model, or tensors that do not fit or are not finite; names
+            the first of them.
     """
     description = describe_weights(path)
     found = description["architecture"]
@@ -83,6 +84,12 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> nn.Mod
             raise InputError(f"{path}: layer '{key}': model '{found}' expects {expected}, found {actual}")
     if description.get("sha256") != _digest(tensors):
         raise InputError(f"{path}: expected tensors that match the header's sha256, found others; the file is damaged")
+    for key, tensor in sorted(tensors.items()):
+        if not tensor.is_floating_point():
+            raise InputError(f"{path}: layer '{key}': expected floating-point numbers, found {tensor.dtype}")
+        # Eight bits have no such test of their own.
+        if not tensor.float().isfinite().all():
+            raise InputError(f"{path}: layer '{key}': expected finite weights, found NaN or infinite ones; train again")
     model.load_state_dict({key: tensor.float() for key, tensor in tensors.items()})
     return model.eval()
 
@@ -137,5 +144,6 @@ def save_weights(model: nn.Module, architecture: str, settings: dict[str, Any], 
 def _digest(tensors: dict[str, torch.Tensor]) -> str:
     digest = hashlib.sha256()
     for key in sorted(tensors):
-        digest.update(key.encode() + tensors[key].contiguous().numpy().tobytes())
+        # As bytes: numpy has no bfloat16.
+        digest.update(key.encode() + tensors[key].contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()

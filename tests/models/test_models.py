@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -814,6 +815,45 @@ def test_a_damaged_tensor_and_an_infinite_weight_are_refused(tmp_path: Path) -> 
     with torch.no_grad():
         next(model.parameters()).flatten()[0] = 1e6  # more than half precision holds
     assert "NaN or infinite" in refused(lambda: save_weights(model, "cascaded", {"width": 4}, {}))
+
+
+def with_tensors(path: Path, change: Callable[[Tensor], Tensor]) -> Path:
+    """The file with other tensors, and the header's digest of these."""
+    tensors = {key: change(tensor) for key, tensor in load_file(path).items()}
+    digest = hashlib.sha256()
+    for key, tensor in sorted(tensors.items()):
+        digest.update(key.encode() + tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+    with safe_open(path, framework="pt") as file:
+        header = {**file.metadata(), "sha256": digest.hexdigest()}
+    save_file(tensors, path, header)
+    return path
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.float8_e4m3fn])
+def test_weights_of_any_floating_point_dtype_are_loaded(weights: Path, dtype: torch.dtype) -> None:
+    before = load_file(weights)
+    model = load_weights(with_tensors(weights, lambda tensor: tensor.to(dtype)))
+    for key, tensor in model.state_dict().items():
+        assert torch.equal(tensor, before[key].to(dtype).float())
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.complex64, torch.bool])
+def test_weights_that_are_no_floating_point_numbers_are_refused(weights: Path, dtype: torch.dtype) -> None:
+    message = refused(lambda: load_weights(with_tensors(weights, lambda tensor: tensor.to(dtype))))
+    assert "expected floating-point numbers" in message
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_weights_that_are_not_finite_are_refused(weights: Path, value: float, dtype: torch.dtype) -> None:
+    def spoiled(tensor: Tensor) -> Tensor:
+        tensor = tensor.to(dtype)
+        tensor.view(-1)[-1] = value
+        return tensor
+
+    path = with_tensors(weights, spoiled)
+    for load in (lambda: load_weights(path), lambda: create_model("cascaded", weights=path)):
+        assert "expected finite weights, found NaN or infinite ones" in refused(load)
 
 
 def test_the_cascades_have_weights() -> None:
