@@ -184,7 +184,8 @@ def test_a_step_has_as_many_resolutions_as_are_drawn(
 
     monkeypatch.setattr(Cascade, "forward", spy)
     settings = {**SMALL, "steps": 12}
-    train(TrainConfig(**settings, draw_resolutions=True), [small_sequence], tmp_path / "drawn")
+    # By default: without it, the low frequencies of the larger ones drift.
+    train(TrainConfig(**settings), [small_sequence], tmp_path / "drawn")
     drawn = [resolutions for training, resolutions in seen if training]
     assert set(drawn) == {1, 2, 3}
     assert {resolutions for training, resolutions in seen if not training} == {3}
@@ -193,7 +194,7 @@ def test_a_step_has_as_many_resolutions_as_are_drawn(
     train(TrainConfig(**settings, draw_resolutions=True), [small_sequence], tmp_path / "again")
     assert [resolutions for training, resolutions in seen if training] == drawn
     seen.clear()
-    train(TrainConfig(**settings), [small_sequence], tmp_path / "all")
+    train(TrainConfig(**settings, draw_resolutions=False), [small_sequence], tmp_path / "all")
     assert {resolutions for _, resolutions in seen} == {3}
 
 
