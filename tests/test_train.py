@@ -155,7 +155,8 @@ def test_what_a_run_leaves(small_sequence: Path, tmp_path: Path) -> None:
     assert all(entry["gradient_norm"] > 0 and entry["learning_rate"] == 1e-4 for entry in log)
 
     about = describe_weights(weights)
-    assert (about["architecture"], about["settings"], about["steps"]) == ("cascaded", {"width": 4}, "6")
+    assert (about["architecture"], about["steps"]) == ("cascaded", "6")
+    assert {"width": 4, "resolutions": 3, "kernel_size": 5}.items() <= about["settings"].items()
     assert (about["licence"], about["credits"]) == ("Apache-2.0", "A. Painter, CC0")
     assert json.loads(about["config"]) == config
     assert json.loads(about["data"]) == data["sequences"]

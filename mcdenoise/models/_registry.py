@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from fnmatch import fnmatch
 from typing import Any
@@ -34,7 +35,30 @@ def build_model(name: str, **settings: Any) -> nn.Module:
     """A registered model with fresh weights."""
     if name not in _MODELS:
         raise InputError(f"model '{name}': expected one of {', '.join(list_models())}; see `mcdenoise models`")
-    return _MODELS[name](**settings)
+    model = _MODELS[name](**settings)
+    # What weights are saved with.
+    model.settings = complete_settings(name, settings)  # type: ignore[assignment]
+    return model
+
+
+def complete_settings(name: str, settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a registered model's constructor, those that are not given at their defaults."""
+    return {
+        **{key: value for key, value in _arguments(name).items() if value is not inspect.Parameter.empty},
+        **settings,
+    }
+
+
+def missing_settings(name: str, settings: dict[str, Any]) -> list[str]:
+    """Names of the constructor's arguments that are not among the settings."""
+    return [argument for argument in _arguments(name) if argument not in settings]
+
+
+def _arguments(name: str) -> dict[str, Any]:
+    """Name and default of what a constructor takes by name."""
+    parameters = inspect.signature(_MODELS[name]).parameters.values()
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    return {parameter.name: parameter.default for parameter in parameters if parameter.kind in named}
 
 
 def describe_model(name: str) -> str:

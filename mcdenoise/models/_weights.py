@@ -13,7 +13,7 @@ from safetensors.torch import save
 from torch import nn
 
 from mcdenoise.errors import InputError
-from mcdenoise.models._registry import build_model
+from mcdenoise.models._registry import build_model, complete_settings, list_models, missing_settings
 
 _SHIPPED = Path(__file__).parent / "weights"
 
@@ -54,20 +54,28 @@ def pretrained_models() -> list[str]:
 def load_weights(path: Path, name: str | None = None, **settings: Any) -> nn.Module:
     """The model that a weights file describes, with these weights.
 
+    The header has every setting of the constructor, so that no default of a later version decides what a file means.
+
     Args:
         path: a file written by :func:`save_weights`, or one like it of any floating-point dtype.
         name: the model it must be; any by default.
         settings: override the settings in the file.
 
     Raises:
-        InputError: no such file, not safetensors, another model, or tensors that do not fit or are not finite; names
-            the first of them.
+        InputError: no such file, not safetensors, another model, a header that lacks settings, or tensors that do not
+            fit or are not finite; names the first of them.
     """
     description = describe_weights(path)
     found = description["architecture"]
     if name is not None and found != name:
         raise InputError(f"{path}: expected weights of model '{name}', found those of '{found}'")
     settings = {**description["settings"], **settings}
+    missing = missing_settings(found, settings) if found in list_models() else []
+    if missing:
+        raise InputError(
+            f"{path}: header 'settings': expected every setting of model '{found}', found no {', '.join(missing)}; "
+            "such weights do not say what they mean: name these settings, or save the weights again"
+        )
     try:
         model = build_model(found, **settings)
     except InputError:
@@ -124,7 +132,8 @@ def save_weights(model: nn.Module, architecture: str, settings: dict[str, Any], 
     Args:
         model: the model.
         architecture: the name under which it is registered.
-        settings: what its constructor was given.
+        settings: what its constructor was given, where that is not what ``create_model`` was given; those at their
+            defaults are added.
         about: how the weights came to be: config, data, steps, commit, licence; texts.
 
     Returns:
@@ -137,6 +146,9 @@ def save_weights(model: nn.Module, architecture: str, settings: dict[str, Any], 
     for key, tensor in tensors.items():
         if not tensor.isfinite().all():
             raise InputError(f"layer '{key}': expected weights that fit half precision, found NaN or infinite ones")
+    settings = {**getattr(model, "settings", {}), **settings}
+    if architecture in list_models():
+        settings = complete_settings(architecture, settings)
     header = {"architecture": architecture, "settings": json.dumps(settings), **about, "sha256": _digest(tensors)}
     return save(tensors, header)
 

@@ -513,15 +513,26 @@ def _register(
     """Enter the cascade spelt as in the paper's Table 3, such as ``P+K``; its K may have a width of its own."""
 
     def construct(
-        width: int = width, kernel_width: int | None = kernel_width, kernel_size: int = kernel_size
+        cascade: str = cascade,
+        bilateral: bool = bilateral,
+        width: int = width,
+        kernel_width: int | None = kernel_width,
+        kernel_size: int = kernel_size,
+        resolutions: int = resolutions,
+        half: bool = half,
     ) -> Cascade:
-        parts = [
+        parts = cascade.split("+")
+        if not (set(parts) <= {"P", "K"} and len(parts) <= 2):
+            raise ValueError(f"cascade: expected one or two of P and K, such as P+K, found {cascade!r}")
+        if resolutions < 1:
+            raise ValueError(f"resolutions: expected at least 1, found {resolutions}")
+        networks = [
             PixelPredictor(width, half)
             if part == "P"
             else KernelPredictor(kernel_width or width, kernel_size, bilateral, half)
-            for part in cascade.split("+")
+            for part in parts
         ]
-        return Cascade(parts[0], parts[1] if len(parts) > 1 else None, resolutions)
+        return Cascade(networks[0], networks[1] if len(networks) > 1 else None, resolutions)
 
     widths = f"widths {width} and {kernel_width}" if kernel_width else f"width {width}"
     kernels = f"{kernel_size}x{kernel_size} kernels, {'with' if bilateral else 'without'} bilateral weights"
