@@ -61,7 +61,7 @@ class SequenceReport:
 
     @property
     def replaced_pixels(self) -> int:
-        """Pixels of the noisy color, over all frames, that were NaN, infinite or negative."""
+        """Pixels of the noisy color, over all frames, that were NaN, infinite, negative or above 1e16."""
         return sum(report.replaced_pixels for report in self.frames.values())
 
 

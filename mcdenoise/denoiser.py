@@ -27,7 +27,7 @@ class FrameReport(Journal):
     """What happened to one frame.
 
     Args:
-        replaced_pixels: pixels of the noisy color that were NaN, infinite, negative or beyond the largest radiance.
+        replaced_pixels: pixels of the noisy color that were NaN, infinite, negative or above 1e16.
         missing: buffers that the method is better with and the frame has not.
         beside: milliseconds of what is done while another frame is denoised: read, write.
     """
@@ -132,7 +132,7 @@ class Denoiser:
             InputError: frames of this size cannot be denoised within ``max_memory``; the message says with what.
         """
         self._state: State = None
-        self._count, self._frames = 0, frames
+        self._count, self._frames, self._buffers = 0, frames, buffers
         # Of one frame there is nothing ahead.
         self.has_room_ahead = size is not None and frames != 1
         if buffers is not None and size is not None and self._tiled:
@@ -150,8 +150,9 @@ class Denoiser:
         """Denoise the next frame of the shot.
 
         Args:
-            frame: a renderer's outputs, any float dtype; NaN, infinite and negative pixels of ``color`` are replaced
-                and counted.
+            frame: a renderer's outputs, any float dtype; pixels of ``color`` that are NaN, infinite, negative or above
+                1e16 are replaced and counted. Nothing of it is kept, so that the next frame may be written into the
+                same buffers.
 
         Returns:
             ``(B, 3, H, W)`` float32 scene-linear radiance on the denoiser's device, a tensor of its own; ``report``
@@ -159,7 +160,8 @@ class Denoiser:
 
         Raises:
             InputError: a buffer that the model needs is missing, another holds NaN, an illegal infinity or a value far
-                out of range; the result is no image; or there is too little memory, see :meth:`reset`.
+                out of range; the result is no finite image; or there is too little memory, see :meth:`reset`. After this
+                error, as after any other, the history is that of the frame before.
         """
         return self._step(frame, stages=False).image
 
@@ -192,7 +194,10 @@ class Denoiser:
         return result
 
     def _is_last(self) -> bool:
-        return self._frames is not None and self._count + 1 >= self._frames
+        """Whether no frame that follows can have a history."""
+        if self._frames is not None and self._count + 1 >= self._frames:
+            return True
+        return self._buffers is not None and not self.has_history(self._buffers)
 
     def _missing(self, frame: Frame) -> list[str]:
         """Buffers that the model is better with, sorted; refuses a frame without one that it needs."""
@@ -238,9 +243,12 @@ class Denoiser:
             raise InputError(f"model: expected an Output with an image of {tuple(frame.color.shape)}, found {found}")
         if image.device != frame.color.device:
             raise InputError(f"model: expected an image on {frame.color.device}, found one on {image.device}")
-        low, high = torch.aminmax(image.detach())
-        if not (low > -torch.inf and high < torch.inf):
-            raise InputError("model: expected a finite image, found NaN or infinite values; the frame is not kept")
+        # A sum is the fastest way to see either, and only what is far beyond all radiance overflows it.
+        if not image.detach().sum().isfinite() and (broken := int((~image.isfinite()).any(1).sum())):
+            raise InputError(
+                f"model: expected finite radiance, found {broken} NaN or infinite pixels; the frame is not kept: check "
+                "the buffers for values far out of range and the network for weights that are"
+            )
         for leaf in pytree.tree_leaves(state):
             if leaf is not None and not isinstance(leaf, Tensor):
                 raise InputError(f"model: expected a state of tensors, found {type(leaf).__name__} in it")

@@ -311,15 +311,16 @@ def test_invalid_colors_are_replaced_and_counted(
         pixels[3, 4] = np.nan
         pixels[9, 9, 1] = np.inf
         pixels[12, 0, 2] = -1
+        pixels[15, 7, 0] = 3e38
 
     edit(small_sequence / "inputs" / "color1.exr", spoil)
     status, text, errors = run(*denoise)
     assert (status, errors) == (0, "")
-    assert "replaced 3 NaN, infinite or negative pixels" in text
+    assert "replaced 4 NaN, infinite, negative or absurdly bright pixels" in text
     for number in range(4):
         assert np.isfinite(read_exr(out / f"denoised{number}.exr")[0]).all()
     frames = json.loads((out / "denoise.json").read_text())["frames"]
-    assert [frames[str(number)]["replaced_pixels"] for number in range(4)] == [0, 3, 0, 0]
+    assert [frames[str(number)]["replaced_pixels"] for number in range(4)] == [0, 4, 0, 0]
 
 
 def test_models(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mcdenoise.frame import BUFFERS, Frame, replace_invalid
+from mcdenoise.frame import BUFFERS, LARGEST_RADIANCE, Frame, replace_invalid
 from mcdenoise.errors import InputError
 
 NAN, INF = float("nan"), float("inf")
@@ -74,7 +74,7 @@ def test_a_mismatch_names_buffer_expected_and_found(name: str, value: object, ex
     assert found in got
 
 
-@pytest.mark.parametrize("bad", [NAN, INF, -INF, -1.0, -1e-6])
+@pytest.mark.parametrize("bad", [NAN, INF, -INF, -1.0, -1e-6, 1.1e16, 3e38])
 @pytest.mark.parametrize("channel", [0, 2])
 def test_an_invalid_color_becomes_the_mean_of_its_usable_neighbours(bad: float, channel: int) -> None:
     color = torch.arange(25, dtype=torch.float32).reshape(1, 1, 5, 5).repeat(1, 3, 1, 1)
@@ -122,7 +122,7 @@ def test_valid_color_is_returned_without_a_copy() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
 def test_bright_neighbours_do_not_overflow(dtype: torch.dtype) -> None:
-    bright = 65504.0 if dtype == torch.float16 else 0.9 * torch.finfo(dtype).max
+    bright = 65504.0 if dtype == torch.float16 else 0.9 * LARGEST_RADIANCE
     color = torch.full((1, 3, 3, 3), bright, dtype=dtype)
     color[0, 0, 1, 1] = INF
     clean, replaced = replace_invalid(color)
@@ -205,7 +205,15 @@ def test_a_small_overshoot_is_clamped(name: str, value: float, clamped: float) -
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("albedo", 255.0), ("albedo", -0.5), ("normal", 128.0), ("normal", -1.5), ("depth", -1.0), ("reference", -1.0)],
+    [
+        ("albedo", 255.0),
+        ("albedo", -0.5),
+        ("normal", 128.0),
+        ("normal", -1.5),
+        ("depth", -1.0),
+        ("reference", -1.0),
+        ("reference", 1e38),
+    ],
 )
 def test_values_far_outside_their_range_are_refused(name: str, value: float) -> None:
     with pytest.raises(InputError) as error:

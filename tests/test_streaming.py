@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
-from mcdenoise import Denoiser, Frame, create_model
+from mcdenoise import Denoiser, Frame, InputError, create_model
+from mcdenoise.cli import main
+from mcdenoise.data import open_sequence, read_exr
+from mcdenoise.data.bmfr import write_bmfr_frame, write_buffer
 
 # With shipped weights, and fast.
 MODEL = "cascaded_micro"
@@ -144,3 +150,99 @@ def test_a_network_that_fails_leaves_the_past_as_it_was(name: str, error: type[B
                 denoiser(frame)
         fails = False
         assert torch.equal(denoiser(frame), image)
+
+
+def refused(action: Callable[[], object]) -> str:
+    with pytest.raises(InputError) as error:
+        action()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize("value", [3.4e38, 1e37, 1.1e16])
+def test_one_absurdly_bright_pixel_is_replaced_and_counted(shot: list[Frame], value: float, precision: str) -> None:
+    repaired, broken = list(shot), list(shot)
+    window = shot[1].color[0, :, 9:12, 19:22].reshape(3, 9)
+    for frames, pixel in ((repaired, window[:, [0, 1, 2, 3, 5, 6, 7, 8]].mean(1)), (broken, value)):
+        color = shot[1].color.clone()
+        color[0, :, 10, 20] = pixel
+        frames[1] = shot[1].replace(color=color)
+    # One channel is enough.
+    assert broken[1].color is not repaired[1].color
+    broken[1].color[0, 1:, 10, 20] = 1.0
+    expected = denoised(repaired, Denoiser(MODEL, precision=precision))
+    denoiser = Denoiser(MODEL, precision=precision)
+    for number, (frame, image) in enumerate(zip(broken, expected, strict=True)):
+        torch.testing.assert_close(denoiser(frame), image)
+        assert denoiser.report.replaced_pixels == (number == 1)
+
+
+@pytest.mark.parametrize("albedo", [None, 0.0, 1e-3, 0.04, 1.0])
+@pytest.mark.parametrize("where", [slice(10, 11), slice(10, 20), slice(None)])
+def test_the_largest_radiance_that_is_one_stays_finite(shot: list[Frame], where: slice, albedo: float | None) -> None:
+    denoiser = Denoiser(MODEL)
+    for frame in shot:
+        color = frame.color.clone()
+        color[..., where, where] = 1e16
+        dark = None if albedo is None else torch.full_like(color, albedo)
+        images = denoiser.images(frame.replace(color=color, albedo=dark))
+        assert denoiser.report.replaced_pixels == 0
+        for image in (images.accumulated, images.initial, images.denoised):
+            assert image.isfinite().all()
+            assert image.max() <= 1.01e16
+
+
+@pytest.mark.parametrize("name", ["moving", "still", "motion vectors", "without albedo", "color"])
+def test_what_is_not_finite_is_neither_handed_out_nor_remembered(name: str) -> None:
+    shot = [SHOTS[name](number) for number in range(FRAMES)]
+    expected, model = denoised(shot), create_model(MODEL, pretrained=True)
+    denoiser, weight = Denoiser(model), [*model.parameters()][-1].data.view(-1)[:1]
+    for frame, image in zip(shot, expected, strict=True):
+        right = weight.clone()
+        weight.fill_(torch.nan)
+        assert "image: expected finite radiance, found" in refused(lambda frame=frame: denoiser(frame))
+        weight.copy_(right)
+        assert torch.equal(denoiser(frame), image)
+
+
+@pytest.mark.parametrize("alpha_min", [0.0, -1.0, 2.0, 1.0001, torch.nan, torch.inf])
+def test_a_weight_of_the_frame_that_cannot_be_is_refused_at_once(alpha_min: float) -> None:
+    assert "alpha_min: expected in (0, 1]" in refused(lambda: Denoiser(MODEL, alpha_min=alpha_min))
+    assert Denoiser(MODEL, alpha_min=1.0)(scene(0)).isfinite().all()
+
+
+def run(sequence: Path, out: Path, frames: str) -> tuple[np.ndarray, str]:
+    """The last image of `mcdenoise denoise`, and what its report says of that frame's past."""
+    with pytest.raises(SystemExit) as stop:
+        main(["denoise", str(sequence), "-o", str(out), "--model", MODEL, "--frames", frames, "--full-float"])
+    assert stop.value.code == 0
+    number, done = list(json.loads((out / "denoise.json").read_text())["frames"].items())[-1]
+    return read_exr(out / f"denoised{number}.exr")[0], done["reset"]
+
+
+def test_motion_across_frames_that_were_not_chosen_is_not_followed(tmp_path: Path) -> None:
+    for number in range(5):
+        write_bmfr_frame(tmp_path / "motion" / "inputs", number, with_motion(number))
+    alone, _ = run(tmp_path / "motion", tmp_path / "alone", "4")
+    after_a_gap, why = run(tmp_path / "motion", tmp_path / "gap", "0-1,4")
+    assert why
+    assert np.array_equal(after_a_gap, alone)
+    followed, why = run(tmp_path / "motion", tmp_path / "followed", "0-1,3-4")
+    assert not why
+    assert not np.array_equal(followed, alone)
+
+
+def test_across_frames_that_were_not_chosen_positions_and_cameras_still_lead(
+    small_sequence: Path, tmp_path: Path
+) -> None:
+    expected, _ = run(small_sequence, tmp_path / "positions", "0,2")
+    sequence = open_sequence(small_sequence)
+    for number, frame in [(number, sequence.frame(number)) for number in sequence.numbers]:
+        moved = torch.full_like(frame.color[:, :2], 3.0)
+        write_buffer(small_sequence / "inputs", number, "motion", moved)
+        assert frame.position is not None
+        write_buffer(small_sequence / "inputs", number, "previous_position", frame.position + 0.5)
+    found, why = run(small_sequence, tmp_path / "motion", "0,2")
+    assert not why
+    assert np.array_equal(found, expected)

@@ -155,7 +155,8 @@ def test_what_a_run_leaves(small_sequence: Path, tmp_path: Path) -> None:
     assert all(entry["gradient_norm"] > 0 and entry["learning_rate"] == 1e-4 for entry in log)
 
     about = describe_weights(weights)
-    assert (about["architecture"], about["settings"], about["steps"]) == ("cascaded", {"width": 4}, "6")
+    assert (about["architecture"], about["steps"]) == ("cascaded", "6")
+    assert {"width": 4, "resolutions": 3, "kernel_size": 5}.items() <= about["settings"].items()
     assert (about["licence"], about["credits"]) == ("Apache-2.0", "A. Painter, CC0")
     assert json.loads(about["config"]) == config
     assert json.loads(about["data"]) == data["sequences"]
@@ -184,7 +185,8 @@ def test_a_step_has_as_many_resolutions_as_are_drawn(
 
     monkeypatch.setattr(Cascade, "forward", spy)
     settings = {**SMALL, "steps": 12}
-    train(TrainConfig(**settings, draw_resolutions=True), [small_sequence], tmp_path / "drawn")
+    # By default: without it, the low frequencies of the larger ones drift.
+    train(TrainConfig(**settings), [small_sequence], tmp_path / "drawn")
     drawn = [resolutions for training, resolutions in seen if training]
     assert set(drawn) == {1, 2, 3}
     assert {resolutions for training, resolutions in seen if not training} == {3}
@@ -193,7 +195,7 @@ def test_a_step_has_as_many_resolutions_as_are_drawn(
     train(TrainConfig(**settings, draw_resolutions=True), [small_sequence], tmp_path / "again")
     assert [resolutions for training, resolutions in seen if training] == drawn
     seen.clear()
-    train(TrainConfig(**settings), [small_sequence], tmp_path / "all")
+    train(TrainConfig(**settings, draw_resolutions=False), [small_sequence], tmp_path / "all")
     assert {resolutions for _, resolutions in seen} == {3}
 
 
@@ -528,6 +530,18 @@ def test_a_frame_that_is_damaged_leaves_no_run(small_sequence: Path, tmp_path: P
     message = refused(lambda: train(TrainConfig(**SMALL), [small_sequence], run))
     assert f"{small_sequence}, frame 1: buffer 'normal': expected finite values" in message
     assert [path.name for path in run.iterdir()] == ["cache"]
+
+
+@pytest.mark.parametrize("value", [3e38, 1e37, 1e16, 1e12])
+def test_an_absurdly_bright_pixel_does_not_stop_a_run(small_sequence: Path, tmp_path: Path, value: float) -> None:
+    """One of each 3x3 pixels, so that every clip has some."""
+    for number in range(4):
+        path = small_sequence / "inputs" / f"color{number}.exr"
+        image, channels, _ = read_exr(path)
+        image[::3, ::3] = value
+        write_exr(path, image, channels, half=False)
+    weights = train(TrainConfig(**SMALL), [small_sequence], tmp_path / "run")
+    assert all(tensor.isfinite().all() for tensor in load_file(weights).values())
 
 
 @pytest.mark.parametrize(

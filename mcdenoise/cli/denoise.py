@@ -120,7 +120,7 @@ def denoise(
     for row in report.plan:
         print(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
     if report.replaced_pixels:
-        print(f"replaced {report.replaced_pixels} NaN, infinite or negative pixels of the noisy color")
+        print(f"replaced {report.replaced_pixels} NaN, infinite, negative or absurdly bright pixels of the noisy color")
     print(f"  tiles: {report.tiles}")
     print_times(report.milliseconds)
     print(f"{'beside that' if denoiser.has_room_ahead else 'of the waiting'}: {stages(report.beside)}")

@@ -24,13 +24,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mcdenoise import frame, history
 from mcdenoise.frame import Frame
-from mcdenoise.data import bmfr, camera_matrices, exr
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.history import CAUSTICS, History
-from mcdenoise.ops import Accumulate, ClampFireflies, demodulation, fireflies, temporal
+from mcdenoise.ops import Accumulate, ClampFireflies
 
 # name, channels: what a training clip holds, in the order in which :meth:`Shot.read` stacks it
 PARTS = {"color": 3, "current": 3, "length": 1, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
@@ -240,10 +238,15 @@ def _key(plan: _Plan) -> str:
 
 @functools.cache
 def _code() -> bytes:
-    """Checksum of the code that decodes and accumulates: a mended reader must not find what its predecessor read."""
-    modules = (buffers, history, bmfr, camera_matrices, exr, demodulation, fireflies, temporal)
-    sources = [Path(__file__), *(Path(str(module.__file__)) for module in modules)]
-    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).digest()
+    """Checksum of the whole package: a mended reader or operator must not find what its predecessor made.
+
+    Not of those files only that decode and accumulate: nobody would keep a list of them true.
+    """
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        content = source.read_bytes()
+        digest.update(f"{source.relative_to(package).as_posix()}\0{len(content)}\0".encode() + content)
+    return digest.digest()
 
 
 @contextmanager

@@ -101,7 +101,9 @@ class Sequence:
 
         ``color`` is radiance with the albedo in it, whatever the files hold. ``depth`` is that of the depth file or
         else the clip w of the position; it is ``inf`` where nothing was hit. ``view_projection`` has the pixel
-        offset of the files folded in: ``u W - 0.5, v H - 0.5`` is the pixel index.
+        offset of the files folded in: ``u W - 0.5, v H - 0.5`` is the pixel index. Where frames were left out before
+        this one, it has neither ``motion`` nor ``previous_position``: its past is found by positions and cameras, or it
+        has none.
 
         Args:
             number: one of ``numbers``.
@@ -117,7 +119,11 @@ class Sequence:
                 f"{self.root}: expected a realisation of the noise from 0 to {self.realisations - 1}, "
                 f"found {realisation}; render more of them"
             )
-        return self._source.frame(number, reference=reference, realisation=realisation)
+        frame = self._source.frame(number, reference=reference, realisation=realisation)
+        if self.numbers.index(number) == 0 or number - 1 in self.numbers:
+            return frame
+        # They lead to a frame that was not chosen, and not to the one before in this sequence.
+        return frame.replace(motion=None, previous_position=None)
 
     def reference(self, number: int) -> Tensor:
         """Read the reference of one frame, and nothing else.

@@ -144,7 +144,7 @@ class Accumulated(Wrapper):
         if self.rule == "bmfr" and (frame.position is None or frame.normal is None):
             reset = reset or "no position and normal, which the rule compares"
         reset = reset or (_NO_WAY if not can_move else "first frame" if history is None else "")
-        keeps = can_move and not (frame.hints.last and not frame.hints.keep_all)
+        keeps = frame.hints.keep_all or not frame.hints.last
         # What has no history and will be none is compared with nothing.
         compared = math.isfinite(self.lag_threshold) and (keeps or not reset)
         limit = self._chosen(frame.color) if reset or history is None else history.limit
@@ -217,7 +217,7 @@ class Accumulated(Wrapper):
         note("accumulate", alone or source, float(not can_move))
         why = alone or ("nothing moves in the image" if still and not frame.hints.keep_all else "")
         note("reproject", why or source, float(why != ""))
-        note("remember", "for the next frame" if keeps else alone or "last frame", float(not keeps))
+        note("remember", "for the next frame" if keeps else alone or "no frame reads it", float(not keeps))
 
 
 def surface_before(frame: Frame) -> Surface:

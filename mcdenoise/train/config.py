@@ -63,7 +63,7 @@ class TrainConfig:
     temporal_weight: float = 0.1
     gradient_norm: float = 0.0
     ema: float = 0.0
-    draw_resolutions: bool = False
+    draw_resolutions: bool = True
     alpha_min: float = 0.1
     start_every: int = 4
     keep_fireflies: int = 0

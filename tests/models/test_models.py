@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -728,11 +729,23 @@ def test_settings_are_saved_and_loaded(name: str, settings: dict[str, int], tmp_
     torch.manual_seed(0)
     model = create_model(name, **settings)
     path.write_bytes(save_weights(model, name, settings, {}))
-    assert describe_weights(path)["settings"] == settings
+    assert settings.items() <= describe_weights(path)["settings"].items()
     for loaded in (load_weights(path), create_model(name, weights=path)):
         state = loaded.state_dict()
         assert list(state) == list(model.state_dict())
         assert all(torch.equal(state[key], value.half().float()) for key, value in model.state_dict().items())
+
+
+# Every setting of `cascaded`.
+FULL = {
+    "cascade": "P+K",
+    "bilateral": True,
+    "width": 40,
+    "kernel_width": None,
+    "kernel_size": 5,
+    "resolutions": 3,
+    "half": False,
+}
 
 
 def test_the_header_describes_the_weights(weights: Path) -> None:
@@ -742,11 +755,36 @@ def test_the_header_describes_the_weights(weights: Path) -> None:
         digest.update(key.encode() + tensor.numpy().tobytes())
     assert about == {
         "architecture": "cascaded",
-        "settings": {"width": WIDTH},
+        "settings": {**FULL, "width": WIDTH},
         "steps": "7",
         "licence": "none",
         "sha256": digest.hexdigest(),
     }
+
+
+@pytest.mark.parametrize("name", pretrained_models())
+def test_the_header_alone_says_what_shipped_weights_mean(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes((SHIPPED / f"{name}.safetensors").read_bytes())
+    expected = create_model(name, pretrained=True)(*inputs(40, 33)).final
+    # Under the name of a model with other defaults it is still the same network.
+    for other in ("kernel_kernel_plain", "cascaded_small"):
+        model = load_weights(altered(path, lambda tensors, header, other=other: header.update(architecture=other)))
+        assert torch.equal(model(*inputs(40, 33)).final, expected)
+
+
+@pytest.mark.parametrize("resolutions", [1, 2, 4])
+def test_the_number_of_resolutions_is_a_setting_that_is_kept(resolutions: int, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model, path = build("cascaded", resolutions=resolutions), tmp_path / "weights.safetensors"
+    path.write_bytes(save_weights(model, "cascaded", {}, {}))
+    loaded, other = create_model("cascaded", weights=path), build("cascaded", resolutions=3)
+    other.load_state_dict(loaded.state_dict())
+    assert describe_weights(path)["settings"] == {**FULL, "width": WIDTH, "resolutions": resolutions}
+    with torch.no_grad():
+        image = loaded(*inputs(96, 110)).final
+        torch.testing.assert_close(image, model(*inputs(96, 110)).final, rtol=1e-2, atol=1e-2)
+        assert not torch.allclose(image, other(*inputs(96, 110)).final, rtol=1e-3)
 
 
 def test_weights_of_another_model_are_refused(weights: Path) -> None:
@@ -776,8 +814,13 @@ def test_a_layer_of_another_shape_is_named(weights: Path) -> None:
         ("architecture", "other", "model 'other': expected one of"),
         ("settings", "{", "header 'settings': expected a JSON object"),
         ("settings", "[1]", "header 'settings': expected a JSON object"),
-        ("settings", '{"colour": 1}', "expected settings of model 'cascaded', found {'colour': 1}"),
-        ("settings", '{"width": -1}', "expected settings of model 'cascaded', found {'width': -1}"),
+        ("settings", json.dumps({**FULL, "colour": 1}), "expected settings of model 'cascaded', found {"),
+        ("settings", json.dumps({**FULL, "width": -1}), "expected settings of model 'cascaded', found {"),
+        ("settings", json.dumps({**FULL, "resolutions": 0}), "expected settings of model 'cascaded', found {"),
+        ("settings", json.dumps({**FULL, "cascade": "P+K+Q"}), "expected settings of model 'cascaded', found {"),
+        # As files of earlier versions were, which left it to the code what they mean.
+        ("settings", "{}", "expected every setting of model 'cascaded', found no cascade, bilateral, width"),
+        ("settings", json.dumps({"width": WIDTH}), "expected every setting of model 'cascaded', found no cascade"),
     ],
 )
 def test_a_header_that_means_nothing_is_refused(weights: Path, key: str, value: str, expected: str) -> None:
@@ -814,6 +857,45 @@ def test_a_damaged_tensor_and_an_infinite_weight_are_refused(tmp_path: Path) -> 
     with torch.no_grad():
         next(model.parameters()).flatten()[0] = 1e6  # more than half precision holds
     assert "NaN or infinite" in refused(lambda: save_weights(model, "cascaded", {"width": 4}, {}))
+
+
+def with_tensors(path: Path, change: Callable[[Tensor], Tensor]) -> Path:
+    """The file with other tensors, and the header's digest of these."""
+    tensors = {key: change(tensor) for key, tensor in load_file(path).items()}
+    digest = hashlib.sha256()
+    for key, tensor in sorted(tensors.items()):
+        digest.update(key.encode() + tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+    with safe_open(path, framework="pt") as file:
+        header = {**file.metadata(), "sha256": digest.hexdigest()}
+    save_file(tensors, path, header)
+    return path
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.float8_e4m3fn])
+def test_weights_of_any_floating_point_dtype_are_loaded(weights: Path, dtype: torch.dtype) -> None:
+    before = load_file(weights)
+    model = load_weights(with_tensors(weights, lambda tensor: tensor.to(dtype)))
+    for key, tensor in model.state_dict().items():
+        assert torch.equal(tensor, before[key].to(dtype).float())
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.complex64, torch.bool])
+def test_weights_that_are_no_floating_point_numbers_are_refused(weights: Path, dtype: torch.dtype) -> None:
+    message = refused(lambda: load_weights(with_tensors(weights, lambda tensor: tensor.to(dtype))))
+    assert "expected floating-point numbers" in message
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_weights_that_are_not_finite_are_refused(weights: Path, value: float, dtype: torch.dtype) -> None:
+    def spoiled(tensor: Tensor) -> Tensor:
+        tensor = tensor.to(dtype)
+        tensor.view(-1)[-1] = value
+        return tensor
+
+    path = with_tensors(weights, spoiled)
+    for load in (lambda: load_weights(path), lambda: create_model("cascaded", weights=path)):
+        assert "expected finite weights, found NaN or infinite ones" in refused(load)
 
 
 def test_the_cascades_have_weights() -> None:
