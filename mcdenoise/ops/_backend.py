@@ -12,6 +12,7 @@ from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 Backend = Literal["torch", "numba", "triton"]
 BACKENDS: tuple[Backend, ...] = get_args(Backend)
@@ -88,6 +89,8 @@ def _obstacle(
         return ""
     if backend not in forms:
         return "has no form of this op"
+    if _is_transformed():
+        return "has no rule for torch.func, vmap or forward mode"
     given = [tensor for tensor in tensors if tensor is not None]
     for tensor in given:
         device = tensor.device
@@ -100,6 +103,13 @@ def _obstacle(
         if not differentiable and tensor.requires_grad and torch.is_grad_enabled():
             return "has no derivatives of this op"
     return _missing(backend)
+
+
+def _is_transformed() -> bool:
+    """Whether torch.func, ``vmap`` or forward mode is at work, of which a compiled form knows nothing."""
+    if torch.compiler.is_compiling():
+        return False
+    return torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
 
 
 def _missing(backend: Backend) -> str:

@@ -165,7 +165,7 @@ def _exponent(
     margin = pad(torch.cat([guide.to(dtype) for guide in guides], 1), radius, border) if guides else None
     factors = torch.cat([scale.to(dtype) for scale in scales], 1) if scales else None
     distance = None if distance_scale is None else distance_scale.to(dtype)
-    return _Exponent.apply(start, distance, margin, factors, channels, radius)
+    return _Exponent.of(start, distance, margin, factors, channels, radius)
 
 
 class _Exponent(Function):
@@ -201,6 +201,46 @@ class _Exponent(Function):
         start, _, guides, scales, ctx.channels, ctx.radius = inputs
         ctx.dtype = start.dtype
         ctx.save_for_backward(guides, scales)
+        ctx.save_for_forward(guides, scales)
+
+    @staticmethod
+    def tangent(
+        ctx: Any,
+        of_start: Tensor | None,
+        of_distance: Tensor | None,
+        of_guides: Tensor | None,
+        of_scales: Tensor | None,
+        *_: None,
+    ) -> Tensor:
+        radius = ctx.radius
+        guides, scales = ctx.saved_tensors
+        given = next(tangent for tangent in (of_start, of_distance, of_scales, of_guides) if tangent is not None)
+        margin = 2 * radius if given is of_guides else 0
+        height, width = given.shape[-2] - margin, given.shape[-1] - margin
+        pairs = _each(guides, scales, ctx.channels)
+        tangents = zip(
+            [None] * len(pairs) if of_guides is None else torch.split(of_guides, list(ctx.channels), 1),
+            [None] * len(pairs) if of_scales is None else torch.split(of_scales, 1, 1),
+            strict=True,
+        )
+        moving = list(zip(pairs, tangents, strict=True))
+        taps = []
+        for tap, dy, dx in offsets(2 * radius + 1):
+            total = given.new_zeros(given.shape[0], 1, height, width, dtype=accumulator_dtype(ctx.dtype))
+            if of_start is not None:
+                total = total + of_start[:, tap : tap + 1]
+            if of_distance is not None:
+                total = total - of_distance * (dy * dy + dx * dx)
+            for (padded, scale), (of_padded, of_scale) in moving:
+                size = (height, width)
+                difference = shifted(padded, radius, dy, dx, *size) - shifted(padded, radius, 0, 0, *size)
+                if of_scale is not None:
+                    total = total - of_scale * difference.square().sum(1, keepdim=True)
+                if of_padded is not None:
+                    change = shifted(of_padded, radius, dy, dx, *size) - shifted(of_padded, radius, 0, 0, *size)
+                    total = total - 2 * scale * (difference * change).sum(1, keepdim=True)
+            taps.append(total)
+        return torch.cat(taps, 1)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
@@ -244,7 +284,8 @@ def guide_gradient(gradient: Tensor, guide: Tensor, scale: Tensor, border: Borde
 def _guide_gradient(gradient: Tensor, padded: Tensor, scale: Tensor, radius: int) -> Tensor:
     """Each tap pulls the neighbour one way and the centre the other."""
     height, width = gradient.shape[-2:]
-    total = torch.zeros_like(padded)
+    # Under vmap it must have the axis of whichever of the three has one.
+    total = torch.zeros_like(padded) + gradient.new_zeros(()) + scale.new_zeros(())
     centre_total = torch.zeros_like(shifted(padded, radius, 0, 0, height, width))
     centre = shifted(padded, radius, 0, 0, height, width)
     for tap, dy, dx in offsets(2 * radius + 1):

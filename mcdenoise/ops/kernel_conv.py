@@ -119,10 +119,10 @@ def kernel_conv_torch(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
     kernel_size = kernel_size_of(kernel.shape[1], "kernel")
     radius = kernel_size // 2
     if border != "renormalize":
-        return _Gather.apply(pad(image, radius, border), kernel)
+        return _Gather.of(pad(image, radius, border), kernel)
     # The mean of a few large values fits where their sum does not, and the gradient where its two terms do not.
     kernel = kernel.to(accumulator_dtype(kernel.dtype))
-    total = _Gather.apply(pad(image.to(accumulator_dtype(image.dtype)), radius, border), kernel)
+    total = _Gather.of(pad(image.to(accumulator_dtype(image.dtype)), radius, border), kernel)
     return _renormalized(total, kernel, kernel_size).to(image.dtype)
 
 
@@ -134,7 +134,7 @@ def kernel_splat_torch(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
     if border == "renormalize":
         kernel = kernel.to(accumulator_dtype(kernel.dtype))
         source = _renormalized(source, kernel, kernel_size)
-    return unpad(_Splat.apply(source, kernel), radius, border).to(image.dtype)
+    return unpad(_Splat.of(source, kernel), radius, border).to(image.dtype)
 
 
 class KernelConv(nn.Module):
@@ -193,8 +193,20 @@ def _renormalized(values: Tensor, kernel: Tensor, kernel_size: int) -> Tensor:
 
 
 # Gather, splat and correlate are the three bilinear maps of one trilinear form, sum_{t,p,c} k[t,p] y[c,p] x[c,p+o_t]:
-# the derivative of each is the other two. Written as loops over the taps with that derivative, none of them ever holds
-# K*K copies of the image, and gradients of any order come for free.
+# the derivative of each is the other two, and its tangent that of its arguments in turn. Written as loops over the taps
+# with these derivatives, none of them ever holds K*K copies of the image, and gradients of any order come for free.
+
+
+def _tangent(
+    function: type[Function], arguments: tuple[Tensor, Tensor], tangents: tuple[Tensor | None, Tensor | None]
+) -> Tensor:
+    """Of a bilinear map."""
+    of_first, of_second = tangents
+    if of_first is None:
+        assert of_second is not None
+        return function.of(arguments[0], of_second)
+    moved = function.of(of_first, arguments[1])
+    return moved if of_second is None else moved + function.of(arguments[0], of_second)
 
 
 class _Gather(Function):
@@ -212,12 +224,17 @@ class _Gather(Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
         ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def tangent(ctx: Any, of_padded: Tensor | None, of_kernel: Tensor | None) -> Tensor:
+        return _tangent(_Gather, ctx.saved_tensors, (of_padded, of_kernel))
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
         padded, kernel = ctx.saved_tensors
-        to_image = _Splat.apply(gradient, kernel) if ctx.needs_input_grad[0] else None
-        to_kernel = _Correlate.apply(gradient, padded).to(kernel.dtype) if ctx.needs_input_grad[1] else None
+        to_image = _Splat.of(gradient, kernel) if ctx.needs_input_grad[0] else None
+        to_kernel = _Correlate.of(gradient, padded).to(kernel.dtype) if ctx.needs_input_grad[1] else None
         return to_image, to_kernel
 
 
@@ -237,12 +254,17 @@ class _Splat(Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
         ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def tangent(ctx: Any, of_image: Tensor | None, of_kernel: Tensor | None) -> Tensor:
+        return _tangent(_Splat, ctx.saved_tensors, (of_image, of_kernel))
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
         image, kernel = ctx.saved_tensors
-        to_image = _Gather.apply(gradient, kernel) if ctx.needs_input_grad[0] else None
-        to_kernel = _Correlate.apply(image, gradient).to(kernel.dtype) if ctx.needs_input_grad[1] else None
+        to_image = _Gather.of(gradient, kernel) if ctx.needs_input_grad[0] else None
+        to_kernel = _Correlate.of(image, gradient).to(kernel.dtype) if ctx.needs_input_grad[1] else None
         return to_image, to_kernel
 
 
@@ -262,10 +284,15 @@ class _Correlate(Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
         ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def tangent(ctx: Any, of_image: Tensor | None, of_padded: Tensor | None) -> Tensor:
+        return _tangent(_Correlate, ctx.saved_tensors, (of_image, of_padded))
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
         image, padded = ctx.saved_tensors
-        to_image = _Gather.apply(padded, gradient) if ctx.needs_input_grad[0] else None
-        to_padded = _Splat.apply(image, gradient) if ctx.needs_input_grad[1] else None
+        to_image = _Gather.of(padded, gradient) if ctx.needs_input_grad[0] else None
+        to_padded = _Splat.of(image, gradient) if ctx.needs_input_grad[1] else None
         return to_image, to_padded

@@ -57,8 +57,8 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
     radiance = layout(draw(3, batch, 3, height, width, dtype).exp())
     depth = draw(4, batch, 1, height, width, dtype).exp() * 20
     depth[..., 0, -1] = torch.inf
-    depth = layout(depth)
     scale = network.depth_scale(depth, backend="torch")
+    depth = layout(depth)
     exposure = top * 0.7
     buffers = [some(5, 3), some(6, 3), depth, radiance]
     calls: list[Call] = [
@@ -255,12 +255,68 @@ def test_nan_stays_where_it_is_and_below_zero_is_zero() -> None:
     assert fused[..., 3:, 6:].unique().tolist() == [0]
 
 
-def test_where_nothing_was_hit_there_is_no_depth() -> None:
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_where_nothing_was_hit_there_is_no_depth(backend: str) -> None:
     depth = torch.full((2, 1, 3, 4), torch.inf)
     depth[1, 0, 1] = torch.tensor([1.0, 4.0, torch.inf, 2.0])
-    largest, typical = (part.flatten().tolist() for part in network.depth_scale(depth, backend="numba"))
-    assert largest == pytest.approx([1e-30, 4])
-    assert typical == pytest.approx([1, 0.5])
+    near, typical = (part.flatten().tolist() for part in network.depth_scale(depth, backend=backend))
+    # The mean of 1 / sqrt(d) is (1 + 1 / 2 + 1 / sqrt(2)) / 3, the geometric mean of d is 2.
+    assert near == pytest.approx([1, (9 / (1.5 + math.sqrt(0.5)) ** 2)])
+    assert [unit * each for unit, each in zip(near, typical, strict=True)] == pytest.approx([1, 2])
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+@pytest.mark.parametrize("unit", [1e-20, 1.0, 1e20])
+def test_normalised_depth_is_that_of_the_geometric_mean(unit: float, backend: str) -> None:
+    depth = draw(1, 2, 1, 9, 40, torch.float64).exp()
+    depth[0, 0, :4] = torch.inf
+    hits = torch.isfinite(depth)
+    means = [torch.exp(torch.log(image[hit]).mean()) for image, hit in zip(depth, hits, strict=True)]
+    expected = torch.where(hits, 1 - 1 / (1 + depth / torch.stack(means).reshape(2, 1, 1, 1)), 1)
+    depth = (depth * unit).float()
+    found = network.normalized_depth(depth, *network.depth_scale(depth, backend=backend))
+    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+@pytest.mark.parametrize("sky", [1e10, 1e30, 3e38, torch.inf])
+@pytest.mark.parametrize("rows", [1, 60, 95])
+def test_a_far_sky_hides_no_differences_of_what_is_near(rows: int, sky: float, backend: str) -> None:
+    """Blender writes 1e10 where nothing was hit, others 1e30; here and there one of these is beside infinity."""
+    depth = draw(1, 1, 1, 100, 8, torch.float32).exp() * 5
+    depth[..., :rows, :] = torch.inf
+    expected = network.normalized_depth(depth, *network.depth_scale(depth, backend=backend))
+    depth[..., :rows, :-1] = sky
+    scale = network.depth_scale(depth, backend=backend)
+    for found in (
+        network.normalized_depth(depth, *scale),
+        network.network_guides(depth.expand(1, 3, -1, -1), depth, scale, backend=backend)[:, 3:],
+    ):
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_depths_of_zero_are_finite(backend: str) -> None:
+    """Where nothing was hit some renderers write 0."""
+    depth = torch.ones(1, 1, 4, 6)
+    depth[..., 0] = 0
+    for image in (depth, torch.zeros_like(depth), torch.full_like(depth, 1e-38)):
+        found = network.normalized_depth(image, *network.depth_scale(image, backend=backend))
+        assert found.isfinite().all()
+        assert 0 <= found.min() <= found.max() <= 1
+
+
+def test_the_scale_of_depths_has_a_derivative() -> None:
+    depth = (draw(1, 2, 1, 3, 4, torch.float64).exp() + 0.1).requires_grad_()
+
+    def normalized(depth: Tensor) -> Tensor:
+        return network.normalized_depth(depth, *network.depth_scale(depth))
+
+    assert torch.autograd.gradcheck(normalized, (depth,))
+    depth = depth.detach().clone()
+    depth[0, 0, 0, 0], depth[1, 0, 0, 0] = torch.inf, 1e10
+    depth.requires_grad_()
+    assert torch.autograd.grad(normalized(depth).sum(), depth)[0].isfinite().all()
 
 
 def test_where_derivatives_are_asked_for_it_is_plain() -> None:

@@ -25,7 +25,7 @@ from mcdenoise.ops._fast._numba_filter import (
     source,
 )
 from mcdenoise.ops._fast._operator import custom_op
-from mcdenoise.ops._steps.network import BLOCK
+from mcdenoise.ops._steps.network import BLOCK, FARTHEST, SHORTEST
 from mcdenoise.ops._window import accumulator_dtype
 
 # Pixels whose channels are gathered at a time: they stay in the second-level cache.
@@ -81,7 +81,7 @@ def _stack(
     "mcdenoise::buffers_input",
     device_types="cpu",
     schema="(Tensor image, Tensor albedo, Tensor normal, Tensor depth, Tensor current, Tensor? length, "
-    "Tensor exposure, Tensor largest, Tensor typical, Tensor? image_factor, bool logarithms, ScalarType dtype) "
+    "Tensor exposure, Tensor near, Tensor typical, Tensor? image_factor, bool logarithms, ScalarType dtype) "
     "-> Tensor",
 )
 def buffers_input(
@@ -92,7 +92,7 @@ def buffers_input(
     current: Tensor,
     length: Tensor | None,
     exposure: Tensor,
-    largest: Tensor,
+    near: Tensor,
     typical: Tensor,
     image_factor: Tensor | None,
     logarithms: bool,
@@ -107,7 +107,7 @@ def buffers_input(
         images = tuple(source(_readable(buffer, sums)) for buffer in (image, albedo, normal, depth, current))
         lengths = nothing if length is None else source(_readable(length, sums))
         factor = torch.ones_like(exposure) if image_factor is None else image_factor
-        factors = torch.cat([each.to(sums).expand(batch, 1, 1, 1) for each in (exposure, largest, typical, factor)], 1)
+        factors = torch.cat([each.to(sums).expand(batch, 1, 1, 1) for each in (exposure, near, typical, factor)], 1)
         buffer = np.empty((14, _CHUNK), factors.numpy().dtype)
         arguments = (source(result), images, lengths, factors.flatten(1).numpy(), logarithms)
         share_rows(image, lambda *rows: _stack_buffers(*arguments, np.empty_like(buffer), width, *rows))
@@ -136,7 +136,7 @@ def _stack_buffers(
 ) -> None:
     image, albedo, normal, depth, current = images
     memory, strides, channels = out
-    exposure, largest, typical, factor = factors[b]
+    exposure, near, typical, factor = factors[b]
     half, one = rows.dtype.type(0.5), rows.dtype.type(1)
     bits = np.empty((channels, rows.shape[1]), memory.dtype)
     for y in range(first, last):
@@ -160,7 +160,7 @@ def _stack_buffers(
                 _to_logarithms(row, exposure)
             row = rows[9, :n]
             _read_row(row, depth, b, 0, y, x0)
-            _normalize(row, largest, typical)
+            _normalize(row, near, typical)
             row = rows[13, :n]
             if length[2]:
                 _read_row(row, length, b, 0, y, x0)
@@ -177,14 +177,14 @@ def _stack_buffers(
 @custom_op(
     "mcdenoise::network_guides",
     device_types="cpu",
-    schema="(Tensor normal, Tensor depth, Tensor largest, Tensor typical) -> Tensor",
+    schema="(Tensor normal, Tensor depth, Tensor near, Tensor typical) -> Tensor",
 )
-def network_guides(normal: Tensor, depth: Tensor, largest: Tensor, typical: Tensor) -> Tensor:
+def network_guides(normal: Tensor, depth: Tensor, near: Tensor, typical: Tensor) -> Tensor:
     """See :func:`mcdenoise.ops._steps.network.network_guides`."""
     result = _empty_guides(normal)
     if result.numel():
         images = tuple(source(image.to(result.dtype)) for image in (normal, depth))
-        factors = torch.cat([each.to(result.dtype).expand(len(normal), 1, 1, 1) for each in (largest, typical)], 1)
+        factors = torch.cat([each.to(result.dtype).expand(len(normal), 1, 1, 1) for each in (near, typical)], 1)
         scales = factors.flatten(1).numpy()
         share_rows(normal, lambda *rows: _guide(result.numpy(), *images, scales, *rows))
     return result
@@ -198,7 +198,7 @@ def _empty_guides(normal: Tensor, *_: Any) -> Tensor:
 @compiled
 def _guide(out: Any, normal: Any, depth: Any, scales: Any, b: int, first: int, last: int) -> None:
     half = out.dtype.type(0.5)
-    largest, typical = scales[b]
+    near, typical = scales[b]
     for y in range(first, last):
         for c in range(3):
             row = out[b, c, y]
@@ -206,7 +206,7 @@ def _guide(out: Any, normal: Any, depth: Any, scales: Any, b: int, first: int, l
             for x in range(row.size):
                 row[x] = row[x] * half + half
         _read_row(out[b, 3, y], depth, b, 0, y, 0)
-        _normalize(out[b, 3, y], largest, typical)
+        _normalize(out[b, 3, y], near, typical)
 
 
 @compiled
@@ -243,7 +243,7 @@ def _read_row(row: Any, image: Any, b: int, c: int, y: int, x0: int) -> None:
     "mcdenoise::network_features",
     device_types="cpu",
     schema="(Tensor albedo, Tensor normal, Tensor depth, Tensor current, Tensor? length, Tensor exposure, "
-    "Tensor largest, Tensor typical) -> Tensor",
+    "Tensor near, Tensor typical) -> Tensor",
 )
 def network_features(
     albedo: Tensor,
@@ -252,7 +252,7 @@ def network_features(
     current: Tensor,
     length: Tensor | None,
     exposure: Tensor,
-    largest: Tensor,
+    near: Tensor,
     typical: Tensor,
 ) -> Tensor:
     """See :func:`mcdenoise.ops._steps.network.network_features`."""
@@ -261,7 +261,7 @@ def network_features(
         nothing = source(torch.empty((0, 0, 0, 0), dtype=result.dtype))
         images = tuple(source(image.to(result.dtype)) for image in (albedo, normal, depth, current))
         lengths = nothing if length is None else source(length.to(result.dtype))
-        factors = torch.cat([exposure, largest, typical], 1).to(result.dtype).flatten(1).numpy()
+        factors = torch.cat([exposure, near, typical], 1).to(result.dtype).flatten(1).numpy()
         share_rows(albedo, lambda *rows: _assemble(result.numpy(), images, lengths, factors, *rows))
     return result
 
@@ -275,7 +275,7 @@ def _empty_features(albedo: Tensor, *_: Any) -> Tensor:
 def _assemble(out: Any, images: Any, length: Any, factors: Any, b: int, first: int, last: int) -> None:
     albedo, normal, depth, current = images
     half, one = out.dtype.type(0.5), out.dtype.type(1)
-    exposure, largest, typical = factors[b]
+    exposure, near, typical = factors[b]
     for y in range(first, last):
         for c in range(3):
             _read_row(out[b, c, y], albedo, b, c, y, 0)
@@ -288,7 +288,7 @@ def _assemble(out: Any, images: Any, length: Any, factors: Any, b: int, first: i
             _to_logarithms(row, exposure)
         row = out[b, 6, y]
         _read_row(row, depth, b, 0, y, 0)
-        _normalize(row, largest, typical)
+        _normalize(row, near, typical)
         row = out[b, 10, y]
         if length[2]:
             _read_row(row, length, b, 0, y, 0)
@@ -299,12 +299,13 @@ def _assemble(out: Any, images: Any, length: Any, factors: Any, b: int, first: i
 
 
 @compiled
-def _normalize(depths: Any, largest: Any, typical: Any) -> None:
-    least, infinity, one = depths.dtype.type(1e-30), depths.dtype.type(np.inf), depths.dtype.type(1)
+def _normalize(depths: Any, near: Any, typical: Any) -> None:
+    shortest, infinity, one = depths.dtype.type(SHORTEST), depths.dtype.type(np.inf), depths.dtype.type(1)
+    longest = one / shortest
     for x in range(depths.size):
         depth = depths[x]
-        share = max(depth, least) / largest
-        depths[x] = share / (share + typical) if depth < infinity else one
+        in_units = min(max(depth / near, shortest), longest)
+        depths[x] = in_units / (in_units + typical) if depth < infinity else one
 
 
 @custom_op("mcdenoise::depth_scale", device_types="cpu", schema="(Tensor depth) -> (Tensor, Tensor)")
@@ -313,47 +314,70 @@ def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
     batch, _, height, _ = depth.shape
     dtype = accumulator_dtype(depth.dtype)
     image = source(_readable(depth, dtype))
-    rows = torch.zeros((3, batch, height), dtype=dtype)
+    rows = torch.zeros((2, batch, height), dtype=dtype)
     arguments = (rows.numpy(), image, depth.shape[3])
-    share_rows(depth, lambda *share: _largest_of_rows(*arguments, *share))
-    largest = rows[0].amax(1, keepdim=True).clamp_min(1e-30)
-    share_rows(depth, lambda *share: _logarithms_of_rows(*arguments, largest[:, 0].numpy(), *share))
-    logarithms, count = rows[1:].double().sum(2, keepdim=True)
-    typical = torch.exp(logarithms / count.clamp_min(1)).to(dtype)
-    return largest.reshape(batch, 1, 1, 1), typical.reshape(batch, 1, 1, 1)
+    share_rows(depth, lambda *share: _roots_of_rows(*arguments, *share))
+    root = _mean(rows)
+    near = torch.where(root > 0, 1 / root.square(), 1).to(dtype)
+    share_rows(depth, lambda *share: _logarithms_of_rows(*arguments, near.numpy(), *share))
+    return near.reshape(batch, 1, 1, 1), torch.exp(_mean(rows)).to(dtype).reshape(batch, 1, 1, 1)
+
+
+def _mean(rows: Tensor) -> Tensor:
+    """Of each image, from the sums and the numbers of summands of its rows."""
+    totals = rows.double().sum(2)
+    return totals[0] / totals[1].clamp_min(1)
 
 
 @depth_scale.register_fake
 def _(depth: Tensor) -> tuple[Tensor, Tensor]:
-    largest = depth.new_empty((depth.shape[0], 1, 1, 1), dtype=accumulator_dtype(depth.dtype))
-    return largest, torch.empty_like(largest)
+    near = depth.new_empty((depth.shape[0], 1, 1, 1), dtype=accumulator_dtype(depth.dtype))
+    return near, torch.empty_like(near)
 
 
 @compiled
-def _largest_of_rows(out: Any, depth: Any, width: int, b: int, first: int, last: int) -> None:
-    row, infinity = np.empty(width, out.dtype), out.dtype.type(np.inf)
+def _roots_of_rows(out: Any, depth: Any, width: int, b: int, first: int, last: int) -> None:
+    row = np.empty(width, out.dtype)
+    zero, one, infinity = out.dtype.type(0), out.dtype.type(1), out.dtype.type(np.inf)
+    shortest = out.dtype.type(SHORTEST)
     for y in range(first, last):
         _read_row(row, depth, b, 0, y, 0)
-        largest = out.dtype.type(0)
+        count = 0
         for x in range(width):
-            if row[x] < infinity:
-                largest = max(largest, row[x])
-        out[0, b, y] = largest
+            known = (row[x] >= shortest) & (row[x] < infinity)
+            count += known
+            row[x] = one / math.sqrt(row[x] if known else one) if known else zero
+        out[0, b, y] = _sum(row)
+        out[1, b, y] = count
 
 
 @compiled
-def _logarithms_of_rows(out: Any, depth: Any, width: int, largest: Any, b: int, first: int, last: int) -> None:
-    row, hits, scale = np.empty(width, out.dtype), np.empty(width, out.dtype), largest[b]
-    zero, one = out.dtype.type(0), out.dtype.type(1)
-    infinity, least = out.dtype.type(np.inf), out.dtype.type(1e-30)
+def _sum(values: Any) -> Any:
+    """In eight parts, which LLVM adds side by side."""
+    parts = np.zeros(8, values.dtype)
+    whole = values.size // 8 * 8
+    for x in range(0, whole, 8):
+        for k in range(8):
+            parts[k] += values[x + k]
+    for x in range(whole, values.size):
+        parts[0] += values[x]
+    return parts.sum()
+
+
+@compiled
+def _logarithms_of_rows(out: Any, depth: Any, width: int, near: Any, b: int, first: int, last: int) -> None:
+    row, unit, zero = np.empty(width, out.dtype), near[b], out.dtype.type(0)
+    infinity, shortest, farthest = out.dtype.type(np.inf), out.dtype.type(SHORTEST), out.dtype.type(FARTHEST)
     for y in range(first, last):
         _read_row(row, depth, b, 0, y, 0)
+        count = 0
         for x in range(width):
-            hit = row[x] < infinity
-            hits[x] = one if hit else zero
-            row[x] = _log(max(row[x], least) / scale) if hit else zero
-        out[1, b, y] = row.sum()
-        out[2, b, y] = hits.sum()
+            in_units = max(row[x] / unit, shortest)
+            known = (row[x] < infinity) & (in_units <= farthest)
+            count += known
+            row[x] = _log(in_units) if known else zero
+        out[0, b, y] = _sum(row)
+        out[1, b, y] = count
 
 
 @custom_op("mcdenoise::softplus", device_types="cpu", schema="(Tensor x, float[] units) -> Tensor")

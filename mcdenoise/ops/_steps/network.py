@@ -17,6 +17,8 @@ from mcdenoise.ops.fusion import downsample, laplacian_fusion, upsample
 # are left alone.
 BLOCK = 8
 _DARK = 1e-3
+# The least number that a depth counts as, and how many near depths away the scene ends.
+SHORTEST, FARTHEST = 1e-30, 1e4
 _FORMS: tuple[Backend, ...] = ("torch", "numba")
 
 
@@ -118,14 +120,20 @@ def network_guides(
 
 
 def depth_scale(depth: Tensor, *, backend: Backend | None = None) -> tuple[Tensor, Tensor]:
-    """The largest depth of what was hit, and the typical one as a share of it: the geometric mean.
+    """A near depth to count depths in, and the typical one in that unit: the geometric mean of what was hit.
+
+    The near depth is ``1 / mean(1 / sqrt(d))^2``, which far depths hardly change. What is 10,000 times as far is no
+    part of the scene, but a sky that the renderer gave a large finite depth (Blender 1e10, others 1e30), and does not
+    count: its logarithm would hide all differences of what is near.
 
     Args:
         depth: ``(B, 1, H, W)`` distance, any unit, ``inf`` where nothing was hit.
         backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
-        ``(B, 1, 1, 1)`` each, at least float32; depths below 1e-30 count as that.
+        ``(B, 1, 1, 1)`` each, at least float32; 1 where there is nothing to count. Depths below 1e-30, such as zeros,
+        tell nothing of the near depth, and none counts as less than 1e-30 of it. The near depth is a mere unit and has
+        no derivative.
     """
     if choose_backend(backend, depth, differentiable=False, forms=_FORMS) != "torch":
         from mcdenoise.ops._fast import fused as fast
@@ -133,24 +141,41 @@ def depth_scale(depth: Tensor, *, backend: Backend | None = None) -> tuple[Tenso
         scale: tuple[Tensor, Tensor] = fast.depth_scale(depth)
         return scale
 
-    def finite(rows: Tensor) -> Tensor:
-        rows = torch.where(torch.isfinite(rows), rows, 0)
-        return rows.to(accumulator_dtype(rows.dtype)).clamp_min(1e-30)
+    dtype = accumulator_dtype(depth.dtype)
 
-    def logs(rows: Tensor) -> Tensor:
-        return (torch.log(finite(rows) / largest) * torch.isfinite(rows)).sum(-1, keepdim=True)
+    def totals(values: Tensor, count: Tensor) -> Tensor:
+        """Of rows: sums of values, and how many there are."""
+        return torch.cat([values.sum(-1, keepdim=True), count.sum(-1, keepdim=True).to(values.dtype)], 1)
 
-    # Of the largest, so that the logarithms are small numbers in any unit.
-    largest = by_rows(lambda rows: finite(rows).amax(-1, keepdim=True), depth).amax((1, 2, 3), keepdim=True)
-    count = torch.isfinite(depth).sum((1, 2, 3), keepdim=True).clamp_min(1)
-    return largest, torch.exp(by_rows(logs, depth).sum((1, 2, 3), keepdim=True) / count)
+    def mean(rows: Tensor) -> Tensor:
+        total, count = rows.sum((2, 3), keepdim=True).unbind(1)
+        return (total / count.clamp_min(1))[:, None]
+
+    def roots(rows: Tensor) -> Tensor:
+        rows = rows.detach().to(dtype)
+        counts = torch.isfinite(rows) & (rows >= SHORTEST)
+        return totals(torch.where(counts, torch.where(counts, rows, 1).rsqrt(), 0), counts)
+
+    def logarithms(rows: Tensor) -> Tensor:
+        in_units = _in_units(rows, near)
+        counts = torch.isfinite(rows) & (in_units <= FARTHEST)
+        return totals(torch.where(counts, torch.log(in_units), 0), counts)
+
+    root = mean(by_rows(roots, depth))
+    near = torch.where(root > 0, 1 / torch.where(root > 0, root, 1).square(), 1)
+    return near, torch.exp(mean(by_rows(logarithms, depth)))
 
 
-def normalized_depth(depth: Tensor, largest: Tensor, typical: Tensor) -> Tensor:
-    """``d / (d + typical d)`` with :func:`depth_scale`, and 1 where nothing was hit."""
+def _in_units(depth: Tensor, near: Tensor) -> Tensor:
+    """From 1e-30 to 1e30; 1 where nothing was hit."""
     hit = torch.isfinite(depth)
-    shares = torch.where(hit, depth, 0).to(largest.dtype).clamp_min(1e-30) / largest
-    return torch.where(hit, shares / (shares + typical), 1).to(depth.dtype)
+    return torch.where(hit, (torch.where(hit, depth, 1).to(near.dtype) / near).clamp(SHORTEST, 1 / SHORTEST), 1)
+
+
+def normalized_depth(depth: Tensor, near: Tensor, typical: Tensor) -> Tensor:
+    """``d / (d + typical d)`` with :func:`depth_scale`, and 1 where nothing was hit."""
+    in_units = _in_units(depth, near)
+    return torch.where(torch.isfinite(depth), in_units / (in_units + typical), 1).to(depth.dtype)
 
 
 def network_features(

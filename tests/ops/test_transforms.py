@@ -1,0 +1,145 @@
+"""Forward mode, ``torch.func`` and ``vmap``: right for every op, also where a fast form would be chosen otherwise."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from mcdenoise import ops
+from mcdenoise.ops import _backend
+from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
+
+# Of torch's own making, when its rules for forward mode are loaded.
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+
+every_case = pytest.mark.parametrize(
+    ("op", "case"),
+    [pytest.param(op, case, id=f"{op.name}-{case.name}") for op in OPS for case in op.cases if case.kind == "ordinary"],
+)
+
+
+@pytest.fixture(autouse=True)
+def no_image_is_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that fast forms are chosen wherever they can run."""
+    monkeypatch.setattr(_backend, "_FEW_PIXELS", 0)
+
+
+NO_RULE = re.escape("found 'numba', which has no rule for torch.func, vmap or forward mode")
+
+
+def parted(op: Op, case: Case) -> tuple[Callable[..., Tensor], list[Tensor]]:
+    """The op as a function of its differentiable arguments to all numbers of its results, and these arguments."""
+    inputs = case.inputs()
+    leaves: list[Tensor] = []
+    names = [name for name in inputs if name in case.differentiable]
+    map_tensors(lambda tensor: leaves.append(tensor) or tensor, {name: inputs[name] for name in names})
+
+    def function(*tensors: Tensor) -> Tensor:
+        rest = iter(tensors)
+        given: Inputs = {**inputs, **map_tensors(lambda _: next(rest), {name: inputs[name] for name in names})}
+        result = op.function(**given, **case.settings)
+        results = [result] if isinstance(result, Tensor) else result
+        return torch.cat([part.flatten() for part in results])
+
+    return function, leaves
+
+
+def drawn(like: Tensor, seed: int) -> Tensor:
+    return torch.randn(like.shape, generator=torch.Generator().manual_seed(seed), dtype=like.dtype)
+
+
+@every_case
+def test_forward_mode_is_the_transpose_of_reverse_mode(op: Op, case: Case) -> None:
+    function, leaves = parted(op, case)
+    tangents = [drawn(leaf, seed) for seed, leaf in enumerate(leaves)]
+    result, moved = torch.func.jvp(function, tuple(leaves), tuple(tangents))
+    upstream = drawn(result, 100)
+    gradients = torch.func.vjp(function, *leaves)[1](upstream)
+    terms = [gradient * tangent for gradient, tangent in zip(gradients, tangents, strict=True)]
+    size = sum(term.abs().sum() for term in terms) + (upstream * moved).abs().sum()
+    assert (upstream * moved).sum().item() == pytest.approx(
+        sum(term.sum() for term in terms).item(), rel=0, abs=1e-13 * float(size)
+    )
+    with forward_ad.dual_level():
+        dual = function(*(forward_ad.make_dual(*each) for each in zip(leaves, tangents, strict=True)))
+        assert torch.equal(forward_ad.unpack_dual(dual).tangent, moved)
+    # Of one argument at a time.
+    alone = [
+        torch.func.jvp(lambda x, i=i: function(*leaves[:i], x, *leaves[i + 1 :]), (leaves[i],), (tangents[i],))[1]
+        for i in range(len(leaves))
+    ]
+    torch.testing.assert_close(sum(alone), moved, rtol=1e-10, atol=1e-12 * float(moved.abs().max()))
+
+
+@every_case
+def test_vmap_is_a_loop(op: Op, case: Case) -> None:
+    function, leaves = parted(op, case)
+    several = [torch.stack([leaf, leaf * 0.75 + 0.125 * leaf.mean()]) for leaf in leaves]
+    found = torch.func.vmap(function)(*several)
+    gradients = torch.func.vmap(torch.func.grad(lambda *x: function(*x).cos().sum(), tuple(range(len(leaves)))))(
+        *several
+    )
+    for i in range(2):
+        one = [each[i].clone().requires_grad_() for each in several]
+        expected = function(*one)
+        torch.testing.assert_close(found[i], expected.detach(), rtol=1e-12, atol=1e-12)
+        for found_gradient, gradient in zip(gradients, torch.autograd.grad(expected.cos().sum(), one), strict=True):
+            torch.testing.assert_close(found_gradient[i], gradient, rtol=1e-9, atol=1e-11)
+    # Of one argument at a time, beside others that have no such axis.
+    for k in range(len(leaves)):
+        dims = tuple(0 if i == k else None for i in range(len(leaves)))
+        arguments = [several[i] if i == k else leaves[i] for i in range(len(leaves))]
+        found = torch.func.vmap(function, in_dims=dims)(*arguments)
+        for i in range(2):
+            expected = function(*(each[i] if j == k else each for j, each in enumerate(arguments)))
+            torch.testing.assert_close(found[i], expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("op", OPS, ids=lambda op: op.name)
+def test_the_gradient_of_a_vmap_and_jacobians(op: Op) -> None:
+    function, leaves = parted(op, op.cases[1])
+    several = [leaf[None] for leaf in leaves]
+    whole = torch.func.grad(lambda *x: torch.func.vmap(function)(*x).cos().sum())(*several)
+    leaf = leaves[0].clone().requires_grad_()
+    (expected,) = torch.autograd.grad(function(leaf, *leaves[1:]).cos().sum(), leaf)
+    torch.testing.assert_close(whole[0], expected, rtol=1e-9, atol=1e-11)
+    for number in range(min(len(leaves), 3)):
+        forward, reverse = (
+            jacobian(function, argnums=number)(*leaves) for jacobian in (torch.func.jacfwd, torch.func.jacrev)
+        )
+        torch.testing.assert_close(forward, reverse, rtol=1e-9, atol=1e-11)
+
+
+def test_default_arguments_at_a_size_where_fast_forms_are_chosen() -> None:
+    """What was silently zero."""
+    x = torch.rand(1, 3, 96, 128, dtype=torch.float64)
+    kernel = torch.rand(1, 9, 96, 128, dtype=torch.float64)
+    one = torch.ones_like(x)
+    tangent = torch.func.jvp(lambda x: ops.kernel_conv(x, kernel), (x,), (one,))[1]
+    torch.testing.assert_close(tangent, kernel.sum(1, keepdim=True).expand_as(x))
+    torch.testing.assert_close(torch.func.jvp(ops.downsample, (x,), (one,))[1], one[..., ::2, ::2])
+    gradient = torch.func.grad(lambda x: torch.func.vmap(ops.downsample)(x[None])[0].sum())(x)
+    torch.testing.assert_close(gradient, one / 4)
+
+
+def test_a_named_fast_form_refuses() -> None:
+    x = torch.rand(1, 3, 4, 5)
+    calls: list[Callable[[], Any]] = [
+        lambda: torch.func.jvp(lambda x: ops.downsample(x, backend="numba"), (x,), (x,)),
+        lambda: torch.func.vmap(lambda x: ops.downsample(x, backend="numba"))(x[None]),
+        lambda: torch.func.grad(lambda x: ops.downsample(x, backend="numba").sum())(x),
+    ]
+    for call in calls:
+        with pytest.raises(ValueError, match=NO_RULE):
+            call()
+    with (
+        forward_ad.dual_level(),
+        pytest.raises(ValueError, match=NO_RULE),
+    ):
+        ops.kernel_conv(forward_ad.make_dual(x, x), torch.ones(1, 9, 4, 5), backend="numba")
