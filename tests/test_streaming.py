@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mcdenoise import Denoiser, Frame, create_model
 
 # With shipped weights, and fast.
-MODEL = "cascaded_micro"
+MODEL = "cascaded_v2_micro"
 HEIGHT, WIDTH = 40, 72
 
 
@@ -103,9 +103,10 @@ def test_images_on_the_way_may_be_changed_where_they_are(shot: list[Frame]) -> N
     expected, denoiser = denoised(shot), Denoiser(MODEL)
     for frame, image in zip(shot, expected, strict=True):
         before = frame.color.clone()
-        images = denoiser.images(frame)
-        assert torch.equal(images.denoised, image)
-        for one in (images.noisy, images.accumulated, images.initial, images.denoised):
+        output = denoiser.output(frame)
+        assert list(output.stages) == ["noisy", "accumulated", "initial"]
+        assert torch.equal(output.image, image)
+        for one in (*output.stages.values(), output.image):
             one.fill_(1e6)
         assert torch.equal(frame.color, before)
 
@@ -114,8 +115,8 @@ def test_images_on_the_way_may_be_changed_where_they_are(shot: list[Frame]) -> N
 def test_an_image_is_an_ordinary_tensor(without: tuple[str, ...]) -> None:
     denoiser = Denoiser(MODEL)
     for number in range(2):
-        images = denoiser.images(scene(number, without=without))
-        for image in (denoiser(scene(number, without=without)), images.accumulated, images.initial, images.denoised):
+        output = denoiser.output(scene(number, without=without))
+        for image in (denoiser(scene(number, without=without)), *output.stages.values(), output.image):
             assert not image.is_inference()
             assert not image.requires_grad
             image.clamp_(0, 1)
