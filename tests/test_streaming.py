@@ -17,7 +17,7 @@ from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.data.bmfr import write_bmfr_frame, write_buffer
 
 # With shipped weights, and fast.
-MODEL = "cascaded_micro"
+MODEL = "cascaded_v2_micro"
 HEIGHT, WIDTH = 40, 72
 
 
@@ -109,9 +109,10 @@ def test_images_on_the_way_may_be_changed_where_they_are(shot: list[Frame]) -> N
     expected, denoiser = denoised(shot), Denoiser(MODEL)
     for frame, image in zip(shot, expected, strict=True):
         before = frame.color.clone()
-        images = denoiser.images(frame)
-        assert torch.equal(images.denoised, image)
-        for one in (images.noisy, images.accumulated, images.initial, images.denoised):
+        output = denoiser.output(frame)
+        assert list(output.stages) == ["noisy", "accumulated", "initial"]
+        assert torch.equal(output.image, image)
+        for one in (*output.stages.values(), output.image):
             one.fill_(1e6)
         assert torch.equal(frame.color, before)
 
@@ -120,8 +121,8 @@ def test_images_on_the_way_may_be_changed_where_they_are(shot: list[Frame]) -> N
 def test_an_image_is_an_ordinary_tensor(without: tuple[str, ...]) -> None:
     denoiser = Denoiser(MODEL)
     for number in range(2):
-        images = denoiser.images(scene(number, without=without))
-        for image in (denoiser(scene(number, without=without)), images.accumulated, images.initial, images.denoised):
+        output = denoiser.output(scene(number, without=without))
+        for image in (denoiser(scene(number, without=without)), *output.stages.values(), output.image):
             assert not image.is_inference()
             assert not image.requires_grad
             image.clamp_(0, 1)

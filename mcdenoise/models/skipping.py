@@ -45,8 +45,8 @@ class Remembered(NamedTuple):
         images: results by stage, ``"image"`` the last, ``(B, 3, H, W)``.
         color: ``(B, 3, H, W)`` radiance of which each tile was computed.
         weight: ``(B, 1, H, W)`` of the current frame in it: one over the history length.
-        passed: ``(1, 1, h, w)`` bool, tiles whose accumulated image was passed through.
-        reused: ``(1, 1, h, w)`` bool, tiles whose last result was reused.
+        passed: ``(B, 1, h, w)`` bool, tiles whose accumulated image was passed through; of all images alike.
+        reused: ``(B, 1, h, w)`` bool, tiles whose last result was reused; likewise.
         marks: means of the features over each tile, which tell one content from another; ``None`` until they are
             needed.
     """
@@ -106,7 +106,9 @@ class Skipping(Wrapper):
             if skip is not None:
                 image = torch.where(skip.mask, skip.images["image"].to(output.image.dtype), output.image)
                 output = output._replace(image=image)
-        if kept is not None:
+        if frame.hints.last:
+            kept = None
+        elif kept is not None:
             kept = kept._replace(images={**output.stages, "image": output.image})
         return output, None if kept is None and inner is None else (kept, inner)
 
@@ -141,7 +143,7 @@ class Skipping(Wrapper):
         noise = torch.where(residual.sqrt() > _LEAST_RESIDUAL * mean, variance.sqrt() / mean, torch.inf)
         stays = self.tolerance * _NOISE_HYSTERESIS
         limit = self.tolerance if before is None else torch.where(before, stays, self.tolerance)
-        return (noise <= limit).all(0, keepdim=True)
+        return (noise <= limit).all(0, keepdim=True).expand_as(noise)
 
     def _squared_weights(self, length: Tensor) -> Tensor:
         """Sum of the squared weights of the frames in an accumulated image: an average at first, a window later."""
@@ -212,7 +214,7 @@ def _means(image: Tensor, tile: int) -> Tensor:
 def _marks(frame: Frame) -> Tensor:
     features = [frame.albedo, frame.normal, frame.depth]
     images = [torch.where(image.isfinite(), image, 0) for image in features if image is not None]
-    return _means(torch.cat(images, 1), TILE) if images else frame.color.new_zeros(1, 1, 1, 1)
+    return _means(torch.cat(images, 1), TILE) if images else torch.zeros_like(frame.color[:, :1, :1, :1])
 
 
 def _pixels(tiles: Tensor, size: tuple[int, int]) -> Tensor:

@@ -84,7 +84,8 @@ class Tiled(Wrapper):
         whole = [Region(0, 0, *frame.size)]
         if self.halo is None or torch.compiler.is_compiling():
             return None
-        parts = whole if frame.skip is None else regions(~frame.skip.mask, self.halo)
+        skipped = None if frame.hints.keep_all else frame.skip
+        parts = whole if skipped is None else regions(~skipped.mask, self.halo)
         if self.side is not None:
             parts = [tile for part in parts for tile in part.split(self.side)]
         return None if parts == whole else parts

@@ -1,0 +1,760 @@
+"""The history of a shot: what is kept of it from frame to frame, and when it ends."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from torch.utils import _pytree as pytree
+from toys import Mean, Shot, Watching, refused, still
+
+from mcdenoise.data import open_sequence
+from mcdenoise.frame import Frame, Hints
+from mcdenoise.models import Accumulated
+from mcdenoise.models.accumulated import History, is_still
+from mcdenoise.ops import accumulate, demodulate, remodulate
+from mcdenoise.ops._backend import Backend
+
+HEIGHT, WIDTH = 5, 6
+
+
+def constant(channels: int, value: float = 1.0, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Tensor:
+    return torch.full((1, channels, *size), value)
+
+
+def test_the_first_frame_is_itself() -> None:
+    color = torch.rand(1, 3, HEIGHT, WIDTH)
+    seen = Shot().update(still(color))
+    assert torch.equal(seen.color, color)
+    assert seen.length.unique().tolist() == [1]
+    assert seen.reset == "first frame"
+
+
+def test_a_still_shot_is_averaged() -> None:
+    history, colors = Shot(alpha_min=0.1), torch.rand(10, 1, 3, HEIGHT, WIDTH)
+    for i, color in enumerate(colors, start=1):
+        seen = history.update(still(color))
+        torch.testing.assert_close(seen.color, colors[:i].mean(0))
+        assert seen.length.unique().tolist() == [i]
+        assert seen.reset == ("first frame" if i == 1 else "")
+    # From here on the window is exponential: one tenth of the frame, nine tenths of the history.
+    color = torch.rand(1, 3, HEIGHT, WIDTH)
+    torch.testing.assert_close(history.update(still(color)).color, 0.1 * color + 0.9 * colors.mean(0))
+
+
+def test_albedo_is_divided_out_before_averaging() -> None:
+    history = Shot()
+    albedo, color = torch.rand(1, 3, HEIGHT, WIDTH) + 0.1, torch.rand(2, 1, 3, HEIGHT, WIDTH)
+    for one in color:
+        seen = history.update(still(one, albedo=albedo))
+    torch.testing.assert_close(seen.color, demodulate(color.mean(0), albedo))
+
+
+def test_reset_makes_the_next_frame_the_first() -> None:
+    history, color = Shot(), torch.rand(1, 3, HEIGHT, WIDTH)
+    history.update(still(color + 1))
+    history.reset()
+    seen = history.update(still(color))
+    assert torch.equal(seen.color, color)
+    assert seen.reset == "first frame"
+
+
+def test_another_size_resets() -> None:
+    history = Shot()
+    history.update(still(constant(3)))
+    smaller = constant(3, 2.0, (4, 4))
+    seen = history.update(still(smaller))
+    assert torch.equal(seen.color, smaller)
+    assert seen.reset == "size change"
+    assert history.update(still(smaller)).reset == ""
+
+
+def test_a_cut_resets() -> None:
+    history = Shot()
+    floor = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
+    wall = floor.roll(1, 1)
+    history.update(still(constant(3), normal=floor))
+    history.update(still(constant(3), normal=floor))
+    seen = history.update(still(constant(3, 2.0), normal=wall))
+    assert seen.reset == "cut"
+    assert seen.color.unique().tolist() == [2]
+    assert seen.length.unique().tolist() == [1]
+    assert history.update(still(constant(3, 2.0), normal=wall)).length.unique().tolist() == [2]
+
+
+def test_what_was_hidden_starts_anew_without_a_cut() -> None:
+    history = Shot()
+    near, uncovered = constant(1, 2.0), constant(1, 2.0)
+    uncovered[..., : WIDTH // 2] = 9.0
+    history.update(still(constant(3), depth=near))
+    seen = history.update(still(constant(3, 3.0), depth=uncovered))
+    assert seen.reset == ""
+    assert seen.length[0, 0, 0].tolist() == [1, 1, 1, 2, 2, 2]
+    assert seen.color[0, 0, 0].tolist() == [3, 3, 3, 2, 2, 2]
+
+
+def test_without_motion_every_frame_stands_alone() -> None:
+    history = Shot()
+    for value in (1.0, 2.0):
+        seen = history.update(Frame(color=constant(3, value), depth=constant(1)))
+        assert seen.color.unique().tolist() == [value]
+    assert seen.reset == "no motion, and no position with a previous camera"
+
+
+@pytest.mark.parametrize(("first", "reset"), [("position", "first frame"), ("motion", "no motion")])
+def test_a_frame_without_camera_is_no_history_for_positions(first: str, reset: str) -> None:
+    history, color = Shot(), torch.rand(1, 3, HEIGHT, WIDTH)
+    position, camera = torch.rand(1, 3, HEIGHT, WIDTH), torch.eye(4)[None]
+    if first == "position":
+        history.update(Frame(color=constant(3), position=position))
+    else:
+        history.update(still(constant(3)))
+    seen = history.update(Frame(color=color, position=position, view_projection=camera))
+    assert seen.reset.startswith(reset)
+    assert torch.equal(seen.color, color)
+    assert seen.length.unique().tolist() == [1]
+
+
+def test_the_motion_of_the_renderer_is_followed() -> None:
+    history = Shot(lag_threshold=math.inf)
+    columns = torch.arange(float(WIDTH)).expand(1, 3, HEIGHT, WIDTH)
+    motion = torch.tensor([1.0, 0.0]).reshape(1, 2, 1, 1).expand(1, 2, HEIGHT, WIDTH)
+    history.update(Frame(color=columns, motion=motion))
+    seen = history.update(Frame(color=constant(3, 10.0), motion=motion))
+    # Half of the new frame, and half of the old pixel on the right; the last column came into view.
+    assert seen.color[0, 0, 0].tolist() == [5.5, 6.0, 6.5, 7.0, 7.5, 10.0]
+    assert seen.length[0, 0, 0].tolist() == [2, 2, 2, 2, 2, 1]
+
+
+def test_motion_goes_before_positions() -> None:
+    history = Shot()
+    # Seen from this camera, every position is out of view.
+    buffers = {"position": constant(3, 100.0), "view_projection": torch.eye(4)[None]}
+    history.update(still(constant(3), **buffers))
+    assert history.update(still(constant(3), **buffers)).length.unique().tolist() == [2]
+
+
+@pytest.mark.parametrize("alpha_min", [0.1, 0.25])
+def test_accumulation_reduces_the_error_of_a_moving_camera(small_sequence: Path, alpha_min: float) -> None:
+    sequence, history = open_sequence(small_sequence), Shot(alpha_min=alpha_min)
+    for number in sequence.numbers:
+        frame = sequence.frame(number)
+        seen = history.update(frame)
+        assert seen.reset == ("first frame" if number == 0 else "")
+    assert frame.albedo is not None
+    assert frame.depth is not None
+    assert frame.reference is not None
+    floor = torch.isfinite(frame.depth) & (seen.length > 3)
+    assert floor.float().mean() > 0.3
+    accumulated = remodulate(seen.color, frame.albedo)
+    raw, after = ((image - frame.reference).square() * floor for image in (frame.color, accumulated))
+    # Four frames of independent noise: a quarter of the variance, and a little bias from resampling.
+    assert after.sum() < 0.4 * raw.sum()
+
+
+def test_the_background_has_a_history(small_sequence: Path) -> None:
+    sequence, history = open_sequence(small_sequence), Shot()
+    for number in sequence.numbers:
+        frame = sequence.frame(number)
+        seen = history.update(frame)
+    assert frame.depth is not None
+    sky = ~torch.isfinite(frame.depth)
+    assert sky.float().mean() > 0.1
+    assert (seen.length[sky] > 1).float().mean() > 0.8
+    # It has no noise and one color, which blending must not change.
+    torch.testing.assert_close(seen.color * sky, frame.color * sky)
+
+
+def test_what_moves_keeps_its_history() -> None:
+    """A wall comes closer, by more than the limit for positions; the camera stands still."""
+    matrix = torch.eye(4)[None]
+    matrix[:, 2, 3], matrix[:, 3, 3] = 1, 0  # clip w = z
+
+    def wall(z: float, before: float | None) -> Frame:
+        y, x = torch.meshgrid((torch.arange(10) + 0.5) / 5 - 1, (torch.arange(10) + 0.5) / 5 - 1, indexing="ij")
+        position = torch.stack([x * z, y * z, torch.full_like(x, z)])[None]
+        previous = position.clone()
+        previous[:, 2] = z if before is None else before
+        return Frame(
+            color=torch.ones(1, 3, 10, 10),
+            normal=torch.tensor([0.0, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, 10, 10),
+            position=position,
+            previous_position=None if before is None else previous,
+            view_projection=matrix,
+        )
+
+    for moves in (True, False):
+        history = Shot()
+        history.update(wall(2.0, 2.0))
+        seen = history.update(wall(1.8, 2.0 if moves else None))
+        assert seen.reset == ("" if moves else "cut")
+        if moves:
+            assert seen.length.unique().tolist() == [2]
+
+
+def test_motion_goes_before_previous_positions() -> None:
+    history = Shot()
+    buffers = {"previous_position": constant(3, 100.0), "view_projection": torch.eye(4)[None]}
+    history.update(still(constant(3), **buffers))
+    assert history.update(still(constant(3), **buffers)).length.unique().tolist() == [2]
+
+
+def test_another_surface_at_the_same_pixel_is_no_history_even_without_depth() -> None:
+    """Positions with a camera are enough: depth is what the camera sees of them."""
+    matrix = torch.eye(4)[None]
+    matrix[:, 2, 3], matrix[:, 3, 3] = 1, 0  # clip w = z
+
+    def wall(z: float) -> Frame:
+        y, x = torch.meshgrid(torch.linspace(-0.9, 0.9, 10), torch.linspace(-0.9, 0.9, 10), indexing="ij")
+        position = torch.stack([x * z, y * z, torch.full_like(x, z)])[None]
+        return Frame(color=torch.ones(1, 3, 10, 10), position=position, view_projection=matrix)
+
+    history = Shot()
+    history.update(wall(2.0))
+    assert history.update(wall(2.0)).reset == ""
+    assert history.update(wall(9.0)).reset == "cut"
+
+
+def test_the_published_rule_can_be_asked_for(small_sequence: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    history = Shot(alpha_min=0.2, rule="bmfr", position_limit=1.0, normal_limit=0.25)
+    for number in sequence.numbers:
+        seen = history.update(sequence.frame(number))
+    assert seen.length.max() == len(sequence)
+    nothing_alike = Shot(alpha_min=0.2, rule="bmfr", position_limit=0.0, normal_limit=0.25)
+    for number in sequence.numbers:
+        seen = nothing_alike.update(sequence.frame(number))
+    assert seen.reset == "cut"
+
+
+# Fireflies
+
+
+def with_firefly(albedo: float) -> list[Tensor]:
+    """Four frames of light 1 on a surface; the first has a firefly in one pixel."""
+    colors = [constant(3, albedo, (9, 9)) for _ in range(4)]
+    colors[0][..., 4, 4] *= 1e4
+    return colors
+
+
+@pytest.mark.parametrize("with_albedo", [True, False])
+def test_a_firefly_does_not_survive(with_albedo: bool) -> None:
+    history, albedo = Shot(alpha_min=0.1), 0.5 if with_albedo else 1.0
+    buffers = {"albedo": constant(3, albedo, (9, 9))} if with_albedo else {}
+    for number, color in enumerate(with_firefly(albedo)):
+        seen = history.update(still(color, **buffers))
+        assert seen.color[..., 4, 4].unique().item() == pytest.approx(1 + 14 / (number + 1), rel=1e-5)
+    # Nothing else differs.
+    seen.color[..., 4, 4] = 1
+    torch.testing.assert_close(seen.color, constant(3, 1.0, (9, 9)))
+
+
+def test_a_dark_texture_beside_a_bright_one_is_no_firefly() -> None:
+    """What is clamped is the light: a white pixel among black ones, both lit alike, is as bright as its neighbours."""
+    albedo = constant(3, 0.04, (9, 9))
+    albedo[..., 4, 4] = 0.9
+    seen = Shot().update(still(2 * albedo, albedo=albedo))
+    torch.testing.assert_close(seen.color, constant(3, 2.0, (9, 9)))
+
+
+def test_an_infinite_limit_leaves_fireflies() -> None:
+    history, colors = Shot(alpha_min=0.1, firefly_limit=math.inf), with_firefly(0.5)
+    albedo = constant(3, 0.5, (9, 9))
+    for color in colors:
+        seen = history.update(still(color, albedo=albedo))
+    torch.testing.assert_close(seen.color, demodulate(sum(colors) / 4, albedo))
+
+
+def caustics(fraction: float, size: tuple[int, int] = (128, 160)) -> Frame:
+    """Light 1, and in one pixel of 200 as much that all of these have ``fraction`` of it."""
+    hit = torch.rand(1, 1, *size, generator=torch.Generator().manual_seed(0)) < 1 / 200
+    return still(torch.where(hit, 200 * fraction / (1 - fraction), 1.0).expand(1, 3, *size))
+
+
+@pytest.mark.parametrize(("fraction", "kept"), [(0.1, False), (0.3, True)])
+def test_where_fireflies_are_much_of_the_light_they_are_caustics(fraction: float, kept: bool) -> None:
+    frame, history = caustics(fraction), Shot()
+    seen = history.update(frame)
+    assert torch.equal(seen.current, frame.color) is kept
+    # For the whole shot, and no longer.
+    assert torch.equal(history.update(caustics(0.1)).current, caustics(0.1).color) is kept
+    history.reset()
+    assert not torch.equal(history.update(caustics(0.1)).current, caustics(0.1).color)
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_each_image_of_a_batch_and_each_shot_has_its_own_caustics(backend: Backend) -> None:
+    """As if every image were alone; at a cut, which positions tell, the first frame of the next shot counts."""
+    few, many = caustics(0.1), caustics(0.3)
+
+    def shot(*images: Frame, x: float = 0.0) -> Frame:
+        position = constant(3, 1.0, (128, 160)).repeat(len(images), 1, 1, 1) + x
+        camera = torch.eye(4).repeat(len(images), 1, 1)
+        return Frame(torch.cat([image.color for image in images]), position=position, view_projection=camera)
+
+    history = Shot(backend=backend)
+    seen = history.update(shot(few, many))
+    for image, kept in ((few, False), (many, True)):
+        alone = Shot(backend=backend).update(shot(image)).current
+        assert torch.equal(alone, image.color) is kept
+        torch.testing.assert_close(seen.current[int(kept)][None], alone, rtol=0, atol=0)
+    seen = history.update(shot(many, few, x=1000.0))
+    assert seen.reset == "cut"
+    assert [torch.equal(*both) for both in zip(seen.current, (many.color[0], few.color[0]), strict=True)] == [
+        True,
+        False,
+    ]
+    torch.testing.assert_close(seen.color, seen.current, rtol=0, atol=0)
+
+
+def test_one_firefly_is_no_caustic_however_bright() -> None:
+    color = constant(3, 1.0, (128, 160))
+    color[..., 64, 80] = 1e9
+    assert Shot().update(still(color)).current.max() == pytest.approx(15)
+
+
+def test_who_names_a_limit_gets_it() -> None:
+    frame = caustics(0.3)
+    assert not torch.equal(Shot(firefly_limit=15).update(frame).current, frame.color)
+
+
+# Mirrors and glass
+
+LONG = 12
+
+
+def mirror_in_a_pan(pixels: int) -> list[Frame]:
+    """A mirror two pixels wide on a diffuse wall, both noisy, that move left by ``pixels`` a frame."""
+    frames, generator = [], torch.Generator().manual_seed(0)
+    motion = torch.tensor([float(pixels), 0.0]).reshape(1, 2, 1, 1).expand(1, 2, 3, 24)
+    for number in range(6):
+        albedo = constant(3, 0.5, (3, 24))
+        left = 16 - pixels * number
+        albedo[..., left : left + 2] = 0
+        color = torch.rand(1, 3, 3, 24, generator=generator)
+        frames.append(Frame(color=color, albedo=albedo, motion=motion))
+    return frames
+
+
+def test_the_history_of_a_mirror_that_moves_is_short() -> None:
+    history, last = Shot(), None
+    for number, frame in enumerate(mirror_in_a_pan(2)):
+        seen = history.update(frame)
+        assert frame.albedo is not None
+        mirror = (frame.albedo == 0).all(1, keepdim=True)
+        assert seen.length[mirror].unique().tolist() == [min(number + 1, 3)]
+        if number > 2 and last is not None:
+            expected = torch.lerp(frame.color, last.color.roll(-2, -1), 2 / 3)
+            torch.testing.assert_close(seen.color * mirror, expected * mirror)
+        last = seen
+
+
+def test_what_is_diffuse_keeps_its_history_beside_a_mirror() -> None:
+    """The mirror moves by its width: where it is now, the history was diffuse, and where it was, the present is."""
+    history, everything_alike = Shot(), Shot(specular_length=math.inf)
+    for number, frame in enumerate(mirror_in_a_pan(2)):
+        seen, alike = history.update(frame), everything_alike.update(frame)
+        assert frame.albedo is not None
+        diffuse = (frame.albedo > 0).all(1, keepdim=True)
+        assert torch.equal(seen.length[diffuse], alike.length[diffuse])
+        assert torch.equal(seen.color * diffuse, alike.color * diffuse)
+        assert alike.length.max() == number + 1
+
+
+def test_the_history_of_a_mirror_that_stands_still_grows() -> None:
+    history, everything_alike = Shot(), Shot(specular_length=math.inf)
+    for number, frame in enumerate(mirror_in_a_pan(0), start=1):
+        # Less than what counts as motion.
+        frame = frame.replace(motion=torch.full_like(frame.color[:, :2], 0.03))
+        seen, alike = history.update(frame), everything_alike.update(frame)
+        assert seen.length.max().item() == pytest.approx(number)
+        assert torch.equal(seen.length, alike.length)
+        assert torch.equal(seen.color, alike.color)
+
+
+@pytest.mark.parametrize("alpha_min", [0.1, 0.4, 1.0])
+@pytest.mark.parametrize("longest", [0, 1, 2.5, 20])
+def test_a_shortened_history_is_that_of_a_shorter_history(alpha_min: float, longest: float) -> None:
+    history, albedo = Shot(alpha_min=alpha_min, specular_length=longest), constant(3, 0.0)
+    for _ in range(LONG):
+        before = history.update(still(torch.rand(1, 3, HEIGHT, WIDTH), albedo=albedo))
+    assert before.length.unique().tolist() == [LONG]
+    color, motion = torch.rand(1, 3, HEIGHT, WIDTH), torch.full((1, 2, HEIGHT, WIDTH), 0.25)
+    seen = history.update(Frame(color=color, albedo=albedo, motion=motion))
+    length = before.length.clamp_max(longest)
+    expected = accumulate(color, before.color, length, motion, alpha_min=alpha_min)
+    torch.testing.assert_close(seen.color, expected[0])
+    torch.testing.assert_close(seen.length, expected[1])
+    # No history at all is not a cut: nothing says that the scene has changed.
+    assert seen.reset == ""
+
+
+def test_without_albedo_nothing_is_known_of_mirrors() -> None:
+    history = Shot()
+    motion = torch.full((1, 2, HEIGHT, WIDTH), 0.25)
+    for number in range(1, 6):
+        seen = history.update(Frame(color=torch.rand(1, 3, HEIGHT, WIDTH), motion=motion))
+        assert seen.length.max().item() == pytest.approx(number)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_mirror_of_unknown_motion_starts_anew(value: float) -> None:
+    history, motion = Shot(), torch.zeros(1, 2, HEIGHT, WIDTH)
+    motion[:, 0, 1, 1] = value
+    for number in range(1, 6):
+        color = torch.rand(1, 3, HEIGHT, WIDTH)
+        seen = history.update(Frame(color=color, albedo=constant(3, 0.0), motion=motion))
+        assert torch.equal(seen.color[..., 1, 1], color[..., 1, 1])
+        assert seen.color.isfinite().all()
+        assert seen.length[0, 0, 1, 1] == 1
+        assert seen.length.max() == number
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"specular_length": -1.0}, "specular_length: expected at least 0, found -1.0"),
+        ({"specular_length": math.nan}, "specular_length: expected at least 0, found nan"),
+        ({"alpha_min": 0.0}, "alpha_min: expected in (0, 1], found 0.0"),
+        ({"alpha_min": -1.0}, "alpha_min: expected in (0, 1], found -1.0"),
+        ({"alpha_min": 2.0}, "alpha_min: expected in (0, 1], found 2.0"),
+        ({"alpha_min": math.nan}, "alpha_min: expected in (0, 1], found nan"),
+    ],
+)
+def test_a_setting_out_of_its_range_is_refused(settings: dict[str, float], expected: str) -> None:
+    assert refused(lambda: Shot(**settings)) == expected
+
+
+# Lights in the plane of what is around them
+
+
+def seen_in_passing(number: int, size: tuple[int, int] = (48, 64)) -> Frame:
+    """A wall of uniform noise that moves by fractions of a pixel, without color."""
+    height, width = size
+    shift = torch.tensor([0.37, 0.21], dtype=torch.float64)
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    position = torch.stack([columns + shift[0] * number, rows + shift[1] * number, torch.full_like(rows, 50.0)])[None]
+    return Frame(
+        color=torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(number)),
+        position=position.float(),
+        normal=torch.tensor([0.0, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, height, width),
+        depth=torch.full((1, 1, height, width), 50.0),
+        motion=shift.float().reshape(1, 2, 1, 1).expand(1, 2, height, width),
+    )
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_a_lamp_does_not_bleed_into_the_ceiling_around_it(backend: Backend) -> None:
+    """Same plane, no albedo: only their light tells one from the other."""
+    history, without = Shot(backend=backend), Shot(lag_threshold=math.inf)
+    for number in range(12):
+        frame = seen_in_passing(number)
+        assert frame.position is not None
+        offset = (frame.position[:, :2] - torch.tensor([34.0, 27.0]).reshape(1, 2, 1, 1)).abs()
+        lamp = (offset[:, :1] < 9) & (offset[:, 1:] < 5)
+        frame = frame.replace(color=torch.where(lamp, 40.0, frame.color))
+        seen, bled = history.update(frame), without.update(frame)
+        assert (seen.color * ~lamp).max() <= 1
+        assert ((seen.color - 40) * lamp).abs().max() < 1e-3
+    # Nor does it cost any of the history.
+    assert seen.length[..., 12:-12, 12:-12].min() > 11.9
+    assert (bled.color * ~lamp).max() > 5
+
+
+@pytest.mark.parametrize("fraction", [0.1, 0.25, 0.5, 0.75])
+def test_samples_of_one_brightness_are_no_lights(fraction: float) -> None:
+    """One of a few small lights is drawn: beside each other there are often alike samples, and no light may be lost."""
+    history, means = Shot(firefly_limit=math.inf), []
+    for number in range(24):
+        frame = seen_in_passing(number, (96, 128))
+        lit = frame.color[:, :1] < fraction
+        seen = history.update(frame.replace(color=torch.where(lit, 1.0, 0.02).expand_as(frame.color)))
+        means.append(seen.color[..., 16:-16, 16:-16].mean().item())
+    expected = fraction + 0.02 * (1 - fraction)
+    assert sum(means[12:]) / 12 == pytest.approx(expected, rel=0.01)
+    assert all(mean == pytest.approx(expected, rel=0.05) for mean in means)
+
+
+# What a scene does not need
+
+
+def wall(color: Tensor, **buffers: Any) -> Frame:
+    """A wall seen by the same camera in every frame; its positions are those of the pixels, with their rounding."""
+    height, width = color.shape[-2:]
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    camera = torch.diag(torch.tensor([1 / 1.7, 1 / 1.3, 1.0, 0.0]))
+    camera[2, 3] = 1.0
+    position = torch.stack([(2 * columns / width - 1) * 1.7, (2 * rows / height - 1) * 1.3, torch.ones_like(rows)])[
+        None
+    ]
+    return Frame(color=color, **{"position": position * 3, "view_projection": camera[None], **buffers})
+
+
+def test_a_still_frame_is_known_by_its_motion_or_by_camera_and_positions() -> None:
+    shot, color = Shot(), torch.rand(1, 3, 20, 30)
+    shot.update(wall(color))
+    history: History = shot.state[0]
+    frame = wall(color)
+    assert frame.position is not None
+    assert is_still(frame, history)
+    assert is_still(frame.replace(previous_position=frame.position.clone()), history)
+    moved = frame.position.clone()
+    moved[0, 2, 13, 17] += 1e-3
+    assert not is_still(frame.replace(previous_position=moved), history)
+    assert frame.view_projection is not None
+    assert not is_still(frame.replace(view_projection=frame.view_projection * 1.0001), history)
+    assert is_still(still(color), history)
+    motion = torch.zeros(1, 2, 20, 30)
+    motion[0, 1, 13, 17] = 1e-6
+    assert not is_still(still(color, motion=motion), history)
+    # The frame's own motion goes before its positions.
+    assert not is_still(frame.replace(motion=motion), history)
+    assert not is_still(Frame(color=color), history)
+
+
+def test_the_method_inside_is_told_that_nothing_moves() -> None:
+    shot, color = Shot(), torch.rand(1, 3, 20, 30)
+    for frame, expected in (
+        (wall(color), False),
+        (wall(color), True),
+        (wall(color, motion=torch.full((1, 2, 20, 30), 0.3)), False),
+        (wall(color, motion=torch.zeros(1, 2, 20, 30)), True),
+        (Frame(color=color), False),
+    ):
+        shot.update(frame)
+        assert shot.watching.frames[-1].hints.still is expected
+
+
+@pytest.mark.parametrize("size", [(20, 30), (96, 110)])
+def test_a_still_frame_needs_no_reprojection_to_the_last_bit(size: tuple[int, int]) -> None:
+    """Whether that it is still is told by its motion, which is followed on demand, or by positions and cameras."""
+    ordinary, short, by_positions = Shot(), Shot(), Shot()
+    normal = constant(3, 0.6, size)
+    albedo = constant(3, 0.5, size)
+    albedo[..., : size[1] // 3] = 0
+    for number in range(14):
+        # A thing appears where there was a wall, without being told: its history is not the wall's.
+        normal = normal.clone()
+        normal[..., 5:9, number : number + 4] *= -1
+        color = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(number))
+        frame = wall(color, normal=normal, albedo=albedo)
+        told = frame.replace(motion=torch.zeros(1, 2, *size))
+        seen = ordinary.update(told, keep_all=True)
+        for again in (short.update(told), by_positions.update(frame)):
+            assert all(torch.equal(a, b) for a, b in zip(seen[:3], again[:3], strict=True))
+            assert seen.reset == again.reset
+        assert short.watching.frames[-1].hints.still is (number > 0)
+    assert 1 in seen.length
+    assert seen.length.max() == 14
+
+
+def test_a_still_wall_is_averaged_pixel_by_pixel() -> None:
+    history, colors = Shot(), torch.rand(8, 1, 3, 20, 30)
+    for color in colors:
+        seen = history.update(wall(color))
+    # To the rounding of the average: no pixel has anything of its neighbours.
+    torch.testing.assert_close(seen.color, colors.mean(0), rtol=1e-6, atol=1e-7)
+
+
+def test_an_albedo_of_one_or_of_nothing_needs_no_demodulation() -> None:
+    for albedo in (constant(3), constant(3, 0.0)):
+        ordinary, short = Shot(), Shot()
+        for color in torch.rand(3, 1, 3, HEIGHT, WIDTH):
+            frame = still(color, albedo=albedo, motion=constant(2, 0.3))
+            results = ordinary.update(frame, keep_all=True), short.update(frame)
+            assert all(torch.equal(a, b) for a, b in zip(*(result[:3] for result in results), strict=True))
+
+
+def test_the_last_frame_is_no_history() -> None:
+    history = Shot()
+    color = torch.rand(1, 3, HEIGHT, WIDTH)
+    history.update(still(color))
+    last = history.update(still(color), last=True)
+    assert last.length.unique().tolist() == [2]
+    assert history.state[0] is None
+    assert history.update(still(color)).reset == "first frame"
+
+
+# The state of the method inside
+
+
+CUTS = {
+    "cut": {"normal": torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)},
+    "size change": {},
+    "no motion, and no position with a previous camera": {"motion": None},
+}
+
+
+@pytest.mark.parametrize("reset", CUTS)
+def test_the_method_inside_begins_anew_with_the_shot(reset: str) -> None:
+    history = Shot()
+    floor = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
+    for _ in range(3):
+        history.update(still(constant(3), normal=floor))
+    before, now, next_one = history.watching.states
+    assert before is None
+    assert (now["seen"].max(), next_one["seen"].max()) == (1, 2)
+    size = (4, 4) if reset == "size change" else (HEIGHT, WIDTH)
+    buffers = {"normal": None if size == (4, 4) else floor, **CUTS[reset]}
+    seen = history.update(still(constant(3, 2.0, size), **buffers))
+    assert seen.reset == reset
+    assert history.watching.states[-1] is None
+
+
+def test_what_a_recurrent_method_remembers_ends_with_the_shot() -> None:
+    model, state = Accumulated(Mean(), alpha_min=1.0, lag_threshold=math.inf, firefly_limit=math.inf), None
+    floor = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
+    for value, normal, expected in ((1, floor, 1), (3, floor, 2), (5, floor, 3), (9, -floor, 9), (11, -floor, 10)):
+        output, state = model(still(constant(3, float(value)), normal=normal), state)
+        assert output.image.unique().tolist() == [expected]
+
+
+@pytest.mark.parametrize("by_positions", [False, True])
+@pytest.mark.parametrize("size", [(20, 30), (96, 110)])
+def test_a_state_of_zeros_is_no_state(size: tuple[int, int], by_positions: bool) -> None:
+    """So that a graph which takes a state begins with zeros; also of the method inside."""
+    model = Accumulated(Mean())
+    colors = torch.rand(3, 2, 3, *size)
+
+    def frame(color: Tensor) -> Frame:
+        if not by_positions:
+            return Frame(color, motion=torch.full((2, 2, *size), 0.4), depth=torch.ones(2, 1, *size))
+        seen = wall(color[:1])
+        buffers = {name: torch.cat([value, value]) for name, value in seen.items() if name != "color"}
+        return Frame(color, **buffers)
+
+    expected, state = model(frame(colors[0]))
+    zeros = pytree.tree_map_only(Tensor, torch.zeros_like, model(frame(colors[1]), state)[1])
+    found, again = model(frame(colors[0]), zeros)
+    assert torch.equal(found.image, expected.image)
+    assert pytree.tree_structure(again) == pytree.tree_structure(state)
+    for one, other in zip(pytree.tree_leaves(again), pytree.tree_leaves(state), strict=True):
+        assert one is other or torch.equal(one, other)
+
+
+def test_a_step_is_pure() -> None:
+    """The state that goes in is not changed: the same frame after it is the same again."""
+    model, state = Accumulated(Mean()), None
+    for number in range(12):
+        frame = still(torch.rand(1, 3, HEIGHT, WIDTH), depth=constant(1))
+        before = pytree.tree_map_only(Tensor, torch.clone, (frame, state))
+        output, after = model(frame, state)
+        for mine, copy in zip(pytree.tree_leaves((frame, state)), pytree.tree_leaves(before), strict=True):
+            assert mine is copy or torch.equal(mine, copy), number
+        again, _ = model(frame, state)
+        assert torch.equal(again.image, output.image)
+        state = after
+
+
+def test_what_is_inside_is_handed_the_history_and_hands_out_its_own_images() -> None:
+    watching = Watching()
+    color = torch.rand(1, 3, HEIGHT, WIDTH)
+    output, _ = Accumulated(watching)(still(color).replace(hints=Hints(keep_all=True)))
+    assert list(output.stages) == ["accumulated"]
+    assert torch.equal(output.stages["accumulated"], output.image)
+    frame = watching.frames[0]
+    assert frame.hints.keep_all
+    assert torch.equal(frame.color, color)
+    assert {"current", "length"} <= frame.buffers
+
+
+def test_what_it_gives_is_not_asked_of_a_frame() -> None:
+    class Wanting(Watching):
+        needs = dataclasses.replace(Watching.needs, buffers=frozenset({"color", "current", "length", "roughness"}))
+
+    assert Accumulated(Wanting()).needs.buffers == {"color", "roughness"}
+    # What comes of a history depends on the whole image: whether there was a cut.
+    assert Accumulated(Wanting()).needs.reach is None
+
+
+# Changes of light
+
+
+def switched(off_at: int, count: int, level: float = 0.0) -> list[Frame]:
+    """Noisy light that falls to ``level``; nothing moves."""
+    g, frames = torch.Generator().manual_seed(0), []
+    for number in range(count):
+        noise = -torch.log(torch.rand(1, 3, 16, 16, generator=g).clamp_min(1e-6))
+        frames.append(still(noise if number < off_at else level * noise))
+    return frames
+
+
+@pytest.mark.parametrize("level", [0.0, 0.1])
+def test_the_history_is_given_up_where_the_light_changes(level: float) -> None:
+    lagging, history = Shot(lag_threshold=math.inf), Shot()
+    for frame in switched(20, 21, level):
+        ghost, seen = lagging.update(frame), history.update(frame)
+    # A tenth of the new light, nine of the old; and nothing but the new one.
+    assert abs(ghost.color.mean() - (0.1 * level + 0.9)) < 0.1
+    torch.testing.assert_close(seen.color, frame.color, rtol=0.2, atol=0.05 * level)
+    assert seen.length.max() <= 4
+    assert seen.reset == ""
+
+
+def test_brighter_light_comes_sooner() -> None:
+    """The brighter it is, the more noise there is to hide the change: some frames are needed."""
+    lagging, history = Shot(lag_threshold=math.inf), Shot()
+    for frame in switched(20, 24, 5.0):
+        expected, seen = lagging.update(frame), history.update(frame)
+    assert expected.color.mean() < 2.5
+    assert seen.color.mean() > 4
+
+
+def test_steady_light_keeps_its_history() -> None:
+    lagging, history = Shot(lag_threshold=math.inf), Shot()
+    for frame in switched(20, 20):
+        expected, seen = lagging.update(frame), history.update(frame)
+    torch.testing.assert_close(seen.color, expected.color)
+    assert torch.equal(seen.length, expected.length)
+
+
+def test_after_a_change_a_new_history_grows() -> None:
+    history = Shot()
+    for frame in switched(20, 30, 0.2):
+        seen = history.update(frame)
+    assert seen.length.min() > 9
+    assert abs(seen.color.mean() - 0.2) < 0.02
+
+
+@pytest.mark.parametrize("pixels", [2 * 16, 100])
+def test_the_history_is_the_same_a_few_rows_at_a_time(pixels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    g, frames = torch.Generator().manual_seed(1), switched(6, 9, 0.3)
+    albedo = torch.rand(1, 3, 16, 16, generator=g) * (torch.rand(1, 1, 16, 16, generator=g) > 0.2)
+    motion = torch.rand(1, 2, 16, 16, generator=g) - 0.5
+    frames = [frame.replace(albedo=albedo, motion=motion) for frame in frames]
+    whole, bands = Shot(), Shot()
+    expected = [whole.update(frame) for frame in frames]
+    assert expected[-1].length.max() < 9
+    monkeypatch.setattr("mcdenoise.ops._rows._PIXELS", pixels)
+    for frame, seen in zip(frames, expected, strict=True):
+        found = bands.update(frame)
+        assert torch.equal(found.color, seen.color)
+        assert torch.equal(found.length, seen.length)
+
+
+def test_a_first_frame_a_cut_and_another_size_begin_a_recent_history_too() -> None:
+    history, fresh = Shot(), Shot()
+    floor = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
+    for frame in (still(constant(3, 9.0, (4, 4))), still(constant(3, 5.0), normal=floor.roll(1, 1))):
+        history.update(frame)
+    for value in (1.0, 2.0, 3.0):
+        frame = still(constant(3, value), normal=floor)
+        seen, expected = history.update(frame), fresh.update(frame)
+        assert torch.equal(seen.color, expected.color)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_frames_are_accumulated_in_float32(dtype: torch.dtype) -> None:
+    history, twin = (Shot(alpha_min=1e-6, lag_threshold=math.inf) for _ in range(2))
+    for color in torch.rand(300, 1, 3, 4, 4, generator=torch.Generator().manual_seed(0)).to(dtype):
+        seen, expected = history.update(still(color)), twin.update(still(color.float()))
+    assert seen.color.dtype == seen.length.dtype == torch.float32
+    assert torch.equal(seen.color, expected.color)
+    # More than bfloat16 can count.
+    assert seen.length.unique().tolist() == [300]

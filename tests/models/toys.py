@@ -1,0 +1,163 @@
+"""Methods of ten lines that know nothing of what they wear, and frames for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import BUFFERS, Frame
+from mcdenoise.models import Accumulated, Demodulated, Journal, Model, Needs, Output, create_model, find_model, listening
+from mcdenoise.ops._backend import Backend, preferred
+
+
+def refused(action: Callable[[], object]) -> str:
+    """The message of an error, which must be one line."""
+    with pytest.raises(InputError) as error:
+        action()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def frame_of(height: int, width: int, batch: int = 1, seed: int = 0, **buffers: Any) -> Frame:
+    """Color, albedo, normal and depth at random, with background in the first row of larger images."""
+    generator = torch.Generator().manual_seed(seed)
+    color, albedo, normal, depth = (
+        torch.rand(batch, channels, height, width, generator=generator) for channels in (3, 3, 3, 1)
+    )
+    depth = 1 + 9 * depth
+    if height > 1:
+        depth[:, :, 0] = torch.inf
+    defaults = {"albedo": albedo, "normal": F.normalize(normal - 0.5, dim=1), "depth": depth}
+    return Frame(color.square() * 4, **(defaults | buffers))
+
+
+def still(color: Tensor, **buffers: Any) -> Frame:
+    """A frame of a scene in which nothing moves."""
+    return Frame(color=color, **{"motion": torch.zeros_like(color[:, :2]), **buffers})
+
+
+def whole_frame(model: Model, height: int, width: int, batch: int = 1, seed: int = 0) -> Frame:
+    """A frame with everything that a model needs or is better with, in range; it moves by half a pixel."""
+    frame = frame_of(height, width, batch, seed)
+    generator = torch.Generator().manual_seed(seed + 1000)
+    given: dict[str, Any] = {"motion": torch.full((batch, 2, height, width), 0.5)}
+    for name in sorted((model.needs.buffers | model.needs.uses) - frame.buffers - {"motion", "view_projection"}):
+        samples = (4,) if name == "samples" else ()
+        channels = BUFFERS[name].channels if name in BUFFERS else 3
+        image = torch.rand(batch, *samples, channels, height, width, generator=generator)
+        given[name] = 1 + image if name == "length" else image
+    return frame.replace(**{name: value for name, value in given.items() if value is not None})
+
+
+def small(name: str, **settings: Any) -> Any:
+    """A small model of the zoo off its initial values: heads of zeros hide everything that is before them."""
+    narrow = {"width": 8} if "width" in find_model(name).architecture else {}
+    torch.manual_seed(1)
+    model = create_model(name, **{**narrow, **settings})
+    if isinstance(model, nn.Module):
+        for parameter in model.parameters():
+            if parameter.dim() > 1 and not parameter.any():
+                nn.init.normal_(parameter, std=0.02)
+    return model
+
+
+class Same(nn.Module):
+    """Changes nothing."""
+
+    needs = Needs(trainable=False, reach=0)
+
+    def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+        return Output(frame.color), None
+
+
+class Blur(nn.Module):
+    """The mean of 5x5 pixels, and of as much albedo; counts the pixels that it was asked for."""
+
+    needs = Needs(uses=frozenset({"albedo"}), trainable=False, reach=2)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pixels = 0
+
+    def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+        self.pixels += frame.color.shape[-2] * frame.color.shape[-1]
+        image = frame.color if frame.albedo is None else frame.color + 0.25 * frame.albedo
+        return Output(F.avg_pool2d(image, 5, 1, 2, count_include_pad=False)), None
+
+
+class Brightest(nn.Module):
+    """Twice the color, up to the brightest pixel of the whole image: depends on a statistic."""
+
+    needs = Needs(trainable=False, reach=0)
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        return {"brightest": frame.color.amax((1, 2, 3), keepdim=True)}
+
+    def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+        statistics = frame.statistics or self.statistics(frame)
+        return Output(torch.minimum(2 * frame.color, statistics["brightest"])), None
+
+
+class Mean(nn.Module):
+    """The mean of all frames since there was no state."""
+
+    needs = Needs(trainable=False)
+
+    def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+        total, count = (0 * frame.color, 0 * frame.color[:, :1]) if state is None else (state["total"], state["count"])
+        state = {"total": total + frame.color, "count": count + 1}
+        return Output(state["total"] / state["count"]), state
+
+
+class Watching(Same):
+    """Changes nothing, and remembers what it saw, and in which state."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.frames: list[Frame] = []
+        self.states: list[Any] = []
+
+    def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+        self.frames.append(frame)
+        self.states.append(state)
+        return Output(frame.color), {"seen": torch.full_like(frame.color, float(len(self.frames)))}
+
+
+class Seen(NamedTuple):
+    """What a method inside :class:`Accumulated` sees of a frame, and why it has no history."""
+
+    color: Tensor
+    current: Tensor
+    length: Tensor
+    reset: str
+
+
+class Shot:
+    """The history of a shot, frame by frame; settings are those of :class:`Accumulated`."""
+
+    def __init__(self, backend: Backend | None = None, **settings: Any) -> None:
+        self.watching, self.backend, self.state = Watching(), backend, None
+        self.model = Demodulated(Accumulated(self.watching, **settings))
+
+    def reset(self) -> None:
+        self.state = None
+
+    def update(self, frame: Frame, **hints: bool) -> Seen:
+        journal = Journal()
+        with listening(journal):
+            frame = frame.replace(hints=frame.hints._replace(**hints))
+            if self.backend is None:
+                _, self.state = self.model(frame, self.state)
+            else:
+                with preferred(self.backend):
+                    _, self.state = self.model(frame, self.state)
+        seen = self.watching.frames[-1]
+        assert seen.current is not None
+        assert seen.length is not None
+        return Seen(seen.color, seen.current, seen.length, journal.reset)
