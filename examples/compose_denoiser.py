@@ -2,11 +2,13 @@
 
     python examples/compose_denoiser.py path/to/sequence
 
-The albedo is divided out, the frames of the shot are accumulated, and what noise is left is filtered at three scales
-by cross-bilateral weights over normals, albedo, depth and the color itself; a Laplacian fusion carries each coarse
-result into the next finer scale, and the albedo is multiplied back. Prints the error of the noisy, the accumulated and
-the composed image for the last frames that have a reference. Change SCALES, the guides, or the order of the steps, and
-see what it does. What no guide shows, such as the image in a mirror, a filter like this one blurs.
+The wrapper `Demodulated` divides the albedo out, `Accumulated` blends the frames of the shot, and what noise is left is
+filtered at three scales by cross-bilateral weights over normals, albedo, depth and the color itself; a Laplacian fusion
+carries each coarse result into the next finer scale, and the albedo is multiplied back. Prints the error of the noisy,
+the accumulated and the composed image for the last frames that have a reference. Change SCALES, the guides, or the
+order of the steps, and see what it does. What no guide shows, such as the image in a mirror, a filter like this one
+blurs. As a method it goes into every command: `mcdenoise denoise SEQUENCE -o OUT --model
+examples/compose_denoiser.py:method`, and likewise `benchmark` and `evaluate`.
 """
 
 import argparse
@@ -15,18 +17,18 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mcdenoise.frame import Frame
+from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
-from mcdenoise.history import History
 from mcdenoise.metrics import psnr_srgb, smape_linear
-from mcdenoise.models import auto_exposure, normalize_depth
-from mcdenoise.ops import cross_bilateral_weights, downsample, kernel_conv, laplacian_fusion, remodulate, upsample
+from mcdenoise.models import Accumulated, Demodulated, Needs, Output
+from mcdenoise.nn import auto_exposure, normalize_depth
+from mcdenoise.ops import cross_bilateral_weights, downsample, kernel_conv, laplacian_fusion, upsample
 
 # How fast a neighbour's weight falls off with the squared difference of normal, albedo, depth and color, and with the
 # squared distance in pixels; one row for each scale, finest first. Coarse scales are stricter, since what leaks across
 # an edge there spreads over many pixels. fit_filter_parameters.py finds such numbers by gradient descent.
 SCALES = torch.tensor([[5, 1, 2000, 0.1, 0.1], [50, 2, 6000, 0.7, 0.03], [100, 20, 6000, 2.5, 0.05]])
-FUSION = torch.tensor(0.9)  # share of the low frequencies that comes from the coarser scale
+FUSION = torch.tensor(0.9)  # fraction of the low frequencies that comes from the coarser scale
 KERNEL_SIZE = 5
 
 
@@ -61,24 +63,37 @@ def denoise(color: Tensor, length: Tensor, guides: list[Tensor], scales: Tensor,
     return (kernel_conv(color * length, weights) / kernel_conv(length, weights)).clamp_min(0)
 
 
-@torch.inference_mode()
+class Composed:
+    """The filter as a method, which any wrapper takes."""
+
+    needs = Needs(frozenset({"color", "albedo", "normal", "depth"}), frozenset({"length"}), trainable=False)
+
+    def __call__(self, frame: Frame, state: None = None) -> tuple[Output, None]:
+        """Filter the color that the wrappers hand in."""
+        color, guides = prepare(frame.color, frame)
+        return Output(denoise(color, frame.length, guides, SCALES, FUSION)), None
+
+
+def method() -> Demodulated:
+    """The whole denoiser."""
+    return Demodulated(Accumulated(Composed()))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("sequence", type=Path, help="folder with color, albedo, normals, positions and references")
     parser.add_argument("--last", type=int, default=3, metavar="N", help="score the last N frames with a reference")
     options = parser.parse_args()
 
-    sequence, history = open_sequence(options.sequence), History()
+    sequence, denoiser = open_sequence(options.sequence), Denoiser(method())
     if not sequence.reference_numbers:
         parser.error("expected frames with references to compare with")
     print("SMAPE / PSNR      noisy           accumulated        composed")
     for number in sequence.numbers:
-        frame, _ = sequence.frame(number).validate()
-        past = history.update(frame)
+        frame = sequence.frame(number)
+        output = denoiser.output(frame)
         if number in sequence.reference_numbers[-options.last :]:
-            color, guides = prepare(past.color, frame)
-            filtered = denoise(color, past.length, guides, SCALES, FUSION)
-            images = [frame.color, remodulate(past.color, frame.albedo), remodulate(filtered, frame.albedo)]
+            images = [frame.color, output.stages["accumulated"], output.image]
             errors = [(float(smape_linear(x, frame.reference)), float(psnr_srgb(x, frame.reference))) for x in images]
             print(f"frame {number:<6}", "   ".join(f"{smape:.4f} {psnr:5.2f} dB" for smape, psnr in errors))
 

@@ -1,7 +1,7 @@
 """Denoise a shot frame by frame, as a renderer would: the shortest use of `Denoiser`.
 
     python examples/denoise_sequence.py path/to/sequence out
-    python examples/denoise_sequence.py path/to/sequence out --weights runs/mine/cascaded.safetensors
+    python examples/denoise_sequence.py path/to/sequence out --weights runs/mine/cascaded_v2.safetensors
 
 Writes out/denoised0.exr, out/denoised1.exr, ... (scene-linear), and out/last.png: the last frame before and after, as a
 display shows it. A denoiser remembers: give it the frames in order, one `Denoiser` for each shot. With frames from
@@ -18,13 +18,14 @@ from mcdenoise import Denoiser
 from mcdenoise.data import open_sequence, write_exr
 from mcdenoise.data.png import write_png
 from mcdenoise.metrics import displayed
+from mcdenoise.models import DEFAULT
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("sequence", type=Path, help="folder of a renderer's frames")
     parser.add_argument("out", type=Path, help="folder to write to")
-    parser.add_argument("--model", default="cascaded_v2", help="a name that `mcdenoise models` lists")
+    parser.add_argument("--model", default=DEFAULT, help="a name that `mcdenoise models` lists, or file.py:factory")
     parser.add_argument("--weights", type=Path, help="weights of your own training; by default the shipped ones")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     options = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Draw error over run time: every model with weights and every other denoiser that is installed, on your scenes.
+"""Draw error over run time: every model with weights, filters, and what other denoisers are installed, on your scenes.
 
     python examples/error_vs_runtime.py path/to/scene path/to/another -o figure.svg
     python examples/error_vs_runtime.py path/to/scene -o figure.png --metric PSNR --frames 0-11 --threads 2
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from mcdenoise.benchmark import Settings, choose_candidates, run_benchmark
+from mcdenoise.benchmark import Settings, choose_methods, run_benchmark
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
@@ -26,8 +26,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("sequences", type=Path, nargs="+", metavar="SEQUENCE", help="folder of frames with references")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="figure to write: .svg or .png")
     parser.add_argument("--metric", choices=METRICS, default="SMAPE")
-    parser.add_argument("--models", metavar="NAMES", help="separated by commas; all with weights by default")
-    parser.add_argument("--peers", default="all", metavar="NAMES", help="oidn, bilateral, all or none")
+    parser.add_argument("--models", metavar="NAMES", help="as of `mcdenoise benchmark`; all by default")
     parser.add_argument("--frames", metavar="NUMBERS", help="which frames to use, such as 0-15")
     parser.add_argument("--rounds", type=int, default=3, help="how often each method denoises each frame")
     parser.add_argument("--threads", type=int, metavar="N", help="of all methods")
@@ -39,16 +38,16 @@ def main() -> None:
     check_packages()
     threads = options.threads or torch.get_num_threads()
     sequences = [open_sequence(path, options.frames) for path in options.sequences]
-    candidates = choose_candidates(options.models, options.peers, threads=threads)
+    methods = choose_methods(options.models)
     settings = Settings(rounds=options.rounds, threads=threads, pictures=0)
     with tempfile.TemporaryDirectory() as folder:
-        results = run_benchmark(sequences, candidates, Path(folder) / "results", settings)
+        results = run_benchmark(sequences, methods, Path(folder) / "results", settings)
     machine = results.machine
     print(f"{machine.processor}, {machine.device}, {machine.threads} threads; {len(results.scenes)} scenes")
     for row in write_error_plot(results, options.metric, options.out):
         value, time = row.errors.get(options.metric), row.milliseconds
         shown = f"{value.value:.4g} in {time.value:.1f} ms" if value and time else row.reason
-        print(f"{row.method.name:<44} {shown}")
+        print(f"{row.method.name:<60} {shown}")
     print(options.out)
 
 

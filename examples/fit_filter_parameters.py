@@ -3,10 +3,10 @@
     python examples/fit_filter_parameters.py path/to/sequence --held-out path/to/another/sequence
 
 The filter is that of compose_denoiser.py: at each of three scales, how fast the weight of a neighbour falls off with
-the difference of normal, albedo, depth, color and distance, and the share of the coarse scales in the fusion. These 16
-numbers start at 1 (the share at a half), and the derivative of the error against references moves them. Prints the loss
-as it falls, the numbers it found, and the error before and after on frames that the fit has not seen: those of another
-sequence, or by default the last quarter of all.
+the difference of normal, albedo, depth, color and distance, and the weight of the coarse scales in the fusion. These 16
+numbers start at 1 (the weight at a half), and the derivative of the error against references moves them. Prints the
+loss as it falls, the numbers it found, and the error before and after on frames that the fit has not seen: those of
+another sequence, or by default the last quarter of all.
 """
 
 import argparse
@@ -17,8 +17,8 @@ from compose_denoiser import denoise, prepare
 from torch import Tensor
 
 from mcdenoise.data import open_sequence
-from mcdenoise.history import History
 from mcdenoise.metrics import smape_linear
+from mcdenoise.models import Accumulated, Demodulated, Output
 from mcdenoise.ops import remodulate
 
 NAMES = ("normal", "albedo", "depth", "color", "distance")
@@ -27,19 +27,27 @@ REPORT_EVERY = 20
 
 def samples(folder: Path) -> list[dict]:
     """Accumulated frames with references, as the arguments of the filter and what to compare its result with."""
-    history, found = History(), []
-    sequence = open_sequence(folder)
+    sequence, found, state = open_sequence(folder), [], None
+
+    def note(color: Tensor, length: Tensor) -> Output:
+        light.update(color=color, length=length)
+        return Output(color)
+
+    accumulated = Demodulated(Accumulated(note))
     for number in sequence.numbers:
         frame, _ = sequence.frame(number).validate()
-        past = history.update(frame)
+        light: dict[str, Tensor] = {}
+        _, state = accumulated(frame, state)
         if frame.reference is not None:
-            color, guides = prepare(past.color, frame)
-            found.append({"inputs": (color, past.length, guides), "albedo": frame.albedo, "target": frame.reference})
+            color, guides = prepare(light["color"], frame)
+            found.append(
+                {"inputs": (color, light["length"], guides), "albedo": frame.albedo, "target": frame.reference}
+            )
     return found
 
 
 def error(sample: dict, log_scales: Tensor, fusion_logit: Tensor) -> Tensor:
-    # Logarithms and a logit, so that every step leaves the scales positive and the share between 0 and 1.
+    # Logarithms and a logit, so that every step leaves the scales positive and the weight between 0 and 1.
     filtered = denoise(*sample["inputs"], log_scales.exp(), fusion_logit.sigmoid())
     return smape_linear(remodulate(filtered, sample["albedo"]), sample["target"]).mean()
 
@@ -81,7 +89,7 @@ def main() -> None:
     print("\nscale  " + "".join(f"{name:>10}" for name in NAMES))
     for scale, row in enumerate(log_scales.exp().tolist()):
         print(f"1/{2**scale:<5}" + "".join(f"{value:10.3g}" for value in row))
-    print(f"share of the coarse scales: {fusion_logit.sigmoid().item():.2f}\n")
+    print(f"weight of the coarse scales: {fusion_logit.sigmoid().item():.2f}\n")
     print(f"held-out SMAPE   before {before:.4f}   after {mean_error(held_out, *parameters):.4f}")
 
 

@@ -25,6 +25,7 @@ from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.data.bmfr import write_bmfr_frame
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
+from mcdenoise.models import DEFAULT
 
 
 def measure(width: int, height: int, options: argparse.Namespace, folder: Path) -> dict[str, object]:
@@ -60,7 +61,7 @@ def measure(width: int, height: int, options: argparse.Namespace, folder: Path) 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--sizes", default="1280x720,1920x1080,3840x2160,7680x4320", metavar="WxH,...")
-    parser.add_argument("--model", default="cascaded_v2")
+    parser.add_argument("--model", default=DEFAULT)
     parser.add_argument("--precision", default="bfloat16", choices=["float32", "bfloat16"])
     parser.add_argument("--max-memory", type=float, default=4.0, metavar="GB")
     parser.add_argument("--frames", type=int, default=2, help="of each size; the first warms up")

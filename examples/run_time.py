@@ -1,13 +1,14 @@
-"""Time networks and Open Image Denoise side by side on one frame: what the image filter alone costs.
+"""Time methods side by side on one frame, without accumulation: what the image filter alone costs.
 
     python examples/run_time.py
-    python examples/run_time.py --models cascaded_v2 cascaded_v2_tiny --size 1920x1080 --rounds 9 --json times.json
+    python examples/run_time.py --models cascaded_v2 "oidn(quality=fast)" mine.py:make --size 1920x1080 --rounds 9
 
 Every round runs each of them once, one after the other, so that whatever else the machine does hits all alike; the
-first round warms up and is not counted. Prints the median and the quartiles, and the ratio to Open Image Denoise's
-fastest network. The input is noise, which costs as much as any picture: the time depends on the number of pixels only.
-The time of Open Image Denoise includes copies to its layout and back, 10 to 20 ms at 1280x720 on one core. As in the
-commands of the package, freed memory is kept (mcdenoise/heap.py); --no-heap leaves that to the system.
+first round warms up and is not counted. Prints the median and the quartiles, and the ratio to the first of them, Open
+Image Denoise's fastest network by default. The input is noise, which costs as much as any picture: the time depends on
+the number of pixels only. The time of Open Image Denoise includes copies to its layout and back, 10 to 20 ms at
+1280x720 on one core. As in the commands of the package, freed memory is kept (mcdenoise/heap.py); --no-heap leaves that
+to the system.
 """
 
 import argparse
@@ -20,40 +21,39 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
-from mcdenoise import models
+from mcdenoise import Frame, create_model
 from mcdenoise.benchmark.machine import describe_machine
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
-from mcdenoise.peers import Oidn, Quality
+from mcdenoise.methods import parse_method
+from mcdenoise.models import Accumulated, Skipping, parts_of, pretrained_models
 
-OIDN: dict[str, tuple[Quality, bool]] = {
-    "OIDN fast": ("fast", False),
-    "OIDN balanced": ("balanced", False),
-    "OIDN high, clean aux": ("high", True),
-}
-
-
-def network(name: str, inputs: list[Tensor], bfloat16: bool) -> Callable[[], object]:
-    """A call of a network on these inputs."""
-    model = models.create_model(name).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-    @torch.inference_mode()
-    def call() -> object:
-        with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
-            return model(*inputs)
-
-    return call
+OIDN = (
+    "oidn(quality=fast, auxiliary=noisy)",
+    "oidn(quality=balanced, auxiliary=noisy)",
+    "oidn(quality=high, auxiliary=clean)",
+)
 
 
-def peer(settings: tuple[Quality, bool], inputs: list[Tensor], threads: int) -> Callable[[], object]:
-    """A call of Open Image Denoise on these inputs."""
-    oidn = Oidn(threads=threads)
-    color, albedo, normal, _ = inputs
-    quality, clean_aux = settings
-    return lambda: oidn.denoise(color, albedo, normal, quality=quality, clean_aux=clean_aux)
+def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], object]]:
+    """Calls of a method on this frame; of one that learns, in both precisions."""
+    spelling = parse_method(spelt)
+    settings = {"threads": threads, **spelling.settings} if spelling.takes("threads") else spelling.settings
+    # Fresh weights take as long as others.
+    model = create_model(spelling.model, weights=spelling.weights, **settings)
+    if isinstance(model, torch.nn.Module):
+        model.to(memory_format=torch.channels_last)
+    for accumulated in parts_of(model, Accumulated):
+        model = accumulated.inner.inner if isinstance(accumulated.inner, Skipping) else accumulated.inner
+
+    def call(bfloat16: bool) -> object:
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+            return model(frame)
+
+    calls = {spelling.name: lambda: call(False)}
+    return calls | {f"{spelling.name}, bfloat16": lambda: call(True)} if model.needs.trainable else calls
 
 
 def interleaved(calls: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
@@ -69,7 +69,7 @@ def interleaved(calls: dict[str, Callable[[], object]], rounds: int) -> dict[str
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--models", nargs="+", default=models.pretrained_models(), metavar="MODEL")
+    parser.add_argument("--models", nargs="+", default=[*OIDN, *pretrained_models()], metavar="MODEL")
     parser.add_argument("--size", default="1280x720", metavar="WxH")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=7)
@@ -89,19 +89,19 @@ def main() -> None:
     width, height = int(match[1]), int(match[2])
     torch.manual_seed(0)
     normal = torch.nn.functional.normalize(torch.randn(1, 3, height, width))
-    inputs = [torch.rand(1, 3, height, width), torch.rand(1, 3, height, width), normal, torch.rand(1, 1, height, width)]
-    calls = {name: peer(settings, inputs, options.threads) for name, settings in OIDN.items()}
-    for name in options.models:
-        calls[name] = network(name, inputs, bfloat16=False)
-        calls[f"{name}, bfloat16"] = network(name, inputs, bfloat16=True)
+    color, albedo, depth = (torch.rand(1, channels, height, width) for channels in (3, 3, 1))
+    frame = Frame(color=color, albedo=albedo, normal=normal, depth=depth)
+    calls: dict[str, Callable[[], object]] = {}
+    for spelt in options.models:
+        calls |= calls_of(spelt, frame, options.threads)
 
     times = interleaved(calls, options.rounds)
-    unit = statistics.median(times["OIDN fast"])
+    unit = statistics.median(next(iter(times.values())))
     print(f"{options.size}, {options.threads} threads, {options.rounds} rounds, torch {torch.__version__}")
-    print(f"{'milliseconds':<28}{'median':>8}{'quartiles':>16}{'/ OIDN fast':>13}")
+    print(f"{'milliseconds':<44}{'median':>8}{'quartiles':>16}{'/ first':>13}")
     for name, values in times.items():
         low, median, high = statistics.quantiles(values, n=4)
-        print(f"{name:<28}{median:>8.0f}{f'{low:.0f} .. {high:.0f}':>16}{median / unit:>13.2f}")
+        print(f"{name:<44}{median:>8.0f}{f'{low:.0f} .. {high:.0f}':>16}{median / unit:>13.2f}")
     if options.json:
         machine = describe_machine("cpu")
         write_text(options.json, json.dumps({"machine": vars(machine), "milliseconds": times}, indent=2) + "\n")

@@ -21,7 +21,6 @@ from mcdenoise.denoiser import PRECISIONS, Denoiser, Precision
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import pretrained_models
-from mcdenoise.plan import Plan
 from mcdenoise.results import Results
 
 _ROUNDS = 3
@@ -148,7 +147,7 @@ def _read(cache: Path) -> dict[str, dict[str, float]]:
 
 
 def _measure(choice: Choice, size: tuple[int, int], device: str) -> float:
-    denoiser = Denoiser(choice.model, precision=choice.precision, device=device, plan=Plan(keep_all=True))
+    denoiser = Denoiser(choice.model, precision=choice.precision, device=device, keep_all=True)
     frame = synthetic_frame(size[1], size[0]).to(device)
     times = []
     for _ in range(_ROUNDS + 2):

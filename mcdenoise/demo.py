@@ -12,15 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.benchmark import Settings, choose_candidates, run_benchmark
-from mcdenoise.frame import Frame
+from mcdenoise.benchmark import BASELINES, Score, Settings, choose_methods, run_benchmark, scores_of
 from mcdenoise.data import open_sequence
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
 from mcdenoise.demo_scene import demo_cameras, demo_scene
-from mcdenoise.denoise import SequenceReport, denoise_sequence, make_folder
-from mcdenoise.denoiser import Denoiser, Images
-from mcdenoise.evaluate import Score, Scorer
+from mcdenoise.folder import SequenceReport, denoise_sequence, make_folder
+from mcdenoise.frame import Frame
+from mcdenoise.methods import parse_method
 from mcdenoise.metrics import displayed
+from mcdenoise.models import DEFAULT, Output
 from mcdenoise.render import render_sequence
 from mcdenoise.report import check_packages, write_report
 from mcdenoise.results import FILE
@@ -38,11 +38,12 @@ class DemoResult:
     """What the demonstration made.
 
     Args:
-        scores: errors of the noisy, accumulated, initial and denoised images over the frames with references.
+        scores: errors of the noisy and the accumulated image, those on the way and the result, over the frames with
+            references.
         report: run times by stage, and what was done.
         picture: noisy, accumulated, denoised and reference side by side, with close-ups.
         denoised: folder of the clean EXRs.
-        page: the report of error against run time of all models and of what other denoisers are installed.
+        page: the report of error against run time of all methods.
     """
 
     scores: list[Score]
@@ -55,7 +56,7 @@ class DemoResult:
 def run_demo(
     out: Path,
     *,
-    model: str = "cascaded",
+    model: str = DEFAULT,
     variant: str | None = "scalar_rgb",
     on_render: Callable[[int, int], None] = lambda done, total: None,
     on_frame: Callable[[], None] = lambda: None,
@@ -67,7 +68,7 @@ def run_demo(
 
     Args:
         out: folder to write to: ``sequence/``, ``denoised/``, ``demo.png`` and ``report/``.
-        model: name of a model with shipped weights.
+        model: see :func:`mcdenoise.methods.parse_method`.
         variant: of Mitsuba; ``"scalar_rgb"`` needs nothing but its package.
         on_render: called with finished and total paths a pixel.
         on_frame: called after each denoised frame.
@@ -78,7 +79,8 @@ def run_demo(
             written to.
     """
     check_packages()
-    denoiser = Denoiser(model)
+    spelling = parse_method(model)
+    denoiser = spelling.denoiser()
     make_folder(out)
     render_sequence(
         demo_scene(),
@@ -91,40 +93,44 @@ def run_demo(
         progress=on_render,
     )
     sequence = open_sequence(out / "sequence")
-    scorer = Scorer("demo")
-    last: list[tuple[Frame, Images]] = []
+    last: list[tuple[Frame, Output]] = []
 
-    def show(frame: Frame, images: Images) -> None:
-        scorer.add(frame, images)
-        last[:] = [(frame, images)]
+    def show(frame: Frame, output: Output) -> None:
+        last[:] = [(frame, output)]
         on_frame()
 
-    report = denoise_sequence(sequence, out / "denoised", denoiser, model, references=True, on_images=show)
+    report = denoise_sequence(sequence, out / "denoised", denoiser, spelling.name, references=True, on_output=show)
     picture = out / "demo.png"
     write_png(picture, _sheet(*last[0]))
-    page = write_report(_compare(out, on_compare))
-    return DemoResult(scorer.scores(), report, picture, out / "denoised", page)
+    folder, scores = _compare(out, model, on_compare)
+    names = {*BASELINES, spelling.name, *(f"{spelling.name}, {stage}" for stage in last[0][1].stages)}
+    shown = [score for score in scores if score.method in names]
+    return DemoResult(shown, report, picture, out / "denoised", write_report(folder))
 
 
-def _compare(out: Path, on_step: Callable[[int, int], None]) -> Path:
-    """All models and peers on the frames of the demonstration; the folder of the results."""
+def _compare(out: Path, model: str, on_step: Callable[[int, int], None]) -> tuple[Path, list[Score]]:
+    """All methods on the frames of the demonstration; the folder of the results, and the errors."""
     folder, threads = out / "report", torch.get_num_threads()
     if (folder / FILE).exists():
         shutil.rmtree(folder)
     settings = Settings(
-        rounds=1, threads=threads, pictures=len(REFERENCE_FRAMES), command=f"mcdenoise demo -o {shlex.quote(str(out))}"
+        rounds=1,
+        threads=threads,
+        pictures=len(REFERENCE_FRAMES),
+        on_the_way=True,
+        command=f"mcdenoise demo -o {shlex.quote(str(out))} --model {shlex.quote(model)}",
     )
     sequence = replace(open_sequence(out / "sequence"), name="demo")
-    run_benchmark([sequence], choose_candidates(threads=threads), folder, settings, on_step=on_step)
-    return folder
+    methods = choose_methods(baselines=(*BASELINES, model))
+    return folder, scores_of(run_benchmark([sequence], methods, folder, settings, on_step=on_step))
 
 
-def _sheet(frame: Frame, images: Images) -> Picture:
-    """A frame four times side by side, and under each image a close-up."""
+def _sheet(frame: Frame, output: Output) -> Picture:
+    """A frame several times side by side, and under each image a close-up."""
     shown = {
-        "1 sample a pixel": images.noisy,
-        "accumulated": images.accumulated,
-        "denoised": images.denoised,
+        "1 sample a pixel": frame.color,
+        "accumulated": output.stages.get("accumulated"),
+        "denoised": output.image,
         f"reference, {REFERENCE_SPP} samples": frame.reference,
     }
     return np.concatenate([_column(text, image) for text, image in shown.items() if image is not None], 1)

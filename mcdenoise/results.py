@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from mcdenoise.data.files import write_text
+from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
 
 FILE = "results.json"
 OPS_FILE = "ops.json"
 IMAGES = "images"
-VERSION = 1
+VERSION = 2
 STAGES = ("read", "accumulate", "network", "filter", "write")
-# Ends the name of a model that leaves nothing out, beside the same model that does.
+# Ends the name of a method that skips nothing, beside the same method that does.
 KEEP_ALL = ", keep all"
-Kind = Literal["model", "peer", "baseline"]
+Kind = Literal["trainable", "fixed", "baseline"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Machine:
         cores: logical cores that the process may use.
         memory: gibibytes.
         device: ``cpu``, or the name of the GPU.
-        threads: of torch and of every peer.
+        threads: of torch and of every method.
         system: operating system and its version.
         packages: versions by name, those that were measured.
     """
@@ -99,13 +100,18 @@ class Scene:
 
 @dataclass(frozen=True)
 class Method:
-    """One way to get an image.
+    """One way to get an image: a model with settings, as :class:`mcdenoise.denoiser.Denoiser` takes it.
 
     Args:
-        name: unique, such as ``cascaded`` or ``OIDN fast, clean aux, raw``.
-        kind: a model of the package, a peer, or a baseline (``noisy`` does nothing, ``accumulated`` only accumulates).
+        name: unique, such as ``cascaded_v2`` or ``oidn(quality=fast)``.
+        kind: a model that learns, one that does not, or a baseline (``noisy`` does nothing, ``accumulated`` only
+            accumulates).
         folder: name of its folder in ``images/SCENE``.
-        family: what to colour alike, such as ``OIDN``.
+        model: its name, or ``path/to/file.py:factory``; what is of one model is coloured alike.
+        settings: for the model's constructor.
+        weights: path of the weights file; empty for the shipped weights, or none.
+        precision: of convolutions.
+        keep_all: whether nothing is skipped.
         parameters: number of weights of a network, where that is known.
         missing: why it could not be run at all, such as a package that is not installed; else ``""``.
     """
@@ -113,7 +119,11 @@ class Method:
     name: str
     kind: Kind
     folder: str
-    family: str
+    model: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    weights: str = ""
+    precision: Precision = "float32"
+    keep_all: bool = False
     parameters: int | None = None
     missing: str = ""
 
@@ -128,13 +138,14 @@ class Cell:
         errors: mean over the scored frames, by name in :data:`mcdenoise.evaluate.METRICS`.
         errors_spread: median and quartiles over the scored frames, by the same names.
         whole: milliseconds a frame, from reading to writing.
-        stages: milliseconds a frame of each stage, by name in :data:`STAGES`; what a method does not do is left out.
+        stages: milliseconds a frame of each stage that a method has, by name in :data:`STAGES`.
         memory: peak memory in mebibytes that making the method and denoising two frames added, in a process of its own
             (on a GPU: there), where it could be measured; of the first scene of this size.
         failure: why the method failed on this scene; nothing else is known then.
         computing: milliseconds a frame of what happens in memory, without reading and writing files; measured around
             all of it, so that the stages may add up to a little less.
-        plan: of a model, what was left out of the scene and why, see :func:`mcdenoise.plan.summarize`.
+        plan: what was skipped of the scene and why, see :func:`mcdenoise.models.summarize`.
+        on_the_way: errors of the images on the way to the result, by stage, where they were asked for.
     """
 
     scene: str
@@ -147,18 +158,19 @@ class Cell:
     failure: str = ""
     computing: Spread | None = None
     plan: list[dict[str, Any]] = field(default_factory=list)
+    on_the_way: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class LeftOut:
-    """What a model left out of a scene, and what that brought.
+class Skipped:
+    """What a method skipped of a scene, and what that brought.
 
     Args:
         scene: name.
         method: name.
-        stages: what was left out, and how much of it.
-        saved: milliseconds a frame less than the same model that leaves nothing out, without files; ``None`` where that
-            was not measured.
+        stages: what was skipped, and how much of it.
+        saved: milliseconds a frame less than the same method that skips nothing, without files; ``None`` where that was
+            not measured.
         change: by name of a metric, by how much the error differs from that of the other.
     """
 
@@ -222,7 +234,7 @@ class Results:
         costs: by method and size.
         fits: by method.
         version: of this format.
-        notes: what to know about the run as a whole, such as a metric that is left out, and why.
+        notes: what to know about the run as a whole, such as a metric that was not computed, and why.
     """
 
     command: str
@@ -246,21 +258,21 @@ class Results:
         """What is known of a method on a scene."""
         return next((one for one in self.cells if (one.scene, one.method) == (scene, method)), None)
 
-    def left_out(self) -> list[LeftOut]:
-        """What each model left out of each scene, where it did."""
+    def skipped(self) -> list[Skipped]:
+        """What each method skipped of each scene, where it did."""
         rows = []
         for cell in self.cells:
-            shares = {row["stage"]: row["left_out"] for row in cell.plan if row["left_out"] > 0}
-            if cell.method.endswith(KEEP_ALL) or not shares:
+            fractions = {row["stage"]: row["skipped"] for row in cell.plan if row["skipped"] > 0}
+            if cell.method.endswith(KEEP_ALL) or not fractions:
                 continue
             whole = self.cell(cell.scene, cell.method + KEEP_ALL)
-            row = LeftOut(cell.scene, cell.method, ", ".join(f"{name} {share:.0%}" for name, share in shares.items()))
+            row = Skipped(cell.scene, cell.method, ", ".join(f"{name} {part:.0%}" for name, part in fractions.items()))
             if whole is not None and whole.computing is not None and cell.computing is not None:
                 saved = whole.computing.median - cell.computing.median
                 change = {
                     name: value - whole.errors[name] for name, value in cell.errors.items() if name in whole.errors
                 }
-                row = LeftOut(row.scene, row.method, row.stages, saved, change)
+                row = replace(row, saved=saved, change=change)
             rows.append(row)
         return rows
 

@@ -1,17 +1,26 @@
-"""Error against run time: every chosen denoiser on the same frames, in the same run, taking turns."""
+"""Error against run time: every chosen method on the same frames, in the same run, taking turns."""
 
-from mcdenoise.benchmark.methods import PEERS, Candidate, Runner, choose_candidates
+from mcdenoise.benchmark.comparison import Score, Verdict, folded, mean_over_scenes, scores_of, summary, verdicts
+from mcdenoise.benchmark.methods import BASELINES, COMPARED, Timed, choose_methods, make_method
 from mcdenoise.benchmark.operators import benchmark_ops
 from mcdenoise.benchmark.run import Settings, run_benchmark
 from mcdenoise.benchmark.sizes import parse_sizes
 
 __all__ = [
-    "PEERS",
-    "Candidate",
-    "Runner",
+    "BASELINES",
+    "COMPARED",
+    "Score",
     "Settings",
+    "Timed",
+    "Verdict",
     "benchmark_ops",
-    "choose_candidates",
+    "choose_methods",
+    "folded",
+    "make_method",
+    "mean_over_scenes",
     "parse_sizes",
     "run_benchmark",
+    "scores_of",
+    "summary",
+    "verdicts",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import multiprocessing
 import os
 import signal
@@ -14,10 +15,12 @@ from pathlib import Path
 import torch
 
 from mcdenoise.benchmark.machine import fix_threads
-from mcdenoise.benchmark.methods import Candidate, Runner
+from mcdenoise.benchmark.methods import make_method
 from mcdenoise.frame import Frame
+from mcdenoise.results import Method
 
 Frames = Callable[[], list[Frame]]
+Make = Callable[[], Callable[[Frame], object]]
 
 _STATUS, _FORGET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 # What methods import, at the latest when they are called: torch the second of these, with the first operator of ours.
@@ -37,17 +40,16 @@ class Peaks:
         self._threads, self._device = threads, device
         self._known: dict[tuple[str, tuple[int, int]], float | None] = {}
 
-    def of(self, candidate: Candidate, size: tuple[int, int], frames: Frames) -> float | None:
+    def of(self, method: Method, size: tuple[int, int], frames: Frames) -> float | None:
         """See :func:`peak_memory`; ``frames`` are of the size, and read only if it was not asked for before."""
-        key = candidate.method.name, size
+        key = method.name, size
         if key not in self._known:
-            self._known[key] = peak_memory(candidate.make, frames, threads=self._threads, device=self._device)
+            make = functools.partial(make_method, method, threads=self._threads, device=self._device)
+            self._known[key] = peak_memory(make, frames, threads=self._threads, device=self._device)
         return self._known[key]
 
 
-def peak_memory(
-    make: Callable[[], Runner], frames: Frames, *, threads: int, device: str, seconds: float = _SECONDS
-) -> float | None:
+def peak_memory(make: Make, frames: Frames, *, threads: int, device: str, seconds: float = _SECONDS) -> float | None:
     """Memory that making a method and denoising some frames adds at its peak: weights, history and all.
 
     On a CPU it is the peak of the resident set in a fresh process, less the resident set before: the frames are there
@@ -57,7 +59,8 @@ def peak_memory(
     itself is not seen.
 
     Args:
-        make: see :class:`mcdenoise.benchmark.methods.Candidate`.
+        make: makes the method, whose first calls may still warm up; another process must be able to call it: a function
+            of a module, or :func:`functools.partial` of one.
         frames: reads or makes the frames, on the CPU; another process must be able to call it.
         threads: of the method.
         device: ``"cpu"`` or ``"cuda"``.
@@ -90,7 +93,7 @@ def peak_memory(
         process.join()
 
 
-def _send_peak(sender: Connection, make: Callable[[], Runner], frames: Frames, threads: int) -> None:
+def _send_peak(sender: Connection, make: Make, frames: Frames, threads: int) -> None:
     # Ctrl+C reaches every process of a terminal; the first one ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -106,7 +109,7 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _peak_of_this_process(make: Callable[[], Runner], frames: Frames, threads: int) -> float:
+def _peak_of_this_process(make: Make, frames: Frames, threads: int) -> float:
     fix_threads(threads)
     shown = frames()
     _FORGET_PEAK.write_text("5")
@@ -123,7 +126,7 @@ def _status(name: str) -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
 
 
-def _peak_on_gpu(make: Callable[[], Runner], frames: Frames) -> float | None:
+def _peak_on_gpu(make: Make, frames: Frames) -> float | None:
     shown = [frame.to("cuda") for frame in frames()]
     before = torch.cuda.memory_allocated()
     torch.cuda.reset_peak_memory_stats()

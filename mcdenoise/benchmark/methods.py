@@ -1,223 +1,148 @@
-"""What takes part in a benchmark: models, peers and baselines, each called with a frame and timed stage by stage."""
+"""What takes part in a benchmark: methods by name, each a :class:`mcdenoise.denoiser.Denoiser` timed stage by stage."""
 
 from __future__ import annotations
 
-import functools
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from mcdenoise.benchmark.machine import Moment, Stopwatch
-from mcdenoise.frame import Frame
-from mcdenoise.denoiser import PRECISIONS, Denoiser, Images, Precision
+from mcdenoise.denoiser import PRECISIONS, Denoiser
 from mcdenoise.errors import InputError
-from mcdenoise.history import History
-from mcdenoise.models import FusionModule, UNet, create_model, describe_weights, pretrained_models
-from mcdenoise.ops import remodulate
-from mcdenoise.peers import QUALITIES, JointBilateral, Oidn, OidnPeer, Peer, Quality
-from mcdenoise.plan import Plan, Stage
+from mcdenoise.frame import Frame
+from mcdenoise.methods import Spelling, parse_method, split_methods
+from mcdenoise.models import Output, Skipping, parts_of, pretrained_models
+from mcdenoise.nn import FusionModule, LogFusion, UNet
 from mcdenoise.results import KEEP_ALL, Kind, Method
 
-PEERS = ("oidn", "bilateral")
+BASELINES = ("noisy", "accumulated")
+PRETRAINED = "pretrained"
+# What is compared by default: filters in a narrow and a wide setting, other denoisers, and all shipped weights.
+COMPARED = (
+    "joint_bilateral(sigma_color=0.1, sigma_space=1.5),joint_bilateral(sigma_color=0.2, sigma_space=4.0),svgf,"
+    f"oidn(quality=fast|balanced|high, auxiliary=clean, source=raw|accumulated),{PRETRAINED}"
+)
 
-# Of the plain filter: a narrow and a wide one.
-_BILATERAL_SETTINGS = ((0.1, 1.5), (0.2, 4.0))
 
+class Timed:
+    """A denoiser whose frames are timed by stages.
 
-class Runner(Protocol):
-    """A method at work on the frames of a shot.
+    The stages are ``accumulate`` (all that goes before: looking at every value, demodulation, accumulation, planning),
+    ``network`` (U-Nets and convolutions, wherever in the model they are) and ``filter`` (all the rest: kernels, fusion,
+    remodulation, and a method that says nothing of itself). The second is told from the third by hooks on the modules,
+    which read a clock.
 
     Args:
+        denoiser: any.
+
+    Attributes:
         stages: milliseconds of each stage of the last call, by name in :data:`mcdenoise.results.STAGES`.
     """
 
-    stages: dict[str, float]
-
-    def reset(self) -> None:
-        """Forget the past: the next frame is the first of a shot."""
-        ...
-
-    def __call__(self, frame: Frame) -> Tensor:
-        """Denoise the next frame.
-
-        Args:
-            frame: valid values (:meth:`mcdenoise.frame.Frame.validate`), on the device.
-
-        Returns:
-            ``(1, 3, H, W)`` float32 scene-linear radiance with albedo, on the device.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A method that could take part.
-
-    Args:
-        method: what it is, and why it is missing where it is.
-        make: makes it ready; its first call may still warm up. To have its memory measured, other processes must be
-            able to call it too: a function of a module, or :func:`functools.partial` of one.
-    """
-
-    method: Method
-    make: Callable[[], Runner]
-
-
-class ModelRunner:
-    """A model with everything :class:`mcdenoise.denoiser.Denoiser` does around it.
-
-    Its stages are ``accumulate`` (also looking at every value, and planning), ``network`` (U-Nets and convolutions) and
-    ``filter`` (all the rest: kernel weights, kernel convolution, fusion, remodulation). The second is told from the
-    third by hooks on the modules, which read a clock.
-
-    Args:
-        model: see :class:`mcdenoise.denoiser.Denoiser`.
-        weights: of a model given by name.
-        precision: of the convolutions.
-        device: where to run.
-        keep_all: leave nothing out that a scene does not need.
-    """
-
-    def __init__(
-        self,
-        model: str | nn.Module,
-        weights: Path | None = None,
-        precision: Precision = "float32",
-        device: str = "cpu",
-        keep_all: bool = False,
-    ) -> None:
+    def __init__(self, denoiser: Denoiser) -> None:
+        self.denoiser = denoiser
         self.stages: dict[str, float] = {}
-        plan = Plan(keep_all=keep_all)
-        self._denoiser = Denoiser(model, weights=weights, precision=precision, device=device, plan=plan)
-        self._watch = Stopwatch(device)
+        self._watch = Stopwatch(denoiser.device)
         self._marks: list[Moment] = []
-        self._networks = list(_networks(self._denoiser.model))
+        self._networks = list(_networks(denoiser.model))
         for module in self._networks:
             module.register_forward_pre_hook(self._mark)
             module.register_forward_hook(self._mark)
 
-    @property
-    def planned(self) -> list[Stage]:
-        """What was left out of the last frame."""
-        return self._denoiser.report.stages
-
-    def reset(self) -> None:
-        """See :class:`Runner`."""
-        self._denoiser.reset()
-
     def __call__(self, frame: Frame) -> Tensor:
-        """See :class:`Runner`."""
+        """Denoise the next frame of a shot."""
         self._marks.clear()
-        image = self._denoiser(frame)
-        times = self._denoiser.report.milliseconds
+        start = self._watch.mark()
+        image = self.denoiser(frame)
+        whole = self._watch.between(start, self._watch.mark())
+        times = self.denoiser.report.milliseconds
+        before = sum(times.get(stage, 0.0) for stage in ("validate", "accumulate", "plan"))
         pairs = zip(self._marks[::2], self._marks[1::2], strict=True)
-        network = sum(self._watch.between(start, end) for start, end in pairs) if self._networks else times["network"]
-        self.stages = {
-            "accumulate": times["validate"] + times["plan"] + times["accumulate"],
-            "network": network,
-            # On a GPU the two are told by different clocks.
-            "filter": max(times["network"] - network, 0.0) + times["remodulate"],
-        }
+        network = sum(self._watch.between(begin, end) for begin, end in pairs)
+        if not self._networks:
+            network = times.get("network", 0.0)
+        # On a GPU they are told by different clocks.
+        self.stages = {"accumulate": before, "network": network, "filter": max(whole - before - network, 0.0)}
+        if not network:
+            del self.stages["network"]
         return image
+
+    def output(self, frame: Frame) -> Output:
+        """The same with the images on the way to the result; is not timed."""
+        output = self.denoiser.output(frame)
+        self._marks.clear()
+        return output
 
     def _mark(self, *_: Any) -> None:
         self._marks.append(self._watch.mark())
 
 
-class PeerRunner:
-    """A peer, or nothing, on the image it starts from.
-
-    What starts from the accumulated image pays for it: stage ``accumulate``, the same that a model pays for. What
-    starts from the noisy one has no such stage.
+def make_method(method: Method, *, threads: int | None = None, device: str = "cpu") -> Timed:
+    """A method at work.
 
     Args:
-        peer: without one, the image to start from is the result.
-        accumulates: start from the accumulated image, else from the noisy one.
-        stage: what the peer's own work counts as.
-        device: where to run, as far as the peer can choose.
-    """
-
-    def __init__(
-        self,
-        peer: Peer | None = None,
-        accumulates: bool = False,
-        stage: Literal["network", "filter"] = "filter",
-        device: str = "cpu",
-    ) -> None:
-        self.stages: dict[str, float] = {}
-        self._peer, self._accumulates, self._stage = peer, accumulates, stage
-        self._history = History()
-        self._watch = Stopwatch(device)
-
-    def reset(self) -> None:
-        """See :class:`Runner`."""
-        self._history.reset()
-        if self._peer is not None:
-            self._peer.reset()
-
-    @torch.inference_mode()
-    def __call__(self, frame: Frame) -> Tensor:
-        """See :class:`Runner`."""
-        self.stages = {}
-        image = frame.color
-        start = self._watch.mark()
-        if self._accumulates:
-            frame, _ = frame.validate()
-            frame = frame.with_depth()
-            image = self._history.update(frame).color
-            if frame.albedo is not None:
-                image = remodulate(image, frame.albedo)
-            self.stages["accumulate"] = self._watch.between(start, self._watch.mark())
-        if self._peer is None:
-            return image
-        start = self._watch.mark()
-        result = self._peer(frame, Images(frame.color, image, image, image))
-        self.stages[self._stage] = self._watch.between(start, self._watch.mark())
-        return result
-
-
-def choose_candidates(
-    models: str | None = None,
-    peers: str = "all",
-    *,
-    precisions: str = ",".join(PRECISIONS),
-    threads: int = 1,
-    device: str = "cpu",
-    keep_all: bool = False,
-) -> list[Candidate]:
-    """The baselines, and the chosen peers and models.
-
-    Args:
-        models: names of models with shipped weights, or weights files (``*.safetensors``), separated by commas;
-            ``"none"``, or by default all with shipped weights.
-        peers: names in :data:`PEERS`, separated by commas; ``"all"`` or ``"none"``. One whose package is not installed
-            is there as missing.
-        precisions: of the models' convolutions, separated by commas: ``float32``, ``bfloat16``.
-        threads: of the peers that do not ask torch.
-        device: where to run, ``"cpu"`` or ``"cuda"``; Open Image Denoise runs on the CPU.
-        keep_all: have each model twice, the second time leaving nothing out that a scene does not need.
+        method: which.
+        threads: of a model that does not ask torch and has a setting ``threads``.
+        device: where to run.
 
     Raises:
-        InputError: a model, peer or precision is unknown, or a model has no weights.
+        InputError: see :class:`mcdenoise.denoiser.Denoiser`.
     """
-    wanted = _names(peers, "--peers", PEERS)
-    kinds = [precision for precision in PRECISIONS if precision in _names(precisions, "--precisions", PRECISIONS)]
-    candidates = [
-        _candidate("noisy", "baseline", "baseline", functools.partial(PeerRunner, device=device)),
-        _candidate("accumulated", "baseline", "baseline", functools.partial(PeerRunner, None, True, device=device)),
-    ]
-    if "bilateral" in wanted:
-        candidates += [_bilateral_candidate(color, space, device) for color, space in _BILATERAL_SETTINGS]
-    if "oidn" in wanted:
-        candidates += _oidn_candidates(threads, device)
-    for model in pretrained_models() if models is None else _list(models, "--models"):
-        candidates += _model_candidates(model, kinds, device, keep_all)
-    return _with_folders(candidates)
+    spelling = Spelling(method.model, Path(method.weights) if method.weights else None, method.settings)
+    more = {"threads": threads} if threads is not None and spelling.takes("threads") else {}
+    return Timed(spelling.denoiser(precision=method.precision, device=device, keep_all=method.keep_all, **more))
+
+
+def choose_methods(
+    names: str | None = None,
+    *,
+    precisions: str = ",".join(PRECISIONS),
+    keep_all: bool = False,
+    baselines: Collection[str] = BASELINES,
+) -> list[Method]:
+    """The baselines, and the methods that are named.
+
+    Args:
+        names: spellings of methods separated by commas, see :func:`mcdenoise.methods.split_methods`; ``"pretrained"``
+            stands for all models with shipped weights, ``"all"`` (or ``None``) for :data:`COMPARED`, ``"none"`` for
+            none.
+        precisions: of the convolutions of what learns, separated by commas: ``float32``, ``bfloat16``.
+        keep_all: have each method that skips what a scene does not need twice, the second time skipping nothing.
+        baselines: methods that are there in any case, first.
+
+    Returns:
+        The methods; one whose package is not installed, and one of ``"all"`` that cannot be had, is there as missing.
+
+    Raises:
+        InputError: a method or precision is unknown, or a model has no weights.
+    """
+    chosen = [each.strip() for each in precisions.split(",")]
+    for name in chosen:
+        if name not in PRECISIONS:
+            raise InputError(f"--precisions: expected some of {', '.join(PRECISIONS)}, found '{name}'")
+    everything = names is None or names == "all"
+    text = COMPARED if names is None or names == "all" else names
+    methods: list[Method] = []
+    for spelt in [*baselines, *(split_methods(text) if text != "none" else ())]:
+        for one in pretrained_models() if spelt == PRETRAINED else [spelt]:
+            spelling = parse_method(one)
+            if spelling.name in {method.name for method in methods}:
+                continue
+            kind: Kind = "baseline" if one in BASELINES else "fixed"
+            method = Method(spelling.name, kind, "", spelling.model, spelling.settings, str(spelling.weights or ""))
+            try:
+                model = spelling.denoiser().model
+            except InputError as error:
+                if not (everything or one in BASELINES or isinstance(error.__cause__, ImportError)):
+                    raise
+                methods.append(replace(method, missing=str(error)))
+                continue
+            methods += _variants(method, model, chosen, keep_all)
+    return _with_folders(methods)
 
 
 def one_line(error: BaseException) -> str:
@@ -226,106 +151,40 @@ def one_line(error: BaseException) -> str:
     return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"
 
 
-def _names(text: str, option: str, known: Sequence[str]) -> Sequence[str]:
-    if text == "all":
-        return known
-    names = _list(text, option)
-    for name in names:
-        if name not in known:
-            raise InputError(f"{option}: expected some of {', '.join(known)}, or all, or none, found '{name}'")
-    return names
+def _variants(method: Method, model: Any, precisions: list[str], keep_all: bool) -> Iterator[Method]:
+    """A model in all precisions, where it has any, and also with nothing skipped, where it skips anything."""
+    if not model.needs.trainable:
+        yield method
+        return
+    weights = sum(parameter.numel() for parameter in model.parameters()) if isinstance(model, nn.Module) else None
+    whole = (False, True) if keep_all and next(parts_of(model, Skipping), None) else (False,)
+    for precision in PRECISIONS:
+        for everything in whole if precision in precisions else ():
+            name = method.name if precision == "float32" else f"{method.name}, {precision}"
+            name += KEEP_ALL if everything else ""
+            yield replace(
+                method, name=name, kind="trainable", precision=precision, keep_all=everything, parameters=weights
+            )
 
 
-def _list(text: str, option: str) -> list[str]:
-    if text == "none":
-        return []
-    names = [name.strip() for name in text.split(",")]
-    if "" in names or len(set(names)) < len(names):
-        raise InputError(f"{option}: expected different names separated by commas, or none, found '{text}'")
-    return names
-
-
-def _candidate(name: str, kind: Kind, family: str, make: Callable[[], Runner], **about: Any) -> Candidate:
-    return Candidate(Method(name, kind, _folder(name), family, **about), make)
-
-
-def _folder(name: str) -> str:
-    return re.sub(r"[^a-z0-9._]+", "-", name.lower()).strip("-.") or "method"
-
-
-def _with_folders(candidates: list[Candidate]) -> list[Candidate]:
+def _with_folders(methods: list[Method]) -> list[Method]:
     """Each with a folder of its own; names that differ in their marks only are numbered."""
     taken = {"reference"}
     unique = []
-    for candidate in candidates:
-        first = folder = candidate.method.folder
+    for method in methods:
+        first = folder = re.sub(r"[^a-z0-9._]+", "-", method.name.lower()).strip("-.") or "method"
         number = 2
         while folder in taken:
             folder, number = f"{first}-{number}", number + 1
         taken.add(folder)
-        unique.append(replace(candidate, method=replace(candidate.method, folder=folder)))
+        unique.append(replace(method, folder=folder))
     return unique
 
 
-def _model_candidates(model: str, precisions: list[Precision], device: str, keep_all: bool) -> Iterator[Candidate]:
-    path = Path(model) if model.endswith(".safetensors") else None
-    name = model if path is None else path.stem
-    architecture = model if path is None else str(describe_weights(path)["architecture"])
-    made = create_model(architecture, pretrained=path is None, weights=path)
-    parameters = sum(parameter.numel() for parameter in made.parameters())
-    for precision in precisions:
-        for everything in (False, True) if keep_all else (False,):
-            full_name = name if precision == "float32" else f"{name}, {precision}"
-            yield _candidate(
-                full_name + KEEP_ALL if everything else full_name,
-                "model",
-                name,
-                functools.partial(ModelRunner, architecture, path, precision, device, everything),
-                parameters=parameters,
-            )
-
-
-def _bilateral_candidate(color: float, space: float, device: str) -> Candidate:
-    peer = JointBilateral(color, space)
-    return _candidate(peer.name, "peer", peer.family, functools.partial(PeerRunner, peer, True, "filter", device))
-
-
-def _oidn_candidates(threads: int, device: str) -> list[Candidate]:
-    try:
-        _oidn(threads)
-        missing = ""
-    except InputError as error:
-        missing = str(error)
-    settings: list[tuple[Quality, Literal["raw", "accumulated"]]] = [
-        (quality, source) for source in ("raw", "accumulated") for quality in QUALITIES
-    ]
-    return [
-        _candidate(
-            f"OIDN {quality}, clean aux, {source}",
-            "peer",
-            "OIDN",
-            functools.partial(_oidn_runner, quality, source, threads, device),
-            missing=missing,
-        )
-        for quality, source in settings
-    ]
-
-
-def _oidn_runner(quality: Quality, source: Literal["raw", "accumulated"], threads: int, device: str) -> Runner:
-    peer = OidnPeer(_oidn(threads), quality, "clean", source)
-    return PeerRunner(peer, source == "accumulated", "network", device)
-
-
-@functools.cache
-def _oidn(threads: int) -> Oidn:
-    """One for all settings: they share its buffers."""
-    return Oidn(threads=threads)
-
-
-def _networks(model: nn.Module) -> Iterator[nn.Module]:
+def _networks(model: Any) -> Iterator[nn.Module]:
     """The U-Nets and convolutions of a model, outermost only; the fusion of scales is part of the filter."""
-    for child in model.children():
-        if isinstance(child, UNet | nn.Sequential | nn.Conv2d | nn.ConvTranspose2d):
-            yield child
-        elif not isinstance(child, FusionModule):
+    if isinstance(model, UNet | nn.Sequential | nn.Conv2d | nn.ConvTranspose2d):
+        yield model
+    elif isinstance(model, nn.Module) and not isinstance(model, FusionModule | LogFusion):
+        for child in model.children():
             yield from _networks(child)

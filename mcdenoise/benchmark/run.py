@@ -16,20 +16,24 @@ from torch import Tensor
 
 from mcdenoise.benchmark.machine import Stopwatch, check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.memory import Peaks
-from mcdenoise.benchmark.methods import Candidate, ModelRunner, Runner, one_line
+from mcdenoise.benchmark.methods import Timed, make_method, one_line
 from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import Size, measure_sizes
 from mcdenoise.benchmark.tables import write_csv
-from mcdenoise.frame import Frame
 from mcdenoise.data import Sequence, open_sequence, write_exr
 from mcdenoise.data.files import new_folder
 from mcdenoise.data.sequences import with_unique_names
 from mcdenoise.errors import InputError
-from mcdenoise.evaluate import check_references, reference_noise
-from mcdenoise.plan import Stage, summarize
-from mcdenoise.results import IMAGES, STAGES, Cell, Cost, Fit, Results, Scene, Spread
+from mcdenoise.evaluate import METRICS, check_references, reference_noise
+from mcdenoise.frame import Frame
+from mcdenoise.models import Output, Stage, summarize
+from mcdenoise.results import IMAGES, STAGES, Cell, Method, Results, Scene, Spread
 
 _WHOLE, _COMPUTING = "whole", "computing"
+# Hands its input on: the time of looking at it is nobody's.
+_NOTHING = "noisy"
+# Images on the way that are those of a method of their own.
+_METHODS_TOO = ("noisy", "accumulated")
 
 
 @dataclass(frozen=True)
@@ -37,11 +41,15 @@ class Settings:
     """How to measure.
 
     Args:
-        rounds: how often each method denoises each frame, and an image of each size, without warming up.
-        threads: of torch, of the peers, and of reading and writing EXRs.
+        rounds: how often each method denoises each frame, and an image of each size, without warming up; with 0, errors
+            are all that is measured.
+        threads: of torch, of methods that do not ask torch, and of reading and writing EXRs.
         device: ``"cpu"`` or ``"cuda"``.
         sizes: widths and heights for the cost over pixels, see :func:`mcdenoise.benchmark.parse_sizes`.
         pictures: of how many frames of each scene the images are kept, at most.
+        metrics: names in :data:`mcdenoise.evaluate.METRICS`.
+        flip_every: FLIP is slow: compute it for the first of so many frames with a reference.
+        on_the_way: whether to compare the images on the way to a result, too, such as ``initial``.
         command: the command line, to be stored with the results.
 
     Raises:
@@ -53,18 +61,22 @@ class Settings:
     device: str = "cpu"
     sizes: tuple[Size, ...] = ()
     pictures: int = 4
+    metrics: tuple[str, ...] = tuple(METRICS)
+    flip_every: int = 1
+    on_the_way: bool = False
     command: str = ""
 
     def __post_init__(self) -> None:
-        for name, least in (("rounds", 1), ("threads", 1), ("pictures", 0)):
+        for name, least in (("rounds", 0), ("threads", 1), ("pictures", 0), ("flip_every", 1)):
             if getattr(self, name) < least:
-                raise InputError(f"--{name}: expected at least {least}, found {getattr(self, name)}")
+                option = name.replace("_", "-")
+                raise InputError(f"--{option}: expected at least {least}, found {getattr(self, name)}")
         check_device(self.device)
 
 
 def run_benchmark(
     sequences: list[Sequence],
-    candidates: list[Candidate],
+    methods: list[Method],
     out: Path,
     settings: Settings | None = None,
     *,
@@ -75,15 +87,16 @@ def run_benchmark(
     Of each scene, all methods denoise one frame after the other, taking turns on each: A B C, A B C. The first pass
     over the frames warms up: it is not timed; images are compared with the references, and kept, there. Then every
     round is a pass that is timed. As all see every frame in its order, all histories are right; the first frame of a
-    pass has none, and is not counted where there are others.
+    pass has none, and is not counted where there are others. A frame that does not follow the one before it has none
+    either.
 
     The stages: ``read`` is reading all buffers of a frame and bringing them to the device; it is done once for all
-    methods. Then :class:`mcdenoise.benchmark.methods.ModelRunner` and ``PeerRunner``. ``write`` is bringing the image
-    back and writing it as ``mcdenoise denoise`` does, into the folder of the results.
+    methods. Then those of :class:`Timed`. ``write`` is bringing the image back and writing it as ``mcdenoise denoise``
+    does, into the folder of the results.
 
     Args:
         sequences: frames with references.
-        candidates: the methods; those that are missing are listed as such.
+        methods: see :func:`choose_methods`; those that are missing are listed as such.
         out: folder to make: ``results.json``, ``results.csv`` and ``images/SCENE/METHOD/N.exr``. It comes into being
             when all is done.
         settings: how to measure; sets the threads of torch.
@@ -101,36 +114,44 @@ def run_benchmark(
         check_references(sequence)
     fix_threads(settings.threads)
     total = sum((settings.rounds + 1) * len(sequence) for sequence in sequences)
-    total += len(settings.sizes) * (settings.rounds + 2)
+    sizes = list(settings.sizes) if settings.rounds else []
+    total += len(sizes) * (settings.rounds + 2)
     steps = iter(range(1, total + 1))
 
     def step() -> None:
         on_step(next(steps), total)
 
     with new_folder(out) as folder:
-        left_out: dict[str, str] = {}
-        present = [candidate for candidate in candidates if not candidate.method.missing]
-        made = _Made(present, Peaks(settings.threads, settings.device))
+        skipped: dict[str, str] = {}
+        made = _Made(methods, settings)
         scenes: list[Scene] = []
         cells: list[Cell] = []
         for sequence in with_unique_names(sequences):
-            run = _SceneRun(sequence, present, made, folder, settings)
+            run = _SceneRun(sequence, made, folder, settings)
             scene, own = run.measure(step)
-            left_out |= run.errors.left_out
+            skipped |= run.errors.skipped
             scenes.append(scene)
             cells += own
-        costs, fits = _costs(present, made, settings, step)
+        costs, fits = measure_sizes(
+            [method for method in made.methods if method.model != _NOTHING],
+            made.denoisers,
+            sizes,
+            rounds=settings.rounds,
+            threads=settings.threads,
+            device=settings.device,
+            on_step=step,
+        )
         results = Results(
             command=settings.command,
             created=datetime.now(UTC).isoformat(timespec="seconds"),
             machine=describe_machine(settings.device),
             rounds=settings.rounds,
             scenes=scenes,
-            methods=[candidate.method for candidate in candidates],
+            methods=methods,
             cells=cells,
             costs=costs,
             fits=fits,
-            notes=[f"{name} is left out where it cannot be computed: {reason}" for name, reason in left_out.items()],
+            notes=[f"{name} is skipped where it cannot be computed: {reason}" for name, reason in skipped.items()],
         )
         results.write(folder)
         write_csv(results, folder)
@@ -140,15 +161,16 @@ def run_benchmark(
 class _Made:
     """The methods that could be made, why the others could not, and what memory they take."""
 
-    def __init__(self, candidates: list[Candidate], peaks: Peaks) -> None:
-        self.runners: dict[str, Runner] = {}
+    def __init__(self, methods: list[Method], settings: Settings) -> None:
+        self.methods = [method for method in methods if not method.missing]
+        self.denoisers: dict[str, Timed] = {}
         self.failures: dict[str, str] = {}
-        self.peaks = peaks
-        for candidate in candidates:
+        self.peaks = Peaks(settings.threads, settings.device)
+        for method in self.methods:
             try:
-                self.runners[candidate.method.name] = candidate.make()
+                self.denoisers[method.name] = make_method(method, threads=settings.threads, device=settings.device)
             except Exception as error:  # whatever a method fails with: the others go on
-                self.failures[candidate.method.name] = one_line(error)
+                self.failures[method.name] = one_line(error)
 
 
 class _Read(NamedTuple):
@@ -163,19 +185,18 @@ class _SceneRun:
     def __init__(
         self,
         sequence: Sequence,
-        candidates: list[Candidate],
         made: _Made,
         folder: Path,
         settings: Settings,
     ) -> None:
-        self.errors = Errors()
-        self._sequence, self._candidates, self._settings = sequence, candidates, settings
-        self._runners, self._peaks = made.runners, made.peaks
+        self.errors = Errors(settings.metrics, settings.flip_every)
+        self._sequence, self._made, self._settings = sequence, made, settings
         self._failures = dict(made.failures)
         self._folder, self._written = folder, folder / ".written.exr"
         self._watch = Stopwatch(settings.device)
-        self._times: dict[str, dict[str, list[float]]] = {name: {} for name in self._runners}
-        self._planned: dict[str, list[list[Stage]]] = {name: [] for name in self._runners}
+        self._times: dict[str, dict[str, list[float]]] = {method.name: {} for method in made.methods}
+        self._planned: dict[str, list[list[Stage]]] = {method.name: [] for method in made.methods}
+        self._stages: dict[str, dict[str, None]] = {method.name: {} for method in made.methods}
         height, width = sequence.size
         self._scene = Scene(
             sequence.name,
@@ -196,12 +217,12 @@ class _SceneRun:
         except InputError as error:
             # A frame cannot be read: nobody has seen the whole scene.
             reason = one_line(error)
-            self._failures = {candidate.method.name: reason for candidate in self._candidates}
+            self._failures = {method.name: reason for method in self._made.methods}
             self._scene = replace(self._scene, pictures=[])
             shutil.rmtree(self._folder / IMAGES / self._scene.name, ignore_errors=True)
         finally:
             self._written.unlink(missing_ok=True)
-        return self._scene, [self._cell(candidate) for candidate in self._candidates]
+        return self._scene, [self._cell(method) for method in self._made.methods]
 
     def _warm_up(self, on_step: Callable[[], None]) -> None:
         """Every method on every frame: what its images are worth, and look like."""
@@ -209,30 +230,32 @@ class _SceneRun:
             kept = number in self._scene.pictures
             if kept and frame.reference is not None:
                 self._keep("reference", number, frame.reference)
-            for candidate, runner in self._at_work():
-                name = candidate.method.name
-                image: Tensor | None = None
-                with self._noted(name):
-                    image = runner(frame)
-                    if isinstance(runner, ModelRunner):
-                        self._planned[name].append(runner.planned)
-                    if not image.isfinite().all():
-                        raise ArithmeticError(f"frame {number} has NaN or infinite values")
+            for method, timed in self._at_work():
+                output: Output | None = None
+                with self._noted(method.name):
+                    output = timed.output(frame) if self._settings.on_the_way else Output(timed(frame))
+                    self._planned[method.name].append(list(timed.denoiser.report.stages.values()))
                     if frame.reference is not None:
-                        self.errors.add(name, number, image, frame.reference)
-                if kept and image is not None and name not in self._failures:
-                    self._keep(candidate.method.folder, number, image)
+                        self._compare(method.name, number, output, frame.reference)
+                if kept and output is not None and method.name not in self._failures:
+                    self._keep(method.folder, number, output.image)
             on_step()
+
+    def _compare(self, name: str, number: int, output: Output, reference: Tensor) -> None:
+        self.errors.add(name, number, output.image, reference)
+        for stage, image in output.stages.items():
+            if stage not in _METHODS_TOO:
+                self._stages[name][stage] = None
+                self.errors.add(_of(name, stage), number, image, reference)
 
     def _round(self, on_step: Callable[[], None]) -> None:
         first = self._sequence.numbers[0]
         for number, frame, reading in self._frames(reference=False):
             metadata = self._sequence.metadata(number)
-            for candidate, runner in self._at_work():
-                name = candidate.method.name
-                with self._noted(name):
+            for method, timed in self._at_work():
+                with self._noted(method.name):
                     start = self._watch.mark()
-                    image = runner(frame)
+                    image = timed(frame)
                     done = self._watch.mark()
                     computing = self._watch.between(start, done)
                     start = self._watch.mark()
@@ -244,17 +267,20 @@ class _SceneRun:
                         _WHOLE: reading + computing + writing,
                         _COMPUTING: computing,
                         "read": reading,
-                        **runner.stages,
+                        **({} if method.model == _NOTHING else timed.stages),
                         "write": writing,
                     }
                     for stage, milliseconds in taken.items():
-                        self._times[name].setdefault(stage, []).append(milliseconds)
+                        self._times[method.name].setdefault(stage, []).append(milliseconds)
             on_step()
 
     def _frames(self, *, reference: bool) -> Iterator[_Read]:
-        for runner in self._runners.values():
-            runner.reset()
+        before: int | None = None
         for number in self._sequence.numbers:
+            if before != number - 1:
+                for timed in self._made.denoisers.values():
+                    timed.denoiser.reset()
+            before = number
             start = self._watch.mark()
             frame = self._sequence.frame(number, reference=reference).to(self._settings.device)
             reading = self._watch.between(start, self._watch.mark())
@@ -264,10 +290,10 @@ class _SceneRun:
                 raise InputError(f"{self._sequence.root}, frame {number}: {error}") from error
             yield _Read(number, frame, reading)
 
-    def _at_work(self) -> Iterator[tuple[Candidate, Runner]]:
-        for candidate in self._candidates:
-            if candidate.method.name not in self._failures:
-                yield candidate, self._runners[candidate.method.name]
+    def _at_work(self) -> Iterator[tuple[Method, Timed]]:
+        for method in self._made.methods:
+            if method.name not in self._failures:
+                yield method, self._made.denoisers[method.name]
 
     @contextmanager
     def _noted(self, name: str) -> Iterator[None]:
@@ -286,24 +312,35 @@ class _SceneRun:
         pixels = image[0].permute(1, 2, 0).cpu().numpy()
         write_exr(path, pixels, ["R", "G", "B"], metadata=metadata)
 
-    def _cell(self, candidate: Candidate) -> Cell:
-        name = candidate.method.name
+    def _cell(self, method: Method) -> Cell:
+        name = method.name
         if name in self._failures:
-            shutil.rmtree(self._folder / IMAGES / self._scene.name / candidate.method.folder, ignore_errors=True)
+            shutil.rmtree(self._folder / IMAGES / self._scene.name / method.folder, ignore_errors=True)
             return Cell(self._scene.name, name, failure=self._failures[name])
-        times = {stage: Spread.of(values) for stage, values in self._times[name].items()}
-        frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
-        return Cell(
+        cell = Cell(
             self._scene.name,
             name,
             self.errors.means(name),
             self.errors.spreads(name),
+            plan=summarize(self._planned[name]),
+            on_the_way={stage: self.errors.means(_of(name, stage)) for stage in self._stages[name]},
+        )
+        if not self._settings.rounds:
+            return cell
+        times = {stage: Spread.of(values) for stage, values in self._times[name].items()}
+        frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
+        return replace(
+            cell,
             whole=times[_WHOLE],
             stages={stage: times[stage] for stage in STAGES if stage in times},
-            memory=self._peaks.of(candidate, self._sequence.size, frames),
+            memory=self._made.peaks.of(method, self._sequence.size, frames),
             computing=times[_COMPUTING],
-            plan=summarize(self._planned[name]),
         )
+
+
+def _of(method: str, stage: str) -> str:
+    """What an image on the way is called."""
+    return f"{method}, {stage}"
 
 
 def kept_frames(numbers: list[int], most: int) -> list[int]:
@@ -316,22 +353,6 @@ def kept_frames(numbers: list[int], most: int) -> list[int]:
     runs = [[number for _, number in run] for _, run in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
     longest = max(runs, key=lambda run: (min(len(run), most), run[-1]), default=[])
     return longest[-most:] if most else []
-
-
-def _costs(
-    candidates: list[Candidate], made: _Made, settings: Settings, on_step: Callable[[], None]
-) -> tuple[list[Cost], list[Fit]]:
-    # What does nothing has no cost.
-    timed = [candidate for candidate in candidates if candidate.method.name != "noisy"]
-    return measure_sizes(
-        timed,
-        made.runners,
-        list(settings.sizes),
-        rounds=settings.rounds,
-        threads=settings.threads,
-        device=settings.device,
-        on_step=on_step,
-    )
 
 
 def _first_two_frames(root: Path, numbers: tuple[int, ...]) -> list[Frame]:

@@ -10,10 +10,10 @@ import torch
 
 from mcdenoise.benchmark.machine import Stopwatch, available_memory
 from mcdenoise.benchmark.memory import Peaks
-from mcdenoise.benchmark.methods import Candidate, Runner, one_line
-from mcdenoise.frame import Frame
+from mcdenoise.benchmark.methods import Timed, one_line
 from mcdenoise.errors import InputError
-from mcdenoise.results import Cost, Fit, Spread
+from mcdenoise.frame import Frame
+from mcdenoise.results import Cost, Fit, Method, Spread
 
 Size = tuple[int, int]
 
@@ -74,8 +74,8 @@ def synthetic_frame(width: int, height: int) -> Frame:
 
 
 def measure_sizes(
-    candidates: list[Candidate],
-    runners: Mapping[str, Runner],
+    methods: list[Method],
+    made: Mapping[str, Timed],
     sizes: list[Size],
     *,
     rounds: int,
@@ -89,8 +89,8 @@ def measure_sizes(
     need more than half of the memory that is free, as foretold by what it takes at a half and at a quarter of the side.
 
     Args:
-        candidates: what to time.
-        runners: those that could be made, by name.
+        methods: what to time.
+        made: those that could be made, by name.
         sizes: widths and heights, ascending.
         rounds: frames of each.
         threads: for measuring memory.
@@ -102,25 +102,23 @@ def measure_sizes(
         at two sizes or more.
     """
     memory = _Memory(threads, device)
-    candidates = [candidate for candidate in candidates if candidate.method.name in runners]
+    methods = [method for method in methods if method.name in made]
     costs: list[Cost] = []
     for width, height in sizes:
         times: dict[str, list[float]] = {}
         failures: dict[str, str] = {}
-        for candidate in candidates:
-            reason = memory.lack(candidate, width, height)
-            if reason:
-                failures[candidate.method.name] = reason
+        for method in methods:
+            if reason := memory.lack(method, width, height):
+                failures[method.name] = reason
         frame = synthetic_frame(width, height).to(device)
         watch = Stopwatch(device)
         for turn in range(rounds + 2):
-            for candidate in candidates:
-                name = candidate.method.name
+            for name in (method.name for method in methods):
                 if name in failures:
                     continue
                 try:
                     start = watch.mark()
-                    runners[name](frame)
+                    made[name](frame)
                     taken = watch.between(start, watch.mark())
                 except Exception as error:  # whatever a method fails with: the others go on
                     failures[name] = one_line(error)
@@ -128,12 +126,11 @@ def measure_sizes(
                 if turn >= 2:
                     times.setdefault(name, []).append(taken)
             on_step()
-        for candidate in candidates:
-            name = candidate.method.name
-            runners[name].reset()
+        for name in (method.name for method in methods):
+            made[name].denoiser.reset()
             failed = failures.get(name, "")
             costs.append(Cost(name, width, height, None if failed else Spread.of(times[name]), failed))
-    fits = [fit_line(candidate.method.name, costs) for candidate in candidates]
+    fits = [fit_line(method.name, costs) for method in methods]
     return costs, [fit for fit in fits if fit is not None]
 
 
@@ -166,12 +163,12 @@ class _Memory:
     def __init__(self, threads: int, device: str) -> None:
         self._device, self._peaks = device, Peaks(threads, device)
 
-    def lack(self, candidate: Candidate, width: int, height: int) -> str:
+    def lack(self, method: Method, width: int, height: int) -> str:
         """Why there is too little memory for an image, or ``""`` where there is enough, or nothing is known."""
         if width * height <= _SMALL:
             return ""
         smaller, small = ((max(width // share, 1), max(height // share, 1)) for share in (4, 2))
-        lower, upper = self._peak(candidate, smaller), self._peak(candidate, small)
+        lower, upper = self._peak(method, smaller), self._peak(method, small)
         available = available_memory(self._device)
         if lower is None or upper is None or available is None:
             return ""
@@ -184,8 +181,8 @@ class _Memory:
             else f"too little memory: expected to need {needed:.0f} MiB, found {usable:.0f} MiB that may be used"
         )
 
-    def _peak(self, candidate: Candidate, size: Size) -> float | None:
-        return self._peaks.of(candidate, size, functools.partial(_two_frames, *size))
+    def _peak(self, method: Method, size: Size) -> float | None:
+        return self._peaks.of(method, size, functools.partial(_two_frames, *size))
 
 
 def _two_frames(width: int, height: int) -> list[Frame]:

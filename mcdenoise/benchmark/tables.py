@@ -83,22 +83,22 @@ def scene_rows(results: Results) -> list[dict[str, str]]:
     return rows
 
 
-def left_out_rows(results: Results) -> list[dict[str, str]]:
-    """What to print of what models left out of the scenes."""
+def skipped_rows(results: Results) -> list[dict[str, str]]:
+    """What to print of what methods skipped of the scenes."""
     return [
         {
             "scene": row.scene,
             "method": row.method,
-            "left out": row.stages,
+            "skipped": row.stages,
             "ms saved": _number(row.saved, ".1f"),
             **{f"change of {name}": _number(row.change.get(name), "+.1e") for name in _SHOWN if name in row.change},
         }
-        for row in results.left_out()
+        for row in results.skipped()
     ]
 
 
 def remarks(results: Results) -> list[str]:
-    """What to print below: what failed, what is missing, what is left out, each with its reason."""
+    """What to print below: what failed, what is missing, what was not computed, each with its reason."""
     lines = [f"failed: {cell.scene}, {cell.method}: {cell.failure}" for cell in results.cells if cell.failure]
     lines += [
         f"not tried: {one.method}, {one.width}x{one.height}: {one.failure}" for one in results.costs if one.failure
@@ -155,7 +155,9 @@ def _row(scene: Scene, method: Method, cell: Cell, results: Results) -> dict[str
         "scene": scene.name,
         "method": method.name,
         "kind": method.kind,
-        "family": method.family,
+        "model": method.model,
+        "settings": ", ".join(f"{name}={value}" for name, value in method.settings.items()),
+        "precision": method.precision,
         "parameters": method.parameters,
         "width": scene.width,
         "height": scene.height,

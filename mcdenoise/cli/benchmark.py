@@ -10,9 +10,9 @@ from typing import Annotated
 import torch
 import tyro
 
-from mcdenoise.benchmark import Settings, benchmark_ops, choose_candidates, parse_sizes, run_benchmark
+from mcdenoise.benchmark import Settings, benchmark_ops, choose_methods, parse_sizes, run_benchmark
 from mcdenoise.benchmark.sizes import SIZES
-from mcdenoise.benchmark.tables import left_out_rows, op_rows, remarks, scene_rows
+from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows, skipped_rows
 from mcdenoise.cli._options import Json, check_threads, parse_size
 from mcdenoise.cli._output import print_rows, progress_bar, write_json
 from mcdenoise.data import open_sequence
@@ -25,7 +25,6 @@ def benchmark(
     sequences: tyro.conf.Positional[list[Path]] = [],  # noqa: B006 - tyro reads it
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None,
     models: str | None = None,
-    peers: str = "all",
     precisions: str = "float32,bfloat16",
     frames: str | None = None,
     rounds: int | None = None,
@@ -38,7 +37,7 @@ def benchmark(
     size: str = "1280x720",
     json: Json = None,
 ) -> int:
-    """Measure error against run time: models, other denoisers and doing nothing, on the same frames, taking turns.
+    """Measure error against run time: any methods and doing nothing, on the same frames, taking turns.
 
     Writes OUT/index.html, the report, with its plots, results.json, results.csv and images; OUT must not exist.
     Exit status 1 if a method failed on a scene. With --ops, measures the operators instead: time, error, and how
@@ -47,16 +46,18 @@ def benchmark(
     Args:
         sequences: folders of sequences with references.
         out: folder to make; needed except with --ops.
-        models: names separated by commas, or safetensors files; by default all with shipped weights; or none.
-        peers: oidn, bilateral, or all, or none. Doing nothing and accumulation alone are always there.
-        precisions: of the models' convolutions: float32, bfloat16, or both.
+        models: names separated by commas, see `mcdenoise models`, with settings if need be, several at once such as
+            "oidn(quality=fast|high)"; weights files; file.py:factory; "pretrained" for all with shipped weights; "all",
+            the default, for these, filters, and other denoisers; or none. Doing nothing and accumulation alone are
+            always there.
+        precisions: of the convolutions of models that learn: float32, bfloat16, or both.
         frames: which frames of each sequence, such as 0-59,70; all by default.
         rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.
         threads: CPU threads of all methods; torch's choice by default.
         device: cpu or cuda.
         sizes: of images of which only the cost is measured, such as 1280x720,3840x2160, or none.
         pictures: of how many frames of each scene images are kept.
-        keep_all: measure each model a second time, leaving nothing out, to see what leaving out saves and costs.
+        keep_all: measure each method that skips anything a second time, skipping nothing, to see what that saves.
         ops: measure the operators.
         size: of the images with --ops, WIDTHxHEIGHT.
         json: write what is in results.json, or ops.json, to this file too.
@@ -87,6 +88,8 @@ def benchmark(
         return 0
     if out is None:
         raise InputError("--out: expected a folder to write to, found none; give one with -o")
+    if rounds < 1:
+        raise InputError(f"--rounds: expected at least 1, found {rounds}")
     settings = Settings(
         rounds=rounds,
         threads=threads,
@@ -99,7 +102,6 @@ def benchmark(
             *(["--keep-all"] if keep_all else []),
             out=out,
             models=models,
-            peers=peers,
             precisions=precisions,
             frames=frames,
             rounds=rounds,
@@ -111,20 +113,18 @@ def benchmark(
     )
     check_packages()
     opened = [open_sequence(sequence, frames) for sequence in sequences]
-    candidates = choose_candidates(
-        models, peers, precisions=precisions, threads=threads, device=device, keep_all=keep_all
-    )
+    methods = choose_methods(models, precisions=precisions, keep_all=keep_all)
     with progress_bar() as progress:
         task = progress.add_task("benchmark", total=None)
         results = run_benchmark(
             opened,
-            candidates,
+            methods,
             out,
             settings,
             on_step=lambda done, total: progress.update(task, completed=done, total=total),
         )
     print_rows(scene_rows(results))
-    print_rows(left_out_rows(results))
+    print_rows(skipped_rows(results))
     for line in [*remarks(results), f"report: {write_report(out)}"]:
         print(line)
     write_json(json, asdict(results))

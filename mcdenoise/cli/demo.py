@@ -12,16 +12,17 @@ from mcdenoise.cli._options import Json, Out
 from mcdenoise.cli._output import print_times, progress_bar, show, write_json
 from mcdenoise.demo import FRAMES, run_demo
 from mcdenoise.heap import keep_heap
+from mcdenoise.models import DEFAULT
 
 
-def demo(out: Out = Path("demo"), model: str = "cascaded", json: Json = None) -> None:
+def demo(out: Out = Path("demo"), model: str = DEFAULT, json: Json = None) -> None:
     """Render 16 frames of a small scene at one sample a pixel, denoise them, print errors and times.
 
-    Ends with a report of error against run time: all models, and what other denoisers are installed.
+    Ends with a report of error against run time: all models, filters, and what other denoisers are installed.
 
     Args:
         out: folder to write to; what an earlier run rendered there is used again.
-        model: name of a model with shipped weights.
+        model: a name with settings, a weights file, or file.py:factory, as of `denoise`.
         json: write the printed figures to this file too.
     """
     keep_heap()
@@ -46,5 +47,6 @@ def demo(out: Out = Path("demo"), model: str = "cascaded", json: Json = None) ->
 def _print_scores(rows: list[dict[str, Any]]) -> None:
     table = Table("image", *rows[0]["values"], "frames")
     for row in rows:
-        table.add_row(row["method"], *(f"{value:.4g}" for value in row["values"].values()), str(row["frames"]))
+        values = (row["values"].get(name) for name in rows[0]["values"])
+        table.add_row(row["method"], *("-" if x is None else f"{x:.4g}" for x in values), str(row["frames"]))
     show(table)

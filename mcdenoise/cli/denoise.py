@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,27 +12,28 @@ import tyro
 from mcdenoise.cli._options import Json, Out, check_threads
 from mcdenoise.cli._output import print_times, progress_bar, stages, write_json
 from mcdenoise.data import open_sequence
-from mcdenoise.denoise import denoise_sequence
-from mcdenoise.denoiser import Denoiser, Precision
+from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
+from mcdenoise.folder import denoise_sequence
 from mcdenoise.heap import keep_heap, return_heap
-from mcdenoise.plan import TOLERANCE, Plan
+from mcdenoise.methods import Spelling, parse_method
+from mcdenoise.models import DEFAULT, describe_weights
 
 
 def denoise(
     sequence: tyro.conf.Positional[Path],
     out: Out,
-    model: str = "cascaded",
+    model: str | None = None,
     weights: Path | None = None,
     frames: str | None = None,
     device: str = "cpu",
     threads: int | None = None,
     precision: Precision = "float32",
-    alpha_min: float = 0.1,
+    alpha_min: float | None = None,
     anti_lag: bool = True,
     full_float: bool = False,
     keep_all: bool = False,
-    tolerance: float = TOLERANCE,
+    tolerance: float | None = None,
     tile: int | None = None,
     max_memory: float | None = None,
     budget_ms: float | None = None,
@@ -44,18 +46,20 @@ def denoise(
     Args:
         sequence: folder of a sequence in a known layout.
         out: folder to write to.
-        model: name of a model, see `mcdenoise models`.
+        model: a name, see `mcdenoise models`, with settings if need be, such as "oidn(quality=fast)"; a weights file;
+            or a model of your own, path/to/file.py:factory or package.module:factory. By default cascaded_v2, or the
+            model that the weights are of.
         weights: safetensors file of your own weights for that model.
         frames: which frames, such as 0-59,70; all by default.
         device: cpu or cuda.
         threads: CPU threads; torch's choice by default.
         precision: of the network's convolutions; bfloat16 is faster on processors that have it.
-        alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
-        anti_lag: give up the accumulated past where the light has changed.
+        alpha_min: smallest weight of the current frame in the accumulation, in (0, 1]; the model's own by default.
+        anti_lag: give up the history where the light has changed.
         full_float: write 32-bit instead of half floats.
-        keep_all: leave nothing out, whether the sequence needs it or not.
+        keep_all: skip nothing, whether the sequence needs it or not.
         tolerance: noise, or change, relative to its mean, below which a tile of a still shot is not denoised again;
-            0 leaves out only what makes no difference.
+            0 skips only what makes no difference.
         tile: run the network on tiles of at most so many pixels a side, a multiple of 32 from 64 on; the result is that
             of whole frames, to rounding. By default, frames are tiled where the network's features would take more than
             2 GB.
@@ -70,12 +74,12 @@ def denoise(
     if threads is not None:
         check_threads(threads)
         torch.set_num_threads(threads)
-    if not 0 < alpha_min <= 1:
+    if alpha_min is not None and not 0 < alpha_min <= 1:
         raise InputError(f"--alpha-min: expected in (0, 1], found {alpha_min}")
     opened = open_sequence(sequence, frames)
     if budget_ms is not None or max_error is not None:
-        if weights is not None:
-            raise InputError("--budget-ms, --max-error: expected no --weights, which are of one model")
+        if weights is not None or model is not None:
+            raise InputError("--budget-ms, --max-error: expected no --model or --weights: they choose it")
         # Here because it brings the benchmark, which takes its time to load.
         from mcdenoise.budget import choose_model
 
@@ -91,19 +95,14 @@ def denoise(
             )
         print(f"picked {choice}")
         model, precision = choice.model, choice.precision
-    plan = Plan(keep_all=keep_all, tolerance=tolerance)
+    spelling = _spelling(model, weights)
+    # What is not asked for is not passed on: a model of another kind has no such setting.
+    asked = {"alpha_min": alpha_min, "anti_lag": None if anti_lag else False, "tolerance": tolerance}
+    settings = {name: value for name, value in asked.items() if value is not None}
     if max_memory is not None:
         return_heap()
-    denoiser = Denoiser(
-        model,
-        weights=weights,
-        device=device,
-        alpha_min=alpha_min,
-        anti_lag=anti_lag,
-        precision=precision,
-        plan=plan,
-        tile=tile,
-        max_memory=max_memory,
+    denoiser = spelling.denoiser(
+        device=device, precision=precision, keep_all=keep_all, tile=tile, max_memory=max_memory, **settings
     )
     height, width = opened.size
     print(f"{opened.name}: {opened.layout} layout, {len(opened)} frames of {width}x{height}")
@@ -113,7 +112,7 @@ def denoise(
             opened,
             out,
             denoiser,
-            str(weights or model),
+            str(spelling.weights or spelling.name),
             half=not full_float,
             on_frame=lambda: progress.advance(task),
         )
@@ -127,6 +126,15 @@ def denoise(
     write_json(json, {"model": report.model, "milliseconds": report.milliseconds, "beside": report.beside})
 
 
+def _spelling(model: str | None, weights: Path | None) -> Spelling:
+    """The model that is asked for, or that the weights are of, or the default."""
+    if weights is None:
+        return parse_method(model or DEFAULT)
+    if model is None:
+        return Spelling(str(describe_weights(weights)["architecture"]), weights)
+    return replace(parse_method(model), weights=weights)
+
+
 def _kept(row: dict[str, Any]) -> str:
-    share = row["left_out"]
-    return "kept" if share == 0 else "left out" if share == 1 else f"{share:.1%} left out"
+    fraction = row["skipped"]
+    return "kept" if fraction == 0 else "skipped" if fraction == 1 else f"{fraction:.1%} skipped"

@@ -10,30 +10,48 @@ from rich.table import Table
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import progress_bar, show, write_json
 from mcdenoise.data import open_sequence
-from mcdenoise.evaluate import Evaluation, evaluate_folder
+from mcdenoise.errors import InputError
+from mcdenoise.evaluate import Evaluation, evaluate_folder, evaluate_method
+from mcdenoise.methods import parse_method
 from mcdenoise.metrics.protocols import ProtocolName
 
 
 def evaluate(
     sequence: tyro.conf.Positional[Path],
-    images: tyro.conf.Positional[Path],
+    images: tyro.conf.Positional[Path | None] = None,
+    model: str | None = None,
     protocol: ProtocolName = "strict",
     frames: str | None = None,
+    device: str = "cpu",
     json: Json = None,
 ) -> None:
-    """Compare a folder of denoised images, ours or not, with the references of a sequence.
+    """Compare a folder of denoised images, ours or not, or what a model makes, with the references of a sequence.
 
     Args:
         sequence: folder of a sequence with references.
         images: folder of one EXR a frame, such as denoised12.exr or frame.0012.exr, scene-linear RGB.
+        model: compare this model instead: a name with settings, a weights file, or file.py:factory, as of `denoise`.
         protocol: how a publication computed its numbers; they are printed beside the strict ones.
         frames: which frames, such as 0-59,70; all that have a reference by default.
+        device: where the model runs: cpu or cuda.
         json: write the printed figures to this file too.
     """
+    if (images is None) is (model is None):
+        raise InputError("expected a folder of images, or --model, and not both; see `mcdenoise evaluate --help`")
     opened = open_sequence(sequence, frames)
+    spelling = None if model is None else parse_method(model)
+    total = len(opened.reference_numbers if spelling is None else opened.numbers)
     with progress_bar() as progress:
-        task = progress.add_task("evaluate", total=len(opened.reference_numbers))
-        result = evaluate_folder(opened, images, protocol=protocol, on_frame=lambda number: progress.advance(task))
+        task = progress.add_task("evaluate", total=total)
+
+        def advance(_: int) -> None:
+            progress.advance(task)
+
+        if images is not None:
+            result = evaluate_folder(opened, images, protocol=protocol, on_frame=advance)
+        elif spelling is not None:
+            denoiser = spelling.denoiser(device=device)
+            result = evaluate_method(opened, denoiser, spelling.name, protocol=protocol, on_frame=advance)
     _print_evaluation(result)
     write_json(json, result.as_json())
 
@@ -57,8 +75,8 @@ def _print_evaluation(result: Evaluation) -> None:
         if columns:
             show(table)
         print(f"{name}: {own.description}")
-        for reason in dict.fromkeys(own.left_out.values()):
-            without = [metric for metric, why in own.left_out.items() if why == reason]
+        for reason in dict.fromkeys(own.skipped.values()):
+            without = [metric for metric, why in own.skipped.items() if why == reason]
             print(f"{name}: no {', '.join(without)}: {reason}")
     if result.warping_error:
         ours, theirs = result.warping_error

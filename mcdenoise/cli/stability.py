@@ -24,7 +24,8 @@ def stability(
 
     Args:
         ops: names of operators; all by default.
-        models: names of models with shipped weights; all by default, none where operators are named.
+        models: names with settings if need be, weights files, or file.py:factory; all that can be had by default, none
+            where operators are named.
         dtypes: precisions to try.
         frames: length of the long runs.
         json: write every check to this file too, and the errors of the long runs over time.

@@ -1,4 +1,4 @@
-"""A folder of images, denoised by whatever program, against the references of its sequence."""
+"""Images of a sequence, those of a folder or those that a method makes, against the sequence's references."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mcdenoise.frame import Frame
 from mcdenoise.data import Sequence, read_exr
 from mcdenoise.data.color_space import to_rec709
 from mcdenoise.data.exr import read_exr_header
+from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate.noise import noise_floor, reference_noise
 from mcdenoise.evaluate.scores import METRICS, check_references, measure
-from mcdenoise.history import motion_to_previous, surface_before
+from mcdenoise.folder import denoised_frames
+from mcdenoise.frame import Frame
 from mcdenoise.metrics import (
     PROTOCOLS,
     Flicker,
@@ -32,6 +33,7 @@ from mcdenoise.metrics import (
     warping_error_srgb,
 )
 from mcdenoise.metrics.protocols import ProtocolName
+from mcdenoise.models.accumulated import motion_to_previous, surface_before
 from mcdenoise.ops import Surface
 
 STRICT: ProtocolName = "strict"
@@ -49,13 +51,13 @@ class Table:
     Args:
         description: how the protocol gets its values.
         frames: by frame number and metric; a temporal one stands at the later frame of its pair.
-        left_out: why a metric could not be computed, or not for every frame.
+        skipped: why a metric could not be computed, or not for every frame.
         shots: metrics of whole shots, with the number of frames.
     """
 
     description: str
     frames: dict[int, dict[str, float]] = field(default_factory=dict)
-    left_out: dict[str, str] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
     shots: dict[str, tuple[float, int]] = field(default_factory=dict)
 
     @property
@@ -82,11 +84,11 @@ class Table:
 
 @dataclass
 class Evaluation:
-    """Errors of a folder of images.
+    """Errors of the images of a sequence.
 
     Args:
         sequence: its name.
-        images: the folder.
+        images: the folder, or the name of the method.
         tables: by protocol; ``"strict"`` is always there, with every metric.
         warping_error: Lai's warping error of the images and of the references, mean over the pairs of frames.
         reference_noise: the references' own SMAPE against the truth, where the renderer has noted it.
@@ -94,7 +96,7 @@ class Evaluation:
     """
 
     sequence: str
-    images: Path
+    images: Path | str
     tables: dict[str, Table]
     warping_error: tuple[float, float] | None = None
     reference_noise: float | None = None
@@ -108,7 +110,7 @@ class Evaluation:
                 "frames": {str(number): _finite(values) for number, values in table.frames.items()},
                 "mean": _finite(table.mean),
                 "counts": table.counts,
-                "left_out": table.left_out,
+                "skipped": table.skipped,
             }
             for name, table in self.tables.items()
         }
@@ -179,7 +181,6 @@ def _numbered(folder: Path, stems: list[str]) -> list[tuple[int, str]]:
     return [(int(parts[changing[0]]), stem) for parts, stem in zip(split, stems, strict=True)]
 
 
-@torch.inference_mode()
 def evaluate_folder(
     sequence: Sequence,
     folder: Path,
@@ -205,11 +206,56 @@ def evaluate_folder(
             or pixels that are not finite; or a buffer has invalid values.
     """
     check_references(sequence)
-    numbers = sequence.reference_numbers
-    files = find_images(folder, numbers)
+    files = find_images(folder, sequence.reference_numbers)
     for path in files.values():
         _check_header(path, sequence.size)
+    images = ((number, *_read(sequence, number, path)) for number, path in files.items())
+    return _evaluate(sequence, folder, images, protocol, on_frame)
 
+
+def evaluate_method(
+    sequence: Sequence,
+    denoiser: Denoiser,
+    name: str,
+    *,
+    protocol: ProtocolName = STRICT,
+    on_frame: Callable[[int], None] = lambda number: None,
+) -> Evaluation:
+    """Compare what a method makes of a sequence with its references, without writing it; see :func:`evaluate_folder`.
+
+    Args:
+        sequence: frames with references; those without are denoised too, as a history needs them.
+        denoiser: is reset first.
+        name: what to call the method.
+        protocol: as there.
+        on_frame: as there, also for frames without a reference.
+
+    Raises:
+        InputError: the sequence has no references, a file is damaged, or a buffer that the method needs is missing.
+    """
+    check_references(sequence)
+
+    def images() -> Iterator[tuple[int, Tensor, Frame, Tensor]]:
+        for number, frame, image in denoised_frames(sequence, denoiser):
+            if frame.reference is None:
+                on_frame(number)
+                continue
+            metadata = sequence.metadata(number)
+            image, reference = (to_rec709(each, metadata) for each in (image.cpu(), frame.reference))
+            yield number, image, frame.with_depth().validate()[0], reference
+
+    return _evaluate(sequence, name, images(), protocol, on_frame)
+
+
+@torch.no_grad()
+def _evaluate(
+    sequence: Sequence,
+    source: Path | str,
+    images: Iterable[tuple[int, Tensor, Frame, Tensor]],
+    protocol: ProtocolName,
+    on_frame: Callable[[int], None],
+) -> Evaluation:
+    """Errors of images, each with its number, frame and reference."""
     chosen = PROTOCOLS[protocol]
     strict = Table(PROTOCOLS[STRICT].description)
     tables: dict[str, Table] = {STRICT: strict}
@@ -217,29 +263,26 @@ def evaluate_folder(
         tables[protocol] = Table(chosen.description)
     pairs = _Pairs(strict)
     past: tuple[int, Tensor, Tensor] | None = None
-    for number in numbers:
-        image, frame, reference = _read(sequence, number, files[number])
+    for number, image, frame, reference in images:
         before = past[1:] if past is not None and past[0] == number - 1 else None
-        strict.frames[number] = measure(_METRICS, image, reference, before, strict.left_out)
+        strict.frames[number] = measure(_METRICS, image, reference, before, strict.skipped)
         pairs.add(number, frame, image, reference, before)
         if protocol != STRICT and number in sequence.numbers[chosen.skipped_frames :]:
-            own, skipped = tables[protocol], number - 1 not in sequence.numbers[chosen.skipped_frames :]
-            own.frames[number] = measure(chosen.metrics, image, reference, None if skipped else before, own.left_out)
+            own, first = tables[protocol], number - 1 not in sequence.numbers[chosen.skipped_frames :]
+            own.frames[number] = measure(chosen.metrics, image, reference, None if first else before, own.skipped)
         past = number, image, reference
         on_frame(number)
     pairs.finish()
     _explain(strict, [*_temporal(_METRICS), WARPED])
     if protocol != STRICT:
-        tables[protocol].left_out |= chosen.missing
+        tables[protocol].skipped |= chosen.missing
         if tables[protocol].frames:
             _explain(tables[protocol], _temporal(chosen.metrics))
         else:
-            reason = (
-                f"{protocol} leaves out the first {chosen.skipped_frames} frames; this sequence has no reference later"
-            )
-            tables[protocol].left_out |= dict.fromkeys(chosen.metrics, reason)
+            reason = f"{protocol} skips the first {chosen.skipped_frames} frames; this sequence has no reference later"
+            tables[protocol].skipped |= dict.fromkeys(chosen.metrics, reason)
     floor = noise_floor(sequence, metrics=[name for name in METRICS if name not in ("RMSE", "FLIP")])
-    return Evaluation(sequence.name, folder, tables, pairs.warping_error, reference_noise(sequence), floor)
+    return Evaluation(sequence.name, source, tables, pairs.warping_error, reference_noise(sequence), floor)
 
 
 class _Pairs:
@@ -261,7 +304,7 @@ class _Pairs:
         if before is not None and past is not None:
             motion = motion_to_previous(frame, past.view_projection)
             if motion is None:
-                self._table.left_out[WARPED] = "the frames have no motion, and no positions with cameras"
+                self._table.skipped[WARPED] = "the frames have no motion, and no positions with cameras"
         if motion is None or before is None or past is None:
             self._flicker = None
             return
@@ -273,7 +316,7 @@ class _Pairs:
             ours, theirs = (float(warping_error_srgb(x, motion, surface, previous)) for x in (clip, truth))
             self._warping.append((ours, theirs))
         except UncomputableError as error:
-            self._table.left_out[WARPED] = str(error)
+            self._table.skipped[WARPED] = str(error)
         if not _is_still(motion):
             self._flicker = None
             return
@@ -290,7 +333,7 @@ class _Pairs:
             mean = sum(shot.frames * float(shot.value()) for shot in self._shots) / frames
             self._table.shots[FLICKER] = mean, frames
         else:
-            self._table.left_out[FLICKER] = "no two successive frames with references between which nothing moves"
+            self._table.skipped[FLICKER] = "no two successive frames with references between which nothing moves"
 
     @property
     def warping_error(self) -> tuple[float, float] | None:
@@ -316,7 +359,7 @@ def _explain(table: Table, temporal: Iterable[str]) -> None:
     counts = table.counts
     for name in temporal:
         if name not in counts:
-            table.left_out.setdefault(name, "no two successive frames with references")
+            table.skipped.setdefault(name, "no two successive frames with references")
 
 
 def _check_header(path: Path, size: tuple[int, int]) -> None:
@@ -341,7 +384,7 @@ def _read(sequence: Sequence, number: int, path: Path) -> tuple[Tensor, Frame, T
         row, column = bad.nonzero()[0].tolist()
         raise InputError(
             f"{path}: expected finite pixels, found {int(bad.sum())} NaN or infinite ones of {bad.numel()}, first at "
-            f"row {row}, column {column}; no error is defined with them: repair them, or leave the frame out"
+            f"row {row}, column {column}; no error is defined with them: repair them, or skip the frame"
         )
     try:
         frame, _ = sequence.frame(number).with_depth().validate()

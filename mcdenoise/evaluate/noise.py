@@ -41,7 +41,7 @@ def noise_floor(sequence: Sequence, *, metrics: Collection[str] = ("SMAPE", "tSM
 
     Returns:
         Mean over the frames, or pairs of successive frames, whose noise is noted, by metric; empty where none is. What
-        cannot be computed is left out.
+        cannot be computed is skipped.
     """
     values: dict[str, list[float]] = {}
     past = None

@@ -25,15 +25,15 @@ from mcdenoise.results import STAGES, Cost, Method, Results
 Layout = Literal["wide", "narrow"]
 
 # Okabe and Ito 2008: told apart with every kind of colour blindness.
-_FAMILIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _BASELINE = "#767676"
 _STAGES = dict(zip(STAGES, ("#b5b5b5", "#56b4e9", "#0072b2", "#d55e00", "#8a8a8a"), strict=True))
 _INK, _MUTED, _RULE, _PAPER = "#1c1c1e", "#6b6b70", "#e2e2e4", "#fefefe"
 # In the page a colour is a variable of its style sheet, so that it follows the reader's light or dark.
 _VARIABLES = {_INK: "ink", _MUTED: "muted", _RULE: "rule", _PAPER: "paper", _BASELINE: "baseline"}
-_VARIABLES |= {color: f"hue-{index}" for index, color in enumerate(_FAMILIES)}
+_VARIABLES |= {color: f"hue-{index}" for index, color in enumerate(_COLORS)}
 _VARIABLES |= {_STAGES["read"]: "stage-read", _STAGES["write"]: "stage-write"}
-_MARKERS = {"model": "o", "peer": "s", "baseline": "D"}
+_MARKERS = {"trainable": "o", "fixed": "s", "baseline": "D"}
 _SIZES = {"wide": (10.4, 5.6), "narrow": (4.9, 4.9)}
 # What the names beside the last points of the cost plot take, in parts of the axis.
 _ROOM = {"wide": 0.3, "narrow": 0.04}
@@ -75,15 +75,15 @@ def plot_style() -> Iterator[None]:
         yield
 
 
-def family_colors(methods: Sequence[Method]) -> dict[str, str]:
-    """A colour for each family, baselines grey; the first family of models has the first colour.
+def model_colors(methods: Sequence[Method]) -> dict[str, str]:
+    """A colour for each model, whatever its settings, baselines grey; the first that learns has the first colour.
 
     Returns:
-        ``#rrggbb`` by family.
+        ``#rrggbb`` by name of the model.
     """
-    kinds = {kind: [method.family for method in methods if method.kind == kind] for kind in _MARKERS}
-    families = [family for family in dict.fromkeys(kinds["model"] + kinds["peer"]) if family]
-    colors = {family: _FAMILIES[index % len(_FAMILIES)] for index, family in enumerate(families)}
+    kinds = {kind: [method.model for method in methods if method.kind == kind] for kind in _MARKERS}
+    models = dict.fromkeys(kinds["trainable"] + kinds["fixed"])
+    colors = {model: _COLORS[index % len(_COLORS)] for index, model in enumerate(models)}
     return dict.fromkeys(kinds["baseline"], _BASELINE) | colors
 
 
@@ -103,7 +103,7 @@ def error_over_time(view: View, metric: str, colors: dict[str, str], layout: Lay
     Args:
         view: the methods.
         metric: name in :data:`mcdenoise.evaluate.METRICS`.
-        colors: of :func:`family_colors`.
+        colors: of :func:`model_colors`.
         layout: ``"narrow"`` has the methods' numbers for labels.
     """
     figure, axes = _figure(layout)
@@ -123,7 +123,7 @@ def error_over_time(view: View, metric: str, colors: dict[str, str], layout: Lay
     front = pareto_front([(point.milliseconds.value, point.error.value) for point in shown], higher_is_better=higher)
     _draw_front(axes, [(shown[index].milliseconds.value, shown[index].error.value) for index in front])
     for point in shown:
-        color = colors[point.row.method.family]
+        color = colors[point.row.method.model]
         for start, end in _bars(point):
             axes.plot(*zip(start, end, strict=True), color=color, linewidth=1.1, alpha=0.65, zorder=3)
         _mark(axes, point.row.method, point.milliseconds.value, point.error.value, color)
@@ -188,7 +188,7 @@ def cost_over_pixels(results: Results, colors: dict[str, str], layout: Layout = 
         own = sorted((cost for cost in measured if cost.method == method.name), key=_megapixels)
         if not own:
             continue
-        color = colors[method.family]
+        color = colors[method.model]
         pixels = [_megapixels(cost) for cost in own]
         if method.name in fits:
             fit = fits[method.name]

@@ -63,7 +63,7 @@ def write_report(folder: Path) -> Path:
         "stages": STAGES,
         "number": _number,
         "plots": _write_plots(folder, results, shown, names),
-        "left_out": results.left_out(),
+        "skipped": results.skipped(),
         "sizes": sorted({(cost.width, cost.height) for cost in results.costs}, key=lambda size: size[0] * size[1]),
         "costs": {(cost.method, cost.width, cost.height): cost for cost in results.costs},
         "fits": {fit.method: fit for fit in results.fits},
@@ -98,7 +98,7 @@ def write_error_plot(results: Results, metric: str, path: Path) -> list[Row]:
         raise InputError(f"metric: expected one of {', '.join(known)}, found {metric}")
     shown = views(results)[0]
     with plots.plot_style():
-        figure = plots.error_over_time(shown, metric, plots.family_colors(results.methods))
+        figure = plots.error_over_time(shown, metric, plots.model_colors(results.methods))
         plots.write_figure(figure, path)
     return shown.rows
 
@@ -146,7 +146,7 @@ def _write_plots(folder: Path, results: Results, shown: list[View], names: list[
         raise InputError(
             f"{target}: cannot be made ({error.strerror}); check the folder and its permissions"
         ) from error
-    colors = plots.family_colors(results.methods)
+    colors = plots.model_colors(results.methods)
     errors: list[dict[str, Any]] = []
     stages: list[dict[str, str]] = []
 
@@ -176,7 +176,7 @@ def _write_plots(folder: Path, results: Results, shown: list[View], names: list[
         "errors": errors,
         "stages": stages,
         "cost": cost,
-        "colors": {family: plots.css_color(color) for family, color in colors.items()},
+        "colors": {model: plots.css_color(color) for model, color in colors.items()},
         "stage_colors": plots.stage_colors(),
     }
 
@@ -243,11 +243,11 @@ def _comparer(results: Results, galleries: list[Gallery], shown: list[View], nam
 
 
 def _first_pair(results: Results, shown: list[View], names: list[str]) -> list[str]:
-    """The first method, and that model (or else that peer) which the first metric likes best."""
+    """The first method, and that of those that learn (or else of the others) which the first metric likes best."""
     if not results.methods:
         return []
     rows = [row for row in shown[0].rows if names and names[0] in row.errors and row.method.kind != "baseline"]
-    rows = [row for row in rows if row.method.kind == "model"] or rows
+    rows = [row for row in rows if row.method.kind == "trainable"] or rows
     sign = -1 if names and METRICS[names[0]].higher_is_better else 1
     best = min(rows, key=lambda row: sign * row.errors[names[0]].value, default=None)
     return [results.methods[0].name, best.method.name if best else REFERENCE]

@@ -10,6 +10,9 @@ from typing import Any
 
 import torch
 
+from mcdenoise.errors import InputError
+from mcdenoise.methods import parse_method
+from mcdenoise.models import list_models
 from mcdenoise.stability import _denoiser, _long_runs, _models, _ops
 from mcdenoise.stability._check import DTYPES, Check, Summary, parse_dtypes, summarize
 from mcdenoise.stability._denoiser import check_denoiser
@@ -59,24 +62,38 @@ def stages(
 
     Args:
         ops: names of ops; ``None`` means all, or none where models are named.
-        models: names of models with shipped weights, each also within a denoiser; ``None`` means all (and a denoiser of
-            the first), or none where ops are named.
+        models: spellings of models, see :func:`mcdenoise.methods.parse_method`, each within a denoiser, and what learns
+            also by itself; ``None`` means the whole zoo but what needs a package that is not installed or has no
+            shipped weights, or none where ops are named.
         dtypes: the dtypes to try each in.
         frames: length of the long runs, which belong to the whole run only.
 
     Raises:
-        InputError: there is no such op, or no shipped weights of such a model.
+        InputError: there is no such op, or such a model cannot be had.
     """
     everything = ops is None and models is None
     chosen_ops = _ops.select(ops) if everything or ops is not None else []
-    chosen_models = _models.select(models) if everything or models is not None else []
-    within = chosen_models[:1] if models is None else chosen_models
+    chosen_models = _available(models) if everything or models is not None else []
     return [
         *(Stage(op.name, partial(_ops.check_op, op, dtypes)) for op in chosen_ops),
         *(Stage(name, partial(_models.check_model, name, dtypes)) for name in chosen_models),
-        *(Stage(f"Denoiser, {name}", partial(_denoiser.check_denoiser, name, dtypes)) for name in within),
+        *(Stage(f"Denoiser, {name}", partial(_denoiser.check_denoiser, name, dtypes)) for name in chosen_models),
         *([Stage("long runs", partial(_long_runs.long_runs, dtypes, frames))] if everything else []),
     ]
+
+
+def _available(names: Sequence[str] | None) -> list[str]:
+    """Models that can be had; of those that are named, every one."""
+    found = []
+    for name in list_models() if names is None else names:
+        try:
+            parse_method(name).denoiser()
+        except InputError:
+            if names is not None:
+                raise
+            continue
+        found.append(name)
+    return found
 
 
 def as_json(checks: Sequence[Check], runs: Sequence[LongRun]) -> dict[str, Any]:

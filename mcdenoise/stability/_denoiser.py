@@ -8,9 +8,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mcdenoise.frame import Frame, replace_invalid
 from mcdenoise.denoiser import Denoiser, Precision
 from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame, replace_invalid
+from mcdenoise.methods import parse_method
+from mcdenoise.models import DEFAULT
 from mcdenoise.stability._check import DTYPES, Check, name_of
 from mcdenoise.stability._models import ALLOWED, EXPOSURES, relative_change
 
@@ -23,22 +25,36 @@ _PATTERNS = 8
 _REFUSED = ("albedo", "normal", "depth", "position", "motion", "view_projection")
 
 
-def check_denoiser(model: str = "cascaded", dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
-    """Everything that must hold, with frames in each dtype; bfloat16 also runs the network's convolutions.
+def check_denoiser(model: str = DEFAULT, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
+    """Everything that must hold, with frames in each dtype; bfloat16 also runs convolutions.
 
     Args:
-        model: name of a model with shipped weights.
+        model: a model's spelling, see :func:`mcdenoise.methods.parse_method`.
         dtypes: of the frames.
+
+    Raises:
+        InputError: there is no such model, or no weights of it.
     """
+    name = f"Denoiser, {model}"
     for dtype in dtypes:
-        precision: Precision = "bfloat16" if dtype == torch.bfloat16 else "float32"
-        denoiser = Denoiser(model, precision=precision)
-        for name, frames in _shots(dtype).items():
+        for check in _checks(model, dtype):
+            yield replace(check, subject=name)
+
+
+def _checks(model: str, dtype: torch.dtype) -> Iterator[Check]:
+    precision: Precision = "bfloat16" if dtype == torch.bfloat16 else "float32"
+    denoiser = parse_method(model).denoiser(precision=precision)
+    # Shots without something that a model cannot do without are no shots for it.
+    buffers = denoiser.model.needs.buffers
+    for name, frames in _shots(dtype).items():
+        if buffers <= frames[0].buffers:
             yield _valid(denoiser, name, frames, dtype)
-        for value in (torch.nan, torch.inf, -1.0):
-            yield _contained(denoiser, value, dtype)
-        yield from (_refused(denoiser, name, dtype) for name in _REFUSED)
-        yield from (_exposure(denoiser, exposure, dtype) for exposure in EXPOSURES)
+    if not buffers <= _frame(0, dtype).buffers:
+        return
+    for value in (torch.nan, torch.inf, -1.0):
+        yield _contained(denoiser, value, dtype)
+    yield from (_refused(denoiser, name, dtype) for name in _REFUSED)
+    yield from (_exposure(denoiser, exposure, dtype) for exposure in EXPOSURES)
 
 
 def _frame(seed: int, dtype: torch.dtype, size: tuple[int, int] = _SIZE) -> Frame:

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.history import History
-from mcdenoise.ops import Accumulate, HistoryLag, accumulate
+from mcdenoise.models import Accumulated, Journal, Output, State, listening
+from mcdenoise.ops import accumulate
+from mcdenoise.ops.lag import THRESHOLD
 from mcdenoise.stability._check import DTYPES, name_of
 
 FRAMES, MOVING_FRAMES = 10_000, 1_000
@@ -144,24 +145,24 @@ def _wrong(name: str, dtype: torch.dtype, number: int, history: Tensor, length: 
 
 
 def average(dtype: torch.dtype, frames: int = FRAMES) -> LongRun:
-    """The mean of all frames (no least weight of the current one) in :class:`mcdenoise.history.History`.
+    """The mean of all frames (no least weight of the current one) in :class:`mcdenoise.models.Accumulated`.
 
     It is kept in float32 whatever the frames are in. The error of frame ``n`` counts ``(n - 1) / n`` in the next one,
     so that 6 roundings a frame come to at most ``6 u32 (n + 1) / 2``.
     """
     at = _times(frames)
-    history = History(Accumulate(1 / (2 * frames)), anti_lag=HistoryLag(math.inf))
+    shot = _Shot(alpha_min=1 / (2 * frames), lag_threshold=math.inf)
     generator = torch.Generator().manual_seed(0)
     total, errors, message = torch.zeros(1, 3, *_SIZE, dtype=torch.float64), list[float](), ""
     motion = torch.zeros(1, 2, *_SIZE, dtype=dtype)
     for number in range(1, frames + 1):
         color = _noise(generator, fireflies=False).to(dtype)
-        past = history.update(Frame(color=color, motion=motion))
+        mean, length = shot.accumulate(Frame(color=color, motion=motion))
         total += color.double()
         if number in at:
-            errors.append(float((past.color.double() - total / number).abs().max()))
-            if not (past.length == number).all():
-                message = message or f"frame {number}: found a history length of {past.length.max().item():g}"
+            errors.append(float((mean.double() - total / number).abs().max()))
+            if not (length == number).all():
+                message = message or f"frame {number}: found a history length of {length.max().item():g}"
     allowed = 3 * _unit(torch.float32) * (frames + 1)
     if not max(errors) <= allowed:
         message = message or f"error {max(errors):.3g}, expected at most {allowed:.3g}"
@@ -170,16 +171,14 @@ def average(dtype: torch.dtype, frames: int = FRAMES) -> LongRun:
 
 def cut(dtype: torch.dtype) -> LongRun:
     """A scene cut after a long history: the first frame behind it is that frame exactly, and the history says so."""
-    history, generator = History(), torch.Generator().manual_seed(0)
+    shot, generator = _Shot(), torch.Generator().manual_seed(0)
     walls = torch.eye(3, dtype=dtype).reshape(3, 1, 3, 1, 1).expand(3, 1, 3, *_SIZE)
     motion = torch.zeros(1, 2, *_SIZE, dtype=dtype)
     for _ in range(_LIT):
-        history.update(Frame(color=100 * _noise(generator).to(dtype), normal=walls[0], motion=motion))
+        shot.accumulate(Frame(color=100 * _noise(generator).to(dtype), normal=walls[0], motion=motion))
     color = _noise(generator, fireflies=False).to(dtype)
-    past = history.update(Frame(color=color, normal=walls[1], motion=motion))
-    gone = (
-        past.reset == "cut" and torch.equal(past.color, color.to(past.color.dtype)) and bool((past.length == 1).all())
-    )
+    found, length = shot.accumulate(Frame(color=color, normal=walls[1], motion=motion))
+    gone = shot.reset == "cut" and torch.equal(found, color.to(found.dtype)) and bool((length == 1).all())
     message = "" if gone else "something of the scene before the cut is left"
     return LongRun("cut", name_of(dtype), passed=gone, message=message)
 
@@ -212,15 +211,37 @@ def light_on() -> LongRun:
 
 def _light(levels: Sequence[float], anti_lag: bool, deviation: bool = False) -> list[float]:
     """Mean of the history after each frame of a surface in light of these levels, or its deviation from the level."""
-    history = History(Accumulate(ALPHA_MIN), anti_lag=None if anti_lag else HistoryLag(math.inf))
+    shot = _Shot(alpha_min=ALPHA_MIN, lag_threshold=THRESHOLD if anti_lag else math.inf)
     generator, shape = torch.Generator().manual_seed(0), (1, 3, _WINDOW, _WINDOW)
     found: list[float] = []
     for level in levels:
         # The exponential distribution has the long tail that path tracing has.
         noise = -torch.log(torch.rand(shape, generator=generator).clamp_min(1e-6))
-        color = history.update(Frame(color=level * noise, motion=torch.zeros(1, 2, _WINDOW, _WINDOW))).color
+        color, _ = shot.accumulate(Frame(color=level * noise, motion=torch.zeros(1, 2, _WINDOW, _WINDOW)))
         found.append(float((color - level).square().mean().sqrt() if deviation else color.mean()))
     return found
+
+
+class _Shot:
+    """The accumulated frames of a shot, by the model that wears nothing else."""
+
+    def __init__(self, **settings: float) -> None:
+        self._model = Accumulated(_with_length, **settings)  # type: ignore[arg-type]
+        self._state: State = None
+        self.reset = ""
+
+    @torch.no_grad()
+    def accumulate(self, frame: Frame) -> tuple[Tensor, Tensor]:
+        """The accumulated color of the next frame, and the length of its history."""
+        journal = Journal()
+        with listening(journal):
+            output, self._state = self._model(frame, self._state)
+        self.reset = journal.reset
+        return output.image, output.stages["length"]
+
+
+def _with_length(color: Tensor, length: Tensor) -> Output:
+    return Output(color, {"length": length})
 
 
 def _noise(generator: torch.Generator, fireflies: bool = True) -> Tensor:

@@ -1,20 +1,23 @@
-"""Errors of whole models, and what must hold for them whatever the image is."""
+"""Errors of networks, and what must hold for them whatever the image is."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError
-from mcdenoise.models import create_model, pretrained_models
+from mcdenoise.frame import Frame
+from mcdenoise.methods import parse_method
+from mcdenoise.models import Accumulated, Skipping, parts_of
 from mcdenoise.stability._check import DTYPES, Check, name_of
 
 EXPOSURES = (1e-4, 1e-2, 1e2, 1e4)
 _DRAWS = 3
+_LEAST_RADIANCE = 1e-30
 # A convolution rounds weights, activations and results, each of which is a relative change of its products such as the
 # one that is tried; and of three random ones the largest is not the largest of all, but that is hardly four times it.
 ALLOWED = 3 * 4
@@ -22,14 +25,14 @@ ALLOWED = 3 * 4
 
 @dataclass(frozen=True)
 class ModelCase:
-    """Inputs of a model, by what is special about them; see :meth:`mcdenoise.models.Cascade.forward`."""
+    """A frame for a model, with a history, by what is special about it."""
 
     name: str
     size: tuple[int, int] = (8, 9)
     color: float | None = None
     changes: dict[str, float] = field(default_factory=dict)
 
-    def inputs(self) -> dict[str, Tensor]:
+    def frame(self) -> Frame:
         """Six decades of radiance on two walls, with a bit of sky; float32."""
         g = torch.Generator().manual_seed(0)
         shape = (1, 3, *self.size)
@@ -37,19 +40,17 @@ class ModelCase:
         normal = torch.nn.functional.normalize(torch.randn(shape, generator=g))
         depth = 1 + 9 * torch.rand(shape, generator=g)[:, :1]
         depth[..., :1, :1] = torch.inf
-        inputs = {
-            "color": color if self.color is None else torch.full(shape, self.color),
-            "albedo": torch.rand(shape, generator=g),
-            "normal": normal,
-            "depth": depth,
-        }
+        if self.color is not None:
+            color = torch.full(shape, self.color)
+        albedo = torch.rand(shape, generator=g)
+        images = {"albedo": albedo, "normal": normal, "depth": depth}
         for name, value in self.changes.items():
-            inputs[name] = inputs[name] * value if name == "normal" else torch.full_like(inputs[name], value)
-        inputs["current"] = inputs["color"] * torch.rand(shape, generator=g)
-        inputs["length"] = 1 + 30 * torch.rand(shape, generator=g)[:, :1].round()
+            images[name] = images[name] * value if name == "normal" else torch.full_like(images[name], value)
+        current = color * torch.rand(shape, generator=g)
+        length = 1 + 30 * torch.rand(shape, generator=g)[:, :1].round()
         if self.name == "one firefly of 1e6":
-            inputs["color"][..., self.size[0] // 2, self.size[1] // 2] = 1e6
-        return inputs
+            color[..., self.size[0] // 2, self.size[1] // 2] = 1e6
+        return Frame(color=color, current=current, length=length).replace(**images)
 
 
 CASES = (
@@ -64,29 +65,23 @@ CASES = (
 )
 
 
-def select(names: Sequence[str] | None = None) -> list[str]:
-    """Names of models with shipped weights; all of these for ``None``.
-
-    Raises:
-        InputError: there are no shipped weights of such a name.
-    """
-    shipped = sorted(pretrained_models())
-    unknown = [name for name in names or () if name not in shipped]
-    if unknown:
-        raise InputError(f"models: expected some of {', '.join(shipped)}, found {', '.join(unknown)}")
-    return shipped if names is None else list(names)
-
-
 def check_model(name: str, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
-    """Everything that must hold for a model with its shipped weights, in each dtype.
+    """Everything that must hold for a network, in each dtype: a model that learns, without the history that it wears.
 
     In half precision the convolutions run in it and everything else in float32, as ``Denoiser`` runs them.
 
     Args:
-        name: of the model.
+        name: a model's spelling, see :func:`mcdenoise.methods.parse_method`. One that does not learn, or that keeps a
+            state of its own, has no such checks.
         dtypes: of the convolutions.
+
+    Raises:
+        InputError: there is no such model.
     """
-    model = create_model(name, pretrained=True).eval()
+    whole = parse_method(name).denoiser().model
+    model = _without_history(whole)
+    if not isinstance(model, nn.Module) or not whole.needs.trainable or model(CASES[0].frame())[1] is not None:
+        return
     exact = copy.deepcopy(model).double()
     for dtype in dtypes:
         for case in CASES:
@@ -94,20 +89,34 @@ def check_model(name: str, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[C
         yield _check_exposure(name, model, exact, CASES[0], dtype)
 
 
+def _without_history(model: Any) -> Any:
+    """What is inside of the accumulation, which hands it what a case has: a color and its history's length."""
+    for accumulated in parts_of(model, Accumulated):
+        inner = accumulated.inner
+        return inner.inner if isinstance(inner, Skipping) else inner
+    return model
+
+
+def _image(model: nn.Module, frame: Frame) -> Tensor:
+    image: Tensor = model(frame)[0].image
+    return image
+
+
 def _check_case(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, dtype: torch.dtype) -> Iterator[Check]:
     """Forward against float64, in units of what a relative change of all weights and inputs by ``u`` does to it."""
-    inputs = case.inputs()
-    color = inputs["color"].clone().requires_grad_()
+    frame = case.frame()
+    color = frame.color.clone().requires_grad_()
     with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
-        found = model(**{**inputs, "color": color}).final
+        found = _image(model, frame.replace(color=color))
     valid = bool(torch.isfinite(found).all() and (found >= 0).all())
     yield Check(
         name, case.name, name_of(dtype), "", "finite", 0, 0, 0, valid, "" if valid else "NaN, infinite or below 0"
     )
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    # Of the image in units of its own brightness, so that the largest radiance does not overflow the sum.
-    scale = max(float(inputs["color"].max()), torch.finfo(torch.float32).tiny)
-    if not inputs["color"].any():
+    # Of the image in units of its own brightness, so that the largest radiance does not overflow the sum; what is below
+    # 1e-30 counts as that, as it does in `auto_exposure`.
+    scale = max(float(frame.color.max()), _LEAST_RADIANCE)
+    if not frame.color.any():
         scale = 1.0
     gradients = torch.autograd.grad((found / scale).sum(), [color, *parameters], allow_unused=True)
     finite = all(bool(torch.isfinite(gradient).all()) for gradient in gradients if gradient is not None)
@@ -120,21 +129,21 @@ def _check_case(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, 
 @torch.no_grad()
 def _check_exposure(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, dtype: torch.dtype) -> Check:
     """``model(s x) = s model(x)``: the worst factor of all."""
-    inputs = case.inputs()
+    frame = case.frame()
     checks: list[Check] = []
     for exposure in EXPOSURES:
-        scaled = {**inputs, "color": inputs["color"] * exposure, "current": inputs["current"] * exposure}
+        current = None if frame.current is None else frame.current * exposure
         with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
-            found = model(**scaled).final / exposure
+            found = _image(model, frame.replace(color=frame.color * exposure, current=current)) / exposure
         checks.append(_compared(name, exact, case, dtype, "exposure", found))
     return max(checks, key=lambda check: check.error)
 
 
 def _compared(name: str, exact: nn.Module, case: ModelCase, dtype: torch.dtype, what: str, found: Tensor) -> Check:
-    inputs = {key: value.double() for key, value in case.inputs().items()}
-    expected = exact(**inputs).final
+    frame = case.frame().to(torch.float64)
+    expected = _image(exact, frame)
     unit = torch.finfo(dtype).eps / 2
-    response = max(relative_change(_moved(exact, inputs, unit, seed), expected) for seed in range(_DRAWS))
+    response = max(relative_change(_moved(exact, frame, unit, seed), expected) for seed in range(_DRAWS))
     # Everything outside of the convolutions is in float32.
     response = max(response, torch.finfo(torch.float32).eps)
     error, allowed = relative_change(found, expected) / (2 * unit), ALLOWED * response / (2 * unit)
@@ -142,8 +151,8 @@ def _compared(name: str, exact: nn.Module, case: ModelCase, dtype: torch.dtype, 
     return Check(name, case.name, name_of(dtype), "", what, error, allowed, response / unit, not message, message)
 
 
-def _moved(exact: nn.Module, inputs: dict[str, Tensor], unit: float, seed: int) -> Tensor:
-    """The image with every weight and input changed by ``unit`` of itself, up or down."""
+def _moved(exact: nn.Module, frame: Frame, unit: float, seed: int) -> Tensor:
+    """The image with every weight and buffer changed by ``unit`` of itself, up or down."""
     generator = torch.Generator().manual_seed(seed)
 
     def move(tensor: Tensor) -> Tensor:
@@ -151,8 +160,8 @@ def _moved(exact: nn.Module, inputs: dict[str, Tensor], unit: float, seed: int) 
         return tensor * (1 + unit * signs)
 
     weights = {name: move(parameter) for name, parameter in exact.named_parameters()}
-    moved = {name: move(tensor) for name, tensor in inputs.items()}
-    image: Tensor = torch.func.functional_call(exact, weights, kwargs=moved, args=()).final
+    output, _ = torch.func.functional_call(exact, weights, (frame.map(move),))
+    image: Tensor = output.image
     return image
 
 

@@ -1,4 +1,4 @@
-"""Denoise a folder of frames: clean EXRs, and a report of what was done and how long each stage took."""
+"""From a folder of frames to a folder of clean ones, with a report of what was done and how long each stage took."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from mcdenoise.frame import Frame
 from mcdenoise.data import Sequence, write_exr
 from mcdenoise.data.files import write_text
-from mcdenoise.denoiser import Denoiser, FrameReport, Images
+from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
-from mcdenoise.plan import Stage, summarize
+from mcdenoise.frame import Frame
+from mcdenoise.models import Output, Skipping, Stage, parts_of, summarize
 
 
 @dataclass
@@ -29,7 +29,7 @@ class SequenceReport:
     """What was done to a sequence.
 
     Args:
-        model: name of the model or path of its weights.
+        model: name of the model, with its settings, or path of its weights.
         reading: how the sequence stores its color.
         frames: what happened to each frame, by number; its run times include waiting for the disk.
     """
@@ -55,9 +55,9 @@ class SequenceReport:
 
     @property
     def plan(self) -> list[dict[str, Any]]:
-        """For each stage whether it was kept, how much of it was left out, and why, see :func:`summarize`."""
+        """For each stage whether it was kept, how much of it was skipped, and why, see :func:`summarize`."""
         read = Stage("read", 0.0, self.reading)
-        return summarize([[read, *report.stages] for report in self.frames.values()])
+        return summarize([[read, *report.stages.values()] for report in self.frames.values()])
 
     @property
     def replaced_pixels(self) -> int:
@@ -74,7 +74,7 @@ def denoise_sequence(
     half: bool = True,
     references: bool = False,
     on_frame: Callable[[], None] = lambda: None,
-    on_images: Callable[[Frame, Images], None] | None = None,
+    on_output: Callable[[Frame, Output], None] | None = None,
 ) -> SequenceReport:
     """Denoise a sequence and write ``OUT/denoisedN.exr`` and ``OUT/denoise.json``.
 
@@ -87,13 +87,14 @@ def denoise_sequence(
         denoiser: is reset first.
         model: what to call the model in the report.
         half: write half floats, else 32-bit floats.
-        references: read references too, for ``on_images``.
+        references: read references too, for ``on_output``.
         on_frame: called after each denoised frame.
-        on_images: called with each denoised frame and its images, which take memory of their own.
+        on_output: called with each frame and its image with those on the way to it, which take memory of their own.
 
     Raises:
-        InputError: a file is damaged, a buffer has invalid values, the folder cannot be written to, or memory is too
-            short. Frames before the one that the message names are written.
+        InputError: a file is damaged, a buffer has invalid values or one that the model needs is missing, the result is
+            not finite, the folder cannot be written to, or memory is too short. Frames before the one that the message
+            names are written.
     """
     make_folder(out)
     # A report stands for a complete result: an old one must not survive a run that fails half-way.
@@ -110,13 +111,13 @@ def denoise_sequence(
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
         for number, frame, times in _read_frames(sequence, denoiser, reference=references):
-            if on_images is None:
+            if on_output is None:
                 image = _denoised(denoiser, sequence, number, denoiser, frame, times)
             else:
-                images = _denoised(denoiser.images, sequence, number, denoiser, frame, times)
-                on_images(frame, images)
-                image = images.denoised
-                del images
+                output = _denoised(denoiser.output, sequence, number, denoiser, frame, times)
+                on_output(frame, output)
+                image = output.image
+                del output
             del frame
             start = time.perf_counter()
             if writing is not None:
@@ -136,36 +137,41 @@ def denoise_sequence(
 
 def denoised_frames(
     sequence: Sequence, denoiser: Denoiser, *, reference: bool = True
-) -> Iterator[tuple[Frame, Images]]:
+) -> Iterator[tuple[int, Frame, Tensor]]:
     """Denoise frame after frame, each while the next one is read.
 
     Args:
         sequence: the frames.
-        denoiser: is reset first.
+        denoiser: is reset first, and where a frame does not follow the one before it.
         reference: read references too.
 
     Yields:
-        Each frame with its images; the denoiser's report includes the time to read.
+        The number of each frame, the frame, and its image; the denoiser's report includes the time to read.
 
     Raises:
-        InputError: a file is damaged, a buffer has invalid values, or memory is too short; the message names the frame.
+        InputError: as :func:`denoise_sequence`; the message names the frame.
     """
     for number, frame, times in _read_frames(sequence, denoiser, reference=reference):
-        yield frame, _denoised(denoiser.images, sequence, number, denoiser, frame, times)
+        yield number, frame, _denoised(denoiser, sequence, number, denoiser, frame, times)
 
 
 class _Times(NamedTuple):
-    """Milliseconds that reading a frame took, and those of them that were waited for."""
+    """Milliseconds that reading a frame took, and those of them that were waited for; why no history goes before."""
 
     read: float
     waiting: float
+    reset: str
 
 
 def _read_frames(sequence: Sequence, denoiser: Denoiser, *, reference: bool) -> Iterator[tuple[int, Frame, _Times]]:
-    """Each frame, and meanwhile the next one is read, if there is room for it. Resets the denoiser."""
+    """Each frame, and meanwhile the next one is read, if there is room for it.
+
+    Resets the denoiser first, and where frames are missing: motion is that from the frame before, whose number is one
+    less.
+    """
     buffers = sequence.buffers - (set() if reference else {"reference"})
     denoiser.reset(buffers, len(sequence), sequence.size)
-    streaming = denoiser.plan.has_past(buffers)
+    streaming = denoiser.has_history(buffers)
 
     def read(number: int) -> tuple[Frame, float]:
         start = time.perf_counter()
@@ -176,19 +182,22 @@ def _read_frames(sequence: Sequence, denoiser: Denoiser, *, reference: bool) -> 
     with ThreadPoolExecutor(1) as reader:
         # No frame has a name here: whoever gets it decides when it goes.
         coming: deque[Future[tuple[Frame, float]]] = deque()
-        for number, following in zip_longest(sequence.numbers, sequence.numbers[1:]):
+        for place, (number, following) in enumerate(zip_longest(sequence.numbers, sequence.numbers[1:])):
             start = time.perf_counter()
             if not coming:
                 coming.append(reader.submit(read, number))
             wait(coming)
-            waiting = _since(start)
+            waiting, reset = _since(start), ""
+            if place and sequence.numbers[place - 1] != number - 1:
+                reset = f"frame {number - 1} is not among the frames"
+                denoiser.reset(buffers, len(sequence) - place, sequence.size)
             if following is not None and denoiser.has_room_ahead and coming[0].exception() is None:
                 coming.append(reader.submit(read, following))
-            yield _numbered(number, waiting, *coming.popleft().result())
+            yield _numbered(number, waiting, reset, *coming.popleft().result())
 
 
-def _numbered(number: int, waiting: float, frame: Frame, read: float) -> tuple[int, Frame, _Times]:
-    return number, frame, _Times(read, waiting)
+def _numbered(number: int, waiting: float, reset: str, frame: Frame, read: float) -> tuple[int, Frame, _Times]:
+    return number, frame, _Times(read, waiting, reset)
 
 
 _Result = TypeVar("_Result")
@@ -208,6 +217,7 @@ def _denoised(
         raise InputError(f"{sequence.root}, frame {number}: {error}") from error
     denoiser.report.milliseconds = {"waiting": times.waiting, **denoiser.report.milliseconds}
     denoiser.report.beside["read"] = times.read
+    denoiser.report.reset = times.reset or denoiser.report.reset
     return result
 
 
@@ -217,7 +227,9 @@ def _since(start: float) -> float:
 
 def _medians(frames: list[dict[str, float]]) -> dict[str, float]:
     frames = frames[1:] or frames
-    return {stage: sorted(times[stage] for times in frames)[len(frames) // 2] for stage in frames[0]}
+    # A model may do without a stage in some frames.
+    stages = dict.fromkeys(stage for times in frames for stage in times)
+    return {stage: sorted(times.get(stage, 0.0) for times in frames)[len(frames) // 2] for stage in stages}
 
 
 def make_folder(out: Path) -> None:
@@ -236,8 +248,8 @@ def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> 
         "precision": denoiser.precision,
         "threads": torch.get_num_threads(),
         "sequence": {"name": sequence.name, "layout": sequence.layout, "size": list(sequence.size)},
-        "keep_all": denoiser.plan.keep_all,
-        "tolerance": denoiser.plan.tolerance,
+        "keep_all": denoiser.keep_all,
+        "tolerance": next((skipping.tolerance for skipping in parts_of(denoiser.model, Skipping)), None),
         "plan": report.plan,
         "tiles": report.tiles,
         "reads_ahead": denoiser.has_room_ahead,

@@ -1,13 +1,13 @@
-"""What a scene does not need is left out: how much time that saves, and what it does to the error.
+"""What a scene does not need is skipped: how much time that saves, and what it does to the error.
 
-    python examples/leave_out.py path/to/scene path/to/another --model cascaded_v2_tiny
-    python examples/leave_out.py path/to/scene --markdown --tolerance 0.01
+    python examples/skipped.py path/to/scene path/to/another --model cascaded_v2_tiny
+    python examples/skipped.py path/to/scene --markdown --tolerance 0.01
 
 Five shots are made of each scene: the flythrough as it is; the same without albedo; the same with a sky over its upper
 half; a static shot of its last frame that has a reference, with new noise in every frame (one sample a pixel); and an
 editor's viewport, twice as long, that shows one image of that frame (64 samples a pixel) again and again, until a
-corner of it is changed and rendered anew (one sample a pixel). Each frame is denoised twice, taking turns: with the
-plan, and with everything kept. The last column is the change of SMAPE.
+corner of it is changed and rendered anew (one sample a pixel). Each frame is denoised twice, taking turns: as it
+is, and with nothing skipped. The last column is the change of SMAPE.
 """
 
 import argparse
@@ -22,9 +22,9 @@ from torch import Tensor
 from mcdenoise import Denoiser, Frame, InputError
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.metrics import smape_linear
-from mcdenoise.plan import TOLERANCE, Plan, Stage, summarize
+from mcdenoise.models import DEFAULT, TOLERANCE, Stage, summarize
 
-COLUMNS = ("scene", "shot", "left out", "ms, all kept", "ms", "saved", "SMAPE, all kept", "SMAPE", "change")
+COLUMNS = ("scene", "shot", "skipped", "ms, all kept", "ms", "saved", "SMAPE, all kept", "SMAPE", "change")
 
 
 def flythrough(sequence: Sequence, frames: int) -> Iterator[Frame]:
@@ -106,18 +106,18 @@ def measure(name: str, shot: str, frames: Iterator[Frame], denoisers: tuple[Deno
                 own_times.append(sum(denoiser.report.milliseconds.values()))
             if frame.reference is not None:
                 own_errors.append(float(smape_linear(image, frame.reference)))
-        planned.append(denoisers[1].report.stages)
-    left_out = ", ".join(f"{row['stage']} {row['left_out']:.0%}" for row in summarize(planned) if row["left_out"])
+        planned.append(list(denoisers[1].report.stages.values()))
+    skipped = ", ".join(f"{row['stage']} {row['skipped']:.0%}" for row in summarize(planned) if row["skipped"])
     whole, short = (statistics.mean(own) for own in times)
     before, after = (statistics.mean(own) for own in errors)
     figures = (f"{whole:.1f}", f"{short:.1f}", f"{1 - short / whole:.0%}", f"{before:.5f}", f"{after:.5f}")
-    return [name, shot, left_out or "nothing", *figures, f"{after - before:+.1e}"]
+    return [name, shot, skipped or "nothing", *figures, f"{after - before:+.1e}"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("sequences", type=Path, nargs="+", metavar="SEQUENCE", help="folder of frames with references")
-    parser.add_argument("--model", default="cascaded_v2")
+    parser.add_argument("--model", default=DEFAULT)
     parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32")
     parser.add_argument("--tolerance", type=float, default=TOLERANCE)
     parser.add_argument("--frames", type=int, default=12, metavar="N", help="of each shot")
@@ -128,8 +128,8 @@ def main() -> None:
         raise InputError(f"--frames: expected at least 2, found {options.frames}")
     if options.threads:
         torch.set_num_threads(options.threads)
-    plans = Plan(keep_all=True), Plan(tolerance=options.tolerance)
-    whole, short = (Denoiser(options.model, precision=options.precision, plan=plan) for plan in plans)
+    whole = Denoiser(options.model, precision=options.precision, keep_all=True)
+    short = Denoiser(options.model, precision=options.precision, tolerance=options.tolerance)
     rows = []
     for path in options.sequences:
         sequence = open_sequence(path)

@@ -1,0 +1,120 @@
+"""Methods as people spell them: ``name``, ``name(setting=value, ...)``, a weights file, or a factory of one's own."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import itertools
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mcdenoise.denoiser import Denoiser
+from mcdenoise.errors import InputError
+from mcdenoise.models import describe_weights, find_model
+
+WEIGHTS = ".safetensors"
+# A name, or a path, and settings in brackets at the end.
+_SPELLING = re.compile(r"(?P<name>[^()]+|.+?)(?:\((?P<settings>[^()]*)\))?", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Spelling:
+    """What a method's spelling says.
+
+    Args:
+        model: name of the zoo, or ``path/to/file.py:factory``, or ``package.module:factory``.
+        weights: file of other weights than the shipped ones.
+        settings: for the model's constructor.
+    """
+
+    model: str
+    weights: Path | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """For tables: settings as they were spelt, files without their folders."""
+        name = self.model if self.weights is None else self.weights.stem
+        if ":" in name:
+            path, _, factory = name.rpartition(":")
+            name = f"{Path(path).name}:{factory}"
+        settings = ", ".join(f"{setting}={value}" for setting, value in self.settings.items())
+        return f"{name}({settings})" if settings else name
+
+    def takes(self, setting: str) -> bool:
+        """Whether the model's constructor has such a setting."""
+        return setting in inspect.signature(find_model(self.model).construct).parameters
+
+    def denoiser(self, **options: Any) -> Denoiser:
+        """A denoiser with this method.
+
+        Args:
+            options: of :class:`mcdenoise.denoiser.Denoiser`, and settings beside those that were spelt.
+
+        Raises:
+            InputError: see :class:`mcdenoise.denoiser.Denoiser`.
+        """
+        return Denoiser(self.model, weights=self.weights, **{**options, **self.settings})
+
+
+def parse_method(text: str) -> Spelling:
+    """Read a method's spelling.
+
+    Args:
+        text: such as ``"cascaded_v2(alpha_min=0.2)"``, ``"oidn(quality=fast)"``, ``"run/mine.safetensors"`` or
+            ``"mine.py:make"``. Values are numbers, ``True``, ``False``, ``None``, or words.
+
+    Raises:
+        InputError: the text is something else, or a weights file cannot be read.
+
+    Example:
+        >>> parse_method("joint_bilateral(sigma_color=0.1, sigma_space=4)").settings
+        {'sigma_color': 0.1, 'sigma_space': 4}
+    """
+    match = _SPELLING.fullmatch(text.strip())
+    if match is None:
+        raise InputError(f"method '{text}': expected a name, or name(setting=value, ...), found neither")
+    settings: dict[str, Any] = {}
+    for part in match["settings"].split(",") if (match["settings"] or "").strip() else []:
+        name, equals, value = (each.strip() for each in part.partition("="))
+        if not (name.isidentifier() and equals and value) or name in settings:
+            raise InputError(f"method '{text}': expected settings such as (setting=value), found '{part.strip()}'")
+        settings[name] = _value(value)
+    name = match["name"].strip()
+    if not name.endswith(WEIGHTS):
+        return Spelling(name, None, settings)
+    return Spelling(str(describe_weights(Path(name))["architecture"]), Path(name), settings)
+
+
+def split_methods(text: str) -> list[str]:
+    """Spellings separated by commas, each with all combinations of its alternatives.
+
+    Args:
+        text: such as ``"noisy,oidn(quality=fast|high, source=raw)"``.
+
+    Raises:
+        InputError: one is empty, or given twice.
+
+    Example:
+        >>> split_methods("noisy, oidn(quality=fast|high,source=raw)")
+        ['noisy', 'oidn(quality=fast,source=raw)', 'oidn(quality=high,source=raw)']
+    """
+    found: list[str] = []
+    for part in re.split(r",(?![^(]*\))", text):
+        # Every second piece is a list of alternatives.
+        pieces = re.split(r"(?<==)([^,=()]*\|[^,=()]*)(?=[,)])", part.strip())
+        choices = [[piece] for piece in pieces]
+        choices[1::2] = [[each.strip() for each in piece.split("|")] for piece in pieces[1::2]]
+        found += map("".join, itertools.product(*choices))
+    if "" in found or len(set(found)) < len(found):
+        raise InputError(f"methods: expected different names separated by commas, found '{text}'")
+    return found
+
+
+def _value(text: str) -> Any:
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return text
