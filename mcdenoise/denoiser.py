@@ -102,6 +102,8 @@ class Denoiser:
             model.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
         self.model = as_model(model)
         self.report = FrameReport()
+        # Set by who never writes into a frame again that was handed over: then nothing of it is copied.
+        self.frames_stay = False
         self._tiled = [tiled for tiled in parts_of(self.model, Tiled) if tiled.halo is not None]
         if tile is not None:
             check_side(tile)
@@ -185,7 +187,7 @@ class Denoiser:
             with timed("validate", self.device):
                 self._check(output, frame, state)
                 # A renderer may write its next frame into the same buffers, and a user change an image in place.
-                state = _owned(state, [given, noisy])
+                state = state if self.frames_stay else _owned(state, [given, noisy])
                 if stages:
                     output = output._replace(stages={"noisy": noisy, **output.stages})
                 result: Output = _owned(Output(output.image.float(), output.stages), [given, noisy, state])

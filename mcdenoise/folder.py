@@ -142,7 +142,7 @@ def denoised_frames(
 
     Args:
         sequence: the frames.
-        denoiser: is reset first, and where a frame does not follow the one before it.
+        denoiser: is reset first.
         reference: read references too.
 
     Yields:
@@ -156,21 +156,17 @@ def denoised_frames(
 
 
 class _Times(NamedTuple):
-    """Milliseconds that reading a frame took, and those of them that were waited for; why no history goes before."""
+    """Milliseconds that reading a frame took, and those of them that were waited for."""
 
     read: float
     waiting: float
-    reset: str
 
 
 def _read_frames(sequence: Sequence, denoiser: Denoiser, *, reference: bool) -> Iterator[tuple[int, Frame, _Times]]:
-    """Each frame, and meanwhile the next one is read, if there is room for it.
-
-    Resets the denoiser first, and where frames are missing: motion is that from the frame before, whose number is one
-    less.
-    """
+    """Each frame, and meanwhile the next one is read, if there is room for it. Resets the denoiser."""
     buffers = sequence.buffers - (set() if reference else {"reference"})
     denoiser.reset(buffers, len(sequence), sequence.size)
+    denoiser.frames_stay = True
     streaming = denoiser.has_history(buffers)
 
     def read(number: int) -> tuple[Frame, float]:
@@ -182,22 +178,19 @@ def _read_frames(sequence: Sequence, denoiser: Denoiser, *, reference: bool) -> 
     with ThreadPoolExecutor(1) as reader:
         # No frame has a name here: whoever gets it decides when it goes.
         coming: deque[Future[tuple[Frame, float]]] = deque()
-        for place, (number, following) in enumerate(zip_longest(sequence.numbers, sequence.numbers[1:])):
+        for number, following in zip_longest(sequence.numbers, sequence.numbers[1:]):
             start = time.perf_counter()
             if not coming:
                 coming.append(reader.submit(read, number))
             wait(coming)
-            waiting, reset = _since(start), ""
-            if place and sequence.numbers[place - 1] != number - 1:
-                reset = f"frame {number - 1} is not among the frames"
-                denoiser.reset(buffers, len(sequence) - place, sequence.size)
+            waiting = _since(start)
             if following is not None and denoiser.has_room_ahead and coming[0].exception() is None:
                 coming.append(reader.submit(read, following))
-            yield _numbered(number, waiting, reset, *coming.popleft().result())
+            yield _numbered(number, waiting, *coming.popleft().result())
 
 
-def _numbered(number: int, waiting: float, reset: str, frame: Frame, read: float) -> tuple[int, Frame, _Times]:
-    return number, frame, _Times(read, waiting, reset)
+def _numbered(number: int, waiting: float, frame: Frame, read: float) -> tuple[int, Frame, _Times]:
+    return number, frame, _Times(read, waiting)
 
 
 _Result = TypeVar("_Result")
@@ -217,7 +210,6 @@ def _denoised(
         raise InputError(f"{sequence.root}, frame {number}: {error}") from error
     denoiser.report.milliseconds = {"waiting": times.waiting, **denoiser.report.milliseconds}
     denoiser.report.beside["read"] = times.read
-    denoiser.report.reset = times.reset or denoiser.report.reset
     return result
 
 
