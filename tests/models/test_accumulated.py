@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-
 from torch.utils import _pytree as pytree
 from toys import Mean, Shot, Watching, refused, still
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from mcdenoise.models._regions import halved, regions
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -35,7 +36,6 @@ from mcdenoise.models import (
     register_model,
     save_weights,
 )
-from mcdenoise.models._regions import halved, regions
 from mcdenoise.models.cascaded import FEATURES, auto_exposure, normalize_depth
 from mcdenoise.ops import cross_bilateral_weights, downsample, kernel_conv
 from mcdenoise.ops._backend import preferred

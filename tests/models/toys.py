@@ -12,7 +12,17 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
-from mcdenoise.models import Accumulated, Demodulated, Journal, Model, Needs, Output, create_model, find_model, listening
+from mcdenoise.models import (
+    Accumulated,
+    Demodulated,
+    Journal,
+    Model,
+    Needs,
+    Output,
+    create_model,
+    find_model,
+    listening,
+)
 from mcdenoise.ops._backend import Backend, preferred
 
 
