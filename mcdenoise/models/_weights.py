@@ -73,7 +73,7 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
         model = build_model(name or found, **settings)
     except (TypeError, ValueError, RuntimeError) as error:
         if isinstance(error, InputError):
-            raise
+            raise InputError(f"{path}: {error}") from error
         raise InputError(f"{path}: expected settings of model '{found}', found {settings}") from error
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - a safetensors handle is no dict

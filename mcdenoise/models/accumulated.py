@@ -141,7 +141,8 @@ class Accumulated(Wrapper):
         compiling = torch.compiler.is_compiling()
         can_move = frame.motion is not None or (frame.position is not None and frame.view_projection is not None)
         reset = "" if history is None else _misfit(history, frame)
-        if self.rule == "bmfr" and (frame.position is None or frame.normal is None):
+        surfaces = (frame, frame if history is None else history.surface)
+        if self.rule == "bmfr" and any(each.position is None or each.normal is None for each in surfaces):
             reset = reset or "no position and normal, which the rule compares"
         reset = reset or (_NO_WAY if not can_move else "first frame" if history is None else "")
         keeps = frame.hints.keep_all or not frame.hints.last
@@ -192,9 +193,12 @@ class Accumulated(Wrapper):
             motion = None if motion is None else torch.where(still, 0, motion)
         elif not still or (frame.hints.keep_all and frame.motion is not None):
             motion = motion_to_previous(frame, history.view_projection)
+        surface, previous = surface_before(frame)._replace(label=seen), history.surface
+        if self.rule == "relative" and (surface.depth is None or previous.depth is None):
+            # What tells how far two positions may be apart.
+            surface, previous = surface._replace(position=None), previous._replace(position=None)
         return blend(
-            *(entering, history.color, history.length, motion),
-            *(surface_before(frame)._replace(label=seen), history.surface),
+            *(entering, history.color, history.length, motion, surface, previous),
             alpha_min=self.alpha_min,
             rule=self.rule,
             position_limit=self.position_limit,

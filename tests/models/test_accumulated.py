@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-
 from torch.utils import _pytree as pytree
 from toys import Mean, Shot, Watching, refused, still
 
@@ -20,6 +19,7 @@ from mcdenoise.models import Accumulated
 from mcdenoise.models.accumulated import History, is_still
 from mcdenoise.ops import accumulate, demodulate, remodulate
 from mcdenoise.ops._backend import Backend
+from mcdenoise.ops.temporal import Rule
 
 HEIGHT, WIDTH = 5, 6
 
@@ -231,6 +231,36 @@ def test_the_published_rule_can_be_asked_for(small_sequence: Path) -> None:
     for number in sequence.numbers:
         seen = nothing_alike.update(sequence.frame(number))
     assert seen.reset == "cut"
+
+
+@pytest.mark.parametrize("rule", ["relative", "bmfr"])
+def test_any_buffers_may_come_and_go(rule: Rule) -> None:
+    """What only one of two frames has is not compared; where nothing can be, each frame stands alone."""
+    size = (1, 3, HEIGHT, WIDTH)
+    every: dict[str, Tensor] = {
+        "normal": torch.rand(size),
+        # As this camera sees positions: its clip w.
+        "depth": constant(1),
+        "position": torch.rand(size),
+        "motion": torch.zeros(1, 2, HEIGHT, WIDTH),
+        "view_projection": torch.eye(4)[None],
+    }
+    subsets = [
+        {name: value for bit, (name, value) in enumerate(every.items()) if choice >> bit & 1} for choice in range(32)
+    ]
+    color = torch.rand(2, *size)
+    model = Accumulated(Watching(), rule=rule, position_limit=1.0, normal_limit=1.0)
+    for first in subsets:
+        _, state = model(Frame(color[0], **first))
+        for second in subsets:
+            output, _ = model(Frame(color[1], **second), state)
+            length = model.inner.frames.pop().length
+            assert torch.isfinite(output.image).all()
+            if rule == "relative" and state[0] is not None and "motion" in second:
+                assert length.unique().tolist() == [2]
+            if state[0] is None or (rule == "bmfr" and not {"position", "normal"} <= first.keys() & second.keys()):
+                assert length.unique().tolist() == [1]
+                assert torch.equal(output.image, model(Frame(color[1], **second))[0].image)
 
 
 # Fireflies

@@ -12,7 +12,17 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
-from mcdenoise.models import Accumulated, Demodulated, Journal, Model, Needs, Output, create_model, find_model, listening
+from mcdenoise.models import (
+    Accumulated,
+    Demodulated,
+    Journal,
+    Model,
+    Needs,
+    Output,
+    create_model,
+    find_model,
+    listening,
+)
 from mcdenoise.ops._backend import Backend, preferred
 
 
@@ -43,16 +53,33 @@ def still(color: Tensor, **buffers: Any) -> Frame:
 
 
 def whole_frame(model: Model, height: int, width: int, batch: int = 1, seed: int = 0) -> Frame:
-    """A frame with everything that a model needs or is better with, in range; it moves by half a pixel."""
-    frame = frame_of(height, width, batch, seed)
-    generator = torch.Generator().manual_seed(seed + 1000)
-    given: dict[str, Any] = {"motion": torch.full((batch, 2, height, width), 0.5)}
-    for name in sorted((model.needs.buffers | model.needs.uses) - frame.buffers - {"motion", "view_projection"}):
+    """A frame with everything that a model needs or is better with, in range: a wall that moves by half a pixel.
+
+    The seed draws what has noise; the wall is the same.
+    """
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    position = torch.stack([columns / 40, rows / 40, 2 + columns / 400]).repeat(batch, 1, 1, 1)
+    depth = position[:, 2:].clone()
+    if height > 1:
+        depth[:, :, 0] = torch.inf
+    normal = torch.tensor([0.6, 0.0, -0.8]).reshape(1, 3, 1, 1).repeat(batch, 1, height, width)
+    albedo = (0.2 + 0.6 * ((rows // 4 + columns // 4) % 2)).repeat(batch, 3, 1, 1)
+    motion = torch.full((batch, 2, height, width), 0.5)
+    generator = torch.Generator().manual_seed(seed)
+    color = 4 * torch.rand(batch, 3, height, width, generator=generator).square()
+    given: dict[str, Any] = {"albedo": albedo, "normal": normal, "depth": depth, "motion": motion}
+    extra = {}
+    wanted = model.needs.buffers | model.needs.uses
+    if wanted & {"position", "previous_position"}:
+        given["position"] = position
+    if "view_projection" in wanted:
+        given["view_projection"] = torch.eye(4).repeat(batch, 1, 1)
+    for name in sorted(wanted - given.keys() - {"color", "previous_position"}):
         samples = (4,) if name == "samples" else ()
         channels = BUFFERS[name].channels if name in BUFFERS else 3
         image = torch.rand(batch, *samples, channels, height, width, generator=generator)
-        given[name] = 1 + image if name == "length" else image
-    return frame.replace(**{name: value for name, value in given.items() if value is not None})
+        (given if name in BUFFERS or name == "samples" else extra)[name] = 1 + image if name == "length" else image
+    return Frame(color, **given, extra=extra)
 
 
 def small(name: str, **settings: Any) -> Any:

@@ -1,0 +1,500 @@
+"""What a scene does not need is skipped, and the pixels stay the same, or as near as was asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils import _pytree as pytree
+from toys import Blur, Mean, Same, Shot, Watching, refused, small
+
+from mcdenoise import Denoiser, Frame, create_model
+from mcdenoise.models import (
+    Accumulated,
+    Chain,
+    Demodulated,
+    Journal,
+    Output,
+    Skipping,
+    Stage,
+    Tiled,
+    listening,
+    parts_of,
+    summarize,
+)
+from mcdenoise.models._noise_free import noise_free
+
+HEIGHT, WIDTH = 160, 224
+NORMAL = torch.tensor([0.0, 0.6, 0.8]).reshape(1, 3, 1, 1)
+
+
+def draw(seed: int, channels: int = 3, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Tensor:
+    return torch.rand(1, channels, *size, generator=torch.Generator().manual_seed(seed))
+
+
+def wall(seed: int, noise: float = 1.0, size: tuple[int, int] = (HEIGHT, WIDTH), **buffers: Any) -> Frame:
+    """A wall of tiles, seen by a camera at rest, in noisy light."""
+    height, width = size
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    albedo = torch.where((rows // 16 + columns // 16) % 2 == 0, 0.7, 0.3).expand(1, 3, -1, -1)
+    light = 1 + 0.5 * torch.sin(columns / 40) + noise * (draw(seed, size=size) - 0.5)
+    position = torch.stack([columns / width - 0.5, rows / width - 0.5, torch.ones_like(rows)])[None] * 4
+    defaults = {
+        "albedo": albedo,
+        "normal": NORMAL.repeat(1, 1, height, width),
+        "depth": position[:, 2:] + 0.1 * draw(1000, 1, size),
+        "position": position,
+        "view_projection": torch.eye(4)[None],
+    }
+    return Frame(color=albedo * light, **(defaults | buffers))
+
+
+def sky(frame: Frame, rows: int) -> Frame:
+    """With a clear sky at the top."""
+    assert frame.albedo is not None
+    assert frame.normal is not None
+    assert frame.depth is not None
+    above = torch.arange(frame.size[0])[:, None].expand(1, 1, *frame.size) < rows
+    blue = torch.tensor([0.2, 0.4, 0.9]).reshape(1, 3, 1, 1) * torch.linspace(1, 2, frame.size[0])[:, None]
+    return frame.replace(
+        color=torch.where(above, blue, frame.color),
+        albedo=torch.where(above, 0, frame.albedo),
+        normal=torch.where(above, 0, frame.normal),
+        depth=torch.where(above, torch.inf, frame.depth),
+    )
+
+
+def stage(denoiser: Denoiser, name: str) -> Stage:
+    return denoiser.report.stages[name]
+
+
+def pair(model: nn.Module | None = None, tolerance: float = 1e-3) -> tuple[Denoiser, Denoiser]:
+    """A denoiser that skips what it can, and one that skips nothing."""
+    model = small("cascaded_v2") if model is None else model
+    for skipping in parts_of(model, Skipping):
+        skipping.tolerance = tolerance
+    return Denoiser(model), Denoiser(model, keep_all=True)
+
+
+# Exactly
+
+
+SHOTS: dict[str, tuple[Callable[[int], Frame], dict[str, float]]] = {
+    "at rest": (wall, {"reproject": 1}),
+    "at rest, by its motion": (lambda n: wall(n, motion=torch.zeros(1, 2, HEIGHT, WIDTH)), {"reproject": 1}),
+    "moving": (lambda n: wall(n, motion=torch.full((1, 2, HEIGHT, WIDTH), 0.3)), {"reproject": 0, "accumulate": 0}),
+    "single frames": (lambda n: wall(n, position=None), {"accumulate": 1, "reproject": 1}),
+    "white": (lambda n: wall(n, albedo=torch.ones(1, 3, HEIGHT, WIDTH)), {"demodulate": 1}),
+    "mirrors": (lambda n: wall(n, albedo=torch.zeros(1, 3, HEIGHT, WIDTH)), {"demodulate": 1}),
+    "without albedo": (lambda n: wall(n, albedo=None), {"demodulate": 1}),
+    "without normal": (lambda n: wall(n, normal=None), {"network": 0}),
+    "flat": (lambda n: wall(n, depth=torch.full((1, 1, HEIGHT, WIDTH), 2.0)), {"network": 0}),
+    "half sky": (lambda n: sky(wall(n), 90), {"noise-free pixels": 90 / HEIGHT}),
+    "all sky": (lambda n: sky(wall(n), HEIGHT), {"network": 1, "demodulate": 1}),
+}
+
+
+@pytest.mark.parametrize("shot", SHOTS)
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_what_is_skipped_exactly_changes_no_pixel(shot: str, precision: Any) -> None:
+    make, expected = SHOTS[shot]
+    model = small("cascaded_v2", tolerance=0)
+    short, whole = Denoiser(model, precision=precision), Denoiser(model, precision=precision, keep_all=True)
+    for number in range(3):
+        a, b = short.output(make(number)), whole.output(make(number))
+        assert list(a.stages) == list(b.stages) == ["noisy", "accumulated", "initial"]
+        for name in a.stages:
+            assert torch.equal(a.stages[name], b.stages[name]), name
+        assert torch.equal(a.image, b.image)
+    skipped = {name: one.skipped for name, one in short.report.stages.items()}
+    assert {name: skipped[name] for name in expected} == pytest.approx(expected)
+    assert all(one.exact for one in short.report.stages.values() if one.skipped)
+    assert whole.report.reset == short.report.reset
+    # Copied by both; nothing else is skipped but what there is nothing for.
+    names = {name for name, one in whole.report.stages.items() if one.skipped}
+    assert whole.report.stages["network"].skipped == 0
+    absent = {"accumulate", "reproject", "remember"} if shot == "single frames" else set()
+    absent |= {"demodulate"} if shot == "without albedo" else set()
+    assert names <= {"noise-free pixels"} | absent
+
+
+def test_the_network_runs_on_what_is_not_sky() -> None:
+    size = (320, 224)
+    short, whole = pair()
+    frame = sky(wall(0, size=size), 200)
+    image, expected = short(frame), whole(frame)
+    # Convolutions choose the order of their sums by the size of the image and the number of threads.
+    torch.testing.assert_close(image, expected, rtol=1e-5, atol=1e-5 * float(expected.mean()))
+    # Down from row 192, a multiple of 32, and 64 rows above it that the network looks at.
+    assert stage(short, "network").skipped == pytest.approx(192 / 320)
+    assert stage(whole, "network").skipped == 0
+    assert torch.equal(short(frame)[..., :200, :], frame.color[..., :200, :])
+
+
+def test_a_method_of_unknown_reach_runs_and_what_is_known_stays_as_it_is() -> None:
+    class Half(nn.Module):
+        calls = 0
+
+        def forward(self, color: Tensor) -> Tensor:
+            self.calls += 1
+            return color / 2
+
+    model = Half()
+    short, whole = pair(Skipping(model))
+    frames = sky(wall(0), 90), sky(wall(0), HEIGHT)
+    images = [(short(frame), whole(frame)) for frame in frames]
+    assert all(torch.equal(a, b) for a, b in images)
+    torch.testing.assert_close(images[0][0][..., 90:, :], frames[0].color[..., 90:, :] / 2)
+    assert torch.equal(images[0][0][..., :90, :], frames[0].color[..., :90, :])
+    assert torch.equal(images[1][0], frames[1].color)
+    # It is asked for the whole image each time.
+    assert model.calls == 4
+
+
+def test_one_frame_and_the_last_one_are_not_remembered() -> None:
+    denoiser = Denoiser(small("cascaded_v2"))
+    for frames, kept in ((1, [False]), (3, [True, True, False]), (None, [True, True, True])):
+        denoiser.reset(frames=frames)
+        for number, keeps in enumerate(kept):
+            denoiser(wall(number))
+            assert (stage(denoiser, "remember").skipped == 0) is keeps
+            assert (denoiser._state is not None) is keeps
+
+
+# What has no noise
+
+
+def found(frame: Frame) -> Tensor | None:
+    return noise_free(frame)
+
+
+def test_a_clear_sky_has_no_noise_and_is_copied() -> None:
+    frame = sky(wall(0), 90)
+    free = found(frame)
+    assert free is not None
+    assert torch.equal(free, frame.depth == torch.inf)
+
+
+def test_noise_fog_and_detail_are_left_to_the_network() -> None:
+    frame = sky(wall(0), 90)
+    for strength in (0.05, 1.0):
+        noisy = frame.color * (1 + strength * (draw(7) - 0.5))
+        assert found(frame.replace(color=noisy)) is None
+    speck = frame.color.clone()
+    speck[..., 40, 100] *= 2
+    free = found(frame.replace(color=speck))
+    assert free is not None
+    assert not free[..., 32:48, 92:112].any()
+    assert free[..., :16, :].all()
+
+
+def test_an_emitter_is_copied_and_a_mirror_that_shows_noise_is_not() -> None:
+    frame = wall(0)
+    assert frame.albedo is not None
+    assert found(frame) is None
+    albedo, color = frame.albedo.clone(), frame.color.clone()
+    albedo[..., 20:60, 20:60] = 0
+    albedo[..., 100:140, 20:60] = 0
+    color[..., 20:60, 20:60] = 12.0
+    free = found(frame.replace(albedo=albedo, color=color))
+    assert free is not None
+    assert free[..., 20:60, 20:60].all()
+    assert free.sum() == 40 * 40
+    # A black hole may only have met no light yet.
+    color[..., 20:60, 20:60] = 0
+    assert found(frame.replace(albedo=albedo, color=color)) is None
+
+
+def test_a_few_pixels_prove_nothing() -> None:
+    frame = wall(0)
+    assert frame.depth is not None
+    depth = frame.depth.clone()
+    depth[..., 50:58, 60:68] = torch.inf
+    color = torch.where(depth == torch.inf, 0.5, frame.color)
+    assert found(frame.replace(depth=depth, color=color)) is None
+
+
+# Up to a tolerance
+
+
+def relative(a: Tensor, b: Tensor) -> float:
+    return float((a - b).square().mean().sqrt() / b.mean())
+
+
+def test_a_tile_without_noise_is_passed_through() -> None:
+    short, whole = pair(tolerance=1e-3)
+    for number in range(12):
+        # Noise in the left part only.
+        quiet, loud = wall(number, 0.003), wall(number, 1.0)
+        right = torch.arange(WIDTH) >= 96
+        frame = quiet.replace(color=torch.where(right, quiet.color, loud.color))
+        output, expected = short.output(frame), whole.output(frame)
+    tiles = stage(short, "converged tiles")
+    assert (tiles.skipped, tiles.exact) == (pytest.approx(128 / WIDTH), False)
+    assert torch.equal(output.image[..., 96:], output.stages["accumulated"][..., 96:])
+    assert not torch.equal(output.image[..., :96], output.stages["accumulated"][..., :96])
+    # What is passed through is a better image for the second network, at its border too.
+    assert relative(output.image[..., :64], expected.image[..., :64]) < 0.02
+
+
+def test_noise_is_estimated_as_it_is() -> None:
+    alpha_min = 0.05
+    for count in (12, 60):
+        shot = Shot(alpha_min=alpha_min)
+        for number in range(count):
+            seen = shot.update(wall(number).replace(albedo=None, color=0.9 + 0.2 * draw(number)))
+        actual = relative(seen.color, torch.ones(1))
+        for tolerance, passes in ((actual * 0.7, False), (actual * 1.5, True)):
+            passed = Skipping(Same(), tolerance, alpha_min)._converged(*seen[:3], None)
+            assert passed.numel() == 35
+            assert bool(passed.all() if passes else passed.any()) is passes
+
+
+def edited(number: int, moved: bool) -> Frame:
+    """A viewport: the same, almost clean image again and again, until a box is put into the corner."""
+    frame = wall(0, 0.2)
+    if not moved:
+        return frame
+    assert frame.albedo is not None
+    albedo, color = frame.albedo.clone(), frame.color.clone()
+    albedo[..., 10:30, 20:50] = 0.9
+    color[..., 10:30, 20:50] = 0.45 + 0.1 * number / 30
+    return frame.replace(albedo=albedo, color=color)
+
+
+def test_only_what_an_edit_changes_is_computed_again() -> None:
+    short, whole = pair(tolerance=1e-3)
+    fractions, errors = [], []
+    for number in range(20):
+        frame = edited(number, number >= 17)
+        image, expected = short(frame), whole(frame)
+        errors.append(relative(image, expected))
+        fractions.append(stage(short, "unchanged tiles").skipped)
+    # A frame that is repeated has the noise it has; its share in the average still changes at first.
+    assert set(fractions[:15]) == {0}
+    assert fractions[15:17] == [1, 1]
+    # The box lies in the first two of 5 x 7 tiles; four more on each side see it.
+    assert fractions[17:] == [pytest.approx(1 - 5 * 6 / 35)] * 3
+    assert errors[:15] == [0] * 15
+    assert 0 < max(errors) < 1e-3
+
+
+def test_a_tile_does_not_switch_to_and_fro() -> None:
+    """The noise of every tile hovers about the tolerance: it leaves once, and comes back never."""
+    noise, frames, alpha_min = 0.02, 60, 0.1
+    # Of uniform noise, in the exponential window.
+    expected = noise / 12**0.5 * (alpha_min / (2 - alpha_min)) ** 0.5
+    changes = {}
+    for name, hysteresis in (("with", 2.0), ("without", 1.0)):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("mcdenoise.models.skipping._NOISE_HYSTERESIS", hysteresis)
+            shot, skipping, states = Shot(alpha_min=alpha_min), Skipping(Same(), expected, alpha_min), [None]
+            for number in range(frames):
+                seen = shot.update(wall(number).replace(albedo=None, color=1 + noise * (draw(number) - 0.5)))
+                states.append(skipping._converged(*seen[:3], states[-1]))
+            states = states[1:]
+        changes[name] = sum((a != b).sum() for a, b in pairwise(states))
+    assert changes["without"] > 100
+    # Each of the 35 tiles at most once.
+    assert changes["with"] <= 35
+    assert states[-1].numel() == 35
+
+
+def test_a_cut_and_a_moving_camera_compute_everything_again() -> None:
+    denoiser = Denoiser(small("cascaded_v2"))
+    for number in range(12):
+        denoiser(wall(number, 0.003))
+    assert stage(denoiser, "converged tiles").skipped == 1
+    assert stage(denoiser, "network").skipped == 1
+    denoiser(wall(0, 0.0, motion=torch.full((1, 2, HEIGHT, WIDTH), 0.5)))
+    assert stage(denoiser, "network").skipped == 0
+    for number in range(12):
+        denoiser(wall(number, 0.003))
+    assert stage(denoiser, "network").skipped == 1
+    cut = wall(0, 0.0)
+    assert cut.normal is not None
+    denoiser(cut.replace(normal=-cut.normal))
+    assert denoiser.report.reset == "cut"
+    assert stage(denoiser, "network").skipped == 0
+
+
+@pytest.mark.parametrize("tolerance", [-1.0, float("nan"), float("inf")])
+def test_a_tolerance_that_is_none_is_refused(tolerance: float) -> None:
+    for make in (lambda: Skipping(Same(), tolerance), lambda: create_model("cascaded_v2_micro", tolerance=tolerance)):
+        assert "tolerance: expected a finite number of at least 0" in refused(make)
+
+
+# Methods that know nothing of it
+
+
+def shot_of(model: Any, frames: list[Frame], **hints: bool) -> tuple[list[Output], Journal]:
+    """Images of a shot, and what was reported of its last frame."""
+    state, outputs, journal = None, [], Journal()
+    for frame in frames:
+        journal = Journal()
+        with listening(journal):
+            output, state = model(frame.replace(hints=frame.hints._replace(**hints)), state)
+        outputs.append(output)
+    return outputs, journal
+
+
+def test_a_toy_computes_only_what_is_needed() -> None:
+    frame, toy = sky(wall(0), 90), Blur()
+    model = Skipping(Tiled(toy))
+    expected, _ = Blur()(frame)
+    [output], journal = shot_of(model, [frame])
+    assert torch.equal(output.image[..., 90:, :], expected.image[..., 90:, :])
+    assert torch.equal(output.image[..., :90, :], frame.color[..., :90, :])
+    # From row 64, a multiple of 32, and the two rows above it that it looks at.
+    assert toy.pixels == (HEIGHT - 64 + 2) * WIDTH
+    assert journal.stages["network"].skipped == pytest.approx(64 / HEIGHT)
+    assert journal.stages["noise-free pixels"] == Stage(
+        "noise-free pixels", pytest.approx(90 / HEIGHT), "background and emitters are copied"
+    )
+    toy.pixels = 0
+    frame = sky(wall(0), HEIGHT)
+    [output], journal = shot_of(model, [frame])
+    assert torch.equal(output.image, frame.color)
+    assert (toy.pixels, journal.stages["network"].skipped) == (0, 1)
+
+
+def test_a_batch_needs_what_any_of_its_images_needs() -> None:
+    upper, lower = sky(wall(0), 96), sky(wall(1), HEIGHT)
+    toy = Blur()
+    both = Frame(**{name: torch.cat([value, getattr(lower, name)]) for name, value in upper.items()})
+    [output], _ = shot_of(Skipping(Tiled(toy)), [both])
+    assert toy.pixels == (HEIGHT - 96 + 2) * WIDTH
+    for index, frame in enumerate((upper, lower)):
+        [alone], _ = shot_of(Skipping(Tiled(Blur())), [frame])
+        torch.testing.assert_close(output.image[index], alone.image[0], rtol=1e-6, atol=1e-7)
+
+
+def test_reused_and_passed_tiles_of_a_toy_are_not_computed() -> None:
+    toy = Blur()
+    model = Accumulated(Skipping(Tiled(toy)))
+    # One tile in which a lamp flickers, the rest has next to no noise: passed through once that is known.
+    frames = []
+    for number in range(12):
+        color = 1 + 0.002 * (draw(number) - 0.5)
+        color[..., 130:140, 200:210] = 1 + draw(number)[..., :10, :10]
+        frames.append(wall(0).replace(color=color, albedo=None))
+    outputs, journal = shot_of(model, frames)
+    assert journal.stages["converged tiles"].skipped == pytest.approx(34 / 35)
+    assert not journal.stages["converged tiles"].exact
+    last = outputs[-1]
+    assert torch.equal(last.image[..., :128, :], last.stages["accumulated"][..., :128, :])
+    assert not torch.equal(last.image[..., 128:, 192:], last.stages["accumulated"][..., 128:, 192:])
+    # The tile, and the two pixels around it that it looks at where the image goes on.
+    counts = toy.pixels
+    toy.pixels = 0
+    shot_of(model, frames[:-1])
+    assert counts - toy.pixels == 34 * 34
+    # A renderer at rest repeats its frame: its noise cannot be told, but nothing changes any more.
+    toy.pixels, repeated = 0, [wall(0).replace(albedo=None)] * 20
+    outputs, journal = shot_of(model, repeated)
+    assert journal.stages["unchanged tiles"].skipped == 1
+    assert journal.stages["network"].skipped == 1
+    assert toy.pixels == 15 * HEIGHT * WIDTH
+    assert torch.equal(outputs[-1].image, outputs[14].image)
+
+
+def test_stages_are_reused_with_the_image() -> None:
+    model = Accumulated(Skipping(Chain(initial=Tiled(Blur()), final=Tiled(Blur()))))
+    outputs, journal = shot_of(model, [wall(0).replace(albedo=None)] * 20)
+    assert journal.stages["network"].skipped == 1
+    assert list(outputs[-1].stages) == ["accumulated", "initial"]
+    for one, other in zip(outputs[-1].stages.values(), outputs[14].stages.values(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=0)
+    expected, _ = Blur()(wall(0).replace(albedo=None, color=outputs[-1].stages["accumulated"]))
+    torch.testing.assert_close(outputs[-1].stages["initial"], expected.image)
+
+
+def test_nothing_is_skipped_but_copied_where_all_is_to_be_kept() -> None:
+    toy = Blur()
+    frames = [sky(wall(0), 96).replace(albedo=None)] * 20
+    outputs, journal = shot_of(Accumulated(Skipping(Tiled(toy))), frames, keep_all=True)
+    assert {name for name, one in journal.stages.items() if one.skipped} == {"noise-free pixels"}
+    assert toy.pixels == 20 * HEIGHT * WIDTH
+    assert torch.equal(outputs[-1].image[..., :96, :], frames[0].color[..., :96, :])
+
+
+def test_a_recurrent_method_keeps_its_state_beside_what_is_skipped() -> None:
+    """Where nothing is known, it is as it is without; at a cut it begins anew, and so does what is remembered."""
+    frames = [wall(number) for number in range(10)]
+    frames.append(frames[-1].replace(normal=-frames[-1].normal))
+    outputs, journal = shot_of(Accumulated(Skipping(Mean()), alpha_min=1.0), frames)
+    assert journal.reset == "cut"
+    expected, _ = shot_of(Accumulated(Mean(), alpha_min=1.0), frames)
+    for output, other in zip(outputs, expected, strict=True):
+        torch.testing.assert_close(output.image, other.image)
+    watching = Watching()
+    shot_of(Accumulated(Skipping(watching)), frames)
+    assert [state is None for state in watching.states] == [True, *[False] * 9, True]
+
+
+def test_the_state_has_a_batch() -> None:
+    """Whoever takes a batch apart, takes its state apart."""
+    frames = [wall(number, 0.003) for number in range(12)]
+    both = [
+        Frame(**{name: value.repeat(2, *[1] * (value.dim() - 1)) for name, value in frame.items()}) for frame in frames
+    ]
+    model, state = Demodulated(Accumulated(Skipping(Tiled(Blur())))), None
+    for frame in both:
+        _, state = model(frame, state)
+    assert state is not None
+    leaves = [leaf for leaf in pytree.tree_leaves(state) if leaf is not None]
+    assert len(leaves) > 6
+    assert {len(leaf) for leaf in leaves} == {2}
+    taken = pytree.tree_map_only(Tensor, lambda leaf: leaf[1:], state)
+    expected, _ = model(both[-1], state)
+    alone, _ = model(frames[-1], taken)
+    torch.testing.assert_close(alone.image, expected.image[1:])
+
+
+# The cost of deciding
+
+
+@pytest.mark.slow
+def test_deciding_costs_less_than_a_hundredth_of_what_it_saves() -> None:
+    size = (720, 1280)
+    short, whole = (Denoiser("cascaded_v2", keep_all=keep_all) for keep_all in (False, True))
+    frame = sky(wall(0, size=size), 400)
+    costs, saved = [], []
+    for _ in range(3):
+        short.reset()
+        whole.reset()
+        short(frame)
+        whole(frame)
+        costs.append(short.report.milliseconds["plan"])
+        saved.append(whole.report.milliseconds["network"] - short.report.milliseconds["network"])
+    assert min(costs) < 0.01 * sorted(saved)[1]
+
+
+def test_deciding_on_an_ordinary_frame_takes_next_to_nothing() -> None:
+    denoiser = Denoiser(small("cascaded_v2"))
+    frame = wall(0, motion=torch.full((1, 2, HEIGHT, WIDTH), 0.3), normal=draw(3) - 0.5)
+    times = []
+    for _ in range(5):
+        denoiser(frame)
+        times.append(denoiser.report.milliseconds)
+    assert min(one["plan"] for one in times) < 0.1 * min(one["network"] for one in times)
+
+
+# Reports
+
+
+def test_a_summary_counts_fractions_and_tells_why() -> None:
+    frames = [
+        [Stage("reproject", 0, "positions"), Stage("network", 0.5, "half")],
+        [Stage("reproject", 1, "still"), Stage("network", 0.25, "quarter"), Stage("tiles", 0.5, "noise", exact=False)],
+        [Stage("reproject", 1, "still"), Stage("network", 0.5, "half")],
+    ]
+    assert summarize(frames) == [
+        {"stage": "reproject", "kept": True, "skipped": pytest.approx(2 / 3), "reason": "still", "exact": True},
+        {"stage": "network", "kept": True, "skipped": pytest.approx(1.25 / 3), "reason": "half", "exact": True},
+        {"stage": "tiles", "kept": True, "skipped": pytest.approx(0.5 / 3), "reason": "noise", "exact": False},
+    ]

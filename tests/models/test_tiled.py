@@ -1,0 +1,341 @@
+"""Methods in tiles: the images of the whole, within a limit of memory."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from toys import Blur, Brightest, Mean, Same, frame_of, refused, small
+
+from mcdenoise import Denoiser, Frame, create_model
+from mcdenoise.frame import Skip
+from mcdenoise.models import Exposed, FromBuffers, Needs, Region, Tiled, parts_of, prepared
+from mcdenoise.models._memory import Frames, Memory, Network, Tiling
+from mcdenoise.models.tiled import regions
+
+BUFFERS = frozenset({"color", "albedo", "normal", "depth"})
+CPU = torch.device("cpu")
+
+
+def synthetic(width: int, height: int, seed: int = 0) -> Frame:
+    """Noise on a checkered floor under a sky that nothing is hit in, with motion."""
+    generator = torch.Generator().manual_seed(seed)
+    rows, columns = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / height, indexing="ij")
+    floor = (rows > 0.3)[None, None]
+    checker = ((rows * 8).floor() + (columns * 8).floor()) % 2
+    noise = -torch.log(torch.rand(1, 3, height, width, generator=generator).clamp_min(1e-6))
+    albedo = (0.2 + 0.6 * checker).expand(1, 3, -1, -1) * floor
+    normal = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1) * floor
+    return Frame(
+        color=torch.where(floor, albedo * noise, 0.7),
+        albedo=albedo,
+        normal=normal,
+        depth=torch.where(floor, 1 / rows.clamp_min(0.1), torch.inf),
+        motion=torch.full((1, 2, height, width), 0.3),
+    )
+
+
+# The same images
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize("tile", [64, 96, 160])
+def test_tiles_give_the_images_of_whole_frames(precision: Any, tile: int) -> None:
+    model = small("cascaded_v2")
+    # Odd sizes, and a sky that is copied: its rectangle is split, too. One after the other, since both set the tiles.
+    frames = [synthetic(331, 237, seed) for seed in range(3)]
+    whole = Denoiser(model, precision=precision)
+    outputs = [whole.output(frame) for frame in frames]
+    assert whole.report.tiles.startswith("whole frames: features of the network within 2 GB")
+    tiled = Denoiser(model, precision=precision, tile=tile)
+    for frame, expected in zip(frames, outputs, strict=True):
+        output = tiled.output(frame)
+        columns, rows = -(-331 // tile), -(-237 // tile)
+        assert tiled.report.tiles.startswith(f"{columns} x {rows} tiles of up to ")
+        assert list(output.stages) == list(expected.stages) == ["noisy", "accumulated", "initial"]
+        assert torch.equal(output.stages["accumulated"], expected.stages["accumulated"])
+        for a, b in ((output.stages["initial"], expected.stages["initial"]), (output.image, expected.image)):
+            # Convolutions of small images are summed in another order; of bfloat16 each sum is rounded to 8 bits.
+            bound = 3e-6 if precision == "float32" else 3e-2
+            # A pixel of 16 is rounded to 2e-6, whatever the mean is.
+            assert ((a - b).abs() < bound * (b + b.mean()) / 2).all()
+            assert (a - b).abs().mean() < bound / 10 * b.mean()
+
+
+def test_two_denoisers_of_one_model_have_tiles_of_their_own() -> None:
+    model, frame = small("cascaded_v2_micro"), synthetic(160, 96)
+    whole, tiled = Denoiser(model), Denoiser(model, tile=64)
+    assert [tiles.side for tiles in parts_of(model, Tiled)] == [None, None]
+    for denoiser, side in ((whole, None), (tiled, 64), (whole, None), (tiled, 64)):
+        denoiser(frame)
+        assert {tiles.side for tiles in parts_of(model, Tiled)} == {side}
+
+
+def test_frames_of_more_than_a_million_pixels_are_prepared_by_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [synthetic(331, 237, seed) for seed in range(3)]
+    broken = frames[1].color.clone()
+    broken[0, 0, ::23, ::31] = torch.nan
+    frames[1] = frames[1].replace(color=broken)
+    model = small("cascaded_v2", anti_lag=True)
+    at_once = Denoiser(model)
+    expected = [at_once.output(frame) for frame in frames]
+    assert at_once.report.replaced_pixels == 0
+    monkeypatch.setattr("mcdenoise.ops._rows._PIXELS", 331 * 10)
+    by_rows = Denoiser(model)
+    for number, (frame, output) in enumerate(zip(frames, expected, strict=True)):
+        found = by_rows.output(frame)
+        assert torch.equal(found.image, output.image)
+        for name, image in output.stages.items():
+            assert torch.equal(found.stages[name], image), name
+        assert by_rows.report.replaced_pixels == (11 * 11 if number == 1 else 0)
+
+
+# Methods that know nothing of it
+
+
+@pytest.mark.parametrize("size", [(96, 160), (99, 131), (20, 30)])
+@pytest.mark.parametrize("side", [32, 64])
+def test_a_toy_is_tiled_without_knowing_it(side: int, size: tuple[int, int]) -> None:
+    toy, frame = Blur(), frame_of(*size, batch=2)
+    expected, _ = Blur()(frame)
+    output, state = Tiled(toy, side)(frame)
+    assert state is None
+    torch.testing.assert_close(output.image, expected.image, rtol=1e-6, atol=1e-7)
+    # Each tile, and two pixels on each side of it, as far as the image goes.
+    rows, columns = (-(-length // side) for length in size)
+    inner = [(size[0] + 4 * (rows - 1)), (size[1] + 4 * (columns - 1))]
+    assert toy.pixels == inner[0] * inner[1]
+
+
+def test_a_reach_that_is_too_short_is_seen() -> None:
+    """The test above could fail."""
+    toy = Blur()
+    toy.needs = Needs(reach=1)
+    frame = frame_of(96, 160)
+    assert not torch.allclose(Tiled(toy, 32)(frame)[0].image, toy(frame)[0].image, rtol=1e-3)
+
+
+def test_a_toy_whose_pixels_depend_on_statistics_is_given_those_of_the_whole_image() -> None:
+    frame = frame_of(96, 160)
+    expected, _ = Brightest()(frame)
+    assert torch.equal(Tiled(Brightest(), 32)(frame)[0].image, expected.image)
+    # Those that it finds of a tile are others.
+    apart = torch.cat(
+        [Brightest()(frame.crop(slice(0, 96), columns))[0].image for columns in (slice(0, 80), slice(80, 160))], 3
+    )
+    assert not torch.equal(apart, expected.image)
+    # Also where another wrapper is around it, or has been given statistics of its own.
+    for model in (Tiled(Exposed(Brightest()), 32), Exposed(Tiled(Brightest(), 32))):
+        torch.testing.assert_close(model(frame)[0].image, expected.image, rtol=1e-6, atol=1e-7)
+
+
+def test_what_depends_on_the_whole_image_is_not_divided() -> None:
+    frame, seen = frame_of(96, 160), []
+
+    def whole(color: Tensor) -> Tensor:
+        seen.append(tuple(color.shape[-2:]))
+        return color - color.mean((2, 3), keepdim=True) + 1
+
+    for model in (Tiled(FromBuffers(whole), 32), Tiled(FromBuffers(whole))):
+        assert model.halo is None
+        model(frame)
+    assert seen == [(96, 160)] * 2
+    # Nor is what begins at multiples that tiles do not.
+    toy = Blur()
+    toy.needs = Needs(reach=2, stride=24)
+    assert Tiled(toy, 32).halo is None
+    assert Tiled(FromBuffers(whole, reach=0), 32).halo == 0
+
+
+@pytest.mark.parametrize(
+    ("reach", "stride", "margin", "halo"), [(2, 1, 0, 2), (2, 8, 0, 8), (57, 8, 8, 72), (0, 32, 0, 0)]
+)
+def test_a_halo_holds_reach_and_margin_in_whole_strides(reach: int, stride: int, margin: int, halo: int) -> None:
+    toy = Same()
+    toy.needs = Needs(reach=reach, stride=stride)
+    assert Tiled(toy, margin=margin).halo == halo
+
+
+def test_tiles_begin_at_multiples_of_the_stride() -> None:
+    """As a U-Net wants that pools eight by eight pixels."""
+
+    class Blocks(Same):
+        needs = Needs(reach=7, stride=8)
+
+        def forward(self, frame: Frame, state: Any = None) -> Any:
+            means = torch.nn.functional.avg_pool2d(frame.color, 8, ceil_mode=True, count_include_pad=False)
+            wide = means.repeat_interleave(8, -2).repeat_interleave(8, -1)
+            return super().forward(frame.replace(color=wide[..., : frame.size[0], : frame.size[1]]))
+
+    frame = frame_of(101, 163)
+    torch.testing.assert_close(Tiled(Blocks(), 32)(frame)[0].image, Blocks()(frame)[0].image, rtol=1e-6, atol=1e-7)
+
+
+def test_a_method_with_a_state_is_refused_in_tiles() -> None:
+    toy = Mean()
+    toy.needs = Needs(reach=0)
+    frame = frame_of(96, 160)
+    with pytest.raises(TypeError, match="expected a method without a state to compute in tiles"):
+        Tiled(toy, 32)(frame)
+    # In one piece, it keeps it.
+    _, state = Tiled(toy)(frame)
+    assert Tiled(toy)(frame.replace(color=3 * frame.color), state)[0].image.equal(2 * frame.color)
+
+
+def test_what_is_known_is_not_computed() -> None:
+    frame, toy = frame_of(237, 331), Blur()
+    known = {"image": torch.full_like(frame.color, 7.0)}
+    for top, left in ((0, 0), (100, 131), (170, 250)):
+        mask = torch.ones(1, 1, 237, 331, dtype=torch.bool)
+        mask[..., top : top + 60, left : left + 70] = False
+        toy.pixels = 0
+        output, _ = Tiled(toy)(frame.replace(skip=Skip(mask, known)))
+        assert 60 * 70 <= toy.pixels < 0.3 * 237 * 331
+        expected = Blur()(frame)[0].image
+        torch.testing.assert_close(output.image[..., ~mask[0, 0]], expected[..., ~mask[0, 0]], rtol=1e-6, atol=1e-7)
+    toy.pixels = 0
+    output, _ = Tiled(toy)(frame.replace(skip=Skip(torch.ones_like(mask), known)))
+    assert toy.pixels == 0
+    assert torch.equal(output.image, known["image"])
+
+
+@pytest.mark.parametrize("name", ["cascaded", "cascaded_v2", "cascaded_v2_tiny", "cascaded_v2_micro"])
+@pytest.mark.parametrize(("top", "left"), [(0, 0), (100, 131), (170, 250)])
+@torch.no_grad()
+def test_a_part_of_an_image_is_that_of_the_whole(name: str, top: int, left: int) -> None:
+    """Of each network of the zoo."""
+    frame = frame_of(237, 331, length=torch.ones(1, 1, 237, 331))
+    mask = torch.ones(1, 1, 237, 331, dtype=torch.bool)
+    mask[..., top : top + 60, left : left + 70] = False
+    for tiled in parts_of(small(name).to(memory_format=torch.channels_last), Tiled):
+        given = prepared(tiled, frame)
+        whole = tiled.inner(given)[0].image
+        part = tiled(given.replace(skip=Skip(mask, {"image": frame.color})))[0].image
+        # Convolutions choose the order of their sums by the size of the image and the number of threads.
+        scale, needed = float(whole.abs().mean()), ~mask[0, 0]
+        assert (whole - part)[..., needed].abs().max() < 1e-5 * scale
+        # The part is all that is computed.
+        assert (part == frame.color).all(1).float().mean() > 0.5
+        # Less than what a network sees is not enough.
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Tiled, "halo", 24)
+            part = tiled(given.replace(skip=Skip(mask, {"image": frame.color})))[0].image
+        assert (whole - part)[..., needed].abs().max() > 1e-4 * scale
+
+
+# Rectangles
+
+
+def test_tiles_hold_every_pixel_once() -> None:
+    for region, side in ((Region(0, 0, 237, 331), 96), (Region(64, 32, 65, 4000), 1024), (Region(0, 0, 64, 64), 64)):
+        count = torch.zeros(region.bottom, region.right)
+        tiles = region.split(side)
+        for tile in tiles:
+            assert max(tile.bottom - tile.top, tile.right - tile.left) <= side
+            assert all(start % 32 == 0 for start in tile[:2])
+            tile.of(count).add_(1)
+        assert region.of(count).min() == count.max() == 1
+        assert count.sum() == region.pixels
+    # No sliver is left over.
+    assert [tile.right - tile.left for tile in Region(0, 0, 32, 1056).split(1024)] == [544, 512]
+
+
+def test_rectangles_hold_what_is_needed_once_and_reach_no_other() -> None:
+    needed = torch.zeros(2, 1, 1000, 1400, dtype=torch.bool)
+    for image, top, left in ((0, 3, 5), (0, 40, 70), (1, 500, 900), (0, 999, 1399)):
+        needed[image, 0, top, left] = True
+    boxes = regions(needed, 64)
+    assert boxes == [Region(0, 0, 64, 96), Region(480, 896, 512, 928), Region(992, 1376, 1000, 1400)]
+    covered = sum(box.of(needed).sum() for box in boxes)
+    assert covered == needed.sum()
+
+
+def test_where_a_part_costs_as_much_as_the_whole_it_is_the_whole() -> None:
+    needed = torch.zeros(1, 1, 90, 160, dtype=torch.bool)
+    assert regions(needed, 64) == []
+    needed[..., 40, 80] = True
+    assert regions(needed, 64) == [Region(0, 0, 90, 160)]
+    assert regions(needed, 8) == [Region(32, 64, 64, 96)]
+
+
+# What is chosen
+
+
+@pytest.fixture
+def loaded(monkeypatch: pytest.MonkeyPatch) -> float:
+    """What a process holds that has loaded torch and no images, unlike the one that runs tests."""
+    monkeypatch.setattr("mcdenoise.models._memory._memory_in_use", lambda device: 0.64e9)
+    return 0.64e9
+
+
+def test_the_largest_tiles_that_fit(loaded: float) -> None:
+    frames, network = Frames((4320, 7680), BUFFERS, streaming=False), Network(64, 1000.0)
+    memory = Memory(4e9, CPU)
+    tiling = memory.choose(frames, network)
+    assert tiling.side is not None
+    # Twenty channels of float32 are held: ten of the frame, four before the network and six of its results.
+    left = 4e9 - loaded - 20 * 4 * 7680 * 4320
+    sides = [int(side) + 128 for side in re.findall(r"(\d+)x(\d+) pixels", tiling.reason)[0]]
+    assert 0.7 * left < 1000 * sides[0] * sides[1] <= left
+    assert tiling.reason.endswith("all within 4 GB")
+    # With less memory they are smaller, and with much of it there are none.
+    assert memory.choose(frames, Network(64, 4000.0)).side < tiling.side
+    assert Memory(100e9, CPU).choose(frames, network).side is None
+
+
+def test_without_a_limit_only_large_frames_are_tiled() -> None:
+    tiles = list(parts_of(create_model("cascaded_v2"), Tiled))
+    assert [each.halo for each in tiles] == [64, 64]
+    needs = Network(64, max(each.bytes_per_pixel(bfloat16=False) for each in tiles))
+
+    def chosen(width: int, height: int) -> Tiling:
+        return Memory(None, CPU).choose(Frames((height, width), BUFFERS, streaming=True), needs)
+
+    assert chosen(1920, 1080) == (None, "whole frames: features of the network within 2 GB")
+    assert chosen(7680, 4320).side is not None
+    assert Memory(None, CPU).has_room_ahead(Frames((4320, 7680), BUFFERS, streaming=True), needs)
+
+
+@pytest.mark.usefixtures("loaded")
+def test_too_little_memory_is_told_with_the_least_that_works() -> None:
+    frames, network = Frames((4320, 7680), BUFFERS, streaming=True), Network(64, 500.0)
+    message = refused(lambda: Memory(3e9, CPU).choose(frames, network))
+    least = re.match(r"max_memory: expected at least ([\d.]+) GB for frames of 7680x4320, found 3;", message)
+    assert least
+    cap = float(least[1]) * 1e9 + 1e7
+    assert Memory(cap, CPU).choose(frames, network).side is not None
+    assert not Memory(cap, CPU).has_room_ahead(frames, network)
+    assert Memory(2 * cap, CPU).has_room_ahead(frames, network)
+    assert "expected at least" in refused(lambda: Memory(cap - 1e8, CPU).choose(frames, network))
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"tile": 32}, "tile: expected a multiple of 32 of at least 64 pixels, found 32"),
+        ({"tile": 100}, "tile: expected a multiple of 32 of at least 64 pixels, found 100"),
+        ({"max_memory": 0.0}, "max_memory: expected a number of GB above 0, found 0"),
+        ({"max_memory": float("nan")}, "max_memory: expected a number of GB above 0, found nan"),
+        ({"tile": 128, "max_memory": 4.0}, "tile, max_memory: expected one of them, found both"),
+    ],
+)
+def test_bad_settings(settings: dict[str, Any], expected: str) -> None:
+    assert expected in refused(lambda: Denoiser(small("cascaded_v2"), **settings))
+
+
+def test_a_module_that_computes_no_tiles_has_none() -> None:
+    def copy(color: Tensor) -> Tensor:
+        return color
+
+    assert "expected a model that computes tiles" in refused(lambda: Denoiser(copy, tile=64))
+    assert "expected a model that computes tiles" in refused(lambda: Denoiser(copy, max_memory=4.0))
+    denoiser = Denoiser(copy)
+    denoiser(synthetic(64, 48))
+    assert denoiser.report.tiles == "whole frames: the model computes no tiles"
+    # One whose reach is known may wear them.
+    denoiser = Denoiser(Tiled(FromBuffers(copy, reach=0)), tile=64)
+    assert denoiser(synthetic(130, 48)).shape == (1, 3, 48, 130)
+    assert denoiser.report.tiles == "3 x 1 tiles of up to 64x48 pixels: as asked for"

@@ -1,0 +1,148 @@
+"""The U-Net: its scales, and what is faster on a CPU."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.nn import Head, UNet
+
+WIDTH = 8
+
+
+def whole_numbers(parameter: Tensor, generator: torch.Generator) -> Tensor:
+    """Of the weights of a convolution, two are 1 or -1 for each result and all others 0; no bias."""
+    values = torch.zeros(parameter.shape)
+    if parameter.dim() > 1:
+        # Transposed convolutions have their results second, and one weight of each input for each of two by two.
+        outputs = values.transpose(0, 1) if parameter.shape[-1] == 2 else values
+        for output in range(outputs.shape[0]):
+            for place in torch.randperm(outputs[0].numel(), generator=generator)[:2].tolist():
+                sign = 1.0 if torch.rand((), generator=generator) < 0.7 else -1.0
+                outputs[(output, *np.unravel_index(place, outputs[0].shape))] = sign
+    return values
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+def test_shortcuts_of_inference_change_no_feature(dtype: torch.dtype) -> None:
+    """Bit by bit, of a network whose sums have no rounding in whichever order a library takes them."""
+    net, generator = UNet(4, WIDTH), torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.copy_(whole_numbers(parameter, generator))
+    net = net.to(dtype=dtype, memory_format=torch.channels_last)
+    # Each of the 17 layers at most doubles them: whole numbers below 2^20, and float32, in which all sums are taken,
+    # holds those below 2^24. bfloat16 rounds the results only, before or after ReLU, which is the same.
+    image = torch.randint(-4, 5, (1, 4, 21, 34), generator=generator).to(dtype)
+    trained = net(image)
+    with torch.no_grad():
+        inferred = net(image)
+    for a, b in zip(trained, inferred, strict=True):
+        assert len(b.unique()) > 20
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+def test_shortcuts_of_inference_change_no_convolution_by_more_than_rounding(dtype: torch.dtype) -> None:
+    """Of ``n`` products, sums in two orders differ by ``2 gamma_n`` times the sum of their absolute values, at most.
+
+    ``gamma_n = n u / (1 - n u)`` with the ``u`` of float32 (Higham 2002, Sec. 3.1). What a first convolution differs by
+    the second one multiplies by its weights. A result in bfloat16 is rounded once more, by up to its ``u``.
+    """
+    torch.manual_seed(0)
+    net = UNet(4, WIDTH).to(dtype=dtype, memory_format=torch.channels_last)
+    entering: list[tuple[nn.Module, Tensor]] = []
+    blocks = [*net.encoder, *net.decoder]
+    for block in blocks:
+        block.register_forward_pre_hook(lambda block, inputs: entering.append((block, inputs[0].detach().clone())))
+    with torch.no_grad():
+        net(torch.randn(1, 4, 21, 34).to(dtype))
+    unit = torch.finfo(torch.float32).eps / 2
+    rounding = 0.0 if dtype == torch.float32 else torch.finfo(dtype).eps / 2
+    # The list grows while they are called again.
+    for block, x in entering[: len(blocks)]:
+        trained = block(x.clone()).detach()
+        with torch.no_grad():
+            inferred = block(x.clone())
+        magnitude, bound = x.double().abs(), torch.zeros_like(x, dtype=torch.float64)
+        for layer in block:
+            if isinstance(layer, nn.Conv2d):
+                weight, bias = layer.weight.detach().double().abs(), layer.bias.detach().double().abs()
+                gamma = (count := weight[0].numel() + 1) * unit / (1 - count * unit)
+                carried = nn.functional.conv2d(bound, weight, None, layer.stride, layer.padding)
+                # Of all absolute values: also an upper bound of the results.
+                magnitude = nn.functional.conv2d(magnitude + bound, weight, bias, layer.stride, layer.padding)
+                bound = carried + (2 * gamma + 2 * rounding) * magnitude
+        assert ((trained.double() - inferred.double()).abs() <= bound).all()
+        assert bound.max() < (1e-3 if dtype == torch.float32 else 2) * trained.max()
+
+
+def test_shortcuts_of_training_change_no_derivative(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    net = UNet(4, WIDTH).to(dtype=torch.bfloat16, memory_format=torch.channels_last)
+    image = torch.randn(1, 4, 21, 34).bfloat16()
+
+    def derivatives() -> tuple[list[Tensor], list[Tensor]]:
+        parameters = list(net.parameters())
+        on_record, plain = (
+            torch.autograd.grad(sum(f.square().sum() for f in net(image)), parameters, create_graph=record)
+            for record in (True, False)
+        )
+        assert all(map(torch.equal, on_record, plain))
+        second = torch.autograd.grad(sum(g.float().square().sum() for g in on_record), parameters)
+        return list(plain), list(second)
+
+    fast = derivatives()
+    monkeypatch.setattr("mcdenoise.nn._cpu.ReLU.forward", lambda self, x: torch.relu(x))
+    monkeypatch.setattr("mcdenoise.nn._cpu.Upsampling.forward", torch.nn.ConvTranspose2d.forward)
+    for order, found, expected in zip((1, 2), fast, derivatives(), strict=True):
+        for (name, _), a, b in zip(net.named_parameters(), found, expected, strict=True):
+            if order == 1 and not (name.startswith("up") and name.endswith("bias")):
+                assert torch.equal(a, b), name
+            else:
+                # Another order of summation, and what follows from it.
+                assert (a - b).abs().max() <= 4 * torch.finfo(torch.bfloat16).eps * b.abs().max(), name
+
+
+@pytest.mark.parametrize(("levels", "half"), [(4, False), (5, False), (3, True), (4, True)])
+def test_unet_gives_three_scales_of_any_size(levels: int, half: bool) -> None:
+    unet = UNet(5, 4, levels, coarse_width=6, half=half)
+    for height, width in ((1, 1), (7, 9), (16, 32)):
+        features = unet(torch.rand(2, 5, height, width))
+        sizes = [(-(-height // s), -(-width // s)) for s in ((2, 2, 4) if half else (1, 2, 4))]
+        widths = (4, 4, 6) if half else (4, 6, 6)
+        assert [tuple(f.shape) for f in features] == [(2, w, *size) for w, size in zip(widths, sizes, strict=True)]
+        sizes = [(-(-height // s), -(-width // s)) for s in (1, 2, 4)]
+        for scale, (feature, size) in enumerate(zip(features, sizes, strict=True)):
+            assert Head(unet, scale, 3)(feature, size).shape == (2, 3, *size)
+
+
+def test_a_head_predicts_the_pixels_that_a_feature_of_half_the_resolution_stands_for() -> None:
+    unet = UNet(1, 2, 3, half=True)
+    head = Head(unet, 0, 1)
+    with torch.no_grad():
+        for parameter in head.parameters():
+            parameter.zero_()
+        # The middle of the kernel: each of two by two pixels is a multiple of the first feature.
+        head.weight[:, 0, 1, 1] = torch.tensor([1.0, 2.0, 3.0, 4.0])
+    predicted = head(torch.tensor([[[[1.0, 10.0]], [[7.0, 7.0]]]]), (2, 3))
+    assert predicted.tolist() == [[[[1, 2, 10], [3, 4, 30]]]]
+
+
+def test_unet_sees_what_it_is_given_at_coarser_scales() -> None:
+    torch.manual_seed(0)
+    unet = UNet(5, 4, coarse_channels=2)
+    image = torch.rand(1, 5, 13, 22)
+    coarse = [torch.rand(1, 2, *size, requires_grad=True) for size in ((7, 11), (4, 6), (2, 3))]
+    features = unet(image, coarse)
+    assert [tuple(f.shape[-2:]) for f in features] == [(13, 22), (7, 11), (4, 6)]
+    for gradient in torch.autograd.grad(features[0].sum(), coarse):
+        assert gradient.abs().sum() > 0
+
+
+@pytest.mark.parametrize(("levels", "half", "lowest"), [(0, False, 4), (2, False, 4), (3, False, 4), (2, True, 3)])
+def test_unet_needs_a_decoder_level_for_each_scale(levels: int, half: bool, lowest: int) -> None:
+    with pytest.raises(ValueError, match=f"levels: expected at least {lowest}, found {levels}"):
+        UNet(5, 4, levels, half=half)
