@@ -21,26 +21,41 @@ import torch
 from torch import Tensor, nn
 
 import mcdenoise.benchmark.memory
-import mcdenoise.benchmark.methods
 import mcdenoise.benchmark.sizes
-from mcdenoise.benchmark import Candidate, Settings, benchmark_ops, choose_candidates, parse_sizes, run_benchmark
+from mcdenoise.benchmark import (
+    Settings,
+    Timed,
+    benchmark_ops,
+    choose_methods,
+    make_method,
+    parse_sizes,
+    run_benchmark,
+)
 from mcdenoise.benchmark.memory import peak_memory
-from mcdenoise.benchmark.methods import ModelRunner, PeerRunner
 from mcdenoise.benchmark.operators import backends
 from mcdenoise.benchmark.run import kept_frames
 from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import fit_line, measure_sizes, synthetic_frame
-from mcdenoise.frame import Frame
 from mcdenoise.cli import main
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.camera_matrices import read_camera_matrices, write_camera_matrices
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
-from mcdenoise.evaluate import score_sequence
-from mcdenoise.models import Denoised, create_model, pretrained_models, save_weights
+from mcdenoise.evaluate import evaluate_method
+from mcdenoise.frame import Frame
+from mcdenoise.models import (
+    Accumulated,
+    Demodulated,
+    Model,
+    Needs,
+    Output,
+    create_model,
+    pretrained_models,
+    save_weights,
+)
 from mcdenoise.ops import downsample, upsample
 from mcdenoise.ops._cases import OPS, Op
-from mcdenoise.results import Cell, Cost, LeftOut, Machine, Method, OpResults, Results, Spread
+from mcdenoise.results import Cell, Cost, Machine, Method, OpResults, Results, Skipped, Spread
 
 METRICS = {"SMAPE", "relMSE", "PSNR", "SSIM", "tSMAPE", "tRMSE"}
 
@@ -83,48 +98,70 @@ def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
     return call
 
 
-class Half(nn.Module):
-    def forward(self, color: Tensor, albedo: Tensor, normal: Tensor, depth: Tensor) -> Denoised:
-        return Denoised(color, color / 2)
+def half() -> Model:
+    """On the way to half of the accumulated light, all of it."""
+    return Demodulated(Accumulated(lambda color: Output(color / 2, {"initial": color})))
+
+
+NOT_FINITE = (
+    "model: expected finite radiance, found 480 NaN or infinite pixels; the frame is not kept: check the buffers for "
+    "values far out of range and the network for weights that are"
+)
+
+# What scripted methods do to a frame, by name, and all that they were asked for.
+ACTS: dict[str, Callable[[Frame], Tensor]] = {}
+LOG: list[str] = []
 
 
 class Scripted:
-    """Writes down what it is asked for; multiplies, or does what it is told to."""
+    """Writes down what it is asked for, and whether it begins a shot; multiplies, or does what it is told to."""
 
-    def __init__(self, name: str, log: list[str], act: Callable[[Frame], Tensor]) -> None:
-        self.stages: dict[str, float] = {}
-        self._name, self._log, self._act = name, log, act
+    needs = Needs(trainable=False)
 
-    def reset(self) -> None:
-        self._log.append(f"reset {self._name}")
+    def __init__(self, act: str) -> None:
+        self._name = act
 
-    def __call__(self, frame: Frame) -> Tensor:
-        self._log.append(self._name)
-        self.stages = {"filter": 1.0}
-        return self._act(frame)
+    def __call__(self, frame: Frame, state: Tensor | None = None) -> tuple[Output, Tensor]:
+        LOG.append(self._name + ("" if state is not None else "!"))
+        return Output(ACTS[self._name](frame)), torch.zeros(1)
 
 
-def scripted(name: str, log: list[str], act: Callable[[Frame], Tensor] = lambda frame: frame.color / 2) -> Candidate:
-    return Candidate(Method(name, "peer", name, name), lambda: Scripted(name, log, act))
+def unmakeable() -> Model:
+    return 1 / 0  # type: ignore[return-value]
+
+
+@pytest.fixture(autouse=True)
+def _empty_log() -> None:
+    LOG.clear()
+    ACTS.clear()
+
+
+def own(name: str, factory: str, **settings: Any) -> Method:
+    """A method of this file."""
+    return Method(name, "fixed", name.replace(" ", "-"), f"{__name__}:{factory}", settings)
+
+
+def scripted(name: str, act: Callable[[Frame], Tensor] = lambda frame: frame.color / 2) -> Method:
+    ACTS[name] = act
+    return own(name, "Scripted", act=name)
 
 
 def test_methods_take_turns_frame_by_frame(small_sequence: Path, out: Path) -> None:
-    log: list[str] = []
     steps: list[tuple[int, int]] = []
-    candidates = [scripted(name, log) for name in "ABC"]
+    methods = [scripted(name) for name in "ABC"]
     settings = Settings(rounds=2, sizes=((16, 12),))
     results = run_benchmark(
-        [open_sequence(small_sequence, "0-2")], candidates, out, settings, on_step=lambda *step: steps.append(step)
+        [open_sequence(small_sequence, "0-2")], methods, out, settings, on_step=lambda *step: steps.append(step)
     )
-    one_pass = ["reset A", "reset B", "reset C", *"ABC" * 3]
+    one_pass = ["A!", "B!", "C!", *"ABC" * 2]
     # The warm-up and two rounds over the frames; then the size: two to warm up, and two rounds.
-    assert log == [*one_pass * 3, *"ABC" * 4, "reset A", "reset B", "reset C"]
+    assert [*one_pass * 3, *"ABC" * 4] == LOG
     assert steps == [(step, 13) for step in range(1, 14)]
     for cell in results.cells:
         # Of three frames the first, which has no history, is not counted.
         assert {spread.count for spread in (cell.whole, cell.computing, *cell.stages.values())} == {2 * 2}
-        assert list(cell.stages) == ["read", "filter", "write"]
-        assert cell.stages["filter"].median == 1.0
+        # What says nothing of itself is a filter.
+        assert list(cell.stages) == ["read", "accumulate", "filter", "write"]
     assert [(cost.method, cost.width, cost.height) for cost in results.costs] == [(name, 16, 12) for name in "ABC"]
     assert {cost.milliseconds.count for cost in results.costs} == {2}
 
@@ -132,27 +169,29 @@ def test_methods_take_turns_frame_by_frame(small_sequence: Path, out: Path) -> N
 def test_errors_and_pictures_are_of_the_images(small_sequence: Path, out: Path) -> None:
     sequence = open_sequence(small_sequence)
     # What has no history of its own, and yet must be in its place.
-    baselines = choose_candidates("none", "none")
-    assert [candidate.method.name for candidate in baselines] == ["noisy", "accumulated"]
-    half = Candidate(Method("half", "model", "half", "half"), lambda: ModelRunner(Half()))
-    results = run_benchmark([sequence], [*baselines, half], out, Settings(rounds=1, pictures=2))
-    expected = {score.method: score for score in score_sequence(sequence, {"half": Denoiser(Half())}, metrics=METRICS)}
-    for cell in results.cells:
-        values = expected[cell.method].values
-        assert {name: cell.errors[name] for name in METRICS} == pytest.approx(values, rel=1e-5)
+    baselines = choose_methods("none")
+    assert [method.name for method in baselines] == ["noisy", "accumulated"]
+    methods = [*baselines, own("half", "half")]
+    results = run_benchmark([sequence], methods, out, Settings(rounds=1, pictures=2, on_the_way=True))
+    for cell, method in zip(results.cells, methods, strict=True):
+        denoiser = make_method(method).denoiser
+        strict = evaluate_method(sequence, denoiser, method.name).tables["strict"]
+        assert {name: cell.errors[name] for name in METRICS} == pytest.approx(
+            {name: strict.mean[name] for name in METRICS}, rel=1e-5
+        )
         assert {name: spread.count for name, spread in cell.errors_spread.items()}.items() >= {
             ("SMAPE", 4),
             ("tSMAPE", 3),
         }
-        assert (
-            cell.whole.median
-            > cell.computing.median
-            >= sum(cell.stages[stage].lower for stage in ("accumulate", "network", "filter") if stage in cell.stages)
-        )
-    noisy, accumulated, own = results.cells
+        assert cell.whole.median > cell.computing.median
+        in_memory = [cell.stages[stage].lower for stage in cell.stages if stage not in ("read", "write")]
+        assert cell.computing.median >= sum(in_memory)
+    noisy, accumulated, ours = results.cells
     assert list(noisy.stages) == ["read", "write"]
-    assert list(accumulated.stages) == ["read", "accumulate", "write"]
-    assert list(own.stages) == ["read", "accumulate", "network", "filter", "write"]
+    assert list(accumulated.stages) == list(ours.stages) == ["read", "accumulate", "filter", "write"]
+    assert noisy.on_the_way == accumulated.on_the_way == {}
+    # Twice the half is the accumulated image.
+    assert ours.on_the_way["initial"] == pytest.approx(accumulated.errors, rel=1e-5)
 
     assert results.scenes[0].pictures == [2, 3]
     written = sorted(path.relative_to(out).as_posix() for path in out.rglob("*.exr"))
@@ -165,26 +204,31 @@ def test_errors_and_pictures_are_of_the_images(small_sequence: Path, out: Path) 
         np.testing.assert_allclose(pixels, image[0].permute(1, 2, 0).numpy(), rtol=1e-3, atol=1e-6)
 
 
-def test_a_method_that_fails_on_one_scene_leaves_the_rest_alone(small_sequence: Path, out: Path) -> None:
-    log: list[str] = []
+def test_errors_alone_take_one_pass(small_sequence: Path, out: Path) -> None:
+    settings = Settings(rounds=0, sizes=((16, 12),), metrics=("PSNR", "SMAPE"))
+    results = run_benchmark([open_sequence(small_sequence)], [scripted("A")], out, settings)
+    assert LOG == ["A!", "A", "A", "A"]
+    (cell,) = results.cells
+    assert set(cell.errors) == {"SMAPE", "PSNR"}
+    assert (cell.whole, cell.computing, cell.stages, cell.memory, results.costs) == (None, None, {}, None, [])
+    assert Results.read(out) == results
 
+
+def test_a_method_that_fails_on_one_scene_leaves_the_rest_alone(small_sequence: Path, out: Path) -> None:
     def cannot_do_frame_1(frame: Frame) -> Tensor:
-        if len(log) == 2:
+        if LOG.count("unlucky") == 1 and LOG.count("unlucky!") == 1:
             raise RuntimeError("out of\nluck")
         return frame.color
 
-    def not_a_number(frame: Frame) -> Tensor:
-        return frame.color * torch.nan
-
-    candidates = [
-        scripted("unlucky", log, cannot_do_frame_1),
-        scripted("not a number", [], not_a_number),
-        scripted("fine", []),
-        Candidate(Method("unmakeable", "model", "unmakeable", "ours"), lambda: 1 / 0),
+    methods = [
+        scripted("unlucky", cannot_do_frame_1),
+        scripted("not a number", lambda frame: frame.color * torch.nan),
+        scripted("fine"),
+        own("unmakeable", "unmakeable"),
     ]
     # The same scene twice: names are unique, and a method that failed on the one is tried on the other.
     sequences = [open_sequence(small_sequence, "0-1")] * 2
-    results = run_benchmark(sequences, candidates, out, Settings(rounds=1, sizes=((16, 12),)))
+    results = run_benchmark(sequences, methods, out, Settings(rounds=1, sizes=((16, 12),)))
     assert [scene.name for scene in results.scenes] == ["plane", "plane (2)"]
     assert results.failed
     failures = {(cell.scene, cell.method): cell.failure for cell in results.cells}
@@ -193,7 +237,7 @@ def test_a_method_that_fails_on_one_scene_leaves_the_rest_alone(small_sequence: 
         for scene in ("plane", "plane (2)")
         for method, failure in {
             "unlucky": "RuntimeError: out of luck" if scene == "plane" else "",
-            "not a number": "ArithmeticError: frame 0 has NaN or infinite values",
+            "not a number": NOT_FINITE,
             "fine": "",
             "unmakeable": "ZeroDivisionError: division by zero",
         }.items()
@@ -212,7 +256,7 @@ def test_a_scene_that_cannot_be_read_fails_alone(small_sequence: Path, out: Path
     path = damaged / "inputs" / "albedo2.exr"
     path.write_bytes(path.read_bytes()[:-200])
     sequences = [open_sequence(damaged), open_sequence(small_sequence)]
-    results = run_benchmark(sequences, [scripted("A", []), scripted("B", [])], out, Settings(rounds=1))
+    results = run_benchmark(sequences, [scripted("A"), scripted("B")], out, Settings(rounds=1))
     assert [bool(cell.failure) for cell in results.cells] == [True, True, False, False]
     assert "albedo2.exr" in results.cells[0].failure
     assert results.scenes[0].pictures == []
@@ -225,11 +269,11 @@ def test_nothing_is_left_of_a_run_that_is_interrupted(small_sequence: Path, out:
 
     before = sorted(out.parent.iterdir())
     with pytest.raises(KeyboardInterrupt):
-        run_benchmark([open_sequence(small_sequence)], [scripted("A", [], interrupt)], out)
+        run_benchmark([open_sequence(small_sequence)], [scripted("A", interrupt)], out)
     assert sorted(out.parent.iterdir()) == before
 
 
-def test_temporal_errors_are_of_neighbours_and_what_is_not_finite_is_left_out() -> None:
+def test_temporal_errors_are_of_neighbours_and_what_is_not_finite_is_skipped() -> None:
     errors = Errors()
     reference = torch.full((1, 3, 16, 16), 0.25)
     for number, level in ((3, 0.25), (4, 0.5), (6, 0.75)):
@@ -246,6 +290,27 @@ def test_temporal_errors_are_of_neighbours_and_what_is_not_finite_is_left_out() 
     assert errors.means("theirs") == {}
 
 
+def test_flip_of_some_frames_only() -> None:
+    pytest.importorskip("flip_evaluator")
+    errors = Errors(("SMAPE", "FLIP"), flip_every=3)
+    image = torch.full((1, 3, 4, 4), 0.5)
+    for number in range(4):
+        errors.add("ours", number, image, image)
+    assert {name: spread.count for name, spread in errors.spreads("ours").items()} == {"SMAPE": 4, "FLIP": 2}
+
+
+def test_a_metric_that_cannot_be_computed_is_skipped_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    errors = Errors(("SMAPE", "SSIM", "FLIP"))
+    image = torch.full((1, 3, 10, 20), 0.5)
+    errors.add("ours", 0, image, image)
+    assert errors.means("ours") == {"SMAPE": 0}
+    assert "11 x 11 pixels, found 10 x 20" in errors.skipped["SSIM"]
+    assert "flip-evaluator" in errors.skipped["FLIP"]
+    with pytest.raises(ValueError, match="reference: expected the shape of image"):
+        errors.add("wrong", 0, image[..., :6], image)
+
+
 # The command
 
 
@@ -253,49 +318,48 @@ def test_temporal_errors_are_of_neighbours_and_what_is_not_finite_is_left_out() 
 def weights(tmp_path: Path) -> Path:
     torch.manual_seed(0)
     path = tmp_path / "small.safetensors"
-    path.write_bytes(save_weights(create_model("cascaded", width=4), "cascaded", {"width": 4}, {}))
+    path.write_bytes(save_weights(create_model("cascaded_v2", width=4), "cascaded_v2", {"width": 4}, {}))
     return path
 
 
-def test_missing_peers_are_said_to_be_missing(
+def absent(quality: str = "high") -> Model:
+    try:
+        import no_such_package  # type: ignore[import-not-found]
+    except ImportError as error:
+        raise InputError("this method needs no_such_package, which is not installed") from error
+    return no_such_package.make(quality)
+
+
+def test_missing_methods_are_said_to_be_missing(
     small_sequence: Path, weights: Path, out: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mcdenoise.benchmark.methods._oidn.cache_clear()
-    monkeypatch.setitem(sys.modules, "pyoidn", None)
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     file = out.parent / "copy.json"
+    models = f"{__name__}:half,{__name__}:absent(quality=fast|high),{weights}"
     status, printed, errors = run(
-        small_sequence, "-o", out, "--models", weights, "--rounds", 1, "--sizes", "24x20,48x40", "--json", file
+        small_sequence, "-o", out, "--models", models, "--rounds", 1, "--sizes", "24x20,48x40", "--json", file
     )
     assert (status, errors) == (0, "")
     results = Results.read(out)
-    present = [
-        "noisy",
-        "accumulated",
-        "joint bilateral 0.1 1.5",
-        "joint bilateral 0.2 4.0",
-        "small",
-        "small, bfloat16",
-    ]
-    missing = [
-        f"OIDN {quality}, clean aux, {image}"
-        for image in ("raw", "accumulated")
-        for quality in ("fast", "balanced", "high")
-    ]
-    assert [method.name for method in results.methods] == [*present[:4], *missing, *present[4:]]
+    present = ["noisy", "accumulated", f"{__name__}:half", "small", "small, bfloat16"]
+    missing = [f"{__name__}:absent(quality={quality})" for quality in ("fast", "high")]
+    assert [method.name for method in results.methods] == [*present[:3], *missing, *present[3:]]
+    assert [method.kind for method in results.methods[2:4]] == ["fixed", "fixed"]
     assert [method.name for method in results.methods if method.missing] == missing
-    assert "pip install 'mcdenoise[peers]'" in results.methods[4].missing
+    assert results.methods[4].missing == "this method needs no_such_package, which is not installed"
+    assert results.methods[4].settings == {"quality": "high"}
     assert [cell.method for cell in results.cells] == present
-    assert "FLIP is left out where it cannot be computed: FLIP needs flip-evaluator" in results.notes[0]
+    assert "FLIP is skipped where it cannot be computed: FLIP needs flip-evaluator" in results.notes[0]
     assert all(set(cell.errors) >= METRICS and "FLIP" not in cell.errors for cell in results.cells)
     own = results.methods[-1]
-    assert own.parameters == sum(p.numel() for p in create_model("cascaded", width=4).parameters())
+    assert own.parameters == sum(p.numel() for p in create_model("cascaded_v2", width=4).parameters())
+    assert (own.model, own.weights, own.precision) == ("cascaded_v2", str(weights), "bfloat16")
     assert results.machine.threads == 1
-    assert f"--models={weights}" in results.command
+    assert "--models=" in results.command
     assert [fit.method for fit in results.fits] == present[1:]
     assert json.loads(file.read_text()) == asdict(results)
 
-    # What is printed: the best first, and below what is missing and left out.
+    # What is printed: the best first, and below what is missing and was not computed.
     order = [line.split("│")[2].strip() for line in printed.splitlines() if "│" in line]
     assert sorted(order) == sorted(present)
     smape = [cell.errors["SMAPE"] for name in order for cell in results.cells if cell.method == name]
@@ -323,19 +387,19 @@ def test_missing_peers_are_said_to_be_missing(
 def test_a_model_that_fails_is_a_row_and_exit_status_1(
     small_sequence: Path, out: Path, run: Callable[..., Any]
 ) -> None:
-    model = create_model("cascaded", width=4)
+    model = create_model("cascaded_v2", width=4)
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.copy_(torch.randn_like(parameter).sign() * 6e4)
     path = out.parent / "wild.safetensors"
-    path.write_bytes(save_weights(model, "cascaded", {"width": 4}, {}))
-    arguments = ("--models", path, "--peers", "none", "--precisions", "float32", "--rounds", 1, "--sizes", "none")
+    path.write_bytes(save_weights(model, "cascaded_v2", {"width": 4}, {}))
+    arguments = ("--models", path, "--precisions", "float32", "--rounds", 1, "--sizes", "none")
     status, printed, errors = run(small_sequence, "-o", out, *arguments)
     assert (status, errors) == (1, "")
     noisy, accumulated, wild = Results.read(out).cells
     assert noisy.errors
     assert accumulated.errors
-    assert wild.failure == "ArithmeticError: frame 0 has NaN or infinite values"
+    assert wild.failure.startswith("model: expected finite radiance, found ")
     assert f"failed: plane, {wild.method}: {wild.failure}\n" in printed
 
 
@@ -344,8 +408,10 @@ def test_a_model_that_fails_is_a_row_and_exit_status_1(
     [
         ((), "expected nothing there yet, found something"),
         (("--models", "cascade"), "model 'cascade': expected one of"),
-        (("--models", "cascaded,cascaded"), "--models: expected different names"),
-        (("--peers", "oidn,optix"), "--peers: expected some of oidn, bilateral, or all, or none, found 'optix'"),
+        (("--models", "cascaded_v2,cascaded_v2"), "methods: expected different names"),
+        (("--models", "cascaded_v2(width)"), "expected settings such as (setting=value), found 'width'"),
+        (("--models", "cascaded_v2(hue=3)"), "model 'cascaded_v2': got an unexpected keyword argument 'hue'"),
+        (("--models", "nowhere.py:make"), "nowhere.py: expected a Python file with a factory of a model"),
         (("--precisions", "float8"), "--precisions: expected some of float32, bfloat16"),
         (("--device", "tpu"), "--device: expected cpu or cuda, found 'tpu'"),
         (("--rounds", 0), "--rounds: expected at least 1, found 0"),
@@ -362,7 +428,7 @@ def test_bad_arguments_are_refused_before_anything_is_measured(
     out.mkdir()
     (out / "old").touch()
     cheap = () if "--models" in arguments else ("--models", "none")
-    status, _, message = run(small_sequence, "-o", out, "--peers", "none", *cheap, *arguments)
+    status, _, message = run(small_sequence, "-o", out, *cheap, *arguments)
     assert status == 2
     assert expected in message
     assert message.count("\n") == 1
@@ -380,7 +446,7 @@ def test_references_are_looked_at_first(small_sequence: Path, out: Path, run: Ca
     assert "reference2.exr: expected 24 x 20 pixels" in message
     for path in (other / "inputs").glob("reference*.exr"):
         path.unlink()
-    status, _, message = run(small_sequence, other, "-o", out, "--models", "none", "--peers", "none")
+    status, _, message = run(small_sequence, other, "-o", out, "--models", "none")
     assert status == 2
     assert f"{other}: expected references to compare with, found none" in message
     assert not out.exists()
@@ -392,75 +458,97 @@ def test_references_are_looked_at_first(small_sequence: Path, out: Path, run: Ca
 # Methods
 
 
-def test_every_setting_is_a_candidate() -> None:
-    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
-    candidates = choose_candidates()
-    methods = [candidate.method for candidate in candidates]
+def test_what_is_compared_by_default() -> None:
+    methods = choose_methods()
     names = [method.name for method in methods]
-    assert (
-        len(set(names)) == len({method.folder for method in methods}) == len(names) == 10 + 2 * len(pretrained_models())
-    )
-    assert names[4] == "OIDN fast, clean aux, raw"
-    assert methods[4].folder == "oidn-fast-clean-aux-raw"
-    assert not any(method.missing for method in methods)
-    assert [method.family for method in methods[4:10]] == ["OIDN"] * 6
-    assert "cascaded, bfloat16" in names
-    assert [c.method.name for c in choose_candidates("cascaded_tiny", "none", precisions="bfloat16")[2:]] == [
-        "cascaded_tiny, bfloat16"
+    assert names[:2] == ["noisy", "accumulated"]
+    assert {method.kind for method in methods[:2]} == {"baseline"}
+    assert len(set(names)) == len({method.folder for method in methods}) == len(names)
+    trained = [method for method in methods if method.kind == "trainable"]
+    assert {method.model for method in trained} == set(pretrained_models())
+    assert {method.precision for method in trained} == {"float32", "bfloat16"}
+    assert len(trained) == 2 * len(pretrained_models())
+    assert {"svgf", "joint_bilateral", "oidn"} <= {method.model for method in methods if method.kind == "fixed"}
+    assert {method.settings["quality"] for method in methods if method.model == "oidn"} == {"fast", "balanced", "high"}
+
+
+def test_some_methods_in_some_precisions() -> None:
+    names = "cascaded_v2_tiny(alpha_min=0.1|0.2), cascaded_v2_micro"
+    methods = choose_methods(names, precisions="bfloat16", keep_all=True, baselines=())
+    base = ["cascaded_v2_tiny(alpha_min=0.1)", "cascaded_v2_tiny(alpha_min=0.2)", "cascaded_v2_micro"]
+    assert [method.name for method in methods] == [
+        f"{name}, bfloat16{more}" for name in base for more in ("", ", keep all")
     ]
-    # The stage of each: what starts from the noisy image has no accumulation.
-    frame = synthetic_frame(24, 20)
-    stages = {}
-    for candidate in candidates[:10]:
-        runner = candidate.make()
-        assert runner(frame).shape == (1, 3, 20, 24)
-        stages[candidate.method.name] = list(runner.stages)
-    assert stages == {
-        name: ([] if name == "noisy" else ["accumulate"] if "accumulated" in name or "bilateral" in name else [])
-        + (["network"] if "OIDN" in name else ["filter"] if "bilateral" in name else [])
-        for name in names[:10]
-    }
+    assert methods[0].folder == "cascaded_v2_tiny-alpha_min-0.1-bfloat16"
+    denoiser = make_method(methods[3]).denoiser
+    assert (denoiser.precision, denoiser.keep_all) == ("bfloat16", True)
+    (accumulated,) = (part for part in denoiser.model.modules() if isinstance(part, Accumulated))
+    assert accumulated.alpha_min == 0.2
+    # What is named twice is there once.
+    assert len(choose_methods("accumulated,cascaded_v2_micro,pretrained", precisions="float32")) == 2 + 4
+
+
+def threaded(*, threads: int = 1) -> Model:
+    ACTS["threads"] = lambda frame: frame.color * threads
+    return Scripted("threads")
+
+
+def test_a_method_that_asks_for_threads_gets_them() -> None:
+    make_method(own("threaded", "threaded"), threads=3)
+    assert ACTS["threads"](Frame(color=torch.ones(1, 3, 2, 2))).max() == 3
+    make_method(own("threaded", "threaded", threads=2), threads=3)
+    assert ACTS["threads"](Frame(color=torch.ones(1, 3, 2, 2))).max() == 2
 
 
 def test_network_and_filter_are_told_apart_without_touching_the_image() -> None:
     torch.manual_seed(0)
-    model = create_model("cascaded", width=8)
-    for head in [*model.first.heads, *model.second.heads]:
-        nn.init.normal_(head.weight, std=0.02)
+    model = create_model("cascaded_v2", width=8, resolutions=1)
+    for name, module in model.named_modules():
+        if ".heads." in name:
+            nn.init.normal_(module.weight, std=0.02)
     frame = synthetic_frame(64, 48)
     alone = [denoise(frame) for denoise in [Denoiser(model)] for _ in range(2)]
-    assert model.first.unet._forward_hooks == {}
-    runner = ModelRunner(model)
+    assert not any(module._forward_hooks for module in model.modules())
+    timed = Timed(Denoiser(model))
     hooked = [name for name, module in model.named_modules() if module._forward_hooks]
     # Both U-Nets and their three heads; neither what is inside them, nor the fusions.
     parts = ["unet", "heads.0", "heads.1", "heads.2"]
-    assert hooked == [f"{network}.{part}" for network in ("first", "second") for part in parts]
+    assert all(name.endswith(f".{part}") for name, part in zip(hooked, 2 * parts, strict=True))
+    assert [name.count("initial") for name in hooked] == [1] * 4 + [0] * 4
     for expected in alone:
-        assert torch.equal(runner(frame), expected)
-        assert set(runner.stages) == {"accumulate", "network", "filter"}
-        assert min(runner.stages.values()) > 0
-    runner.reset()
-    assert torch.equal(runner(frame), alone[0])
+        assert torch.equal(timed(frame), expected)
+        assert set(timed.stages) == {"accumulate", "network", "filter"}
+        assert min(timed.stages.values()) > 0
+    timed.denoiser.reset()
+    assert torch.equal(timed(frame), alone[0])
 
 
-def test_peers_start_from_the_accumulated_image_they_pay_for(small_sequence: Path) -> None:
-    sequence = open_sequence(small_sequence)
-    runner, denoiser = PeerRunner(accumulates=True), Denoiser(Half())
-    for number in sequence.numbers:
-        frame, _ = sequence.frame(number).validate()
-        torch.testing.assert_close(runner(frame), denoiser.images(frame).accumulated)
+def test_a_convolution_of_ones_own_is_a_network_and_anything_else_a_filter() -> None:
+    class Own(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.inside = nn.ModuleDict({"convolution": nn.Conv2d(3, 3, 3, padding=1)})
+
+        def forward(self, color: Tensor) -> Tensor:
+            time.sleep(0.02)
+            return self.inside["convolution"](color).abs()
+
+    frame = synthetic_frame(24, 20)
+    timed = Timed(Denoiser(Own()))
+    timed(frame)
+    assert timed.stages["filter"] > 20
+    assert 0 < timed.stages["network"] < 20
+    timed = Timed(Denoiser(lambda color: time.sleep(0.02) or color))
+    timed(frame)
+    assert set(timed.stages) == {"accumulate", "filter"}
+    assert timed.stages["filter"] > 20
 
 
 class Greedy:
     """Holds 64 MiB while it works."""
 
-    stages: dict[str, float] = {}  # noqa: RUF012
-
     def __init__(self) -> None:
         self.weights = torch.ones(2**22)
-
-    def reset(self) -> None:
-        """It has no past."""
 
     def __call__(self, frame: Frame) -> Tensor:
         return frame.color * torch.ones(3 * 2**22).mean()
@@ -550,7 +638,7 @@ def test_sizes() -> None:
 
 def test_the_synthetic_frame_has_a_history() -> None:
     frame, replaced = synthetic_frame(40, 30).validate()
-    denoiser = Denoiser(Half())
+    denoiser = Denoiser(half())
     for expected in ("first frame", ""):
         denoiser(frame)
         assert (denoiser.report.reset, denoiser.report.missing) == (expected, [])
@@ -558,18 +646,16 @@ def test_the_synthetic_frame_has_a_history() -> None:
 
 
 def test_too_large_an_image_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    log: list[str] = []
-
     def peak(make: Callable[..., Any], frames: functools.partial[Any], **_: Any) -> float:
         width, height = frames.args
         return 10 + width * height * 1e-3
 
     monkeypatch.setattr(mcdenoise.benchmark.memory, "peak_memory", peak)
     monkeypatch.setattr(mcdenoise.benchmark.sizes, "available_memory", lambda device: 2 * 1013 * 2**20)
-    large = scripted("A", log)
+    large = scripted("A")
     sizes = [(1003, 1000), (1004, 1000)]
-    costs, _ = measure_sizes([large], {"A": large.make()}, sizes, rounds=1, threads=1, device="cpu")
-    assert log == ["A"] * 3 + ["reset A"] * 2
+    costs, _ = measure_sizes([large], {"A": make_method(large)}, sizes, rounds=1, threads=1, device="cpu")
+    assert LOG == ["A!", "A", "A"]
     assert costs[0].failure == ""
     assert costs[1].milliseconds is None
     assert costs[1].failure == "too little memory: expected to need 1014 MiB, found 1013 MiB that may be used"
@@ -679,10 +765,10 @@ def test_the_command_for_ops(run: Callable[..., Any], out: Path, monkeypatch: py
     assert run("--ops", "--size", "1x1")[0] == 2
 
 
-# What models leave out
+# What methods skip
 
 
-def test_models_are_shown_beside_themselves_with_nothing_left_out(
+def test_methods_are_shown_beside_themselves_with_nothing_skipped(
     run: Callable[..., tuple[int, str, str]], small_sequence: Path, out: Path
 ) -> None:
     # A camera at rest: the first matrix for all frames, and the first position.
@@ -693,29 +779,29 @@ def test_models_are_shown_beside_themselves_with_nothing_left_out(
     for number in (1, 2, 3):
         for name in ("world_position", "depth", "shading_normal", "albedo"):
             shutil.copy(inputs / f"{name}0.exr", inputs / f"{name}{number}.exr")
-    arguments = (small_sequence, "-o", out, "--models", "cascaded_tiny", "--precisions", "float32", "--peers", "none")
+    arguments = (small_sequence, "-o", out, "--models", "cascaded_v2_tiny", "--precisions", "float32")
     status, printed, _ = run(*arguments, "--keep-all", "--sizes", "none", "--rounds", "1")
     assert status == 0
     results = Results.read(out)
     assert " --keep-all " in results.command
-    short, whole = (results.cell("plane", name) for name in ("cascaded_tiny", "cascaded_tiny, keep all"))
+    short, whole = (results.cell("plane", name) for name in ("cascaded_v2_tiny", "cascaded_v2_tiny, keep all"))
     assert short is not None
     assert whole is not None
-    left_out = {row["stage"]: row["left_out"] for row in short.plan}
-    assert left_out["reproject"] == 0.75
-    assert not any(row["left_out"] for row in whole.plan)
-    (row,) = results.left_out()
-    assert (row.scene, row.method) == ("plane", "cascaded_tiny")
+    skipped = {row["stage"]: row["skipped"] for row in short.plan}
+    assert skipped["reproject"] == 0.75
+    assert not any(row["skipped"] for row in whole.plan)
+    (row,) = (row for row in results.skipped() if row.method not in ("noisy", "accumulated"))
+    assert (row.scene, row.method) == ("plane", "cascaded_v2_tiny")
     assert row.stages.startswith("reproject 75%")
     assert row.saved == pytest.approx(whole.computing.median - short.computing.median)
     assert set(row.change) == set(short.errors)
     assert row.change["SMAPE"] == short.errors["SMAPE"] - whole.errors["SMAPE"] == 0
     assert "ms saved" in printed
-    assert "What models left out" in (out / "index.html").read_text()
+    assert "What methods skipped" in (out / "index.html").read_text()
 
 
 def test_without_the_other_nothing_is_known_of_what_was_saved() -> None:
-    plan = [{"stage": "network", "kept": True, "left_out": 0.25, "reason": "", "exact": True}]
+    plan = [{"stage": "network", "kept": True, "skipped": 0.25, "reason": "", "exact": True}]
     machine = Machine("", 1, 1.0, "cpu", 1, "")
     cells = [Cell("a", "x", plan=plan), Cell("a", "y")]
-    assert Results("", "", machine, 1, [], [], cells).left_out() == [LeftOut("a", "x", "network 25%")]
+    assert Results("", "", machine, 1, [], [], cells).skipped() == [Skipped("a", "x", "network 25%")]

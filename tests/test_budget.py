@@ -18,7 +18,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.models import pretrained_models
 from mcdenoise.results import Cell, Machine, Results
 
-TIMES = {"cascaded": 300.0, "cascaded_small": 170.0, "cascaded_tiny": 80.0, "cascaded_micro": 50.0}
+TIMES = {"cascaded_v2": 300.0, "cascaded_v2_small": 170.0, "cascaded_v2_tiny": 80.0, "cascaded_v2_micro": 50.0}
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +43,7 @@ def sequence(small_sequence: Path) -> Sequence:
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
     """A benchmark over two scenes."""
-    errors = {"cascaded": 0.05, "cascaded, bfloat16": 0.052, "cascaded_small": 0.06, "cascaded_tiny": 0.08}
+    errors = {"cascaded_v2": 0.05, "cascaded_v2, bfloat16": 0.052, "cascaded_v2_small": 0.06, "cascaded_v2_tiny": 0.08}
     cells = [
         Cell(scene, name, {"SMAPE": error + shift})
         for name, error in errors.items()
@@ -65,13 +65,13 @@ def refused(action: Callable[[], object]) -> str:
 @pytest.mark.parametrize(
     ("limits", "expected"),
     [
-        ({"max_error": 0.09}, "cascaded_tiny"),
-        ({"max_error": 0.055}, "cascaded, bfloat16"),
-        ({"max_error": 0.051}, "cascaded"),
-        ({"budget": 1000}, "cascaded"),
-        ({"budget": 200}, "cascaded, bfloat16"),
-        ({"budget": 175, "max_error": 0.07}, "cascaded_small"),
-        ({"budget": 100}, "cascaded_tiny"),
+        ({"max_error": 0.09}, "cascaded_v2_tiny"),
+        ({"max_error": 0.055}, "cascaded_v2, bfloat16"),
+        ({"max_error": 0.051}, "cascaded_v2"),
+        ({"budget": 1000}, "cascaded_v2"),
+        ({"budget": 200}, "cascaded_v2, bfloat16"),
+        ({"budget": 175, "max_error": 0.07}, "cascaded_v2_small"),
+        ({"budget": 100}, "cascaded_v2_tiny"),
     ],
 )
 def test_the_choice(sequence: Sequence, results: Path, limits: dict[str, float], expected: str) -> None:
@@ -86,22 +86,22 @@ def test_what_nothing_meets_is_told_in_one_line(sequence: Sequence, results: Pat
     message = refused(lambda: choose_model(sequence, budget=10))
     assert message == (
         "--budget-ms: expected a model that takes at most 10 ms, "
-        "found at best cascaded_micro, bfloat16: 30.0 ms a frame"
+        "found at best cascaded_v2_micro, bfloat16: 30.0 ms a frame"
     )
     message = refused(lambda: choose_model(sequence, budget=100, max_error=0.01, results=results))
-    assert message.endswith("at most 0.01 in 100 ms, found at best cascaded_tiny: 80.0 ms a frame, SMAPE 0.08")
+    assert message.endswith("at most 0.01 in 100 ms, found at best cascaded_v2_tiny: 80.0 ms a frame, SMAPE 0.08")
     assert "--max-error: expected more than 0" in refused(lambda: choose_model(sequence, max_error=-1))
     for path in (sequence.root / "inputs").glob("reference*.exr"):
         path.unlink()
     bare = open_sequence(sequence.root)
     assert "expected references in" in refused(lambda: choose_model(bare, max_error=0.1))
     # Without any error, the slowest that keeps to the budget.
-    assert choose_model(bare, budget=150).name == "cascaded_small, bfloat16"
+    assert choose_model(bare, budget=150).name == "cascaded_v2_small, bfloat16"
 
 
 def test_errors_come_from_the_references(sequence: Sequence) -> None:
     choice = choose_model(sequence, max_error=0.9)
-    assert choice.name == "cascaded_micro, bfloat16"
+    assert choice.name == "cascaded_v2_micro, bfloat16"
     assert choice.error is not None
     assert 0.01 < choice.error < 0.9
     stricter = choose_model(sequence, budget=1000)
@@ -124,7 +124,7 @@ def test_times_are_measured_once_for_each_size_and_number_of_threads(
     ((key, times),) = json.loads(cache.read_text()).items()
     assert "24x20" in key
     assert "threads" in key
-    assert times["cascaded_tiny, bfloat16"] == 48
+    assert times["cascaded_v2_tiny, bfloat16"] == 48
     cache.write_text("{ damaged")
     assert choose_model(sequence, **bare) == first
     assert len(measured) == 4 * len(pretrained_models())
@@ -135,9 +135,9 @@ def test_the_command_line(small_sequence: Path, tmp_path: Path, capsys: pytest.C
     with pytest.raises(SystemExit) as stop:
         main([*command, "--max-error", "0.9"])
     assert stop.value.code == 0
-    assert "picked cascaded_micro, bfloat16: 30.0 ms a frame, SMAPE 0." in capsys.readouterr().out
+    assert "picked cascaded_v2_micro, bfloat16: 30.0 ms a frame, SMAPE 0." in capsys.readouterr().out
     report = json.loads((tmp_path / "out" / "denoise.json").read_text())
-    assert (report["model"], report["precision"]) == ("cascaded_micro", "bfloat16")
+    assert (report["model"], report["precision"]) == ("cascaded_v2_micro", "bfloat16")
     with pytest.raises(SystemExit) as stop:
         main([*command, "--budget-ms", "1"])
     assert stop.value.code == 2
@@ -148,6 +148,6 @@ def test_the_command_line(small_sequence: Path, tmp_path: Path, capsys: pytest.C
 
 def test_a_measurement_is_that_of_frames_with_a_history(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
-    taken = mcdenoise.budget._measure(Choice("cascaded_tiny", "float32", 0.0), (36, 64), "cpu")
+    taken = mcdenoise.budget._measure(Choice("cascaded_v2_tiny", "float32", 0.0), (36, 64), "cpu")
     assert 0.5 < taken < 60_000
     assert asdict(Choice("a", "float32", 1.0))["error"] is None

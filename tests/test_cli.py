@@ -40,7 +40,7 @@ def _one_thread() -> Iterator[None]:
 def weights(tmp_path: Path) -> Path:
     torch.manual_seed(0)
     path = tmp_path / "small.safetensors"
-    path.write_bytes(save_weights(create_model("cascaded", width=4), "cascaded", {"width": 4}, {}))
+    path.write_bytes(save_weights(create_model("cascaded_v2", width=4), "cascaded_v2", {"width": 4}, {}))
     return path
 
 
@@ -178,7 +178,8 @@ def test_bad_usage(refused: Callable[..., str], arguments: list[str], expected: 
         ("--alpha-min", "1.5", "--alpha-min: expected in (0, 1], found 1.5"),
         ("--alpha-min", "nan", "--alpha-min: expected in (0, 1], found nan"),
         ("--device", "abacus", "device 'abacus': expected one that torch can use"),
-        ("--model", "pixel", "expected weights of model 'pixel', found those of 'cascaded'"),
+        ("--model", "cascaded_v2_tiny", "expected weights of model 'cascaded_v2_tiny', found those of 'cascaded_v2'"),
+        ("--model", "cascaded_v2(hue=1)", "model 'cascaded_v2': got an unexpected keyword argument 'hue'"),
         ("--weights", "nothing.safetensors", "nothing.safetensors: expected a safetensors file"),
     ],
 )
@@ -190,10 +191,106 @@ def test_bad_options_leave_nothing(
 
 
 def test_models_that_cannot_be_had(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
-    assert "model 'oidn': expected one of cascaded" in refused("denoise", small_sequence, "-o", out, "--model", "oidn")
-    for name in sorted(set(list_models()) - set(pretrained_models())):
-        assert "expected shipped weights" in refused("denoise", small_sequence, "-o", out, "--model", name)
+    denoise = ("denoise", small_sequence, "-o", out, "--model")
+    message = refused(*denoise, "unet")
+    assert "model 'unet': expected one of " in message
+    assert all(name in message for name in pretrained_models())
+    for name in list_models():
+        if create_model(name).needs.trainable and name not in pretrained_models():
+            assert "expected shipped weights" in refused(*denoise, name)
     assert not out.exists()
+
+
+MINE = """
+import torch
+from mcdenoise.models import Accumulated, Demodulated
+
+def blur(radius=1):
+    def filtered(color, albedo):
+        return torch.nn.functional.avg_pool2d(color, 2 * radius + 1, 1, radius, count_include_pad=False)
+    return Demodulated(Accumulated(filtered))
+
+def infinite():
+    return lambda color: color / 0
+
+def smaller():
+    return lambda color: color[..., 1:]
+
+def demanding():
+    return lambda color, hit_distance: color
+
+def nothing():
+    return 3
+"""
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    """Somebody's own models."""
+    path = tmp_path / "mine.py"
+    path.write_text(MINE)
+    return path
+
+
+def test_a_model_of_ones_own(
+    run: Callable[..., tuple[int, str, str]], small_sequence: Path, mine: Path, out: Path
+) -> None:
+    for name in ("blur", "blur(radius=2)"):
+        status, _, errors = run("denoise", small_sequence, "-o", out / name, "--model", f"{mine}:{name}")
+        assert (status, errors) == (0, "")
+        report = json.loads((out / name / "denoise.json").read_text())
+        assert report["model"] == f"mine.py:{name}"
+        assert report["tolerance"] is None
+    images = [read_exr(out / name / "denoised3.exr")[0] for name in ("blur", "blur(radius=2)")]
+    assert not np.allclose(*images)
+    file = mine.parent / "errors.json"
+    assert run("evaluate", small_sequence, "--model", f"{mine}:blur", "--json", file)[0] == 0
+    in_memory = json.loads(file.read_text())
+    assert in_memory["images"] == "mine.py:blur"
+    assert run("evaluate", small_sequence, out / "blur", "--json", file)[0] == 0
+    written = json.loads(file.read_text())["protocols"]["strict"]["mean"]
+    # Files are of half precision.
+    assert in_memory["protocols"]["strict"]["mean"]["SMAPE"] == pytest.approx(written["SMAPE"], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("factory", "options", "expected"),
+    [
+        ("blurred", (), "expected a factory 'blurred' in"),
+        ("blur(radius=)", (), "expected settings such as (setting=value), found 'radius='"),
+        ("blur", ("--alpha-min", "0.2"), "got an unexpected keyword argument 'alpha_min'; it takes radius"),
+        ("blur", ("--no-anti-lag",), "got an unexpected keyword argument 'anti_lag'"),
+        ("blur", ("--tolerance", "0"), "got an unexpected keyword argument 'tolerance'"),
+        ("blur", ("--tile", "64"), "expected a model that computes tiles"),
+        ("nothing", (), "expected a model with `needs`"),
+    ],
+)
+def test_a_model_of_ones_own_that_cannot_be_had(
+    refused: Callable[..., str],
+    small_sequence: Path,
+    mine: Path,
+    out: Path,
+    factory: str,
+    options: tuple[str, ...],
+    expected: str,
+) -> None:
+    assert expected in refused("denoise", small_sequence, "-o", out, "--model", f"{mine}:{factory}", *options)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("factory", "expected"),
+    [
+        ("infinite", "frame 0: model: expected finite radiance, found 480 NaN or infinite pixels"),
+        ("smaller", "frame 0: model: expected an Output with an image of (1, 3, 20, 24), found an image of"),
+        ("demanding", "frame 0: buffer 'hit_distance': the model needs it"),
+    ],
+)
+def test_a_bad_result_is_not_written(
+    refused: Callable[..., str], small_sequence: Path, mine: Path, out: Path, factory: str, expected: str
+) -> None:
+    assert expected in refused("denoise", small_sequence, "-o", out, "--model", f"{mine}:{factory}")
+    assert not list(out.iterdir())
 
 
 def missing_buffer(inputs: Path) -> None:
@@ -293,7 +390,7 @@ def test_json_that_cannot_be_written(refused: Callable[..., str], tmp_path: Path
 
 def test_denoise(run: Callable[..., tuple[int, str, str]], denoise: list[Any], out: Path, tmp_path: Path) -> None:
     figures = tmp_path / "times.json"
-    status, text, errors = run(*denoise, "--frames", "1,3", "--threads", "1", "--json", figures)
+    status, text, errors = run(*denoise, "--frames", "1,3", "--threads", "1", "--json", figures, "--keep-all")
     assert (status, errors) == (0, "")
     assert "plane: bmfr layout, 2 frames of 24x20" in text
     assert "accumulate: kept (positions and cameras)" in text
@@ -302,6 +399,7 @@ def test_denoise(run: Callable[..., tuple[int, str, str]], denoise: list[Any], o
     written, report = json.loads(figures.read_text()), json.loads((out / "denoise.json").read_text())
     assert written == {key: report[key] for key in ("model", "milliseconds", "beside")}
     assert report["threads"] == 1
+    assert report["keep_all"] is True
 
 
 def test_invalid_colors_are_replaced_and_counted(
@@ -397,6 +495,8 @@ def test_evaluate_what_cannot_be_compared(
     for path in (small_sequence / "inputs").glob("reference*.exr"):
         path.unlink()
     assert "expected references" in refused(*evaluate)
+    assert "a folder of images, or --model, and not both" in refused(*evaluate, "--model", "cascaded_v2")
+    assert "a folder of images, or --model, and not both" in refused(*evaluate[:2])
     assert "no such folder" in refused("evaluate", small_sequence / "nowhere", colors)
 
 
@@ -433,7 +533,7 @@ def test_train(
     command = ["train", small_sequence, "-o", tmp_path / "run", *small, "--steps", "2", "--checkpoint-every", "1"]
     status, text, errors = run(*command)
     assert status == 0
-    weights = tmp_path / "run" / "cascaded.safetensors"
+    weights = tmp_path / "run" / "cascaded_v2.safetensors"
     assert text == f"{weights}\n"
     # Rich colours nothing where there is no terminal.
     assert re.findall(r"^step (\d)  loss 0\.\d{4}  \d+ s  validation smape", errors, re.MULTILINE) == ["1", "2"]

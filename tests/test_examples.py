@@ -41,11 +41,12 @@ def real_sequence(name: str) -> Path:
 def weights(tmp_path: Path) -> Path:
     """A small cascade that does next to nothing, for examples that need some network."""
     torch.manual_seed(0)
-    model = create_model("cascaded", width=8)
-    for head in model.first.heads:
-        nn.init.normal_(head.weight, std=0.02)
+    model = create_model("cascaded_v2", width=8)
+    for name, module in model.named_modules():
+        if ".initial" in name and ".heads." in name:
+            nn.init.normal_(module.weight, std=0.02)
     path = tmp_path / "small.safetensors"
-    path.write_bytes(save_weights(model, "cascaded", {"width": 8}, {}))
+    path.write_bytes(save_weights(model, "cascaded_v2", {"width": 8}, {}))
     return path
 
 
@@ -77,6 +78,13 @@ def test_composed_denoiser_improves_on_real_frames(name: str) -> None:
     _, accumulated, composed = errors(line)
     assert composed[0] < 0.8 * accumulated[0]
     assert composed[1] > accumulated[1] + 1
+
+
+def test_composed_denoiser_is_a_method_of_every_command(small_sequence: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mcdenoise", "denoise", str(small_sequence), "-o", str(tmp_path / "out")]
+    command += ["--model", f"{EXAMPLES / 'compose_denoiser.py'}:method"]
+    subprocess.run(command, check=True, timeout=SECONDS, capture_output=True)
+    assert json.loads((tmp_path / "out" / "denoise.json").read_text())["model"] == "compose_denoiser.py:method"
 
 
 def test_denoise_sequence_writes_every_frame(small_sequence: Path, weights: Path, tmp_path: Path) -> None:
@@ -123,44 +131,46 @@ def test_unseen_scenes_compares_every_image(small_sequence: Path, weights: Path,
     pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
     pytest.importorskip("flip_evaluator", reason="FLIP is in the extra mcdenoise[peers]")
     file = tmp_path / "scores.json"
-    arguments = (small_sequence, small_sequence, "--weights", weights, "--json", file, "--markdown", "--peers", "oidn")
-    first_table, second_table, notes, lines = run("unseen_scenes.py", *arguments).strip().split("\n\n")
+    arguments = (small_sequence, small_sequence, "--models", weights, "--json", file, "--markdown")
+    printed = run("unseen_scenes.py", *arguments, "--sweep", "joint_bilateral", "oidn")
+    first_table, second_table, notes, lines = printed.strip().split("\n\n")
     header = "| scene | frames | image | SMAPE | relMSE | RMSE | PSNR | SSIM | FLIP | tSMAPE | tRMSE |"
     assert first_table.startswith(header)
     assert second_table.startswith(header)
     assert notes == "- FLIP: of one in 4 frames."
     metrics = header.split(" | ")[3:]
     metrics[-1] = metrics[-1].removesuffix(" |")
-    assert [line.partition(":")[0] for line in lines.splitlines()] == [f"- {metric}" for metric in metrics]
+    assert [line.partition(":")[0] for line in lines.splitlines()] == [f"- {metric}" for metric in metrics] * 2
 
     everything = json.loads(file.read_text())
     scores = everything["scores"]
     # Two images, 20 settings of the plain filter, 36 of OIDN, two images of the network, of each scene.
     assert len(scores) == 2 * 60
-    assert [score["sequence"] for score in scores] == [*["plane"] * 60, *["plane (2)"] * 60]
+    assert [score["scene"] for score in scores] == [*["plane"] * 60, *["plane (2)"] * 60]
     assert all(set(score["values"]) == set(metrics) for score in scores)
     methods = [score["method"] for score in everything["folded"]]
-    plain, best = "joint bilateral, best of 20 settings", "OIDN, best of 36 settings"
-    images = ("raw", "accumulated", "accumulated after")
-    oidn = [f"OIDN {quality}, {image}" for image in images for quality in ("fast", "balanced", "high")]
-    assert methods == ["noisy", "accumulated", plain, *oidn, best, "cascaded, initial", "cascaded"] * 2
+    plain, best = "joint_bilateral, best of 20 settings", "oidn, best of 36 settings"
+    sources = ("raw", "accumulated", "demodulated", "accumulated after")
+    oidn = [f"oidn(source={source}, quality={name})" for source in sources for name in ("fast", "balanced", "high")]
+    assert methods == ["noisy", "accumulated", plain, *oidn, best, "small, initial", "small"] * 2
     assert len(first_table.splitlines()) == 2 + len(methods)
     assert len(second_table.splitlines()) == 2 + len(everything["summary"])
-    first = {score["method"]: score["values"] for score in everything["folded"][:15]}
+    first = {score["method"]: score["values"] for score in everything["folded"][:18]}
     mean = {score["method"]: score["values"] for score in everything["summary"]}
     for method, values in first.items():
         assert mean[method] == pytest.approx(values)
-    assert mean["OIDN, best of each scene"] == pytest.approx(first[best])
+    assert mean["oidn, best of each scene"] == pytest.approx(first[best])
     assert first[plain]["SMAPE"] < first["accumulated"]["SMAPE"] < first["noisy"]["SMAPE"]
     assert first[best]["PSNR"] > first["accumulated"]["PSNR"] > first["noisy"]["PSNR"]
-    assert [verdict["metric"] for verdict in everything["verdicts"]] == metrics
+    assert [verdict["metric"] for verdict in everything["verdicts"]] == metrics * 2
     verdict = everything["verdicts"][0]
-    assert verdict["value"] == pytest.approx(mean["cascaded"]["SMAPE"])
+    assert (verdict["method"], verdict["family"]) == ("small", "joint_bilateral")
+    assert verdict["value"] == pytest.approx(mean["small"]["SMAPE"])
     assert verdict["ahead"] is (verdict["value"] < verdict["single"])
 
 
 def test_unseen_scenes_prints_plain_columns_too(small_sequence: Path, weights: Path) -> None:
-    arguments = (small_sequence, "--weights", weights, "--no-bilateral", "--no-flip", "--frames", "1-3")
+    arguments = (small_sequence, "--models", weights, "--no-flip", "--frames", "1-3")
     lines = run("unseen_scenes.py", *arguments).splitlines()
     assert len(lines) == 5
     assert lines[0].split() == [
@@ -178,22 +188,20 @@ def test_unseen_scenes_prints_plain_columns_too(small_sequence: Path, weights: P
     assert lines[1].split()[:3] == ["plane", "3", "noisy"]
 
 
-def test_unseen_scenes_shows_what_resolutions_and_fireflies_are_worth(small_sequence: Path, weights: Path) -> None:
-    arguments = (small_sequence, "--weights", weights, "--no-bilateral", "--no-flip", "--frames", "1-3")
-    options: tuple[tuple[str, ...], ...] = ((), ("--resolutions", "1"), ("--fireflies", "0.5"))
-    own, *others = (run("unseen_scenes.py", *arguments, *more).splitlines() for more in options)
-    for other in others:
-        assert own[1].split() == other[1].split()
-        assert own[1].split()[2] == "noisy"
-        assert own[-1].split() != other[-1].split()
+def test_unseen_scenes_sweeps_any_settings(small_sequence: Path, weights: Path) -> None:
+    models = f"{weights}(alpha_min=0.1|0.5),{weights}"
+    lines = run("unseen_scenes.py", small_sequence, "--models", models, "--no-flip", "--frames", "0-2").splitlines()
+    images = [line[15:].partition("  ")[0].strip() for line in lines[1:]]
+    assert images[:2] == ["noisy", "accumulated"]
+    assert images[2:] == ["cascaded_v2, best of 2 settings", "small, initial", "small"]
 
 
-def test_unseen_scenes_says_in_one_line_what_is_wrong(small_sequence: Path, weights: Path) -> None:
-    command = [sys.executable, str(EXAMPLES / "unseen_scenes.py"), str(small_sequence), "--weights", str(weights)]
-    command += ["--models", "cascaded,cascaded"]
+def test_unseen_scenes_says_in_one_line_what_is_wrong(small_sequence: Path) -> None:
+    command = [sys.executable, str(EXAMPLES / "unseen_scenes.py"), str(small_sequence)]
+    command += ["--models", "cascaded_v2,cascaded_v2"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
     assert done.returncode == 2
-    assert done.stderr == "--weights: expected one model to load them into, found --models cascaded,cascaded\n"
+    assert done.stderr == "methods: expected different names separated by commas, found 'cascaded_v2,cascaded_v2'\n"
 
 
 def test_unseen_scenes_looks_for_references_before_it_starts(small_sequence: Path, weights: Path) -> None:
@@ -202,19 +210,20 @@ def test_unseen_scenes_looks_for_references_before_it_starts(small_sequence: Pat
     for path in (other / "inputs").glob("reference*.exr"):
         path.unlink()
     command = [sys.executable, str(EXAMPLES / "unseen_scenes.py"), str(small_sequence), str(other)]
-    command += ["--weights", str(weights)]
+    command += ["--models", str(weights)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
     assert done.returncode == 2
     assert done.stderr == f"{other}: expected references to compare with, found none; render them\n"
 
 
-def test_run_time_prints_a_line_for_each_network(tmp_path: Path) -> None:
-    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+def test_run_time_prints_a_line_for_each_method(tmp_path: Path) -> None:
     file = tmp_path / "times.json"
-    arguments = ("--models", "cascaded_tiny", "--size", "64x36", "--threads", "1", "--rounds", "2", "--json", file)
+    models = ("accumulated", "cascaded_v2_tiny(alpha_min=0.2)", f"{EXAMPLES / 'compose_denoiser.py'}:method")
+    arguments = ("--models", *models, "--size", "64x36", "--threads", "1", "--rounds", "2", "--json", file)
     lines = run("run_time.py", *arguments).splitlines()
-    names = ["OIDN fast", "OIDN balanced", "OIDN high, clean aux", "cascaded_tiny", "cascaded_tiny, bfloat16"]
-    assert [line[:28].strip() for line in lines[2:]] == names
+    tiny = "cascaded_v2_tiny(alpha_min=0.2)"
+    names = ["accumulated", tiny, f"{tiny}, bfloat16", "compose_denoiser.py:method"]
+    assert [line[:44].strip() for line in lines[2:]] == names
     assert lines[2].endswith(" 1.00")
     written = json.loads(file.read_text())
     assert {name: len(times) for name, times in written["milliseconds"].items()} == dict.fromkeys(names, 2)
@@ -224,15 +233,15 @@ def test_run_time_prints_a_line_for_each_network(tmp_path: Path) -> None:
 def test_error_vs_runtime_draws_what_it_prints(small_sequence: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="plots need the packages of mcdenoise[report]")
     figure = tmp_path / "figure.svg"
-    arguments = (small_sequence, "-o", figure, "--models", "cascaded_tiny", "--peers", "none", "--rounds", "1")
+    arguments = (small_sequence, "-o", figure, "--models", "cascaded_v2_tiny", "--rounds", "1")
     first, *lines, last = run("error_vs_runtime.py", *arguments, "--frames", "1-2", "--threads", "1").splitlines()
     assert first.endswith("1 threads; 1 scenes")
     assert last == str(figure)
-    printed = {line[:44].strip(): line[44:].strip() for line in lines}
+    printed = {line[:60].strip(): line[60:].strip() for line in lines}
     assert all(re.fullmatch(r"0\.\d+ in \d+\.\d ms", figures) for figures in printed.values())
     drawn = figure.read_text()
     assert drawn.startswith("<?xml")
-    assert {"noisy", "accumulated", "cascaded_tiny"} <= printed.keys()
+    assert {"noisy", "accumulated", "cascaded_v2_tiny"} <= printed.keys()
     assert all(name in drawn for name in printed)
 
 
@@ -317,13 +326,13 @@ def test_paper_tables_of_what_is_there(dataset: Path, tmp_path: Path) -> None:
     assert "| P+K without BWA | 544,424 |" in fourth
 
 
-# What is left out
+# What is skipped
 
 
-def test_leave_out_shows_five_shots_of_a_scene(small_sequence: Path) -> None:
-    lines = run("leave_out.py", small_sequence, "--model", "cascaded_tiny", "--frames", "4", "--markdown").splitlines()
+def test_skipped_shows_five_shots_of_a_scene(small_sequence: Path) -> None:
+    lines = run("skipped.py", small_sequence, "--model", "cascaded_v2_tiny", "--frames", "4", "--markdown").splitlines()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
-    assert rows[0][:3] == ["scene", "shot", "left out"]
+    assert rows[0][:3] == ["scene", "shot", "skipped"]
     shots = {row[1]: row for row in rows[2:]}
     assert list(shots) == ["flythrough", "no albedo", "half sky", "static shot", "viewport edit"]
     assert "demodulate 100%" in shots["no albedo"][2]
@@ -343,7 +352,7 @@ def test_start_up_times_whole_processes(tmp_path: Path) -> None:
     lines = run("start_up.py", *arguments).splitlines()
     assert lines[0] == "64x48, one frame, whole process, 1 threads, 2 rounds"
     times = json.loads(file.read_text())["seconds"]
-    own, torch_alone = times["mcdenoise denoise, cascaded_tiny, float32"], times["import torch"]
+    own, torch_alone = times["mcdenoise denoise, cascaded_v2_tiny, float32"], times["import torch"]
     assert list(times)[:2] == ["pyoidn, fast", "pyoidn, fast, without torch"]
     assert all(len(values) == 2 for values in times.values())
     assert min(own) > min(torch_alone) > min(times["pyoidn, fast, without torch"])
@@ -372,9 +381,9 @@ def test_training_speed_times_both_forms_in_both_precisions(small_sequence: Path
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory as Linux tells it")
 def test_large_frames_prints_what_a_pixel_costs(tmp_path: Path) -> None:
     file = tmp_path / "costs.json"
-    arguments = ("--sizes", "64x48,96x64", "--model", "cascaded_tiny", "--max-memory", "2", "--threads", "1")
+    arguments = ("--sizes", "64x48,96x64", "--model", "cascaded_v2_tiny", "--max-memory", "2", "--threads", "1")
     lines = run("large_frames.py", *arguments, "--json", file).splitlines()
-    assert lines[0] == "cascaded_tiny, bfloat16, within 2 GB, 2 frames"
+    assert lines[0] == "cascaded_v2_tiny, bfloat16, within 2 GB, 2 frames"
     costs = json.loads(file.read_text())["costs"]
     assert [cost["size"] for cost in costs] == ["64x48", "96x64"]
     for line, cost in zip(lines[3:], costs, strict=True):

@@ -23,17 +23,27 @@ def results() -> Results:
         rounds=3,
         scenes=[Scene("plane", 1000, 500, [0, 1], [1], [1], 0.01)],
         methods=[
-            Method("noisy", "baseline", "noisy", "baseline"),
-            Method("ours", "model", "ours", "ours", 12),
-            Method("theirs", "peer", "theirs", "theirs", missing="not installed"),
+            Method("noisy", "baseline", "noisy", "noisy"),
+            Method("ours", "trainable", "ours", "ours", {"width": 4}, "ours.safetensors", "bfloat16", True, 12),
+            Method("theirs", "fixed", "theirs", "theirs", missing="not installed"),
         ],
         cells=[
             Cell("plane", "noisy", failure="it broke"),
-            Cell("plane", "ours", {"SMAPE": 0.1}, {"SMAPE": SPREAD}, SPREAD, {"read": SPREAD}, 5.0, computing=SPREAD),
+            Cell(
+                "plane",
+                "ours",
+                {"SMAPE": 0.1},
+                {"SMAPE": SPREAD},
+                SPREAD,
+                {"read": SPREAD},
+                5.0,
+                computing=SPREAD,
+                on_the_way={"initial": {"SMAPE": 0.2}},
+            ),
         ],
         costs=[Cost("ours", 10, 20, SPREAD), Cost("ours", 1000, 2000, failure="too little memory")],
         fits=[Fit("ours", 1.0, 2.0, 0.1)],
-        notes=["FLIP is left out"],
+        notes=["FLIP is skipped"],
     )
 
 
@@ -76,8 +86,8 @@ def test_missing_damaged_and_foreign_files_are_refused(results: Results, tmp_pat
         path.write_text(damaged)
         with pytest.raises(InputError, match=r"results\.json: expected the results of .*found damage"):
             Results.read(tmp_path)
-    path.write_text(text.replace('"version": 1', '"version": 2'))
-    with pytest.raises(InputError, match="expected version 1 of the format, found 2"):
+    path.write_text(text.replace('"version": 2', '"version": 3'))
+    with pytest.raises(InputError, match="expected version 2 of the format, found 3"):
         Results.read(tmp_path)
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from mcdenoise import stability
 from mcdenoise.cli import main
 from mcdenoise.errors import InputError
+from mcdenoise.models import list_models, pretrained_models
 from mcdenoise.ops import kernel_conv
 from mcdenoise.ops._cases import OPS, Op
 from mcdenoise.stability import Check, check_case, check_denoiser, check_model, check_op, long_runs, summarize
@@ -169,15 +170,39 @@ def test_the_reference_of_an_exponent_that_float64_cannot_hold() -> None:
 
 
 def test_a_model_is_stable() -> None:
-    checks = list(check_model("cascaded_tiny", (torch.float32,)))
+    checks = list(check_model("cascaded_v2_tiny", (torch.float32,)))
     assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
     assert {check.what for check in checks} == {"finite", "gradient", "forward", "exposure"}
 
 
 def test_a_denoiser_is_stable() -> None:
-    checks = list(check_denoiser("cascaded_tiny", (torch.float16,)))
+    checks = list(check_denoiser("cascaded_v2_tiny", (torch.float16,)))
     assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
     assert {check.what for check in checks} == {"finite", "contained", "refused", "exposure"}
+
+
+OWN = """
+def same():
+    return lambda color: color
+
+def brighter():
+    return lambda color: color + 1
+
+def negative():
+    return lambda color: -color
+"""
+
+
+def test_a_model_of_ones_own_is_checked(tmp_path: Path) -> None:
+    path = tmp_path / "own.py"
+    path.write_text(OWN)
+    failed = {}
+    for name in ("same", "brighter", "negative"):
+        assert not list(check_model(f"{path}:{name}"))
+        checks = list(check_denoiser(f"{path}:{name}", (torch.float32,)))
+        assert {check.subject for check in checks} == {f"Denoiser, {path}:{name}"}
+        failed[name] = {check.what for check in checks if not check.passed}
+    assert failed == {"same": set(), "brighter": {"exposure"}, "negative": {"finite"}}
 
 
 def test_long_runs() -> None:
@@ -203,12 +228,19 @@ def test_the_worst_check_comes_first() -> None:
 def test_what_is_checked_by_default_and_by_name() -> None:
     names = [stage.name for stage in stability.stages()]
     assert names[: len(OPS)] == [op.name for op in OPS]
-    assert names[len(OPS) :][-2:] == ["Denoiser, cascaded", "long runs"]
+    models = names[len(OPS) :]
+    assert models[-1] == "long runs"
+    assert {f"Denoiser, {name}" for name in pretrained_models()} < set(models)
+    # What learns is checked by itself, too; what does not, within a denoiser.
+    assert [name for name in models if name not in list_models()] == [
+        *(f"Denoiser, {name}" for name in models if name in list_models()),
+        "long runs",
+    ]
     assert [stage.name for stage in stability.stages(["demodulate"])] == ["demodulate"]
-    named = [stage.name for stage in stability.stages(None, ["cascaded_tiny"])]
-    assert named == ["cascaded_tiny", "Denoiser, cascaded_tiny"]
+    named = [stage.name for stage in stability.stages(None, ["cascaded_v2_tiny"])]
+    assert named == ["cascaded_v2_tiny", "Denoiser, cascaded_v2_tiny"]
     for arguments in ((["sharpen"], None), (None, ["unet"])):
-        with pytest.raises(InputError, match=r"expected .* found (sharpen|unet)"):
+        with pytest.raises(InputError, match=r"(expected .* found sharpen|model 'unet': expected one of)"):
             stability.stages(*arguments)
     with pytest.raises(InputError, match="found float8"):
         stability.parse_dtypes(["float32", "float8"])

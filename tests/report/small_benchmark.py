@@ -28,11 +28,11 @@ def picture(seed: int, noise: float, frame: int) -> np.ndarray:
 def write_benchmark(root: Path) -> None:
     """With a method that is missing, one that failed on the second scene, and one with a hostile name."""
     methods = [
-        Method("noisy", "baseline", "noisy", "baseline"),
-        Method("ours", "model", "ours", "cascaded", 1234),
-        Method(HOSTILE, "peer", "hostile", "OIDN"),
-        Method("fails", "peer", "fails", "other"),
-        Method("absent", "peer", "absent", "absent", missing="the package <absent> is not installed"),
+        Method("noisy", "baseline", "noisy", "noisy"),
+        Method("ours", "trainable", "ours", "cascaded_v2", parameters=1234),
+        Method(HOSTILE, "fixed", "hostile", "oidn"),
+        Method("fails", "fixed", "fails", "other"),
+        Method("absent", "fixed", "absent", "absent", missing="the package <absent> is not installed"),
     ]
     noises = {"noisy": 1.0, "ours": 0.1, HOSTILE: 0.3, "fails": 0.2}
     scenes, cells = [], []

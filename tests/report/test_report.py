@@ -17,7 +17,7 @@ from mcdenoise.evaluate import METRICS
 from mcdenoise.report import write_report
 from mcdenoise.report import writing as report_writing
 from mcdenoise.report.pictures import decode
-from mcdenoise.report.plots import family_colors, ticks
+from mcdenoise.report.plots import model_colors, ticks
 from mcdenoise.report.views import views
 from mcdenoise.results import Method, Results
 
@@ -202,15 +202,15 @@ def test_the_command_says_where_the_page_is_or_what_is_wrong(tmp_path: Path, cap
     assert "mcdenoise report: " in capsys.readouterr().err
 
 
-def test_families_have_colours_of_their_own():
+def test_models_have_colours_of_their_own():
     methods = [
-        Method("a", "baseline", "a", "none"),
-        Method("b", "peer", "b", "OIDN"),
-        Method("c", "model", "c", "cascaded"),
-        Method("d", "model", "d", "cascaded"),
+        Method("a", "baseline", "a", "noisy"),
+        Method("b", "fixed", "b", "oidn"),
+        Method("c", "trainable", "c", "cascaded"),
+        Method("d", "trainable", "d", "cascaded", {"width": 4}),
     ]
-    colors = family_colors(methods)
-    assert list(colors) == ["none", "cascaded", "OIDN"]
+    colors = model_colors(methods)
+    assert list(colors) == ["noisy", "cascaded", "oidn"]
     assert len(set(colors.values())) == 3
 
 

@@ -1,0 +1,127 @@
+"""Many methods, settings and scenes in short: means, the best settings, and who is ahead."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from mcdenoise.benchmark import Score, folded, mean_over_scenes, scores_of, summary, verdicts
+from mcdenoise.evaluate import METRICS
+from mcdenoise.results import Cell, Machine, Method, Results, Scene
+
+
+def by_method(scores: list[Score]) -> dict[str, Score]:
+    return {score.method: score for score in scores}
+
+
+def score(scene: str, method: str, smape: float, psnr: float, quality: str = "") -> Score:
+    about = {"family": "oidn", "settings": {"quality": quality, "trick": method}} if quality else {}
+    return Score(scene, method, 2, {"SMAPE": smape, "PSNR": psnr}, **about)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def two_scenes() -> list[Score]:
+    """A is best for the first scene in SMAPE, B for the second, C never; D has the best PSNR throughout."""
+    return [
+        score("one", "noisy", 0.9, 5),
+        score("one", "A", 0.10, 20, "fast"),
+        score("one", "B", 0.20, 21, "fast"),
+        score("one", "C", 0.16, 22, "high"),
+        score("one", "D", 0.30, 30, "high"),
+        score("one", "ours", 0.09, 29),
+        score("two", "noisy", 0.7, 7),
+        score("two", "A", 0.30, 20, "fast"),
+        score("two", "B", 0.12, 21, "fast"),
+        score("two", "C", 0.14, 22, "high"),
+        score("two", "D", 0.30, 26, "high"),
+        score("two", "ours", 0.13, 31),
+    ]
+
+
+def test_settings_fold_to_the_best_of_each_metric(two_scenes: list[Score]) -> None:
+    rows = folded(two_scenes, ("quality",))
+    methods = ["noisy", "oidn(quality=fast)", "oidn(quality=high)", "oidn, best of 4 settings", "ours"]
+    assert [(row.scene, row.method) for row in rows] == [(s, m) for s in ("one", "two") for m in methods]
+    one = by_method(rows[:5])
+    assert one["oidn(quality=fast)"].values == {"SMAPE": 0.10, "PSNR": 21}
+    assert one["oidn(quality=fast)"].chosen == {"SMAPE": "A", "PSNR": "B"}
+    assert one["oidn, best of 4 settings"].values == {"SMAPE": 0.10, "PSNR": 30}
+    assert one["oidn, best of 4 settings"].chosen == {"SMAPE": "A", "PSNR": "D"}
+    assert one["ours"].values == {"SMAPE": 0.09, "PSNR": 29}
+
+
+def test_every_scene_counts_the_same(two_scenes: list[Score]) -> None:
+    longer = [replace(s, frames=98) if s.scene == "two" else s for s in two_scenes]
+    means = by_method(mean_over_scenes(longer))
+    assert means["A"].values == pytest.approx({"SMAPE": 0.2, "PSNR": 20})
+    assert (means["A"].scene, means["A"].frames) == ("mean of 2", 100)
+
+
+def test_a_metric_that_one_scene_lacks_has_no_mean(two_scenes: list[Score]) -> None:
+    two_scenes[0].values["tRMSE"] = 0.5
+    assert set(by_method(mean_over_scenes(two_scenes))["noisy"].values) == {"SMAPE", "PSNR"}
+
+
+def test_summary_tells_one_setting_for_all_from_one_for_each(two_scenes: list[Score]) -> None:
+    rows = by_method(summary(two_scenes, ("quality",)))
+    best, of_each = "oidn, best of 4 settings", "oidn, best of each scene"
+    assert list(rows) == ["noisy", "oidn(quality=fast)", "oidn(quality=high)", best, of_each, "ours"]
+    # Means of A, B, C: 0.2, 0.16, 0.15. Best of each scene: 0.10 and 0.12.
+    assert rows[best].values == pytest.approx({"SMAPE": 0.15, "PSNR": 28})
+    assert rows[best].chosen == {"SMAPE": "C", "PSNR": "D"}
+    assert rows[of_each].values == pytest.approx({"SMAPE": 0.11, "PSNR": 28})
+
+
+def test_verdicts(two_scenes: list[Score]) -> None:
+    smape, psnr = verdicts(two_scenes, "ours")
+    assert (smape.metric, smape.value) == ("SMAPE", pytest.approx(0.11))
+    assert (smape.single, smape.setting, smape.best) == (pytest.approx(0.15), "C", pytest.approx(0.11))
+    assert smape.scenes == {"one": (0.09, 0.10), "two": (0.13, 0.12)}
+    assert smape.ahead
+    assert smape.won == ["one"]
+    assert str(smape) == (
+        "SMAPE: ours 0.11; oidn's best single setting 0.15 (C): 0.733 times; its best setting of each scene 0.11: "
+        "1.000 times; better in 1 of 2 scenes, not in two"
+    )
+    # 29 and 31 dB against 30 and 26 dB: higher is better, and 29 is not.
+    assert psnr.ahead
+    assert psnr.won == ["two"]
+    assert "+2; its best setting of each scene 28: +2; better in 1 of 2 scenes, not in one" in str(psnr)
+
+
+def test_a_worse_model_is_not_ahead(two_scenes: list[Score]) -> None:
+    smape, psnr = verdicts(two_scenes, "noisy")
+    assert not smape.ahead
+    assert not psnr.ahead
+    assert smape.won == psnr.won == []
+    # As good is not better.
+    assert not METRICS["SMAPE"].better(0.1, 0.1)
+    with pytest.raises(ValueError, match="'ours' and of 'joint_bilateral'"):
+        verdicts(two_scenes, "ours", "joint_bilateral")
+
+
+def test_scores_are_those_of_the_cells() -> None:
+    methods = [
+        Method("noisy", "baseline", "noisy", "noisy"),
+        Method("ours", "trainable", "ours", "ours", {"width": 4}),
+        Method("theirs(a=1)", "fixed", "1", "theirs", {"a": 1}),
+        Method("theirs(a=2)", "fixed", "2", "theirs", {"a": 2}),
+        Method("absent", "fixed", "absent", "absent", missing="not installed"),
+    ]
+    cells = [
+        Cell("one", "noisy", {"SMAPE": 0.5}),
+        Cell("one", "ours", {"SMAPE": 0.1}, on_the_way={"initial": {"SMAPE": 0.2}}),
+        Cell("one", "theirs(a=1)", {"SMAPE": 0.3}, on_the_way={"initial": {"SMAPE": 0.4}}),
+        Cell("one", "theirs(a=2)", failure="it broke"),
+    ]
+    scene = Scene("one", 8, 8, [0, 1, 2], [1, 2])
+    scores = scores_of(Results("", "", Machine("", 1, 1.0, "cpu", 1, ""), 0, [scene], methods, cells))
+    assert [(score.method, score.values["SMAPE"], score.family) for score in scores] == [
+        ("noisy", 0.5, ""),
+        ("ours, initial", 0.2, ""),
+        # One setting alone is no sweep.
+        ("ours", 0.1, ""),
+        ("theirs(a=1)", 0.3, "theirs"),
+    ]
+    assert {score.frames for score in scores} == {2}

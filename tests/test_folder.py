@@ -1,0 +1,321 @@
+"""From a folder of frames to a folder of clean ones: what is written, what is told, and what goes on beside."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+from torch import Tensor, nn
+
+import mcdenoise.folder
+from mcdenoise import Denoiser, Frame, InputError, create_model
+from mcdenoise.cli import main
+from mcdenoise.data import Sequence, open_sequence, read_exr, write_exr
+from mcdenoise.folder import denoise_sequence
+from mcdenoise.models import save_weights
+
+STAGES = ["validate", "accumulate", "plan", "network", "remodulate"]
+
+
+def small_model() -> nn.Module:
+    """A small cascade with random weights, also in the heads that start at zero."""
+    torch.manual_seed(0)
+    model = create_model("cascaded_v2", width=8)
+    assert isinstance(model, nn.Module)
+    for name, module in model.named_modules():
+        if ".initial" in name and ".heads." in name:
+            nn.init.normal_(module.weight, std=0.02)  # type: ignore[arg-type]
+    return model
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    path = tmp_path / "small.safetensors"
+    path.write_bytes(save_weights(small_model(), "cascaded_v2", {"width": 8}, {}))
+    return path
+
+
+def refused(action: Callable[[], object]) -> str:
+    with pytest.raises(InputError) as error:
+        action()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_the_command_line_sets_the_precision(
+    precision: str, small_sequence: Path, weights: Path, tmp_path: Path
+) -> None:
+    command = ["denoise", str(small_sequence), "-o", str(tmp_path / "out"), "--weights", str(weights), "--frames", "0"]
+    with pytest.raises(SystemExit) as stop:
+        main([*command, "--precision", precision])
+    assert stop.value.code == 0
+    assert json.loads((tmp_path / "out" / "denoise.json").read_text())["precision"] == precision
+
+
+def stored(path: Path) -> str:
+    """How an EXR stores its pixels."""
+    file = oiio.ImageInput.open(str(path))
+    kind = str(file.spec().format)
+    file.close()
+    return kind
+
+
+def test_a_sequence_is_written_with_its_numbers_and_metadata(small_sequence: Path, tmp_path: Path) -> None:
+    sequence, out = open_sequence(small_sequence, "1-2"), tmp_path / "deep" / "out"
+    for number in sequence.numbers:
+        color = small_sequence / "inputs" / f"color{number}.exr"
+        write_exr(color, read_exr(color)[0], ["R", "G", "B"], metadata={"Owner": f"frame {number}", "camera": 1.5})
+    seen: list[tuple[bool, bool]] = []
+    denoise_sequence(
+        sequence,
+        out,
+        Denoiser(small_model()),
+        "small",
+        on_output=lambda frame, output: seen.append(
+            (frame.reference is None, output.stages["noisy"].equal(frame.color))
+        ),
+    )
+    assert seen == [(True, True)] * 2
+    assert sorted(path.name for path in out.iterdir()) == ["denoise.json", "denoised1.exr", "denoised2.exr"]
+    denoiser = Denoiser(small_model())
+    for number in sequence.numbers:
+        pixels, channels, metadata = read_exr(out / f"denoised{number}.exr")
+        assert channels == ["R", "G", "B"]
+        assert (metadata["Owner"], metadata["camera"]) == (f"frame {number}", 1.5)
+        assert stored(out / f"denoised{number}.exr") == "half"
+        expected = denoiser(sequence.frame(number))[0].permute(1, 2, 0).numpy()
+        np.testing.assert_allclose(pixels, expected, rtol=2**-11, atol=1e-6)
+
+
+def test_full_floats_and_a_denoiser_that_was_used_before(small_sequence: Path, tmp_path: Path) -> None:
+    sequence, denoiser = open_sequence(small_sequence, "1"), Denoiser(small_model())
+    denoiser(open_sequence(small_sequence).frame(0))
+    denoise_sequence(sequence, tmp_path / "out", denoiser, "small", half=False)
+    assert stored(tmp_path / "out" / "denoised1.exr") == "float"
+    denoiser.reset()
+    expected = denoiser(sequence.frame(1))[0].permute(1, 2, 0).numpy()
+    assert np.array_equal(read_exr(tmp_path / "out" / "denoised1.exr")[0], expected)
+
+
+def test_the_report_of_a_sequence(small_sequence: Path, tmp_path: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    report = denoise_sequence(sequence, tmp_path / "out", Denoiser(small_model()), "small")
+    written = json.loads((tmp_path / "out" / "denoise.json").read_text())
+    assert written["model"] == "small"
+    assert set(written["versions"]) == {"mcdenoise", "torch", "kornia"}
+    assert written["device"] == "cpu"
+    assert written["precision"] == "float32"
+    assert written["threads"] == torch.get_num_threads()
+    assert written["sequence"] == {"name": "plane", "layout": "bmfr", "size": [20, 24]}
+    assert (written["keep_all"], written["tolerance"]) == (False, 1e-3)
+    assert written["plan"] == report.plan
+    assert [(row["stage"], row["kept"], row["skipped"], row["reason"]) for row in report.plan] == [
+        ("read", True, 0, "color is stored with albedo"),
+        ("demodulate", True, 0, "albedo"),
+        ("accumulate", True, 0, "positions and cameras"),
+        ("reproject", True, 0, "positions and cameras"),
+        ("remember", True, 0.25, "no frame reads it"),
+        ("noise-free pixels", True, 0, "there are none"),
+        ("converged tiles", True, 0, "there are none"),
+        ("unchanged tiles", True, 0, "there are none"),
+        ("network", True, 0, "on 100% of the pixels"),
+    ]
+    assert {row["stage"] for row in report.plan if not row["exact"]} == {"converged tiles", "unchanged tiles"}
+    assert list(written["frames"]) == ["0", "1", "2", "3"]
+    for number, frame in written["frames"].items():
+        assert list(frame["milliseconds"]) == ["waiting", *STAGES]
+        assert list(frame["beside"]) == ["read", "write"]
+        assert all(value >= 0 for times in (frame["milliseconds"], frame["beside"]) for value in times.values())
+        assert frame["reset"] == ("first frame" if number == "0" else "")
+        assert (frame["replaced_pixels"], frame["missing"]) == (0, [])
+    assert written["milliseconds"] == report.milliseconds
+    network = sorted(report.frames[number].milliseconds["network"] for number in (1, 2, 3))
+    assert report.milliseconds["network"] == network[1]
+
+
+def test_the_plan_of_color_alone(small_sequence: Path, tmp_path: Path) -> None:
+    for path in (small_sequence / "inputs").iterdir():
+        if not path.name.startswith("color"):
+            path.unlink()
+    report = denoise_sequence(open_sequence(small_sequence), tmp_path / "out", Denoiser(small_model()), "small")
+    assert {row["stage"]: row["reason"] for row in report.plan if not row["kept"]} == {
+        "accumulate": "no motion, and no positions with cameras: single frames",
+        "reproject": "no motion, and no positions with cameras: single frames",
+        "remember": "no motion, and no positions with cameras: single frames",
+        "demodulate": "no albedo",
+    }
+    assert report.frames[3].missing == ["albedo", "depth", "motion", "normal"]
+    assert report.frames[3].reset.startswith("no motion")
+
+
+def test_a_bad_frame_is_named_and_leaves_only_whole_files(small_sequence: Path, tmp_path: Path) -> None:
+    path = small_sequence / "inputs" / "shading_normal2.exr"
+    pixels = read_exr(path)[0]
+    pixels[4, 5] = np.nan
+    write_exr(path, pixels, ["R", "G", "B"])
+    sequence, out = open_sequence(small_sequence), tmp_path / "out"
+    message = refused(lambda: denoise_sequence(sequence, out, Denoiser(small_model()), "small"))
+    assert f"{small_sequence}, frame 2: buffer 'normal'" in message
+    assert sorted(path.name for path in out.iterdir()) == ["denoised0.exr", "denoised1.exr"]
+
+
+# Reading and writing beside the network
+
+
+class Slow(nn.Module):
+    """A network that changes nothing, and takes its time."""
+
+    def forward(self, color: Tensor) -> Tensor:
+        time.sleep(DELAY)
+        return color
+
+
+DELAY = 0.15
+
+
+def slowly(monkeypatch: pytest.MonkeyPatch, *, read: float = 0.0, write: float = 0.0) -> None:
+    """Let reading a frame and writing one take so many seconds more."""
+    frame, write_exr = Sequence.frame, mcdenoise.folder.write_exr
+
+    def slow_frame(*arguments: Any, **options: Any) -> Frame:
+        time.sleep(read)
+        return frame(*arguments, **options)
+
+    def slow_write(*arguments: Any, **options: Any) -> None:
+        time.sleep(write)
+        write_exr(*arguments, **options)
+
+    monkeypatch.setattr(Sequence, "frame", slow_frame)
+    monkeypatch.setattr("mcdenoise.folder.write_exr", slow_write)
+
+
+def test_reading_and_writing_go_on_while_a_frame_is_denoised(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slowly(monkeypatch, read=DELAY, write=DELAY)
+    sequence, times = open_sequence(small_sequence), []
+    for ahead in (True, False):
+        denoiser = Denoiser(Slow())
+        monkeypatch.setattr(denoiser, "reset", lambda *_, room=ahead, of=denoiser: setattr(of, "has_room_ahead", room))
+        start = time.perf_counter()
+        report = denoise_sequence(sequence, tmp_path / "out", denoiser, "slow")
+        times.append(time.perf_counter() - start)
+        written = json.loads((tmp_path / "out" / "denoise.json").read_text())
+        assert written["reads_ahead"] is ahead
+        for number, done in report.frames.items():
+            assert min(done.beside["read"], done.beside["write"]) >= DELAY * 1e3
+            assert written["frames"][str(number)]["milliseconds"]["waiting"] == done.milliseconds["waiting"]
+        waiting = [done.milliseconds["waiting"] for done in report.frames.values()]
+        # All of reading and writing, or else reading the first frame and what a busy machine adds.
+        assert (sum(waiting[1:]) < 3 * DELAY * 1e3) is ahead
+        assert waiting[0] >= DELAY * 1e3
+    # One after the other, four frames take twelve delays; side by side, six.
+    assert times[1] >= 12 * DELAY
+    assert times[0] < 0.8 * times[1]
+
+
+def test_reading_ahead_does_not_change_an_image(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = open_sequence(small_sequence)
+    for name, ahead in (("ahead", True), ("alone", False)):
+        denoiser = Denoiser(small_model())
+        monkeypatch.setattr(type(denoiser._memory), "has_room_ahead", lambda *_, room=ahead: room)
+        denoise_sequence(sequence, tmp_path / name, denoiser, "small", half=False)
+        assert denoiser.has_room_ahead is ahead
+    for number in sequence.numbers:
+        images = [read_exr(tmp_path / name / f"denoised{number}.exr")[0] for name in ("ahead", "alone")]
+        assert np.array_equal(*images)
+
+
+def test_no_more_than_one_frame_is_read_ahead(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[int] = []
+    frame = Sequence.frame
+    monkeypatch.setattr(Sequence, "frame", lambda self, number, **_: read.append(number) or frame(self, number))
+    model = Slow()
+    seen: list[int] = []
+    model.register_forward_hook(lambda *_: seen.append(len(read)))
+    denoise_sequence(open_sequence(small_sequence), tmp_path / "out", Denoiser(model), "slow")
+    assert seen == [2, 3, 4, 4]
+
+
+@pytest.mark.parametrize("failing", [0, 1, 3])
+def test_a_frame_that_cannot_be_written_ends_the_run(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int
+) -> None:
+    out = tmp_path / "out"
+    (out / f"denoised{failing}.exr").mkdir(parents=True)
+    sequence = open_sequence(small_sequence)
+    message = refused(lambda: denoise_sequence(sequence, out, Denoiser(small_model()), "small"))
+    assert f"denoised{failing}.exr: expected a file to write" in message
+    whole = sorted(path.name for path in out.iterdir() if path.is_file())
+    assert whole == [f"denoised{number}.exr" for number in range(failing)]
+
+
+def test_an_interrupt_leaves_only_whole_files(
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slowly(monkeypatch, write=DELAY)
+    out, done = tmp_path / "out", []
+    # What an earlier test of this process has left running is not of this run.
+    running = set(threading.enumerate())
+
+    def interrupt() -> None:
+        done.append(len(done))
+        if len(done) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        denoise_sequence(open_sequence(small_sequence), out, Denoiser(small_model()), "small", on_frame=interrupt)
+    # What was being written is finished.
+    assert sorted(path.name for path in out.iterdir()) == ["denoised0.exr", "denoised1.exr"]
+    for number in range(2):
+        assert read_exr(out / f"denoised{number}.exr")[0].shape == (20, 24, 3)
+    started = set(threading.enumerate()) - running
+    assert not [thread for thread in started if thread.name.startswith("ThreadPoolExecutor")]
+
+
+def test_an_output_folder_that_cannot_be(small_sequence: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    sequence, denoiser = open_sequence(small_sequence), Denoiser(small_model())
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        message = refused(lambda out=out: denoise_sequence(sequence, out, denoiser, "small"))
+        assert f"{out}: expected a folder that can be written to" in message
+
+
+def test_an_old_report_does_not_survive_a_run_that_fails(small_sequence: Path, tmp_path: Path) -> None:
+    sequence, out = open_sequence(small_sequence), tmp_path / "out"
+    denoise_sequence(sequence, out, Denoiser(small_model()), "small")
+    path = small_sequence / "inputs" / "albedo2.exr"
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(InputError):
+        denoise_sequence(sequence, out, Denoiser(small_model()), "small")
+    assert not (out / "denoise.json").exists()
+
+
+def test_a_method_that_gives_what_is_no_radiance_ends_the_run(small_sequence: Path, tmp_path: Path) -> None:
+    def broken(color: Tensor) -> Tensor:
+        return color / (frame.color != color).any()
+
+    frame, out = open_sequence(small_sequence).frame(2), tmp_path / "out"
+    message = refused(lambda: denoise_sequence(open_sequence(small_sequence), out, Denoiser(broken), "broken"))
+    assert f"{small_sequence}, frame 2: model: expected" in message
+    assert "NaN or infinite" in message
+    assert sorted(path.name for path in out.iterdir()) == ["denoised0.exr", "denoised1.exr"]
+
+
+def test_a_stage_that_some_frames_do_without_has_a_median(small_sequence: Path, tmp_path: Path) -> None:
+    report = denoise_sequence(open_sequence(small_sequence), tmp_path / "out", Denoiser(small_model()), "small")
+    del report.frames[1].milliseconds["remodulate"], report.frames[2].milliseconds["remodulate"]
+    assert report.milliseconds["remodulate"] == 0
