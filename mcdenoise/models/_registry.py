@@ -6,6 +6,7 @@ import functools
 import importlib
 import importlib.util
 import inspect
+import pkgutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -75,6 +76,7 @@ def register_model(
 
 def list_models(pattern: str = "*") -> list[str]:
     """Names of all registered models that match a shell-style pattern, sorted; those of installed packages as well."""
+    _import_pages()
     return sorted(name for name in {*_MODELS, *_installed()} if fnmatch(name, pattern))
 
 
@@ -88,6 +90,7 @@ def find_model(name: str) -> Entry:
     Raises:
         InputError: there is no such model, file, module or factory.
     """
+    _import_pages()
     if name in _MODELS:
         return _MODELS[name]
     if name in _installed():
@@ -124,6 +127,15 @@ def _of_factory(name: str, factory: Any) -> Entry:
     if not callable(factory):
         raise InputError(f"model '{name}': expected a factory that can be called, found {type(factory).__name__}")
     return Entry(factory, {}, (factory.__doc__ or "").strip().partition("\n")[0])
+
+
+@functools.cache
+def _import_pages() -> None:
+    """Import every page of this room, so that a model is registered by its page alone."""
+    room = __name__.rpartition(".")[0]
+    for page in pkgutil.iter_modules(importlib.import_module(room).__path__):
+        if not page.name.startswith("_"):
+            importlib.import_module(f"{room}.{page.name}")
 
 
 @functools.cache

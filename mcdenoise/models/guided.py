@@ -1,0 +1,84 @@
+"""The guided filter on accumulated and demodulated radiance: a local linear model of the features.
+
+He et al. 2010, "Guided image filtering"; with features as Bauszat et al. 2011, "Guided image filtering for interactive
+high-quality global illumination".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.joint_bilateral import guide_of, scale_of_depth
+from mcdenoise.models.tiled import Tiled
+
+DEPTH_SCALE = 10.0
+# Of a tile's pixel: its covariance matrix of seven guides, and what solving for it takes, measured.
+_BYTES_PER_PIXEL = 4 * 6 * 7**2
+
+
+class Guided(nn.Module):
+    """``kornia.filters.guided_blur`` with all of albedo, normal and depth for a guide, as far as the frame has them.
+
+    In each window the light is a linear function of the guides (He et al. 2010, Eqs. 4 to 6), and each pixel takes the
+    mean of those of all windows that it lies in (Eq. 8); so edges of the guides stay, in what light they have. A
+    linear function may leave the range of the light, and is cut off at 0. A frame without features guides itself.
+
+    Args:
+        radius: of the windows in pixels, at least 1.
+        eps: variance of a guide below which it says little, in the guides' unit squared (Eq. 5), above 0; albedos and
+            normals have their own unit, depths are 10 times :func:`mcdenoise.nn.normalize_depth`.
+
+    Raises:
+        InputError: a setting is out of its range.
+    """
+
+    def __init__(self, radius: int = 4, eps: float = 1e-2) -> None:
+        super().__init__()
+        if radius < 1:
+            raise InputError(f"radius: expected at least 1, found {radius}")
+        if not 0 < eps < math.inf:
+            raise InputError(f"eps: expected a positive number, found {eps}")
+        self.radius, self.eps = radius, eps
+
+    @property
+    def needs(self) -> Needs:
+        """Color; features guide. A pixel sees all windows that it lies in."""
+        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=2 * self.radius)
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """The scale of depths, see :func:`mcdenoise.nn.normalize_depth`."""
+        return scale_of_depth(frame)
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a tile takes."""
+        return float(_BYTES_PER_PIXEL)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        # All of kornia comes with it, which takes as long to import as a single frame to denoise.
+        from kornia.filters import guided_blur
+
+        guide, size = guide_of(frame, DEPTH_SCALE), 2 * self.radius + 1
+        image: Tensor = guided_blur(guide, frame.color, size, self.eps, border_type="replicate", separable=True)
+        return Output(image.clamp_min(0)), None
+
+
+@register_model("guided")
+def guided(radius: int = 4, eps: float = 1e-2, *, alpha_min: float = 0.1) -> Model:
+    """Kornia's guided filter of the accumulated and demodulated radiance.
+
+    Args:
+        radius: see :class:`Guided`.
+        eps: likewise.
+        alpha_min: see :class:`mcdenoise.models.Accumulated`.
+    """
+    return Demodulated(Accumulated(Tiled(Guided(radius, eps)), alpha_min=alpha_min))

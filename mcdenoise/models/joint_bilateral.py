@@ -1,0 +1,116 @@
+"""The joint bilateral filter on accumulated and demodulated radiance: the plain method to compare with.
+
+Petschnigg et al. 2004, "Digital photography with flash and no-flash image pairs", Eq. 3; Eisemann and Durand 2004.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.tiled import TILE, Tiled
+from mcdenoise.ops._steps.network import depth_scale, normalized_depth
+
+# Depths in [0, 1] differ by much less than albedos and normals do: without a scale of its own, depth hardly guides.
+DEPTH_SCALE = 10.0
+# kornia unfolds the windows of small images, of those that have derivatives, and on a GPU: 25x25 pixels of a 1280x720
+# image would take more than 20 GB at once. So they go in tiles of at most so many values.
+_UNFOLDED_VALUES = 250_000_000
+_CHANNELS = 10  # of image and guide
+
+
+class JointBilateral(nn.Module):
+    """``kornia.filters.joint_bilateral_blur``, guided by albedo, normal and depth, as far as the frame has them.
+
+    A frame without any guides itself, which is the bilateral filter.
+
+    Args:
+        sigma_color: standard deviation in the guides' space, where albedos and normals have their own unit and depths
+            are 10 times :func:`mcdenoise.nn.normalize_depth`, L2 distance; above 0.
+        sigma_space: in pixels, above 0; the window is twice as far to every side.
+
+    Raises:
+        InputError: a setting is out of its range.
+    """
+
+    def __init__(self, sigma_color: float = 0.2, sigma_space: float = 4.0) -> None:
+        super().__init__()
+        for name, sigma in (("sigma_color", sigma_color), ("sigma_space", sigma_space)):
+            if not 0 < sigma < math.inf:
+                raise InputError(f"{name}: expected a positive number, found {sigma}")
+        self.sigma_color, self.sigma_space = sigma_color, sigma_space
+        self.radius = math.ceil(2 * sigma_space)
+
+    @property
+    def needs(self) -> Needs:
+        """Color; features guide."""
+        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=self.radius)
+
+    @property
+    def side(self) -> int:
+        """Of tiles that keep kornia's unfolded windows within memory, in pixels."""
+        pixels = math.isqrt(_UNFOLDED_VALUES // (_CHANNELS * (2 * self.radius + 1) ** 2))
+        return max((pixels - 2 * self.radius) // TILE, 2) * TILE
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """The scale of depths, see :func:`mcdenoise.nn.normalize_depth`."""
+        return scale_of_depth(frame)
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a tile takes: its windows, unfolded, and as much again for their weights' derivatives."""
+        return 2 * 4 * _CHANNELS * float((2 * self.radius + 1) ** 2)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        # All of kornia comes with it, which takes as long to import as a single frame to denoise.
+        from kornia.filters import joint_bilateral_blur
+
+        size, sigma_space = 2 * self.radius + 1, (self.sigma_space, self.sigma_space)
+        image: Tensor = joint_bilateral_blur(
+            frame.color,
+            guide_of(frame, DEPTH_SCALE),
+            size,
+            self.sigma_color,
+            sigma_space,
+            border_type="replicate",
+            color_distance_type="l2",
+        )
+        return Output(image), None
+
+
+def scale_of_depth(frame: Frame) -> dict[str, Tensor]:
+    """``depth_scale`` of a whole image as :func:`mcdenoise.nn.inputs.image_statistics` gives it; nothing without one."""
+    if frame.depth is None or "depth_scale" in frame.statistics:
+        return {}
+    return {"depth_scale": torch.cat(depth_scale(frame.depth), 1)}
+
+
+def guide_of(frame: Frame, depth_weight: float) -> Tensor:
+    """Albedo, normal and depth in ``[0, depth_weight]``, of those that a frame has; of none, its color."""
+    guides = [image for image in (frame.albedo, frame.normal) if image is not None]
+    if frame.depth is not None:
+        largest, typical = (frame.statistics | scale_of_depth(frame))["depth_scale"].split(1, 1)  # type: ignore[operator]
+        guides.append(depth_weight * normalized_depth(frame.depth, largest, typical))
+    return torch.cat(guides or [frame.color], 1)
+
+
+@register_model("joint_bilateral")
+def joint_bilateral(sigma_color: float = 0.2, sigma_space: float = 4.0, *, alpha_min: float = 0.1) -> Model:
+    """Kornia's joint bilateral filter of the accumulated and demodulated radiance.
+
+    Args:
+        sigma_color: see :class:`JointBilateral`.
+        sigma_space: likewise.
+        alpha_min: see :class:`mcdenoise.models.Accumulated`.
+    """
+    blur = JointBilateral(sigma_color, sigma_space)
+    return Demodulated(Accumulated(Tiled(blur, blur.side), alpha_min=alpha_min))

@@ -1,0 +1,42 @@
+"""Doing nothing, and accumulation alone: what every method has to be better than."""
+
+from __future__ import annotations
+
+import math
+
+from torch import nn
+
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.ops.lag import THRESHOLD
+
+
+@register_model("noisy")
+class Noisy(nn.Module):
+    """The frame's own color."""
+
+    def __init__(self) -> None:
+        super().__init__()
+
+    @property
+    def needs(self) -> Needs:
+        """The color; each pixel is its own."""
+        return Needs(trainable=False, reach=0)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        return Output(frame.color), None
+
+
+@register_model("accumulated")
+def accumulated(*, alpha_min: float = 0.1, anti_lag: bool = True) -> Model:
+    """The history of the shot without any filter: what the family ``cascaded_v2`` starts from.
+
+    Args:
+        alpha_min: smallest weight of the current frame, see :class:`mcdenoise.models.Accumulated`.
+        anti_lag: whether the history is given up where the light has changed, see :func:`mcdenoise.ops.history_lag`.
+    """
+    return Demodulated(Accumulated(Noisy(), alpha_min=alpha_min, lag_threshold=THRESHOLD if anti_lag else math.inf))

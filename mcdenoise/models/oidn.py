@@ -1,0 +1,184 @@
+"""Intel Open Image Denoise through its own package, in each of its settings: the denoiser to compare with.
+
+https://www.openimagedenoise.org, Apache License 2.0; optional, ``pip install 'mcdenoise[peers]'``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import weakref
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._journal import timed
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.chain import Chain
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.noisy import Noisy, accumulated
+
+Quality = Literal["fast", "balanced", "high"]
+Auxiliary = Literal["noisy", "clean", "prefiltered"]
+Source = Literal["raw", "accumulated", "demodulated", "accumulated after"]
+
+
+class Oidn:
+    """Open Image Denoise on the CPU, of the frame's color as it is; its device, filters and buffers are kept.
+
+    Filters are made when they are first needed, and made anew when the size changes. It has no derivatives.
+
+    Args:
+        quality: which network. With noisy features high is the same network as balanced; else it is a larger one.
+        auxiliary: what is said of albedo and normal: that they may be noisy; that they are clean; or nothing, since
+            they are denoised first, one by one at high quality as the library recommends, and then are clean.
+        threads: how many it may use; by default it decides itself, and takes every core.
+
+    Raises:
+        InputError: the package ``pyoidn`` is not installed, or a setting is unknown.
+    """
+
+    def __init__(
+        self, quality: Quality = "high", auxiliary: Auxiliary = "noisy", *, threads: int | None = None
+    ) -> None:
+        _check("quality", quality, Quality)
+        _check("auxiliary", auxiliary, Auxiliary)
+        if threads is not None and threads < 1:
+            raise InputError(f"threads: expected at least 1, found {threads}")
+        self._oidn = _import_oidn()
+        self.quality, self.auxiliary = quality, auxiliary
+        self._device = self._oidn.Device()
+        if threads is not None:
+            self._device.set_int("numThreads", threads)
+        self._device.commit()
+        self._check_device()
+        self._filters: dict[tuple[tuple[str, ...], Quality, bool], Any] = {}
+        self._buffers: dict[str, Tensor] = {}
+        # Filters go before their device, and both before the library does.
+        weakref.finalize(self, _release, self._filters, self._device)
+
+    @property
+    def needs(self) -> Needs:
+        """Color; albedo and normal are of use. It looks at the whole image, whose exposure it finds."""
+        return Needs(uses=frozenset({"albedo", "normal"}), trainable=False)
+
+    def __call__(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`.
+
+        Raises:
+            InputError: a derivative in the color is asked for, which would silently be zero.
+            RuntimeError: the library refuses; the message is its own.
+        """
+        if torch.is_grad_enabled() and frame.color.requires_grad:
+            raise InputError("oidn: expected a color without gradients, found one with; the library has no derivatives")
+        with timed("network", frame.color.device), torch.no_grad():
+            # Without an albedo the library takes no normal.
+            given = {"albedo": frame.albedo, "normal": frame.normal if frame.albedo is not None else None}
+            guides = {name: image for name, image in given.items() if image is not None}
+            if self.auxiliary == "prefiltered":
+                guides = {name: self._run({name: image}, "high", clean=False) for name, image in guides.items()}
+            image = self._run({"color": frame.color, **guides}, self.quality, clean=self.auxiliary != "noisy")
+        return Output(image.to(frame.color.dtype)), None
+
+    def _run(self, images: dict[str, Tensor], quality: Quality, *, clean: bool) -> Tensor:
+        """A filter of the images ``(B, 3, H, W)``, one after the other."""
+        first = next(iter(images.values()))
+        batch, _, height, width = first.shape
+        self._resize(height, width)
+        denoiser = self._filter(tuple(images), quality, clean)
+        results = []
+        for index in range(batch):
+            for name, image in images.items():
+                self._buffers[name].copy_(image[index].permute(1, 2, 0))
+            denoiser.execute()
+            self._check_device()
+            results.append(self._buffers["output"].permute(2, 0, 1).to(first.device, copy=True).contiguous())
+        return torch.stack(results)
+
+    def _resize(self, height: int, width: int) -> None:
+        if self._buffers and self._buffers["output"].shape == (height, width, 3):
+            return
+        _release_filters(self._filters)
+        self._buffers = {name: torch.zeros(height, width, 3) for name in ("color", "albedo", "normal", "output")}
+
+    def _filter(self, names: tuple[str, ...], quality: Quality, clean: bool) -> Any:
+        key = names, quality, clean
+        if key not in self._filters:
+            made = self._oidn.Filter(self._device, self._oidn.OIDN_FILTER_TYPE_RT)
+            for name in (*names, "output"):
+                made.set_image(name, self._buffers[name], self._oidn.OIDN_FORMAT_FLOAT3)
+            made.set_bool("hdr", "color" in names)
+            made.set_bool("cleanAux", clean)
+            made.set_quality(getattr(self._oidn, f"OIDN_QUALITY_{quality.upper()}"))
+            made.commit()
+            self._check_device()
+            self._filters[key] = made
+        return self._filters[key]
+
+    def _check_device(self) -> None:
+        message = self._device.get_error()
+        if message:
+            raise RuntimeError(f"Open Image Denoise: {message}")
+
+
+@register_model("oidn")
+def oidn(
+    *,
+    quality: Quality = "high",
+    auxiliary: Auxiliary = "noisy",
+    source: Source = "raw",
+    threads: int | None = None,
+) -> Model:
+    """Intel Open Image Denoise (optional package pyoidn).
+
+    Args:
+        quality: see :class:`Oidn`.
+        auxiliary: likewise.
+        source: the image that it starts from: one sample a pixel (``"raw"``), the accumulated radiance, or the
+            accumulated radiance without albedo (``"demodulated"``), which the result is multiplied with.
+            ``"accumulated after"`` starts from one sample a pixel, and accumulates the results by the rule that makes
+            the accumulated image, without a test for lag: denoised frames flicker, and have no noise to excuse it.
+        threads: see :class:`Oidn`.
+
+    Raises:
+        InputError: as of :class:`Oidn`.
+    """
+    _check("source", source, Source)
+    denoiser = Oidn(quality, auxiliary, threads=threads)
+    if source == "accumulated":
+        return Chain(accumulated=accumulated(), denoised=denoiser)
+    if source == "demodulated":
+        return Demodulated(Accumulated(denoiser))
+    if source == "accumulated after":
+        return Chain(denoised=denoiser, accumulated=Demodulated(Accumulated(Noisy(), lag_threshold=math.inf)))
+    return denoiser
+
+
+def _check(name: str, value: str, known: Any) -> None:
+    if value not in get_args(known):
+        raise InputError(f"{name}: expected one of {', '.join(get_args(known))}, found '{value}'")
+
+
+def _import_oidn() -> Any:
+    try:
+        return importlib.import_module("pyoidn")
+    except ImportError as error:
+        raise InputError(
+            "Open Image Denoise needs pyoidn, which is not installed; pip install 'mcdenoise[peers]'"
+        ) from error
+
+
+def _release_filters(filters: dict[Any, Any]) -> None:
+    for made in filters.values():
+        made.release()
+    filters.clear()
+
+
+def _release(filters: dict[Any, Any], device: Any) -> None:
+    _release_filters(filters)
+    device.release()

@@ -1,0 +1,87 @@
+"""The guided filter: kornia's own, with all features for a guide."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from kornia.filters import guided_blur
+
+from mcdenoise.denoiser import Denoiser
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models import create_model
+from mcdenoise.models.guided import Guided
+
+
+def frame(height: int = 40, width: int = 44, seed: int = 0) -> Frame:
+    generator = torch.Generator().manual_seed(seed)
+    color, albedo, normal, depth = (torch.rand(1, c, height, width, generator=generator) for c in (3, 3, 3, 1))
+    return Frame(color=color, albedo=albedo, normal=torch.nn.functional.normalize(normal, dim=1), depth=1 + depth)
+
+
+def test_is_the_filter_of_kornia() -> None:
+    given = frame()
+    typical = torch.exp(torch.log(given.depth).mean())
+    guide = torch.cat([given.albedo, given.normal, 10 * given.depth / (given.depth + typical)], 1)
+    expected = guided_blur(guide, given.color, 7, 0.05, border_type="replicate").clamp_min(0)
+    torch.testing.assert_close(Guided(3, 0.05)(given)[0].image, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_light_that_is_linear_in_the_guides_stays() -> None:
+    """Of such light every window's model is exact, up to eps beside the guides' variance."""
+    given = frame().to(torch.float64)
+    light = 0.2 * given.albedo + 0.1 * given.normal.sum(1, keepdim=True) + 0.3
+    image = Guided(4, 1e-9)(given.replace(color=light))[0].image
+    torch.testing.assert_close(image, light, rtol=1e-5, atol=1e-6)
+
+
+def test_a_constant_image_stays() -> None:
+    given = frame()
+    constant = given.replace(color=torch.full_like(given.color, 0.7))
+    torch.testing.assert_close(Guided()(constant)[0].image, constant.color, rtol=1e-4, atol=0)
+
+
+def test_an_edge_of_normals_is_not_crossed() -> None:
+    """Within a wall the guides are constant, so that each side is blurred, and by no more than eps with the other."""
+    right = (torch.arange(44) >= 22).expand(1, 1, 40, 44)
+    normal = torch.cat([right, torch.zeros_like(right), ~right], 1).double()
+    given = Frame(color=torch.where(right, 1.0, 0.1).double().expand(1, 3, 40, 44).contiguous(), normal=normal)
+    image = Guided(4, 1e-4)(given)[0].image
+    # In a window with the fraction f beyond the edge, the guides' variance along the step is f (1 - f) times two, of
+    # which eps takes eps / (2 f (1 - f)), with f (1 - f) of 8 / 81 at least.
+    assert (image - given.color).abs().max() < 0.9 * 1e-4 / (2 * 8 / 81) * 1.01
+
+
+def test_tiles_change_nothing() -> None:
+    given = frame(100, 140)
+    whole = Denoiser("guided")(given)
+    # Means over the windows are sums of fewer terms in a tile: seven guides, of a variance of eps at least, in float32.
+    torch.testing.assert_close(Denoiser("guided", tile=64)(given), whole, rtol=1e-3, atol=1e-4)
+
+
+def test_never_negative_and_finite_with_fireflies_and_background() -> None:
+    given = frame()
+    color, depth = given.color.clone(), given.depth.clone()
+    color[..., ::7, ::5] = 1e4
+    depth[..., :9, :] = torch.inf
+    image = Denoiser("guided")(given.replace(color=color, depth=depth))
+    assert image.isfinite().all()
+    assert image.min() >= 0
+
+
+def test_has_nothing_to_train_and_refuses_what_is_no_setting() -> None:
+    model = create_model("guided")
+    assert not list(model.parameters())
+    assert not model.needs.trainable
+    with pytest.raises(InputError, match="radius: expected at least 1, found 0"):
+        create_model("guided", radius=0)
+    with pytest.raises(InputError, match="eps: expected a positive number, found nan"):
+        create_model("guided", eps=torch.nan)
+
+
+def test_history_survives_a_resize() -> None:
+    denoiser = Denoiser("guided")
+    for size in ((40, 44), (40, 44), (5, 4)):
+        given = frame(*size)
+        assert denoiser(given.replace(motion=torch.zeros(1, 2, *size))).shape == given.color.shape
+    assert denoiser.report.reset == "size change"

@@ -1,0 +1,111 @@
+"""The joint bilateral filter: kornia's own, in tiles, on accumulated light."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from kornia.filters import joint_bilateral_blur
+
+from mcdenoise.denoiser import Denoiser
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models import Tiled, create_model, parts_of
+from mcdenoise.models.joint_bilateral import JointBilateral
+from mcdenoise.ops import demodulate, remodulate
+
+
+def frame(height: int = 20, width: int = 26, seed: int = 0) -> Frame:
+    """Noise on two walls that differ in normal, albedo and depth, with background in the first row."""
+    generator = torch.Generator().manual_seed(seed)
+    color = torch.rand(1, 3, height, width, generator=generator)
+    right = (torch.arange(width) >= width // 2).expand(1, 1, height, width)
+    normal = torch.where(
+        right, torch.tensor([1.0, 0, 0]).reshape(1, 3, 1, 1), torch.tensor([0, 0, 1.0]).reshape(1, 3, 1, 1)
+    )
+    depth = torch.where(right, 4.0, 2.0)
+    depth[:, :, 0] = torch.inf
+    return Frame(
+        color=color, albedo=torch.where(right, 0.8, 0.3).expand_as(color).contiguous(), normal=normal, depth=depth
+    )
+
+
+def test_is_the_filter_of_kornia() -> None:
+    given = frame(40, 60)
+    depth = torch.where(given.depth.isfinite(), given.depth, 1)
+    typical = torch.exp(torch.log(depth).sum() / given.depth.isfinite().sum())
+    nearness = torch.where(given.depth.isfinite(), depth / (depth + typical), 1)
+    guide = torch.cat([given.albedo, given.normal, 10 * nearness], 1)
+    light = demodulate(given.color, given.albedo)
+    settings = {"border_type": "replicate", "color_distance_type": "l2"}
+    expected = remodulate(joint_bilateral_blur(light, guide, 9, 0.3, (2.0, 2.0), **settings), given.albedo)
+    model = create_model("joint_bilateral", sigma_color=0.3, sigma_space=2.0)
+    image = Denoiser(model)(given)
+    # The albedos' floor and fireflies are not met here; frames without motion stand alone.
+    torch.testing.assert_close(image, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_tiles_change_nothing() -> None:
+    given = frame(100, 140)
+    whole = Denoiser("joint_bilateral", sigma_space=1.5)(given)
+    tiled = Denoiser("joint_bilateral", sigma_space=1.5, tile=64)
+    torch.testing.assert_close(tiled(given), whole, rtol=1e-5, atol=1e-6)
+    assert tiled.report.tiles.startswith("3 x 2 tiles")
+
+
+def test_windows_stay_within_memory() -> None:
+    """Unfolded, a tile of the default has no more than 250 million values, also where kornia is called directly."""
+    for sigma in (1.5, 4.0, 6.0, 12.0):
+        (tiled,) = parts_of(create_model("joint_bilateral", sigma_space=sigma), Tiled)
+        radius = int(2 * sigma)
+        assert tiled.side is not None
+        assert tiled.halo == radius
+        values = 10 * (2 * radius + 1) ** 2 * (tiled.side + 2 * radius) ** 2
+        assert values <= 250_000_000 or tiled.side == 64
+
+
+def test_a_constant_image_stays_and_no_edge_is_crossed() -> None:
+    given = frame()
+    model = JointBilateral(0.1, 2.0)
+    constant = given.replace(color=torch.full_like(given.color, 0.7))
+    torch.testing.assert_close(model(constant)[0].image, constant.color, rtol=1e-6, atol=0)
+    right = given.replace(color=(given.normal[:, :1] == 1).expand_as(given.color).float())
+    torch.testing.assert_close(model(right)[0].image, right.color, rtol=0, atol=1e-6)
+
+
+def test_guides_itself_without_features() -> None:
+    color = frame().color
+    settings = {"border_type": "replicate", "color_distance_type": "l2"}
+    expected = joint_bilateral_blur(color, color, 9, 0.2, (2.0, 2.0), **settings)
+    torch.testing.assert_close(JointBilateral(0.2, 2.0)(Frame(color=color))[0].image, expected)
+
+
+def test_differentiable() -> None:
+    given = frame(3, 4).to(torch.float64)
+    model = JointBilateral(0.5, 0.5)
+
+    def image(color: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
+        return model(given.replace(color=color, albedo=albedo))[0].image
+
+    leaves = given.color.requires_grad_(), given.albedo.clone().requires_grad_()
+    assert torch.autograd.gradcheck(image, leaves)
+
+
+def test_has_nothing_to_train_and_refuses_what_is_no_setting() -> None:
+    model = create_model("joint_bilateral")
+    assert not list(model.parameters())
+    assert not model.needs.trainable
+    with pytest.raises(InputError, match="sigma_color: expected a positive number, found 0"):
+        create_model("joint_bilateral", sigma_color=0)
+    with pytest.raises(InputError, match="sigma_space: expected a positive number, found inf"):
+        create_model("joint_bilateral", sigma_space=torch.inf)
+    with pytest.raises(InputError, match="it takes sigma_color, sigma_space, alpha_min"):
+        create_model("joint_bilateral", sigma=1)
+
+
+def test_history_survives_a_resize() -> None:
+    denoiser = Denoiser("joint_bilateral", sigma_space=1.5)
+    for size in ((20, 26), (20, 26), (11, 9)):
+        given = frame(*size)
+        result = denoiser(given.replace(motion=torch.zeros(1, 2, *size)))
+        assert result.shape == given.color.shape
+    assert denoiser.report.reset == "size change"
