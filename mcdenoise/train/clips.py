@@ -51,19 +51,14 @@ class Clip:
         """The clip on another device."""
         return Clip({name: buffer.to(device) for name, buffer in self.buffers.items()})
 
-    def frame(self, t: int) -> Frame:
-        """One frame of each clip of the batch."""
-        return self._frame(slice(t, t + 1))
+    @property
+    def batch(self) -> int:
+        """B, the number of clips."""
+        return len(self["color"])
 
-    def frames(self, first: int) -> Frame:
-        """The frames from one on as a batch of ``B (T - first)``; :meth:`apart` has them clip by clip again."""
-        return self._frame(slice(first, None))
-
-    def apart(self, images: Tensor) -> Tensor:
-        """From ``(B T', C, H, W)`` to ``(B, T', C, H, W)``."""
-        return torch.unflatten(images, 0, (len(self["color"]), -1))
-
-    def _frame(self, when: slice) -> Frame:
+    def frame(self, t: int | None = None) -> Frame:
+        """One frame of each clip, or all frames of all of them as a batch of ``B T``."""
+        when = slice(None) if t is None else slice(t, t + 1)
         # Convolutions are faster on channels last.
         flat: dict[str, Any] = {
             name: buffer[:, when].flatten(0, 1).contiguous(memory_format=torch.channels_last)

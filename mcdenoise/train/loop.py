@@ -19,7 +19,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
-from mcdenoise.models import CoarseToFine, Model, Output, create_model, describe_weights, parts_of, save_weights
+from mcdenoise.models import CoarseToFine, Model, Output, State, create_model, describe_weights, parts_of, save_weights
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.data import DataFolders, TrainingData
@@ -118,14 +118,15 @@ def train(
     identity = {"credits": credits, "initial_weights": start["sha256"], **data.description}
     first_clip = data.sampler.draw([config.seed])
     network.eval()
-    losses = stage_weights(config.loss_weights, _tried(config.model, rest, first_clip))
+    output, state = _tried(config.model, rest, first_clip)
+    losses = stage_weights(config.loss_weights, output)
     network.train()
     # Only now, so that input that cannot be trained on leaves no trace of a run.
     if fabric.is_global_zero:
         run.claim(config=settled, data=identity)
     fabric.barrier()
 
-    trainer = Trainer(config, network, fabric, losses)
+    trainer = Trainer(config, network, fabric, losses, has_state=state is not None)
     first, provenance = run.load(*trainer.parts)
     weights = out / f"{config.model.rpartition(':')[2]}.safetensors"
     if first == config.steps and weights.exists():
@@ -149,23 +150,24 @@ def _trainable(config: TrainConfig, model: Model) -> Any:
     return model.train()
 
 
-def _tried(name: str, model: Model, clip: Clip) -> Output:
+def _tried(name: str, model: Model, clip: Clip) -> tuple[Output, State]:
     """What a model gives for a frame: what cannot be trained is to be known before the run begins."""
     frame = clip.frame(0)
     try:
         with torch.no_grad():
-            output, _ = model(frame)
+            output, state = model(frame)
+            images = {"image": output.image, **output.stages}
     except InputError:
         raise
     except Exception as error:
         reason = next(iter(str(error).splitlines()), "")
         found = f"{type(error).__name__}: {reason}"
         raise InputError(f"model '{name}': fails on a frame of {', '.join(sorted(frame.buffers))}: {found}") from error
-    for stage, image in {"image": output.image, **output.stages}.items():
+    for stage, image in images.items():
         if image.shape != frame.color.shape:
             sizes = f"of {tuple(frame.color.shape)}, found {tuple(image.shape)}"
             raise InputError(f"model '{name}': expected the stage '{stage}' {sizes}")
-    return output
+    return output, state
 
 
 class Trainer:
@@ -176,14 +178,17 @@ class Trainer:
         network: in training mode; its front is what the clips have been through.
         fabric: devices.
         losses: weights of the loss by stage.
+        has_state: whether the model has a state.
     """
 
-    def __init__(self, config: TrainConfig, network: Any, fabric: Fabric, losses: Mapping[str, float]) -> None:
+    def __init__(
+        self, config: TrainConfig, network: Any, fabric: Fabric, losses: Mapping[str, float], *, has_state: bool
+    ) -> None:
         self.config, self.fabric, self.losses = config, fabric, dict(losses)
         self.network = network.to(memory_format=torch.channels_last)
         self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
         self.scheduler = torch.optim.lr_scheduler.LambdaLR(self.optimizer, config.rate)
-        self.model, self.stepper = fabric.setup(Unrolled(split(network)[1]), self.optimizer)
+        self.model, self.stepper = fabric.setup(Unrolled(split(network)[1], has_state=has_state), self.optimizer)
         self.average = _moving_average(network, config.ema) if config.ema else None
 
     @property

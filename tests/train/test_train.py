@@ -25,8 +25,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import DEFAULT, CoarseToFine, Demodulated, Output, create_model, describe_weights, load_weights
-from mcdenoise.ops import remodulate
+from mcdenoise.models import DEFAULT, CoarseToFine, Demodulated, create_model, describe_weights, load_weights
 
 pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
 pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
@@ -94,10 +93,12 @@ def test_one_clip_is_learnt_by_heart(small_sequence: Path, tmp_path: Path, monke
         return clips[-1]
 
     monkeypatch.setattr(ClipSampler, "draw", draw_once)
-    config = TrainConfig(**{**SMALL, "width": 8, "frames": 3, "batch": 1, "steps": 30}, learning_rate=1e-2)
+    config = TrainConfig(
+        **{**SMALL, "width": 8, "frames": 3, "batch": 1, "steps": 30}, learning_rate=1e-2, draw_resolutions=False
+    )
     train(config, [small_sequence], tmp_path / "run", checkpoint_every=5, report=reports.append)
     assert [progress.step for progress in reports] == [5, 10, 15, 20, 25, 30]
-    # 0.305 to 0.216 was measured.
+    # 0.400 to 0.218 was measured.
     assert reports[-1].loss < 0.8 * reports[0].loss
     assert set(reports[-1].validation) == {"smape", "psnr", "initial_smape", "initial_psnr"}
 
@@ -405,7 +406,9 @@ def test_another_config_needs_another_folder(small_sequence: Path, tmp_path: Pat
     train(TrainConfig(**{**SMALL, "steps": 1}), [small_sequence], run)
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     # One with another cache, too, which must not be filled for nothing.
-    message = refused(lambda: train(TrainConfig(**{**SMALL, "steps": 2, "settings": "alpha_min=0.5"}), [small_sequence], run))
+    message = refused(
+        lambda: train(TrainConfig(**{**SMALL, "steps": 2, "settings": "alpha_min=0.5"}), [small_sequence], run)
+    )
     assert f"{run / 'config.json'}: expected the same as in this run" in message
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
