@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -474,6 +475,16 @@ def test_a_gradient_that_is_not_finite_is_not_learnt_from(
     monkeypatch.setattr("torch.nn.utils.clip_grad_norm_", lambda *args, **kwargs: torch.tensor(torch.inf))
     message = refused(lambda: train(TrainConfig(**SMALL), [small_sequence], tmp_path / "run"))
     assert "training, step 0: expected a finite gradient, found inf" in message
+
+
+@pytest.mark.parametrize(("stem", "value"), [("color", 3e38), ("color", np.nan), ("reference", 3e38)])
+def test_one_pixel_does_not_stop_a_run(small_sequence: Path, tmp_path: Path, stem: str, value: float) -> None:
+    for path in (small_sequence / "inputs").glob(f"{stem}[0-9].exr"):
+        image, channels, _ = read_exr(path)
+        image[3:18:5, 2:22:5] = value
+        write_exr(path, image, channels, half=False)
+    weights = train(TrainConfig(**{**SMALL, "steps": 2}), [small_sequence], tmp_path / "run")
+    assert all(tensor.isfinite().all() for tensor in load_file(weights).values())
 
 
 def test_a_batch_that_cannot_be_shared_out(
