@@ -40,8 +40,6 @@ _CAMERA = frozenset({"position", "view_projection"})
 _SUFFIXES = {".exr", ".h", ".json"}
 _PLACES = ("*", "realisation*/*", "inputs/*", "inputs/realisation*/*")
 _FORMAT = 3
-# No radiance: its square, with 20 stops of exposure on top, would no longer be finite.
-_ABSURD = 1e12
 
 Array: TypeAlias = NDArray[Any]
 # First frame (an index) and realisation of the noise: each has a color of its own.
@@ -178,7 +176,7 @@ def open_cached(
     The features are kept once, the radiance once for each first frame and realisation of the noise: a shot that starts
     later has shorter histories, so that a network also learns how a shot begins. Features are kept in half precision
     where nothing is lost by it, radiance in single. Pixels of the radiance and of the reference that are none (NaN,
-    infinite, negative, or beyond 1e12) get the mean of their neighbours. Motion is the sequence's own, or else computed
+    infinite, negative, or absurdly large) get the mean of their neighbours. Motion is the sequence's own, or else computed
     of positions and cameras; infinite, that is unknown, in the first frame then.
 
     What was made of other files (by name, size or time of change), of other settings or by another version of the
@@ -310,9 +308,8 @@ def _read(sequence: Sequence, number: int, realisation: int, digest: Any) -> Fra
     radiance = {"color": frame.color} | ({} if frame.reference is None else {"reference": frame.reference})
     for image in radiance.values():
         digest.update(image.numpy().tobytes())
-    mended = {
-        name: replace_invalid(torch.where(image > _ABSURD, torch.inf, image))[0] for name, image in radiance.items()
-    }
+    # What validation does to colour alone; a reference is rendered by the same program.
+    mended = {name: replace_invalid(image)[0] for name, image in radiance.items()}
     try:
         return frame.replace(**mended).validate()[0].with_depth()
     except InputError as error:
