@@ -176,8 +176,8 @@ def open_cached(
     The features are kept once, the radiance once for each first frame and realisation of the noise: a shot that starts
     later has shorter histories, so that a network also learns how a shot begins. Features are kept in half precision
     where nothing is lost by it, radiance in single. Pixels of the radiance and of the reference that are none (NaN,
-    infinite, negative, or absurdly large) get the mean of their neighbours. Motion is the sequence's own, or else computed
-    of positions and cameras; infinite, that is unknown, in the first frame then.
+    infinite, negative, or absurdly large) get the mean of their neighbours. Motion is the sequence's own, or else
+    computed of positions and cameras; infinite, that is unknown, in the first frame then.
 
     What was made of other files (by name, size or time of change), of other settings or by another version of the
     code is made again. A run that finds somebody else filling the same place waits.
@@ -240,11 +240,14 @@ def _key(root: Path, settings: list[Any]) -> str:
 
 @functools.cache
 def _code() -> bytes:
-    """Checksum of the package's code: a mended reader or operator must not find what its predecessor made."""
-    package = Path(__file__).parents[1]
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        digest.update(f"{path.relative_to(package)}\0".encode() + path.read_bytes() + b"\0")
+    """Checksum of the whole package: a mended reader or operator must not find what its predecessor made.
+
+    Not of those files only that decode and accumulate: nobody would keep a list of them true.
+    """
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        content = source.read_bytes()
+        digest.update(f"{source.relative_to(package).as_posix()}\0{len(content)}\0".encode() + content)
     return digest.digest()
 
 

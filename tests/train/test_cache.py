@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 
+import mcdenoise
 from mcdenoise.data import open_sequence
 from mcdenoise.data.bmfr import write_buffer
 from mcdenoise.data.exr import read_exr, write_exr
@@ -236,6 +238,41 @@ def test_a_stale_cache_is_made_again(noisy: Path, tmp_path: Path, reads: list[tu
     assert torch.equal(again.shots[0].read()["color"], fresh.shots[0].read()["color"])
     # What is stale is removed.
     assert not set(entries(folder)) & set(before)
+
+
+def test_a_change_of_any_source_makes_it_again(small_sequence: Path, tmp_path: Path) -> None:
+    """Each in a process of its own, with a copy of the package."""
+    root = tmp_path / "copy"
+    package = Path(mcdenoise.__file__).parent
+    shutil.copytree(package, root / "mcdenoise", ignore=shutil.ignore_patterns("weights", "__pycache__"))
+    folder = tmp_path / "cache"
+    script = f"""
+        import sys
+        from pathlib import Path
+        from mcdenoise.data import open_sequence
+        from mcdenoise.models import Accumulated, Demodulated
+        from mcdenoise.train.cache import open_cached
+        from mcdenoise.train.front import Front
+        open_cached(open_sequence(Path(sys.argv[1])), Path(sys.argv[2]), {SETTINGS}, firsts=[0])
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script), small_sequence, folder]
+
+    def made() -> set[Path]:
+        environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
+        subprocess.run(command, check=True, env=environment, cwd=root)
+        return {path.parent for path in folder.rglob("about.json")}
+
+    before = made()
+    assert made() == before
+    sources = sorted((root / "mcdenoise" / "ops").rglob("*.py"))
+    for source in (sources[0], sources[len(sources) // 2], sources[-1]):
+        source.write_text(source.read_text() + "\n")
+        after = made()
+        assert after != before, source
+        before = after
+    # A new file may take the place of another one.
+    (root / "mcdenoise" / "ops" / "new.py").write_text("")
+    assert made() != before
 
 
 def test_every_nth_realisation_keeps_its_fireflies(noisy: Path, tmp_path: Path) -> None:
