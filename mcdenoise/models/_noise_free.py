@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.ops import NO_ALBEDO
+from mcdenoise.ops._window import corner
 
 # Of the mean of two pixels; one sample of a path tracer differs from the next by ten times as much or more.
 _SMOOTH = 0.02
@@ -68,7 +69,7 @@ def noise_free(frame: Frame) -> Tensor | None:
         return None
     wide = cells.repeat_interleave(_CELL, -2).repeat_interleave(_CELL, -1)
     found = torch.zeros_like(known)
-    found[..., band, :] = plain & wide[..., : plain.shape[-2], : plain.shape[-1]]
+    found[..., band, :] = plain & corner(wide, plain.shape[-2], plain.shape[-1])
     return found
 
 

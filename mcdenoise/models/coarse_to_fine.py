@@ -12,6 +12,7 @@ from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.models.tiled import TILE, Tiled
 from mcdenoise.ops import downsample
 from mcdenoise.ops._steps.network import BLOCK, low_frequencies_of
+from mcdenoise.ops._window import corner
 
 # Of the buffers, what a mean of 2x2 pixels is a buffer of.
 _IMAGES = tuple(name for name in BUFFERS if name not in ("motion", "reference"))
@@ -73,4 +74,4 @@ def _halved_mask(mask: Tensor) -> Tensor:
     tiles = F.max_pool2d(F.max_pool2d(needed, TILE), 3, 1, 1)
     coarse = F.max_pool2d(tiles, 2, ceil_mode=True).bool()
     wide = coarse.repeat_interleave(TILE, -2).repeat_interleave(TILE, -1)
-    return ~wide[..., : -(-height // 2), : -(-width // 2)]
+    return ~corner(wide, (height + 1) // 2, (width + 1) // 2)

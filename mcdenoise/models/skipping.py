@@ -17,6 +17,7 @@ from mcdenoise.models._journal import note, timed
 from mcdenoise.models._noise_free import noise_free
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.tiled import TILE
+from mcdenoise.ops._window import corner
 
 # So small that no metric moves in its third digit.
 TOLERANCE = 1e-3
@@ -219,4 +220,4 @@ def _marks(frame: Frame) -> Tensor:
 
 def _pixels(tiles: Tensor, size: tuple[int, int]) -> Tensor:
     wide = tiles.repeat_interleave(TILE, -2).repeat_interleave(TILE, -1)
-    return wide[..., : size[0], : size[1]]
+    return corner(wide, *size)

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.nn._cpu import ConvBlock, ReLU, Upsampling, layout_of, max_pool
+from mcdenoise.ops._window import corner
 
 # Peak numbers for each pixel, measured: 4.5 widths inside the U-Net, and 54 of images and features around it, which
 # stay float32.
@@ -119,7 +120,7 @@ class UNet(nn.Module):
         for scale in range(self.scales):
             level = self.level(scale)
             side = self.stride << level
-            found.append(features[-1 - level][..., : -(-height // side), : -(-width // side)])
+            found.append(corner(features[-1 - level], (height + side - 1) // side, (width + side - 1) // side))
         return found
 
 
@@ -148,13 +149,14 @@ class Head(nn.Conv2d):
             ``(B, channels, *size)``.
         """
         predicted = super().forward(features)
-        return predicted if self.side == 1 else F.pixel_shuffle(predicted, self.side)[..., : size[0], : size[1]]
+        return predicted if self.side == 1 else corner(F.pixel_shuffle(predicted, self.side), *size)
 
 
 def _padded(x: Tensor, size: Sequence[int]) -> Tensor:
     """``x``, its last row and column repeated up to ``size``."""
     missing = (0, size[1] - x.shape[-1], 0, size[0] - x.shape[-2])
-    return F.pad(x, missing, mode="replicate") if any(missing) else x
+    # Whether anything is missing must not be decided in a graph for images of any size.
+    return F.pad(x, missing, mode="replicate") if torch.compiler.is_compiling() or any(missing) else x
 
 
 def _block(in_channels: int, out_channels: int, stride: int = 1) -> nn.Sequential:

@@ -40,7 +40,7 @@ def unpad(padded: Tensor, radius: int, border: Border) -> Tensor:
     """The transpose of :func:`pad`: what fell on the margin is added back where it was read from, or dropped."""
     height, width = padded.shape[-2] - 2 * radius, padded.shape[-1] - 2 * radius
     if border != "replicate" or radius == 0:
-        return padded[..., radius : radius + height, radius : radius + width]
+        return shifted(padded, radius, 0, 0, height, width)
     rows = _fold_edges(padded, radius, height, -2)
     return _fold_edges(rows, radius, width, -1)
 
@@ -66,7 +66,16 @@ def offsets(kernel_size: int) -> Iterator[tuple[int, int, int]]:
 
 def shifted(padded: Tensor, radius: int, dy: int, dx: int, height: int, width: int) -> Tensor:
     """The view of ``padded`` in which pixel ``p`` shows the image's pixel ``p + (dy, dx)``."""
-    return padded[..., radius + dy : radius + dy + height, radius + dx : radius + dx + width]
+    return padded.narrow(-2, radius + dy, height).narrow(-1, radius + dx, width)
+
+
+def corner(image: Tensor, height: int, width: int) -> Tensor:
+    """The first rows and columns of ``(..., H, W)``, as a view.
+
+    No slice, whose size would be the smaller one of two in a graph for images of any size, and an expression in that
+    for all that follows.
+    """
+    return image.narrow(-2, 0, height).narrow(-1, 0, width)
 
 
 def inside(height: int, width: int, kernel_size: int, device: torch.device) -> Tensor:

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from mcdenoise.ops._backend import Backend, choose_backend
 from mcdenoise.ops._check import check_shapes
-from mcdenoise.ops._window import accumulator_dtype
+from mcdenoise.ops._window import accumulator_dtype, corner
 
 
 def downsample(image: Tensor, *, backend: Backend | None = None) -> Tensor:
@@ -79,8 +79,8 @@ def upsample(image: Tensor, size: tuple[int, int]) -> Tensor:
             f"image: expected height and width {expected} for size {size}, found {tuple(image.shape[-2:])}"
         )
     if 0 in image.shape:
-        return image.repeat_interleave(2, -2).repeat_interleave(2, -1)[..., : size[0], : size[1]]
-    return F.interpolate(image, scale_factor=2, mode="nearest")[..., : size[0], : size[1]]
+        return corner(image.repeat_interleave(2, -2).repeat_interleave(2, -1), *size)
+    return corner(F.interpolate(image, scale_factor=2, mode="nearest"), *size)
 
 
 def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:

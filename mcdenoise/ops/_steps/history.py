@@ -13,6 +13,7 @@ from torch import Tensor
 from mcdenoise.ops._backend import Backend, choose_backend
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._rows import by_rows
+from mcdenoise.ops._window import corner
 from mcdenoise.ops.demodulation import NO_ALBEDO, demodulate
 from mcdenoise.ops.fireflies import KERNEL_SIZE, LIMIT, clamp_fireflies
 from mcdenoise.ops.lag import KERNEL_SIZE as LAG_KERNEL_SIZE
@@ -311,4 +312,4 @@ def _lag(threshold: float, kernel_size: int, history: Tensor, recent: Tensor, va
         for image in (history, recent, variance / 4)
     )
     lag = history_lag(*halves, threshold=threshold, kernel_size=kernel_size)
-    return lag.repeat_interleave(2, -2).repeat_interleave(2, -1)[..., :height, :width]
+    return corner(lag.repeat_interleave(2, -2).repeat_interleave(2, -1), height, width)

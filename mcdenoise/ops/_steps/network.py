@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mcdenoise.ops._backend import Backend, choose_backend
 from mcdenoise.ops._rows import by_rows
-from mcdenoise.ops._window import accumulator_dtype
+from mcdenoise.ops._window import accumulator_dtype, corner
 from mcdenoise.ops.fusion import downsample, laplacian_fusion, upsample
 
 # Side of the blocks whose means are an image's low frequencies, in pixels. Below this share of a typical radiance they
@@ -308,7 +308,7 @@ def low_frequencies_of(
         result: Tensor = fast.low_frequencies_of(fine, means, coarse, most, _DARK)
         return result
     wide = F.interpolate(torch.cat([coarse, means], 1), scale_factor=BLOCK, mode="bilinear") + _DARK
-    wanted, found = wide[..., : fine.shape[-2], : fine.shape[-1]].chunk(2, 1)
+    wanted, found = corner(wide, fine.shape[-2], fine.shape[-1]).chunk(2, 1)
     return torch.minimum(fine * (wanted / found), most)
 
 
