@@ -86,6 +86,8 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
     if description.get("sha256") != _digest(tensors):
         raise InputError(f"{path}: expected tensors that match the header's sha256, found others; the file is damaged")
     for key, tensor in tensors.items():
+        if own[key].is_floating_point() and not tensor.is_floating_point():
+            raise InputError(f"{path}: layer '{key}': expected floating-point weights, found {tensor.dtype}")
         if not tensor.isfinite().all():
             raise InputError(f"{path}: layer '{key}': expected finite weights, found NaN or infinite ones")
         with torch.no_grad():
