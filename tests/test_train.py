@@ -606,9 +606,10 @@ def test_a_run_can_start_from_weights(small_sequence: Path, tmp_path: Path) -> N
 
 
 def test_weights_of_another_width_are_gone_on_with(small_sequence: Path, tmp_path: Path) -> None:
-    """The run does not say a width; its result must, or nobody could load it."""
+    """The run does not say a width; its result must, and everything else that its first weights said."""
     first = train(TrainConfig(**{**SMALL, "steps": 1}), [small_sequence], tmp_path / "first")
     config = TrainConfig(**{**SMALL, "steps": 1, "width": 0})
     second = train(config, [small_sequence], tmp_path / "second", initial_weights=first)
-    assert describe_weights(second)["settings"] == {"width": SMALL["width"]}
+    assert describe_weights(second)["settings"]["width"] == SMALL["width"]
+    assert describe_weights(second)["settings"] == describe_weights(first)["settings"]
     load_weights(second, "cascaded")
