@@ -24,6 +24,7 @@ from typing import get_args
 import numpy as np
 import torch
 
+from mcdenoise import ops
 from mcdenoise.benchmark.machine import describe_machine, fix_threads
 from mcdenoise.data.cache import PARTS, Shot
 from mcdenoise.data.clips import ClipSampler
@@ -31,7 +32,6 @@ from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.models import create_model
-from mcdenoise.ops._backend import preferred
 from mcdenoise.train import TrainConfig
 from mcdenoise.train.config import Precision, check_config
 from mcdenoise.train.data import DataFolders
@@ -67,7 +67,7 @@ def steps(config: TrainConfig, sampler: ClipSampler, plain: bool) -> Callable[[i
     trainer = Trainer(config, create_model(config.model).train(), open_fabric("cpu", config.precision, config.batch))
 
     def step(number: int) -> None:
-        with preferred("torch") if plain else nullcontext():
+        with ops.use("torch") if plain else nullcontext():
             trainer.step(number, sampler.draw(trainer.seeds(number)))
 
     return step

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -19,6 +19,7 @@ from mcdenoise.ops import (
     motion_from_position,
 )
 from mcdenoise.ops._steps.history import COLOR, MEAN, SQUARE, blend, incoming, lights, without_history
+from mcdenoise.ops.lag import KERNEL_SIZE
 
 # A cut leaves a few accidental matches; a fast pan keeps far more than this share of the image.
 _CUT_SHARE = 0.05
@@ -64,7 +65,7 @@ def _thinned(image: Tensor) -> Tensor:
     return image[..., ::8, ::8]
 
 
-def _takes_light(clamp: ClampFireflies, color: Tensor, albedo: Tensor | None) -> list[bool]:
+def _takes_light(clamp: Any, color: Tensor, albedo: Tensor | None) -> list[bool]:
     """Of each image, whether most of it would lose much of its light; not told of images of a few lit blocks."""
     rows = -(-color.shape[-2] // _BLOCK)
     shares = []
@@ -198,17 +199,17 @@ class History:
 
     def __init__(
         self,
-        accumulate: Accumulate | None = None,
-        fireflies: ClampFireflies | None = None,
+        accumulate: Any = None,
+        fireflies: Any = None,
         specular_length: float = _SPECULAR_LENGTH,
-        anti_lag: HistoryLag | None = None,
+        anti_lag: Any = None,
     ) -> None:
         if not specular_length >= 0:
             raise ValueError(f"specular_length: expected at least 0, found {specular_length}")
-        self.accumulate = Accumulate() if accumulate is None else accumulate
+        self.accumulate: Any = Accumulate() if accumulate is None else accumulate
         self.fireflies = fireflies
         # Of each image of a shot, or one for all.
-        self._clamps: list[ClampFireflies] = []
+        self._clamps: list[Any] = []
         self.specular_length = specular_length
         anti_lag = HistoryLag() if anti_lag is None else anti_lag
         self.anti_lag = None if math.isinf(anti_lag.threshold) else anti_lag
@@ -252,7 +253,7 @@ class History:
         # What has no past and will be none is compared with nothing.
         compared = self.anti_lag is not None and (keeps or state is not None)
         entering = self._entering(frame.color, albedo, compared)
-        seen = lights(entering[:, MEAN], backend=self.accumulate.backend) if compared else None
+        seen = lights(entering[:, MEAN]) if compared else None
         past = self._blend(frame, entering, seen, reprojects)
         if past.reset == _CUT:
             # Another shot may be of another light, which is seen only now.
@@ -267,7 +268,7 @@ class History:
             self._state = _State(past.color, past.length, surface, frame.view_projection)
         return Accumulated(past.color[:, COLOR], entering[:, COLOR], past.length, past.reset)
 
-    def _chosen(self, color: Tensor, albedo: Tensor | None) -> list[ClampFireflies]:
+    def _chosen(self, color: Tensor, albedo: Tensor | None) -> list[Any]:
         """How the fireflies of the shot are clamped that begins with this frame."""
         if self.fireflies is not None:
             return [self.fireflies]
@@ -281,7 +282,7 @@ class History:
         limits = [clamp.limit for clamp in self._clamps]
         limit = limits[0] if len(limits) == 1 else torch.tensor(limits, device=color.device).reshape(-1, 1, 1, 1)
         window = self._clamps[0].kernel_size
-        return incoming(color, albedo, limit, window, compared=compared, backend=self.accumulate.backend)
+        return incoming(color, albedo, limit, window, compared=compared)
 
     def _blend(self, frame: Frame, entering: Tensor, seen: Tensor | None, reprojects: bool) -> _Past:
         """The frame with its past."""
@@ -307,7 +308,6 @@ class History:
             albedo=frame.albedo,
             specular_length=self.specular_length,
             lag_threshold=math.inf if lag is None else lag.threshold,
-            lag_kernel_size=HistoryLag().kernel_size if lag is None else lag.kernel_size,
-            backend=rule.backend,
+            lag_kernel_size=KERNEL_SIZE if lag is None else lag.kernel_size,
         )
         return _no_past(entering, _CUT) if float(kept.mean()) < _CUT_SHARE else _Past(color, length, "")

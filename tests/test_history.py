@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,15 @@ from torch import Tensor
 from mcdenoise.buffers import Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.history import History
-from mcdenoise.ops import Accumulate, ClampFireflies, HistoryLag, accumulate, demodulate, remodulate
-from mcdenoise.ops._backend import Backend
+from mcdenoise.ops import Accumulate, ClampFireflies, HistoryLag, accumulate, demodulate, remodulate, use
 
 HEIGHT, WIDTH = 5, 6
+
+
+@pytest.fixture
+def backend(request: pytest.FixtureRequest) -> Iterator[None]:
+    with use(request.param):
+        yield
 
 
 def constant(channels: int, value: float = 1.0, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Tensor:
@@ -282,8 +288,8 @@ def test_where_fireflies_are_much_of_the_light_they_are_caustics(share: float, k
     assert not torch.equal(history.update(caustics(0.1)).current, caustics(0.1).color)
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
-def test_each_image_of_a_batch_and_each_shot_has_its_own_caustics(backend: Backend) -> None:
+@pytest.mark.parametrize("backend", ["torch", "numba"], indirect=True)
+def test_each_image_of_a_batch_and_each_shot_has_its_own_caustics(backend: None) -> None:
     """As if every image were alone; at a cut, which positions tell, the first frame of the next shot counts."""
     few, many = caustics(0.1), caustics(0.3)
 
@@ -292,10 +298,10 @@ def test_each_image_of_a_batch_and_each_shot_has_its_own_caustics(backend: Backe
         camera = torch.eye(4).repeat(len(images), 1, 1)
         return Frame(torch.cat([image.color for image in images]), position=position, view_projection=camera)
 
-    history = History(Accumulate(backend=backend))
+    history = History()
     past = history.update(shot(few, many))
     for image, kept in ((few, False), (many, True)):
-        alone = History(Accumulate(backend=backend)).update(shot(image)).current
+        alone = History().update(shot(image)).current
         assert torch.equal(alone, image.color) is kept
         torch.testing.assert_close(past.current[int(kept)][None], alone, rtol=0, atol=0)
     past = history.update(shot(many, few, x=1000.0))
@@ -434,10 +440,10 @@ def seen_in_passing(number: int, size: tuple[int, int] = (48, 64)) -> Frame:
     )
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba"])
-def test_a_lamp_does_not_bleed_into_the_ceiling_around_it(backend: Backend) -> None:
+@pytest.mark.parametrize("backend", ["torch", "numba"], indirect=True)
+def test_a_lamp_does_not_bleed_into_the_ceiling_around_it(backend: None) -> None:
     """Same plane, no albedo: only their light tells one from the other."""
-    history, without = History(Accumulate(backend=backend)), History(anti_lag=HistoryLag(math.inf))
+    history, without = History(), History(anti_lag=HistoryLag(math.inf))
     for number in range(12):
         frame = seen_in_passing(number)
         assert frame.position is not None

@@ -19,7 +19,7 @@ from mcdenoise.models._regions import Region, halved, regions
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.unet import Head, UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
-from mcdenoise.ops._backend import choose_backend
+from mcdenoise.ops._backend import one_backend
 from mcdenoise.ops._rows import by_rows
 from mcdenoise.ops._steps.network import (
     BLOCK,
@@ -207,26 +207,28 @@ class KernelPredictor(nn.Module):
         self, image: Tensor, features: Tensor, guides: Collection[str] = GUIDES, top: Tensor | None = None
     ) -> Tensor:
         """See :class:`Predictor`."""
+        # One for all scales: a part of an image must not be filtered otherwise than the whole.
+        with one_backend(image):
+            return self._predicted(image, features, guides, top)
+
+    def _predicted(self, image: Tensor, features: Tensor, guides: Collection[str], top: Tensor | None) -> Tensor:
         levels = self.unet(network_input(image, features))
         guiding = {"normal": features[:, 3:6], "depth": features[:, 6:7]}
         guiding = {name: guide for name, guide in guiding.items() if name in guides}
         top = torch.log1p(image).amax((1, 2, 3), keepdim=True) if top is None else top
-        # One for all scales: a part of an image must not be filtered otherwise than the whole.
-        backend = choose_backend(None, image, *levels)
-        undifferentiated = choose_backend(None, image, *levels, differentiable=False, forms=("torch", "numba"))
         scales: list[Tensor] = []
         for head, level in zip(self.heads, levels, strict=True):
             prediction = head(level, image.shape[-2:])
             logits = prediction[:, : self.taps]
             # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
             if self.bilateral:
-                *falloffs, f3 = softplus(prediction[:, self.taps :], SCALE_UNITS, backend=undifferentiated).split(1, 1)
+                *falloffs, f3 = softplus(prediction[:, self.taps :], SCALE_UNITS).split(1, 1)
                 falloffs = [falloff for falloff, name in zip(falloffs, GUIDES, strict=True) if name in guiding]
                 filtered = cross_bilateral_filter(
-                    image, logits, list(guiding.values()), falloffs, f3, border="renormalize", backend=backend
+                    image, logits, list(guiding.values()), falloffs, f3, border="renormalize"
                 )
             else:
-                filtered = cross_bilateral_filter(image, logits, border="renormalize", backend=backend)
+                filtered = cross_bilateral_filter(image, logits, border="renormalize")
             scales.append(filtered)
             if len(scales) < len(levels):
                 image = downsample(image)
