@@ -30,8 +30,8 @@ def module_of(name: str, function: Callable[..., Any], check: Callable[..., None
         for setting, value in bound.arguments.items():
             setattr(self, setting, value)
 
-    def forward(self: nn.Module, *arguments: Any) -> Any:
-        return function(*arguments, **{each.name: getattr(self, each.name) for each in settings})
+    def forward(self: nn.Module, *arguments: Any, **named: Any) -> Any:
+        return function(*arguments, **named, **{each.name: getattr(self, each.name) for each in settings})
 
     forward.__doc__ = f"See :func:`mcdenoise.ops.{function.__name__}`."
     return type(
