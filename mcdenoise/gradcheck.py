@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
+from mcdenoise.ops._step_cases import STEPS
 
 # Only to make a failure repeatable: any upstream gradient must do.
 SEED = 0
@@ -55,11 +56,11 @@ def check(names: Sequence[str] | None = None) -> list[GradcheckResult]:
 
 def select(names: Sequence[str] | None = None) -> list[tuple[Op, Case]]:
     """The cases that :func:`check` goes through, each with its op; ``InputError`` as there."""
-    known = {op.name: op for op in OPS}
+    known = {op.name: op for op in OPS + STEPS}
     unknown = [name for name in names or () if name not in known]
     if unknown:
         raise InputError(f"op: expected one of {', '.join(known)}, found {', '.join(unknown)}")
-    ops = OPS if names is None else [known[name] for name in names]
+    ops = OPS + STEPS if names is None else [known[name] for name in names]
     return [(op, case) for op in ops for case in op.cases if case.differentiable]
 
 

@@ -69,6 +69,9 @@ ALLOWED: dict[str, set[str]] = {
 OPS_KNOW = {"torch", "kornia"}
 # Fast forms are imported when one is chosen; `_backend` looks whether that is possible.
 FAST_OPS_KNOW = OPS_KNOW | {"numba", "numpy", "triton"}
+FAST_FORMS = ("mcdenoise.ops._numba", "mcdenoise.ops._triton")
+# Rooms in which a file still imports one that imports it.
+CIRCULAR: set[str] = set()
 # `import mcdenoise` leaves these alone: optional, slow to load, or of use to the command line only.
 LAZY = {"OpenImageIO", "PIL", "colour", "jinja2", "matplotlib", "numba", "triton", "tyro"}
 LAZY |= {"drjit", "mitsuba", "pyoidn", "flip_evaluator", "lightning", "lightning_fabric", "tensorboard"}
@@ -103,11 +106,34 @@ def arrows(module: str, source: str) -> Iterator[str]:
     for name in imported(module, source):
         outermost = name.partition(".")[0]
         if outermost != "mcdenoise":
-            known = FAST_OPS_KNOW if module.startswith(("mcdenoise.ops._fast", "mcdenoise.ops._backend")) else OPS_KNOW
+            known = FAST_OPS_KNOW if module.startswith(FAST_FORMS) else OPS_KNOW
             if room == "ops" and outermost not in known | sys.stdlib_module_names:
                 yield f"{module} imports {name}: ops know torch, kornia and the standard library only"
         elif room_of(name) not in ALLOWED[room] | {room}:
             yield f"{module} imports {name}: not allowed by the table in {Path(__file__).name}"
+
+
+def files_of(room: str) -> dict[str, set[str]]:
+    """For each file of a room, the files of it that it imports, whatever they hold."""
+    files = {module for module in MODULES if room_of(module) == room}
+    return {file: set(imported(file, MODULES[file].read_text())) & files - {file} for file in files}
+
+
+def circles(graph: dict[str, set[str]]) -> list[str]:
+    """A circle among the imports of a graph, or nothing."""
+    # A package holds the files below it: what they import of it is what it has imported of others before.
+    inside = {file: {other for other in others if not file.startswith(f"{other}.")} for file, others in graph.items()}
+    try:
+        graphlib.TopologicalSorter(inside).prepare()
+    except graphlib.CycleError as error:
+        return [str(name) for name in error.args[1]]
+    return []
+
+
+def is_page(module: str) -> bool:
+    """Whether a file of ops holds an op."""
+    *folders, name = module.split(".")
+    return folders in (["mcdenoise", "ops"], ["mcdenoise", "ops", "_steps"]) and not name.startswith("_")
 
 
 def python(code: str) -> str:
@@ -126,6 +152,26 @@ def test_the_table_has_no_cycle() -> None:
     graphlib.TopologicalSorter(ALLOWED).prepare()
 
 
+@pytest.mark.parametrize("room", sorted(set(map(room_of, MODULES)) - {""} - CIRCULAR))
+def test_no_circle_inside_a_room(room: str) -> None:
+    assert not circles(files_of(room))
+
+
+def test_circles_are_recognised() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}})
+    assert not circles({"a": {"b", "c"}, "b": {"c"}, "c": set()})
+    assert not circles({"room": {"room.page"}, "room.page": {"room"}})
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if module.startswith(FAST_FORMS)])
+def test_a_fast_form_has_the_name_of_its_page_and_imports_none(module: str) -> None:
+    source = MODULES[module].read_text()
+    assert not [name for name in imported(module, source) if is_page(name) or name == "mcdenoise.ops"]
+    name = module.rpartition(".")[2]
+    pages = {page.rpartition(".")[2] for page in MODULES if is_page(page)}
+    assert name.startswith("_") or name in pages
+
+
 @pytest.mark.parametrize("module", MODULES)
 def test_no_import_goes_up(module: str) -> None:
     assert not list(arrows(module, MODULES[module].read_text()))
@@ -138,9 +184,9 @@ def test_no_import_goes_up(module: str) -> None:
         ("mcdenoise.ops._check", "import OpenImageIO as oiio", True),
         ("mcdenoise.ops._check", "import numba", True),
         ("mcdenoise.ops._check", "import triton", True),
-        ("mcdenoise.ops._fast._numba_filter", "import numba", False),
-        ("mcdenoise.ops._fast._triton_filter", "import triton.language as tl", False),
-        ("mcdenoise.ops._fast._numba_filter", "import OpenImageIO", True),
+        ("mcdenoise.ops._numba._filter", "import numba", False),
+        ("mcdenoise.ops._triton._filter", "import triton.language as tl", False),
+        ("mcdenoise.ops._numba._filter", "import OpenImageIO", True),
         ("mcdenoise.ops._check", "from mcdenoise.frame import Frame", True),
         ("mcdenoise.ops._check", "from ..buffers import Frame", True),
         ("mcdenoise.ops._check", "def f():\n    from mcdenoise import buffers", True),

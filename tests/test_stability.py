@@ -17,8 +17,9 @@ from mcdenoise import stability
 from mcdenoise.cli import main
 from mcdenoise.errors import InputError
 from mcdenoise.models import list_models, pretrained_models
-from mcdenoise.ops import kernel_conv
+from mcdenoise.ops import _op, kernel_conv
 from mcdenoise.ops._cases import OPS, Op
+from mcdenoise.ops._op import op, plain
 from mcdenoise.stability import Check, check_case, check_denoiser, check_model, check_op, long_runs, summarize
 from mcdenoise.stability import _ops as op_checks
 
@@ -121,23 +122,22 @@ def test_an_error_of_a_hundred_roundings_fails(scale: float) -> None:
     assert failures(like("remodulate", scaled, cases=ordinary))["forward"] == {case.name for case in ordinary}
 
 
-def test_a_backend_is_tried_and_one_that_cannot_run_is_told() -> None:
-    from typing import Literal
+@op("numba", "triton")
+def two_forms(image: Tensor) -> Tensor:
+    return plain(BY_NAME["downsample"].function)(image)
 
-    def doubled(image: Tensor, backend: Literal["plain", "wrong", "absent"] | None = None) -> Tensor:
-        if backend == "absent":
-            raise ValueError("backend: expected one that can run here, found 'absent', which needs another machine")
-        return BY_NAME["downsample"].function(image) * (2 if backend == "wrong" else 1)
 
-    doubled.__annotations__["backend"] = Literal["plain", "wrong", "absent"] | None
-    op = like("downsample", doubled)
-    assert op_checks.backends(op) == ("plain", "wrong", "absent")
-    case = op.cases[0]
-    assert all(check.passed for check in check_case(op, case, torch.float32, "plain"))
-    assert not all(check.passed for check in check_case(op, case, torch.float32, "wrong"))
-    (told,) = check_case(op, case, torch.float32, "absent")
+def test_a_backend_is_tried_and_one_that_cannot_run_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(_op._forms, ("numba", "two_forms"), lambda image: 2 * two_forms.plain(image))
+    tried = like("downsample", two_forms)
+    assert op_checks.backends(tried) == ("torch", "numba", "triton")
+    assert op_checks.backends(BY_NAME["upsample"]) == (None,)
+    case = tried.cases[0]
+    assert all(check.passed for check in check_case(tried, case, torch.float32, "torch"))
+    assert not all(check.passed for check in check_case(tried, case, torch.float32, "numba"))
+    (told,) = check_case(tried, case, torch.float32, "triton")
     assert told.passed
-    assert "another machine" in told.message
+    assert "runs on an NVIDIA GPU" in told.message
 
 
 def test_the_reference_of_an_exponent_that_float64_cannot_hold() -> None:
@@ -227,8 +227,9 @@ def test_the_worst_check_comes_first() -> None:
 
 def test_what_is_checked_by_default_and_by_name() -> None:
     names = [stage.name for stage in stability.stages()]
-    assert names[: len(OPS)] == [op.name for op in OPS]
-    models = names[len(OPS) :]
+    known = [op.name for op in op_checks.select()]
+    assert names[: len(known)] == known
+    models = names[len(known) :]
     assert models[-1] == "long runs"
     assert {f"Denoiser, {name}" for name in pretrained_models()} < set(models)
     # What learns is checked by itself, too; what does not, within a denoiser.

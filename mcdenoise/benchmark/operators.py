@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
-import typing
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,7 +16,10 @@ from mcdenoise.benchmark.methods import one_line
 from mcdenoise.benchmark.tables import write_ops_csv
 from mcdenoise.data.files import new_folder
 from mcdenoise.errors import InputError
+from mcdenoise.ops import use
+from mcdenoise.ops._backend import Backend
 from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
+from mcdenoise.ops._op import backends_of
 from mcdenoise.ops_overview import DTYPES, relative_error
 from mcdenoise.results import OpCost, OpResults, Spread
 
@@ -33,7 +34,7 @@ class _Entry:
 
     op: Op
     case: Case
-    backend: str | None
+    backend: Backend
     dtype: torch.dtype
     times: list[float] = field(default_factory=list)
     mebibytes: float = 0.0
@@ -45,9 +46,8 @@ class _Entry:
 
     def call(self, inputs: dict[str, Any], settings: dict[str, Any]) -> tuple[Tensor, ...]:
         """The op's results."""
-        if self.backend is not None:
-            settings = {**settings, "backend": self.backend}
-        results = self.op.function(**inputs, **settings)
+        with use(self.backend):
+            results = self.op.function(**inputs, **settings)
         return (results,) if isinstance(results, Tensor) else tuple(results)
 
     def differentiate(self, inputs: dict[str, Any], settings: dict[str, Any]) -> list[Tensor] | None:
@@ -74,7 +74,7 @@ class _Entry:
 
     def cost(self, bandwidth: float) -> OpCost:
         """What was found out; ``bandwidth`` in bytes a second."""
-        about = self.op.name, self.backend or "torch", str(self.dtype).removeprefix("torch."), self.case.name
+        about = self.op.name, self.backend, str(self.dtype).removeprefix("torch."), self.case.name
         if self.failure:
             return OpCost(*about, failure=self.failure)
         forward, both = (
@@ -153,7 +153,7 @@ def _measure(
     copies: list[float] = []
     entries: list[_Entry] = []
     for done, op in enumerate(ops, start=1):
-        own = [_Entry(op, largest_case(op), backend, dtype) for backend in backends(op.function) for dtype in DTYPES]
+        own = [_Entry(op, largest_case(op), backend, dtype) for backend in backends_of(op.function) for dtype in DTYPES]
         _take_turns(own, size, rounds, device, lambda: target.copy_(source), copies)
         entries += own
         on_step(done, len(ops))
@@ -212,21 +212,6 @@ def _take_turns(
         taken = watch.between(start, watch.mark())
         if turn >= _WARM_UP:
             copies.append(taken)
-
-
-def backends(function: Callable[..., Any]) -> list[str | None]:
-    """What can be given as the keyword ``backend`` of an op, by its type; ``[None]`` for an op without it."""
-    if "backend" not in inspect.signature(function).parameters:
-        return [None]
-    return list(_choices(typing.get_type_hints(function)["backend"])) or [None]
-
-
-def _choices(hint: Any) -> Iterator[str]:
-    if typing.get_origin(hint) is Literal:
-        yield from (choice for choice in typing.get_args(hint) if choice is not None)
-    else:
-        for part in typing.get_args(hint):
-            yield from _choices(part)
 
 
 def largest_case(op: Op) -> Case:

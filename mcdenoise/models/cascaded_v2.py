@@ -33,7 +33,7 @@ from mcdenoise.nn.fusion import LogFusion
 from mcdenoise.nn.inputs import FEATURES, guides_of, image_statistics, input_of
 from mcdenoise.nn.unet import Head, UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
-from mcdenoise.ops._backend import choose_backend
+from mcdenoise.ops._backend import one_backend
 from mcdenoise.ops._steps.network import softplus
 from mcdenoise.ops.lag import THRESHOLD
 
@@ -137,21 +137,17 @@ class KernelNetwork(_Network):
         image = frame.color * exposure
         levels = self.unet(input_of(frame, image))
         guides = guides_of(frame)
-        # One for all scales: a tile of an image must not be filtered otherwise than the whole.
-        backend = choose_backend(None, image, *levels)
-        undifferentiated = choose_backend(None, image, *levels, differentiable=False, forms=("torch", "numba"))
         scales: list[Tensor] = []
-        for head, level in zip(self.heads, levels, strict=True):
-            prediction = head(level, image.shape[-2:])
-            logits, rest = prediction[:, : self.taps], prediction[:, self.taps :]
-            *falloffs, distance = softplus(rest, SCALE_UNITS, backend=undifferentiated).split(1, 1)
-            # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
-            filtered = cross_bilateral_filter(
-                image, logits, guides, falloffs, distance, border="renormalize", backend=backend
-            )
-            scales.append(filtered)
-            if len(scales) < len(levels):
-                image, guides = downsample(image), [downsample(guide) for guide in guides]
+        # One for all scales: a tile of an image must not be filtered otherwise than the whole.
+        with one_backend(image):
+            for head, level in zip(self.heads, levels, strict=True):
+                prediction = head(level, image.shape[-2:])
+                logits, rest = prediction[:, : self.taps], prediction[:, self.taps :]
+                *falloffs, distance = softplus(rest, SCALE_UNITS).split(1, 1)
+                # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
+                scales.append(cross_bilateral_filter(image, logits, guides, falloffs, distance, border="renormalize"))
+                if len(scales) < len(levels):
+                    image, guides = downsample(image), [downsample(guide) for guide in guides]
         # Each scale is a weighted mean; their fusion could leave the range of the input.
         fused = torch.log1p(scales[-1])
         for scale in (1, 0):

@@ -1,13 +1,16 @@
 """Differentiable image operators: tensor in, tensor out; no weights, no files."""
 
+from mcdenoise.ops._backend import use
+from mcdenoise.ops._constants import NO_ALBEDO
+from mcdenoise.ops._surface import Surface
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
 from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
-from mcdenoise.ops.demodulation import NO_ALBEDO, Demodulate, Remodulate, demodulate, remodulate
+from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
-from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
+from mcdenoise.ops.temporal import Accumulate, accumulate, motion_from_position, reproject
 
 __all__ = [
     "NO_ALBEDO",
@@ -36,4 +39,5 @@ __all__ = [
     "remodulate",
     "reproject",
     "upsample",
+    "use",
 ]

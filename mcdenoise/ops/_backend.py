@@ -1,4 +1,4 @@
-"""Which form of an op runs: plain torch, or the fast form of the same name in ``mcdenoise/ops/_fast``."""
+"""Which form of an op runs: plain torch, or the fast form of the same name in ``_numba/`` or ``_triton/``."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import functools
 import importlib
 import importlib.util
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Literal, cast, get_args
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -21,8 +21,8 @@ _FOUND = {name: importlib.util.find_spec(name) is not None for name in ("numba",
 _EXTRAS = {"numba": "fast", "triton": "gpu"}
 # Pixels of a batch below which importing numba and calling it takes longer than the plain form does.
 _FEW_PIXELS = 8192
-# What to take where nothing is named, of all that can run; see `preferred`.
-_preferred: Backend | None = None
+# What to take, and whether to raise where it cannot run; see `use`.
+_used: tuple[Backend, bool] | None = None
 # Triton's interpreter computes with the memory of any device, slowly: for tests.
 _INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
@@ -33,47 +33,66 @@ def check_backend(backend: str | None) -> None:
         raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, found {backend!r}")
 
 
-def choose_backend(
-    backend: str | None, *tensors: Tensor | None, differentiable: bool = True, forms: tuple[Backend, ...] = BACKENDS
-) -> Backend:
-    """The backend to run an op on ``tensors`` with.
+def choose_backend(forms: Sequence[Backend], tensors: Sequence[Tensor], *, differentiable: bool = False) -> Backend:
+    """The backend to run an op on ``tensors`` with: the fastest that can run and pays, or the one of :func:`use`.
 
     Args:
-        backend: ``"torch"`` runs everywhere and has derivatives of any order. ``"numba"`` is compiled for the
-            processor when it is first called (seconds; later processes load it from numba's cache), ``"triton"``
-            likewise for an NVIDIA GPU. ``None`` takes the one of the tensors' device where it is installed and pays,
-            and torch elsewhere, also while a model is exported, so that what is exported needs neither.
+        forms: what the op has fast forms in.
         tensors: the arguments of the op, the first of them ``(B, C, H, W)``.
         differentiable: whether the fast forms have derivatives.
-        forms: what the op has been written in.
 
     Raises:
-        ValueError: the backend is unknown, or cannot run; the message says why.
+        ValueError: the backend of :func:`use` cannot run; the message says why.
     """
-    check_backend(backend)
-    wanted = _fastest(tensors[0]) if backend is None else cast(Backend, backend)
+    wanted, strict = _used or (_fastest(tensors[0] if tensors else None), False)
     obstacle = _obstacle(wanted, tensors, differentiable, forms)
-    if obstacle and backend is not None:
-        raise ValueError(f"backend: expected one that can run here, found {backend!r}, which {obstacle}")
+    if obstacle and strict:
+        raise ValueError(f"backend: expected one that can run here, found {wanted!r}, which {obstacle}")
     return "torch" if obstacle else wanted
 
 
 @contextmanager
-def preferred(backend: Backend) -> Iterator[None]:
-    """Within it, ops that are told no backend take this one where it can run: to measure what the choice is worth."""
-    global _preferred
+def use(backend: Backend, *, strict: bool = True) -> Iterator[None]:
+    """Within it, in all threads, all ops that have several forms run in this one.
+
+    Args:
+        backend: ``"torch"`` is plain torch, which runs everywhere and has derivatives of any order. ``"numba"`` is
+            compiled for the processor when it is first called (seconds; later processes load it from numba's cache),
+            ``"triton"`` likewise for an NVIDIA GPU. Without this the fastest is taken that can run.
+        strict: whether an op that cannot run in it raises, with the reason; otherwise that op runs in plain torch.
+
+    Raises:
+        ValueError: the backend is unknown; or, strictly, one of the ops within cannot run in it.
+
+    Example:
+        >>> from mcdenoise import ops
+        >>> with ops.use("torch"):
+        ...     half = ops.downsample(torch.ones(1, 3, 4, 4))
+    """
+    global _used
     check_backend(backend)
-    before, _preferred = _preferred, backend
+    before, _used = _used, (backend, strict)
     try:
         yield
     finally:
-        _preferred = before
+        _used = before
+
+
+@contextmanager
+def one_backend(image: Tensor) -> Iterator[None]:
+    """Within it the size of this image decides which form all ops run in, not that of their own arguments.
+
+    A part of an image, or a coarser scale of it, must not be computed otherwise than the whole.
+
+    Args:
+        image: ``(B, C, H, W)``.
+    """
+    with nullcontext() if _used is not None else use(_fastest(image), strict=False):
+        yield
 
 
 def _fastest(image: Tensor | None) -> Backend:
     """What to take for an image if nothing is in its way."""
-    if _preferred is not None:
-        return _preferred
     if image is None or torch.compiler.is_exporting():
         return "torch"
     if image.device.type == "cuda":
@@ -81,9 +100,7 @@ def _fastest(image: Tensor | None) -> Backend:
     return "torch" if image.shape[0] * image.shape[-2] * image.shape[-1] < _FEW_PIXELS else "numba"
 
 
-def _obstacle(
-    backend: Backend, tensors: tuple[Tensor | None, ...], differentiable: bool, forms: tuple[Backend, ...]
-) -> str:
+def _obstacle(backend: Backend, tensors: Sequence[Tensor], differentiable: bool, forms: Sequence[Backend]) -> str:
     """Why a backend cannot run on these tensors; empty if it can."""
     if backend == "torch":
         return ""
@@ -91,15 +108,14 @@ def _obstacle(
         return "has no form of this op"
     if _is_transformed():
         return "has no rule for torch.func, vmap or forward mode"
-    given = [tensor for tensor in tensors if tensor is not None]
-    for tensor in given:
+    for tensor in tensors:
         device = tensor.device
         if backend == "numba" and device.type != "cpu":
             return f"runs on the CPU, not on {device}"
         if backend == "triton" and device.type != "cuda" and not (_INTERPRETED and device.type == "cpu"):
             return f"runs on an NVIDIA GPU, not on {device}"
-        if device != given[0].device:
-            return f"needs all tensors on one device, and they are on {given[0].device} and {device}"
+        if device != tensors[0].device:
+            return f"needs all tensors on one device, and they are on {tensors[0].device} and {device}"
         if not differentiable and tensor.requires_grad and torch.is_grad_enabled():
             return "has no derivatives of this op"
     return _missing(backend)

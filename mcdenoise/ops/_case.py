@@ -85,6 +85,7 @@ class Op:
             they are and the weights sum to one.
         weights: whether, with these settings, the result is non-negative weights that sum to one over the channels.
         rounding: see :class:`Rounding`; of inputs and settings.
+        half: whether it promises anything of inputs in half precision.
     """
 
     function: Callable[..., Any]
@@ -95,6 +96,7 @@ class Op:
     images: tuple[str, ...] = ()
     weights: Callable[[dict[str, Any]], bool] = lambda settings: False
     rounding: Callable[[Inputs, dict[str, Any]], Rounding] = _no_more
+    half: bool = True
 
     @property
     def name(self) -> str:

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.ops._autograd import Function
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._guides import padded_gradient, squared_distance
+from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import (
     Border,
     accumulator_dtype,
@@ -19,7 +21,6 @@ from mcdenoise.ops._window import (
     offsets,
     pad,
     shifted,
-    unpad,
 )
 
 Normalize = Literal["softmax", "none"]
@@ -89,34 +90,6 @@ def cross_bilateral_weights(
     return weights.to(kernel.dtype)
 
 
-class CrossBilateralWeights(nn.Module):
-    """:func:`cross_bilateral_weights` with its modes stored.
-
-    Args:
-        normalize: see :func:`cross_bilateral_weights`.
-        border: see :func:`cross_bilateral_weights`.
-    """
-
-    def __init__(self, normalize: Normalize = "softmax", border: Border = "replicate") -> None:
-        super().__init__()
-        check_normalize(normalize)
-        check_border(border)
-        self.normalize: Normalize = normalize
-        self.border: Border = border
-
-    def forward(
-        self,
-        kernel: Tensor,
-        guides: Sequence[Tensor] = (),
-        scales: Sequence[Tensor] = (),
-        distance_scale: Tensor | None = None,
-    ) -> Tensor:
-        """See :func:`cross_bilateral_weights`."""
-        return cross_bilateral_weights(
-            kernel, guides, scales, distance_scale, normalize=self.normalize, border=self.border
-        )
-
-
 def _inside(kernel: Tensor, kernel_size: int) -> Tensor:
     return inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
 
@@ -125,6 +98,15 @@ def check_normalize(normalize: str) -> None:
     """``ValueError`` for an unknown normalisation."""
     if normalize not in ("softmax", "none"):
         raise ValueError(f"normalize: expected 'softmax' or 'none', found {normalize!r}")
+
+
+def check_settings(normalize: str, border: str) -> None:
+    """``ValueError`` for an unknown mode."""
+    check_normalize(normalize)
+    check_border(border)
+
+
+CrossBilateralWeights = module_of("CrossBilateralWeights", cross_bilateral_weights, check_settings)
 
 
 def check_weights(
@@ -191,7 +173,7 @@ class _Exponent(Function):
             if dy == 0 and dx == 0:
                 continue
             for padded, scale in _each(guides, scales, channels):
-                out.addcmul_(scale, _squared_distance(padded, radius, dy, dx, height, width), value=-1)
+                out.addcmul_(scale, squared_distance(padded, radius, dy, dx, height, width), value=-1)
             if distance_scale is not None:
                 out.sub_(distance_scale, alpha=dy * dy + dx * dx)
         return result
@@ -255,7 +237,7 @@ class _Exponent(Function):
             for tap, dy, dx in offsets(2 * radius + 1):
                 to_distance = torch.sub(to_distance, gradient[:, tap : tap + 1], alpha=dy * dy + dx * dx)
         if need_guides:
-            to_guides = torch.cat([_guide_gradient(gradient, padded, scale, radius) for padded, scale in pairs], 1)
+            to_guides = torch.cat([padded_gradient(gradient, padded, scale, radius) for padded, scale in pairs], 1)
         if need_scales:
             to_scales = torch.cat([_scale_gradient(gradient, padded, radius) for padded, _ in pairs], 1)
         return gradient.to(ctx.dtype), to_distance, to_guides, to_scales, None, None
@@ -268,39 +250,10 @@ def _each(guides: Tensor | None, scales: Tensor | None, channels: tuple[int, ...
     return list(zip(torch.split(guides, list(channels), 1), torch.split(scales, 1, 1), strict=True))
 
 
-def _squared_distance(padded: Tensor, radius: int, dy: int, dx: int, height: int, width: int) -> Tensor:
-    centre = shifted(padded, radius, 0, 0, height, width)
-    difference = shifted(padded, radius, dy, dx, height, width) - centre
-    return difference.square().sum(1, keepdim=True)
-
-
-def guide_gradient(gradient: Tensor, guide: Tensor, scale: Tensor, border: Border) -> Tensor:
-    """Of one guide, times the gradient of each tap's exponent, in the dtype of ``guide``."""
-    radius = kernel_size_of(gradient.shape[1], "kernel") // 2
-    padded = pad(guide.to(gradient.dtype), radius, border)
-    return unpad(_guide_gradient(gradient, padded, scale.to(gradient.dtype), radius), radius, border).to(guide.dtype)
-
-
-def _guide_gradient(gradient: Tensor, padded: Tensor, scale: Tensor, radius: int) -> Tensor:
-    """Each tap pulls the neighbour one way and the centre the other."""
-    height, width = gradient.shape[-2:]
-    # Under vmap it must have the axis of whichever of the three has one.
-    total = torch.zeros_like(padded) + gradient.new_zeros(()) + scale.new_zeros(())
-    centre_total = torch.zeros_like(shifted(padded, radius, 0, 0, height, width))
-    centre = shifted(padded, radius, 0, 0, height, width)
-    for tap, dy, dx in offsets(2 * radius + 1):
-        difference = shifted(padded, radius, dy, dx, height, width) - centre
-        pull = (-2 * gradient[:, tap : tap + 1] * scale) * difference
-        shifted(total, radius, dy, dx, height, width).add_(pull)
-        centre_total = centre_total - pull
-    shifted(total, radius, 0, 0, height, width).add_(centre_total)
-    return total
-
-
 def _scale_gradient(gradient: Tensor, padded: Tensor, radius: int) -> Tensor:
     height, width = gradient.shape[-2:]
     total = torch.zeros_like(gradient[:, :1])
     for tap, dy, dx in offsets(2 * radius + 1):
-        distance = _squared_distance(padded, radius, dy, dx, height, width)
+        distance = squared_distance(padded, radius, dy, dx, height, width)
         total = torch.addcmul(total, gradient[:, tap : tap + 1], distance, value=-1)
     return total

@@ -4,15 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torch import Tensor, nn
+from torch import Tensor
 
-from mcdenoise.ops._backend import Backend, check_backend, choose_backend
 from mcdenoise.ops._check import check_shapes
-from mcdenoise.ops._window import Border, accumulator_dtype, check_border
-from mcdenoise.ops.bilateral import Normalize, check_normalize, check_weights, cross_bilateral_weights
-from mcdenoise.ops.kernel_conv import kernel_conv_torch
+from mcdenoise.ops._module import module_of
+from mcdenoise.ops._op import op, plain
+from mcdenoise.ops._window import Border, accumulator_dtype
+from mcdenoise.ops.bilateral import Normalize, check_settings, check_weights, cross_bilateral_weights
+from mcdenoise.ops.kernel_conv import kernel_conv
 
 
+def _check(
+    image: Tensor,
+    kernel: Tensor,
+    guides: Sequence[Tensor] = (),
+    scales: Sequence[Tensor] = (),
+    distance_scale: Tensor | None = None,
+    *,
+    normalize: str = "softmax",
+    border: str = "replicate",
+) -> None:
+    check_shapes(image=(image, "B C H W"), kernel=(kernel, "B T H W"))
+    check_weights(kernel, guides, scales, distance_scale, normalize, border)
+
+
+@op("numba", "triton", check=_check, differentiable=True)
 def cross_bilateral_filter(
     image: Tensor,
     kernel: Tensor,
@@ -22,7 +38,6 @@ def cross_bilateral_filter(
     *,
     normalize: Normalize = "softmax",
     border: Border = "replicate",
-    backend: Backend | None = None,
 ) -> Tensor:
     """Filter an image with per-pixel kernels that fall off where guides differ.
 
@@ -40,16 +55,13 @@ def cross_bilateral_filter(
         border: what a tap outside the image sees: ``"replicate"`` the nearest edge pixel of image and guides,
             ``"zeros"`` zeros; ``"renormalize"`` leaves such taps out and divides by the sum of the weights that are
             left (0 where that sum is 0), so that the result is a weighted mean everywhere.
-        backend: ``"torch"``, ``"numba"`` (CPU; about five times as fast), ``"triton"`` (NVIDIA GPU), or ``None`` for
-            the fastest that can run.
 
     Returns:
         ``(B, C, H, W)`` in the dtype of ``image``. Half precision is computed in float32.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, ``K`` is even, the numbers of guides and scales differ, a mode is unknown, or the
-            backend cannot run.
+        ValueError: shapes disagree, ``K`` is even, the numbers of guides and scales differ, or a mode is unknown.
 
     Differentiable in ``image``, ``kernel``, ``guides``, ``scales`` and ``distance_scale``, to any order; second
     derivatives are computed in plain torch.
@@ -65,73 +77,12 @@ def cross_bilateral_filter(
         >>> filtered.flatten().tolist()  # the third pixel is another surface
         [3.0, 3.0, 100.0]
     """
-    check_shapes(image=(image, "B C H W"), kernel=(kernel, "B T H W"))
-    check_weights(kernel, guides, scales, distance_scale, normalize, border)
-    chosen = choose_backend(backend, image, kernel, *guides, *scales, distance_scale)
-    if chosen != "torch":
-        from mcdenoise.ops._fast import bilateral_filter as fast
-
-        result: Tensor = fast.cross_bilateral_filter(
-            image, kernel, list(guides), list(scales), distance_scale, normalize, border, chosen
-        )
-        return result
-    return cross_bilateral_filter_torch(image, kernel, guides, scales, distance_scale, normalize, border)
-
-
-def cross_bilateral_filter_torch(
-    image: Tensor,
-    kernel: Tensor,
-    guides: Sequence[Tensor],
-    scales: Sequence[Tensor],
-    distance_scale: Tensor | None,
-    normalize: Normalize,
-    border: Border,
-) -> Tensor:
-    """:func:`cross_bilateral_filter` as its two steps."""
     weights = cross_bilateral_weights(
         kernel.to(accumulator_dtype(kernel.dtype)), guides, scales, distance_scale, normalize=normalize, border=border
     )
     # What a softmax leaves out has the weight 0, and the others have the sum 1 already.
     left_out = border == "renormalize" and normalize == "softmax"
-    return kernel_conv_torch(image, weights, "zeros" if left_out else border)
+    return plain(kernel_conv)(image, weights, border="zeros" if left_out else border)
 
 
-class CrossBilateralFilter(nn.Module):
-    """:func:`cross_bilateral_filter` with its modes stored.
-
-    Args:
-        normalize: see :func:`cross_bilateral_filter`.
-        border: see :func:`cross_bilateral_filter`.
-        backend: see :func:`cross_bilateral_filter`.
-    """
-
-    def __init__(
-        self, normalize: Normalize = "softmax", border: Border = "replicate", backend: Backend | None = None
-    ) -> None:
-        super().__init__()
-        check_normalize(normalize)
-        check_border(border)
-        check_backend(backend)
-        self.normalize: Normalize = normalize
-        self.border: Border = border
-        self.backend: Backend | None = backend
-
-    def forward(
-        self,
-        image: Tensor,
-        kernel: Tensor,
-        guides: Sequence[Tensor] = (),
-        scales: Sequence[Tensor] = (),
-        distance_scale: Tensor | None = None,
-    ) -> Tensor:
-        """See :func:`cross_bilateral_filter`."""
-        return cross_bilateral_filter(
-            image,
-            kernel,
-            guides,
-            scales,
-            distance_scale,
-            normalize=self.normalize,
-            border=self.border,
-            backend=self.backend,
-        )
+CrossBilateralFilter = module_of("CrossBilateralFilter", cross_bilateral_filter, check_settings)

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._constants import FLOOR, NO_ALBEDO
+from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import accumulator_dtype
-
-# What a smooth dielectric reflects at normal incidence: on a darker surface most of the light is gloss, which no albedo
-# tints, and dividing it by a smaller number would give sparse, coloured, huge values.
-FLOOR = 4e-2
-# Below this there is no texture: less than half of the darkest 8-bit sRGB step above black.
-NO_ALBEDO = 1e-4
 
 
 def demodulate(color: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor:
@@ -81,36 +77,8 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
     return (image.to(accumulator_dtype(image.dtype)) * _modulation(albedo, floor)).to(image.dtype)
 
 
-class Demodulate(nn.Module):
-    """:func:`demodulate` with its floor stored.
-
-    Args:
-        floor: see :func:`demodulate`.
-    """
-
-    def __init__(self, floor: float = FLOOR) -> None:
-        super().__init__()
-        self.floor = floor
-
-    def forward(self, color: Tensor, albedo: Tensor) -> Tensor:
-        """See :func:`demodulate`."""
-        return demodulate(color, albedo, floor=self.floor)
-
-
-class Remodulate(nn.Module):
-    """:func:`remodulate` with its floor stored.
-
-    Args:
-        floor: see :func:`remodulate`.
-    """
-
-    def __init__(self, floor: float = FLOOR) -> None:
-        super().__init__()
-        self.floor = floor
-
-    def forward(self, image: Tensor, albedo: Tensor) -> Tensor:
-        """See :func:`remodulate`."""
-        return remodulate(image, albedo, floor=self.floor)
+Demodulate = module_of("Demodulate", demodulate)
+Remodulate = module_of("Remodulate", remodulate)
 
 
 def _modulation(albedo: Tensor, floor: float) -> Tensor:

@@ -6,9 +6,10 @@ import math
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import accumulator_dtype
 
 # At one sample a pixel ordinary noise is up to ten times as bright as what else finds light around it.
@@ -86,30 +87,14 @@ def clamp_fireflies(image: Tensor, *, limit: float | Tensor = LIMIT, kernel_size
     return torch.where(bright, clamped, source).to(image.dtype)
 
 
-class ClampFireflies(nn.Module):
-    """:func:`clamp_fireflies` with its settings stored.
-
-    Args:
-        limit: see :func:`clamp_fireflies`.
-        kernel_size: see :func:`clamp_fireflies`.
-    """
-
-    def __init__(self, limit: float = LIMIT, kernel_size: int = KERNEL_SIZE) -> None:
-        super().__init__()
-        _check_settings(limit, kernel_size)
-        self.limit = limit
-        self.kernel_size = kernel_size
-
-    def forward(self, image: Tensor) -> Tensor:
-        """See :func:`clamp_fireflies`."""
-        return clamp_fireflies(image, limit=self.limit, kernel_size=self.kernel_size)
-
-
 def _check_settings(limit: float, kernel_size: int) -> None:
     if not limit > 0:
         raise ValueError(f"limit: expected above 0, found {limit}")
     if kernel_size < 3 or kernel_size % 2 == 0:
         raise ValueError(f"kernel_size: expected odd and at least 3, found {kernel_size}")
+
+
+ClampFireflies = module_of("ClampFireflies", clamp_fireflies, _check_settings)
 
 
 def _neighbours(values: Tensor, radius: int) -> Tensor:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
-from mcdenoise.ops._backend import Backend, choose_backend
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._module import module_of
+from mcdenoise.ops._op import op
 from mcdenoise.ops._window import accumulator_dtype, corner
 
 
-def downsample(image: Tensor, *, backend: Backend | None = None) -> Tensor:
+def _check_image(image: Tensor) -> None:
+    check_shapes(image=(image, "B C H W"))
+
+
+@op("numba", check=_check_image)
+def downsample(image: Tensor) -> Tensor:
     """Average blocks of 2x2 pixels.
 
     ``out[y, x] = mean of image[2y : 2y + 2, 2x : 2x + 2]``; where the height or width is odd, the last blocks hold
@@ -18,14 +24,13 @@ def downsample(image: Tensor, *, backend: Backend | None = None) -> Tensor:
 
     Args:
         image: ``(B, C, H, W)``, any unit, up to a quarter of the largest number.
-        backend: ``"torch"``; ``"numba"`` (CPU, without derivatives), or ``None`` for the fastest that can run.
 
     Returns:
         ``(B, C, ceil(H / 2), ceil(W / 2))``.
 
     Raises:
         TypeError: the image is no floating-point tensor.
-        ValueError: the image is not four-dimensional, or the backend cannot run.
+        ValueError: the image is not four-dimensional.
 
     Differentiable in ``image``, to any order.
 
@@ -36,14 +41,8 @@ def downsample(image: Tensor, *, backend: Backend | None = None) -> Tensor:
         >>> downsample(torch.arange(9.0).reshape(1, 1, 3, 3)).flatten().tolist()
         [2.0, 3.5, 6.5, 8.0]
     """
-    check_shapes(image=(image, "B C H W"))
     if 0 in image.shape:
         return image[..., ::2, ::2]
-    if choose_backend(backend, image, differentiable=False, forms=("torch", "numba")) != "torch":
-        from mcdenoise.ops._fast import fused as fast
-
-        result: Tensor = fast.downsample(image)
-        return result
     return F.avg_pool2d(image, 2, ceil_mode=True, count_include_pad=False)
 
 
@@ -125,9 +124,4 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     return (source + alpha.to(dtype) * upsample(coarse.to(dtype) - downsample(source), size)).to(fine.dtype)
 
 
-class LaplacianFusion(nn.Module):
-    """:func:`laplacian_fusion` as a module; it has no settings."""
-
-    def forward(self, fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
-        """See :func:`laplacian_fusion`."""
-        return laplacian_fusion(fine, coarse, alpha)
+LaplacianFusion = module_of("LaplacianFusion", laplacian_fusion)

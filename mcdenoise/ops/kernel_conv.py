@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.ops._autograd import Function
-from mcdenoise.ops._backend import Backend, check_backend, choose_backend
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._module import module_of
+from mcdenoise.ops._op import op
 from mcdenoise.ops._window import (
     Border,
     accumulator_dtype,
@@ -23,9 +24,14 @@ from mcdenoise.ops._window import (
 )
 
 
-def kernel_conv(
-    image: Tensor, kernel: Tensor, *, border: Border = "replicate", backend: Backend | None = None
-) -> Tensor:
+def _check(image: Tensor, kernel: Tensor, *, border: str = "replicate") -> None:
+    sizes = check_shapes(image=(image, "B C H W"), kernel=(kernel, "B T H W"))
+    check_border(border)
+    kernel_size_of(sizes["T"], "kernel")
+
+
+@op("numba", "triton", check=_check, differentiable=True)
+def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
     """Filter an image with a kernel of its own at every pixel; all channels share the pixel's kernel.
 
     ``out[p] = sum_t kernel[t, p] * image[p + o_t]`` over the offsets ``o_t`` of the ``K x K`` window.
@@ -36,7 +42,6 @@ def kernel_conv(
         border: what a tap outside the image reads: ``"replicate"`` the nearest edge pixel, ``"zeros"`` zero;
             ``"renormalize"`` leaves such taps out and divides by the sum of the weights that are left
             (0 where that sum is 0), so that the result is a weighted mean everywhere.
-        backend: ``"torch"``, ``"numba"`` (CPU), ``"triton"`` (NVIDIA GPU), or ``None`` for the fastest that can run.
 
     Returns:
         ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32. Holds while the sum of
@@ -45,7 +50,7 @@ def kernel_conv(
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, ``K`` is even, ``border`` is unknown, or the backend cannot run.
+        ValueError: shapes disagree, ``K`` is even, or ``border`` is unknown.
 
     Differentiable in ``image`` and ``kernel``, to any order; second derivatives are computed in plain torch. Memory
     beyond the result is at most a padded copy of ``image``.
@@ -59,19 +64,18 @@ def kernel_conv(
         >>> kernel_conv(image, box)[0, 0, 1, 1].item()
         5.0
     """
-    _check(image, kernel, border)
-    chosen = choose_backend(backend, image, kernel)
-    if chosen != "torch":
-        from mcdenoise.ops._fast import kernel_conv as fast
+    kernel_size = kernel_size_of(kernel.shape[1], "kernel")
+    radius = kernel_size // 2
+    if border != "renormalize":
+        return _Gather.of(pad(image, radius, border), kernel)
+    # The mean of a few large values fits where their sum does not, and the gradient where its two terms do not.
+    kernel = kernel.to(accumulator_dtype(kernel.dtype))
+    total = _Gather.of(pad(image.to(accumulator_dtype(image.dtype)), radius, border), kernel)
+    return _renormalized(total, kernel, kernel_size).to(image.dtype)
 
-        result: Tensor = fast.kernel_conv(image, kernel, border, chosen)
-        return result
-    return kernel_conv_torch(image, kernel, border)
 
-
-def kernel_splat(
-    image: Tensor, kernel: Tensor, *, border: Border = "replicate", backend: Backend | None = None
-) -> Tensor:
+@op("numba", "triton", check=_check, differentiable=True)
+def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
     """Spread every pixel over its neighbours with a kernel of its own: the transpose of :func:`kernel_conv`.
 
     ``out[q] = sum_t kernel[t, q - o_t] * image[q - o_t]``, so that for any two images and every border mode
@@ -84,7 +88,6 @@ def kernel_splat(
         border: where a share goes that leaves the image: ``"replicate"`` to the nearest edge pixel, ``"zeros"``
             nowhere; ``"renormalize"`` first divides each pixel's weights by the sum of those inside the image, so
             that all of every pixel stays inside.
-        backend: see :func:`kernel_conv`.
 
     Returns:
         ``(B, C, H, W)`` in the dtype of ``image``. Half precision is summed in float32. Holds in the range of
@@ -92,7 +95,7 @@ def kernel_splat(
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, ``K`` is even, ``border`` is unknown, or the backend cannot run.
+        ValueError: shapes disagree, ``K`` is even, or ``border`` is unknown.
 
     Differentiable in ``image`` and ``kernel``, to any order; second derivatives are computed in plain torch.
 
@@ -104,30 +107,6 @@ def kernel_splat(
         >>> kernel_splat(image, torch.full((1, 9, 3, 3), 1 / 9)).flatten().tolist()
         [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
     """
-    _check(image, kernel, border)
-    chosen = choose_backend(backend, image, kernel)
-    if chosen != "torch":
-        from mcdenoise.ops._fast import kernel_conv as fast
-
-        result: Tensor = fast.kernel_splat(image, kernel, border, chosen)
-        return result
-    return kernel_splat_torch(image, kernel, border)
-
-
-def kernel_conv_torch(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
-    """:func:`kernel_conv` as a loop over the taps."""
-    kernel_size = kernel_size_of(kernel.shape[1], "kernel")
-    radius = kernel_size // 2
-    if border != "renormalize":
-        return _Gather.of(pad(image, radius, border), kernel)
-    # The mean of a few large values fits where their sum does not, and the gradient where its two terms do not.
-    kernel = kernel.to(accumulator_dtype(kernel.dtype))
-    total = _Gather.of(pad(image.to(accumulator_dtype(image.dtype)), radius, border), kernel)
-    return _renormalized(total, kernel, kernel_size).to(image.dtype)
-
-
-def kernel_splat_torch(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
-    """:func:`kernel_splat` as a loop over the taps."""
     kernel_size = kernel_size_of(kernel.shape[1], "kernel")
     radius = kernel_size // 2
     source = image.to(accumulator_dtype(image.dtype))
@@ -137,50 +116,8 @@ def kernel_splat_torch(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
     return unpad(_Splat.of(source, kernel), radius, border).to(image.dtype)
 
 
-class KernelConv(nn.Module):
-    """:func:`kernel_conv` with its settings stored.
-
-    Args:
-        border: see :func:`kernel_conv`.
-        backend: see :func:`kernel_conv`.
-    """
-
-    def __init__(self, border: Border = "replicate", backend: Backend | None = None) -> None:
-        super().__init__()
-        check_border(border)
-        check_backend(backend)
-        self.border: Border = border
-        self.backend: Backend | None = backend
-
-    def forward(self, image: Tensor, kernel: Tensor) -> Tensor:
-        """See :func:`kernel_conv`."""
-        return kernel_conv(image, kernel, border=self.border, backend=self.backend)
-
-
-class KernelSplat(nn.Module):
-    """:func:`kernel_splat` with its settings stored.
-
-    Args:
-        border: see :func:`kernel_splat`.
-        backend: see :func:`kernel_splat`.
-    """
-
-    def __init__(self, border: Border = "replicate", backend: Backend | None = None) -> None:
-        super().__init__()
-        check_border(border)
-        check_backend(backend)
-        self.border: Border = border
-        self.backend: Backend | None = backend
-
-    def forward(self, image: Tensor, kernel: Tensor) -> Tensor:
-        """See :func:`kernel_splat`."""
-        return kernel_splat(image, kernel, border=self.border, backend=self.backend)
-
-
-def _check(image: Tensor, kernel: Tensor, border: str) -> None:
-    sizes = check_shapes(image=(image, "B C H W"), kernel=(kernel, "B T H W"))
-    check_border(border)
-    kernel_size_of(sizes["T"], "kernel")
+KernelConv = module_of("KernelConv", kernel_conv, check_border)
+KernelSplat = module_of("KernelSplat", kernel_splat, check_border)
 
 
 def _renormalized(values: Tensor, kernel: Tensor, kernel_size: int) -> Tensor:

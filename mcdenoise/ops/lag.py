@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._constants import SMALLEST_LAG
+from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import accumulator_dtype
 
 THRESHOLD = 2.0
 KERNEL_SIZE = 5
-# Of the local mean: a difference that no eye sees is no lag, however little noise there is.
-SMALLEST = 1e-3
 
 
 def history_lag(
@@ -36,7 +36,7 @@ def history_lag(
 
     The variance must come from more than the window of ``recent``: where light arrives in few, large samples, a window
     that none has hit looks dark and free of noise. And radiance itself is a poor ``y``, since one firefly hides all
-    else: :class:`mcdenoise.history.History` compares means of its fourth root, with the variance over the past.
+    else: a history is compared by means of its fourth root, with the variance over the past.
 
     Args:
         history: ``(B, C, H, W)`` mean over a long past, finite, any unit.
@@ -81,30 +81,11 @@ def history_lag(
     height, width = history.shape[-2:]
     count = _count(height, kernel_size, mean)[:, None] * _count(width, kernel_size, mean)
     error = _box(variance.to(dtype) / largest / largest, kernel_size) / count
-    smallest = SMALLEST * ((mean - difference).abs() + mean.abs()) / 2
+    smallest = SMALLEST_LAG * ((mean - difference).abs() + mean.abs()) / 2
     noise = threshold**2 * (error + smallest.square())
     some = noise > 0
     ratio = torch.where(some, difference.square() / torch.where(some, noise, 1), 0)
     return ((ratio - 1) / 3).clamp(0, 1).to(history.dtype)
-
-
-class HistoryLag(nn.Module):
-    """:func:`history_lag` with its settings stored.
-
-    Args:
-        threshold: see :func:`history_lag`.
-        kernel_size: see :func:`history_lag`.
-    """
-
-    def __init__(self, threshold: float = THRESHOLD, kernel_size: int = KERNEL_SIZE) -> None:
-        super().__init__()
-        _check_settings(threshold, kernel_size)
-        self.threshold = threshold
-        self.kernel_size = kernel_size
-
-    def forward(self, history: Tensor, recent: Tensor, variance: Tensor) -> Tensor:
-        """See :func:`history_lag`."""
-        return history_lag(history, recent, variance, threshold=self.threshold, kernel_size=self.kernel_size)
 
 
 def _check_settings(threshold: float, kernel_size: int) -> None:
@@ -112,6 +93,9 @@ def _check_settings(threshold: float, kernel_size: int) -> None:
         raise ValueError(f"threshold: expected above 0, found {threshold}")
     if kernel_size < 3 or kernel_size % 2 == 0:
         raise ValueError(f"kernel_size: expected odd and at least 3, found {kernel_size}")
+
+
+HistoryLag = module_of("HistoryLag", history_lag, _check_settings)
 
 
 def _box(image: Tensor, kernel_size: int) -> Tensor:

@@ -2,45 +2,32 @@
 
 from __future__ import annotations
 
-import math
-from typing import Literal, NamedTuple
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from mcdenoise.ops._backend import Backend, check_backend, choose_backend
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._constants import DEPTH_LIMIT, LABEL_WEIGHT, NORMAL_LIMIT_SQUARED, PLANE_LIMIT
+from mcdenoise.ops._module import module_of
+from mcdenoise.ops._op import op
+from mcdenoise.ops._surface import Rule, Surface, check_surfaces, comparable
 
-Rule = Literal["relative", "bmfr"]
-
-# Of the depth: how far a tap's point may lie off the tangent plane, and (no positions) how far its depth may differ.
-PLANE_LIMIT = 0.02
-DEPTH_LIMIT = 0.1
-# Of two unit normals: |difference|^2 < 0.5 allows an angle of 41 degrees.
-NORMAL_LIMIT_SQUARED = 0.5
-# What taps of a pixel's own label must weigh to be enough; a tap in the pixel itself, which stands still, weighs 1.
-LABEL_WEIGHT = 1e-3
-
-
-class Surface(NamedTuple):
-    """What tells one surface from another; each ``(B, C, H, W)`` or ``None``.
-
-    Args:
-        position: ``(B, 3, H, W)`` world-space hit points, scene units.
-        normal: ``(B, 3, H, W)`` world-space unit normals.
-        depth: ``(B, 1, H, W)`` distance along the view axis, scene units, ``inf`` where nothing was hit.
-        label: ``(B, 1, H, W)`` a number for each kind of what is seen, such as the index of an object.
-    """
-
-    position: Tensor | None = None
-    normal: Tensor | None = None
-    depth: Tensor | None = None
-    label: Tensor | None = None
+__all__ = [
+    "Accumulate",
+    "Rule",
+    "Surface",
+    "accumulate",
+    "check_accumulate",
+    "motion_from_position",
+    "reproject",
+]
 
 
-def motion_from_position(
-    position: Tensor, previous_view_projection: Tensor, *, backend: Backend | None = None
-) -> Tensor:
+def _check_motion(position: Tensor, previous_view_projection: Tensor) -> None:
+    check_shapes(position=(position, "B 3 H W"), previous_view_projection=(previous_view_projection, "B 4 4"))
+
+
+@op("numba", check=_check_motion)
+def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
     """Where each static surface point was in the previous frame, relative to where it is now.
 
     ``clip = [x y z 1] @ M``, ``(u, v) = (clip.xy / clip.w + 1) / 2``, ``motion = (u W, v H) - current pixel centre``.
@@ -48,8 +35,6 @@ def motion_from_position(
     Args:
         position: ``(B, 3, H, W)`` world-space hit points of the current frame, scene units.
         previous_view_projection: ``(B, 4, 4)`` row-vector world-to-clip matrix of the previous frame, clip y down.
-        backend: ``"torch"``, ``"numba"`` (CPU only, without derivatives), or ``None`` for the faster of those that
-            can run.
 
     Returns:
         ``(B, 2, H, W)`` motion in pixels, x right and y down, ``previous = current + motion``; infinite where the
@@ -58,7 +43,7 @@ def motion_from_position(
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, or the backend cannot run.
+        ValueError: shapes disagree.
 
     Differentiable in ``position`` and ``previous_view_projection``, to any order, where the point was in front.
     Half precision is projected in float32 (a pixel of a wide image needs more than 11 bits).
@@ -70,11 +55,7 @@ def motion_from_position(
         >>> motion_from_position(position, torch.eye(4)[None]).flatten().tolist()  # u = 0.75 of one pixel
         [0.25, 0.0]
     """
-    sizes = check_shapes(position=(position, "B 3 H W"), previous_view_projection=(previous_view_projection, "B 4 4"))
-    images = (position, previous_view_projection)
-    if choose_backend(backend, *images, differentiable=False, forms=("torch", "numba")) == "numba":
-        return _motion_numba(*images)
-    height, width = sizes["H"], sizes["W"]
+    height, width = position.shape[-2:]
     dtype = torch.promote_types(position.dtype, torch.float32)
     matrix = previous_view_projection.to(dtype)
     # Where nothing was hit the position may be infinite, which would reach the matrix as a NaN gradient.
@@ -90,13 +71,6 @@ def motion_from_position(
     previous = (clip[:, :2] / torch.where(in_front, w, 1) + 1) / 2 * scale
     centre = _pixel_grid(height, width, position.device, dtype) + 0.5
     return torch.where(in_front, previous - centre, torch.inf)
-
-
-def _motion_numba(position: Tensor, previous_view_projection: Tensor) -> Tensor:
-    from mcdenoise.ops._fast import temporal as fast
-
-    result: Tensor = fast.motion_from_position(position, previous_view_projection)
-    return result
 
 
 def reproject(
@@ -160,10 +134,8 @@ def reproject(
         ([1.5, 2.5, 3.0], [1.0, 1.0, 0.5])
     """
     sizes = _check_images(motion, previous=(previous, "B C H W"))
-    _check_known(rule)
-    here, there = _comparable(surface, previous_surface, previous)
-    if surface is not None and previous_surface is not None:
-        _check_rule(rule, here, position_limit, normal_limit)
+    check_surfaces(surface, previous_surface, previous, rule, position_limit, normal_limit)
+    here, there = comparable(surface, previous_surface)
     test = _bmfr_test if rule == "bmfr" else _relative_test
     if motion is None:
         kept = torch.ones_like(previous[:, :1], dtype=torch.bool) & test(here, there, position_limit, normal_limit)
@@ -220,6 +192,32 @@ def reproject(
     return values.to(previous.dtype), weight.to(previous.dtype)
 
 
+def check_accumulate(
+    color: Tensor,
+    previous: Tensor,
+    previous_length: Tensor,
+    motion: Tensor | None,
+    surface: Surface | None = None,
+    previous_surface: Surface | None = None,
+    *,
+    alpha_min: float = 0.1,
+    rule: str = "relative",
+    position_limit: float | None = None,
+    normal_limit: float | None = None,
+) -> None:
+    """``TypeError`` or ``ValueError`` for what :func:`accumulate` refuses."""
+    _check_images(
+        motion,
+        color=(color, "B C H W"),
+        previous=(previous, "B C H W"),
+        previous_length=(previous_length, "B 1 H W"),
+    )
+    if not 0 < alpha_min <= 1:
+        raise ValueError(f"alpha_min: expected in (0, 1], found {alpha_min}")
+    check_surfaces(surface, previous_surface, previous, rule, position_limit, normal_limit)
+
+
+@op("numba", check=check_accumulate)
 def accumulate(
     color: Tensor,
     previous: Tensor,
@@ -232,7 +230,6 @@ def accumulate(
     rule: Rule = "relative",
     position_limit: float | None = None,
     normal_limit: float | None = None,
-    backend: Backend | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Blend a noisy frame with its reprojected history: an average at first, an exponential window later.
 
@@ -253,8 +250,6 @@ def accumulate(
         rule: see :func:`reproject`.
         position_limit: see :func:`reproject`.
         normal_limit: see :func:`reproject`.
-        backend: ``"torch"``, ``"numba"`` (CPU only, without derivatives), or ``None`` for the faster of those that
-            can run.
 
     Returns:
         ``(B, C, H, W)`` accumulated radiance in the dtype of ``color``, and ``(B, 1, H, W)`` history length in that of
@@ -264,8 +259,7 @@ def accumulate(
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, ``alpha_min`` is outside (0, 1], the backend cannot run, or as in
-            :func:`reproject`.
+        ValueError: shapes disagree, ``alpha_min`` is outside (0, 1], or as in :func:`reproject`.
 
     Differentiable in ``color``, ``previous``, ``previous_length`` (not with ``"bmfr"``, which rounds it) and
     ``motion``, to any order.
@@ -278,19 +272,6 @@ def accumulate(
         >>> accumulated.unique().tolist(), length.unique().tolist()
         ([1.0], [4.0])
     """
-    _check_images(
-        motion,
-        color=(color, "B C H W"),
-        previous=(previous, "B C H W"),
-        previous_length=(previous_length, "B 1 H W"),
-    )
-    check_alpha(alpha_min)
-    images = (color, previous, previous_length)
-    surfaces = (*(surface or ()), *(previous_surface or ()))
-    if choose_backend(backend, *images, motion, *surfaces, differentiable=False, forms=("torch", "numba")) == "numba":
-        return accumulate_numba(
-            *images, motion, surface, previous_surface, alpha_min, rule, position_limit, normal_limit, Shorter()
-        )[:2]
     dtype = torch.promote_types(color.dtype, torch.float32)
     channels = color.shape[1]
     both, weight = reproject(
@@ -312,106 +293,7 @@ def accumulate(
     return accumulated.to(color.dtype), length.to(previous_length.dtype)
 
 
-class Shorter(NamedTuple):
-    """Where the past is to be shorter, see :func:`mcdenoise.ops._steps.history.blend`.
-
-    Args:
-        recent_alpha: smallest weight of the current frame in a second, shorter past of the first channels.
-        albedo: ``(B, 3, H, W)``, which says where a mirror or glass is seen.
-        longest: the longest history of what is seen there while it moves, in frames.
-        still: what moves by no more does not move, in pixels.
-    """
-
-    recent_alpha: float = 1.0
-    albedo: Tensor | None = None
-    longest: float = math.inf
-    still: float = 0.0
-
-
-def accumulate_numba(
-    color: Tensor,
-    previous: Tensor,
-    previous_length: Tensor,
-    motion: Tensor | None,
-    surface: Surface | None,
-    previous_surface: Surface | None,
-    alpha_min: float,
-    rule: Rule,
-    position_limit: float | None,
-    normal_limit: float | None,
-    shorter: Shorter,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """:func:`accumulate` with a past that is shorter in places or channels, and how many pixels of each row have one.
-
-    Channels that ``previous`` has more than ``color`` are the second past of the first of them.
-    """
-    from mcdenoise.ops._fast import temporal as fast
-
-    _check_known(rule)
-    here, there = _comparable(surface, previous_surface, previous)
-    if surface is not None and previous_surface is not None:
-        _check_rule(rule, here, position_limit, normal_limit)
-    if position_limit is None:
-        position_limit = DEPTH_LIMIT if here.position is None else PLANE_LIMIT
-    if normal_limit is None:
-        normal_limit = NORMAL_LIMIT_SQUARED
-    settings = (alpha_min, rule == "bmfr", position_limit, normal_limit, *shorter)
-    result: tuple[Tensor, Tensor, Tensor] = fast.accumulate(
-        color, previous, previous_length, motion, list(here), list(there), *settings
-    )
-    return result
-
-
-class Accumulate(nn.Module):
-    """:func:`accumulate` with its rule and limits stored.
-
-    Args:
-        alpha_min: see :func:`accumulate`.
-        rule: see :func:`accumulate`.
-        position_limit: see :func:`accumulate`.
-        normal_limit: see :func:`accumulate`.
-        backend: see :func:`accumulate`.
-    """
-
-    def __init__(
-        self,
-        alpha_min: float = 0.1,
-        rule: Rule = "relative",
-        position_limit: float | None = None,
-        normal_limit: float | None = None,
-        backend: Backend | None = None,
-    ) -> None:
-        super().__init__()
-        check_backend(backend)
-        self.backend: Backend | None = backend
-        self.alpha_min = alpha_min
-        self.rule: Rule = rule
-        self.position_limit = position_limit
-        self.normal_limit = normal_limit
-
-    def forward(
-        self,
-        color: Tensor,
-        previous: Tensor,
-        previous_length: Tensor,
-        motion: Tensor | None,
-        surface: Surface | None = None,
-        previous_surface: Surface | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """See :func:`accumulate`."""
-        return accumulate(
-            color,
-            previous,
-            previous_length,
-            motion,
-            surface,
-            previous_surface,
-            alpha_min=self.alpha_min,
-            rule=self.rule,
-            position_limit=self.position_limit,
-            normal_limit=self.normal_limit,
-            backend=self.backend,
-        )
+Accumulate = module_of("Accumulate", accumulate)
 
 
 def _check_images(motion: Tensor | None, **images: tuple[Tensor, str]) -> dict[str, int]:
@@ -424,47 +306,6 @@ def _pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtyp
     from kornia.geometry.grid import create_meshgrid
 
     return create_meshgrid(height, width, normalized_coordinates=False, device=device, dtype=dtype).permute(0, 3, 1, 2)
-
-
-def _comparable(surface: Surface | None, previous: Surface | None, like: Tensor) -> tuple[Surface, Surface]:
-    """Both surfaces, reduced to what both have and free of gradients, with shapes checked."""
-    if surface is None or previous is None:
-        return Surface(), Surface()
-    pairs: list[tuple[Tensor | None, Tensor | None]] = []
-    for name, channels, a, b in zip(Surface._fields, (3, 3, 1, 1), surface, previous, strict=True):
-        if a is None or b is None:
-            pairs.append((None, None))
-            continue
-        check_shapes(
-            previous=(like, "B C H W"),
-            **{f"surface.{name}": (a, f"B {channels} H W"), f"previous_surface.{name}": (b, f"B {channels} H W")},
-        )
-        pairs.append((a.detach(), b.detach()))
-    return Surface(*(a for a, _ in pairs)), Surface(*(b for _, b in pairs))
-
-
-def check_alpha(alpha_min: float) -> None:
-    """``ValueError`` for a weight outside (0, 1]."""
-    if not 0 < alpha_min <= 1:
-        raise ValueError(f"alpha_min: expected in (0, 1], found {alpha_min}")
-
-
-def _check_known(rule: str) -> None:
-    if rule not in ("relative", "bmfr"):
-        raise ValueError(f"rule: expected 'relative' or 'bmfr', found {rule!r}")
-
-
-def _check_rule(rule: Rule, surface: Surface, position_limit: float | None, normal_limit: float | None) -> None:
-    """What a rule cannot do without must not be left out in silence: it would accept everything."""
-    if rule == "bmfr":
-        for name, buffer in (("position", surface.position), ("normal", surface.normal)):
-            if buffer is None:
-                raise ValueError(f"surface.{name}: the rule 'bmfr' needs it in both frames, found None")
-        for name, limit in (("position_limit", position_limit), ("normal_limit", normal_limit)):
-            if limit is None:
-                raise ValueError(f"{name}: the rule 'bmfr' needs the scene's squared limit, found None")
-    elif surface.position is not None and surface.depth is None:
-        raise ValueError("surface.depth: the rule 'relative' needs it beside position in both frames, found None")
 
 
 def _bmfr_test(here: Surface, tap: Surface, position_limit: float | None, normal_limit: float | None) -> Tensor | bool:

@@ -20,20 +20,22 @@ of an op, since that is what it hands to autograd, so that ``u`` is the dtype's 
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from typing import get_args, get_type_hints
 
 import torch
 from torch import Tensor
 
 from mcdenoise.errors import InputError
+from mcdenoise.ops import Surface, use
+from mcdenoise.ops._backend import Backend
 from mcdenoise.ops._case import Case, Inputs, Op, Rounding, map_tensors
 from mcdenoise.ops._cases import OPS
+from mcdenoise.ops._op import backends_of
+from mcdenoise.ops._step_cases import STEPS
 from mcdenoise.ops._window import accumulator_dtype
-from mcdenoise.ops.temporal import Surface
 from mcdenoise.stability._check import DTYPES, Check, name_of
 
 _DEPTH = 8
@@ -55,7 +57,7 @@ class _Trial:
     op: Op
     case: Case
     dtype: torch.dtype
-    backend: str
+    backend: Backend | None
     inputs: Inputs
 
     @property
@@ -79,8 +81,8 @@ class _Trial:
         repeated = map_tensors(lambda tensor: tensor.to(leaves[0].dtype).repeat(copies, 1, 1, 1), surfaces)
         # The float64 twin always runs on the first backend, the plain one.
         backend = self.backend if leaves[0].dtype == self.dtype else backends(self.op)[0]
-        chosen = {"backend": backend} if backend else {}
-        results = self.op.function(**given, **repeated, **self.case.settings, **chosen)
+        with use(backend) if backend else nullcontext():
+            results = self.op.function(**given, **repeated, **self.case.settings)
         return [results] if isinstance(results, Tensor) else list(results)
 
     def gradients(self, leaves: Sequence[Tensor]) -> list[Tensor]:
@@ -112,20 +114,19 @@ def select(names: Sequence[str] | None = None) -> list[Op]:
     Raises:
         InputError: there is no op of such a name.
     """
-    known = {op.name: op for op in OPS}
+    # What is not of a batch cannot be tried many times at once.
+    every = OPS + tuple(step for step in STEPS if "weight" not in step.cases[0].inputs())
+    known = {op.name: op for op in every}
     unknown = [name for name in names or () if name not in known]
     if unknown:
         raise InputError(f"op: expected one of {', '.join(known)}, found {', '.join(unknown)}")
-    return list(OPS) if names is None else [known[name] for name in names]
+    return list(every) if names is None else [known[name] for name in names]
 
 
-def backends(op: Op) -> tuple[str, ...]:
-    """What the op can be asked to run on, from its signature; ``("",)`` where there is nothing to choose."""
-    if "backend" not in inspect.signature(op.function).parameters:
-        return ("",)
-    hint = get_type_hints(op.function)["backend"]
-    options = [option for part in (hint, *get_args(hint)) for option in get_args(part) if isinstance(option, str)]
-    return tuple(dict.fromkeys(options)) or ("",)
+def backends(op: Op) -> tuple[Backend | None, ...]:
+    """What the op has forms in; ``(None,)`` where there is nothing to choose."""
+    found = backends_of(op.function)
+    return found if len(found) > 1 else (None,)
 
 
 def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
@@ -136,6 +137,8 @@ def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
         dtypes: the dtypes to try it in.
     """
     for dtype in dtypes:
+        if not op.half and accumulator_dtype(dtype) != dtype:
+            continue
         for backend in backends(op):
             for case in op.cases:
                 yield from check_case(op, case, dtype, backend)
@@ -144,7 +147,7 @@ def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
                 yield from _check_adjoint(op, next(other for other in OPS if other.name == pair[1]), dtype)
 
 
-def check_case(op: Op, case: Case, dtype: torch.dtype, backend: str = "") -> list[Check]:
+def check_case(op: Op, case: Case, dtype: torch.dtype, backend: Backend | None = None) -> list[Check]:
     """Everything that must hold for an op on one case.
 
     Args:
@@ -162,7 +165,7 @@ def check_case(op: Op, case: Case, dtype: torch.dtype, backend: str = "") -> lis
     except ValueError as error:
         # A backend that cannot run on this machine says so.
         passed = bool(backend) and "can run here" in str(error)
-        return [Check(op.name, case.name, name_of(dtype), backend, "runs", 0, 0, 0, passed, str(error))]
+        return [Check(op.name, case.name, name_of(dtype), backend or "", "runs", 0, 0, 0, passed, str(error))]
     exact = _exact_results(trial, results)
     checks = [_compare(trial, "forward", results, exact)]
     upstream = [_upstream(result) for result in results]
@@ -356,7 +359,7 @@ def _check_adjoint(op: Op, transpose: Op, dtype: torch.dtype) -> Iterator[Check]
     for case in op.cases:
         if case.kind == "extreme":
             continue
-        trial = _Trial(op, case, dtype, "", case.inputs(dtype))
+        trial = _Trial(op, case, dtype, None, case.inputs(dtype))
         (name,) = op.images
         x, others = _tensor(trial.inputs[name]), {k: v for k, v in trial.inputs.items() if k != name}
         result = op.function(**{name: x}, **others, **case.settings)
@@ -383,7 +386,7 @@ def _cancellation(kernel: Tensor) -> float:
 
 
 def _found(trial: _Trial, what: str, error: float, allowed: float, condition: float, message: str) -> Check:
-    names = (trial.op.name, trial.case.name, name_of(trial.dtype), trial.backend)
+    names = (trial.op.name, trial.case.name, name_of(trial.dtype), trial.backend or "")
     return Check(*names, what, error, allowed, condition, not message, message)
 
 

@@ -23,7 +23,8 @@ from mcdenoise.models import (
     find_model,
     listening,
 )
-from mcdenoise.ops._backend import Backend, preferred
+from mcdenoise import ops
+from mcdenoise.ops._backend import Backend
 
 
 def refused(action: Callable[[], object]) -> str:
@@ -182,7 +183,7 @@ class Shot:
             if self.backend is None:
                 _, self.state = self.model(frame, self.state)
             else:
-                with preferred(self.backend):
+                with ops.use(self.backend, strict=False):
                     _, self.state = self.model(frame, self.state)
         seen = self.watching.frames[-1]
         assert seen.current is not None

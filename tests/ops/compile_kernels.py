@@ -7,7 +7,7 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.runtime.jit import JITFunction
 
-from mcdenoise.ops._fast import _triton_filter
+from mcdenoise.ops._triton import _filter as _triton_filter
 
 
 class Driver:

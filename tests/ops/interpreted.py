@@ -11,6 +11,7 @@ from plain_form import (
     FAST,
     TOLERANCE,
     assert_same,
+    by,
     channels_last,
     drawn,
     every_other_column,
@@ -24,7 +25,7 @@ from triton.runtime import interpreter
 from mcdenoise import ops
 from mcdenoise.ops import _backend
 from mcdenoise.ops._cases import Case, Op, map_tensors
-from mcdenoise.ops._fast import _triton_filter
+from mcdenoise.ops._triton import _filter as _triton_filter
 
 every_op = pytest.mark.parametrize("op", FAST, ids=lambda op: op.name)
 CASES = [(op, case) for op in FAST for case in op.cases if case.differentiable]
@@ -132,7 +133,7 @@ def test_second_derivatives_go_the_plain_way() -> None:
     image = torch.rand(1, 1, 2, 2, dtype=torch.float64, requires_grad=True)
 
     def second(backend: Any) -> Tensor:
-        result = ops.kernel_conv(image, image.expand(1, 9, 2, 2) * 2, backend=backend)
+        result = by(backend, ops.kernel_conv)(image, image.expand(1, 9, 2, 2) * 2)
         (first,) = torch.autograd.grad(result.square().sum(), image, create_graph=True)
         return torch.autograd.grad(first.square().sum(), image)[0]
 
@@ -153,15 +154,14 @@ def test_goes_through_the_compiler(op: Op) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_is_exported_where_it_is_named() -> None:
     arguments = (torch.rand(1, 3, 2, 3), torch.rand(1, 9, 2, 3), [torch.rand(1, 2, 2, 3)], [torch.rand(1, 1, 2, 3)])
-    program = torch.export.export(ops.CrossBilateralFilter(backend="triton"), arguments)
-    assert "mcdenoise.cross_bilateral_filter" in str(program.graph)
-    assert "triton" in str(program.graph)
-    torch.testing.assert_close(program.module()(*arguments), ops.CrossBilateralFilter(backend="torch")(*arguments))
+    program = by("triton", torch.export.export)(ops.CrossBilateralFilter(), arguments)
+    assert "mcdenoise.triton_cross_bilateral_filter" in str(program.graph)
+    torch.testing.assert_close(program.module()(*arguments), by("torch", ops.CrossBilateralFilter())(*arguments))
 
 
 def test_no_image() -> None:
     image, kernel = torch.rand(0, 3, 4, 5, requires_grad=True), torch.rand(0, 9, 4, 5)
-    result = ops.kernel_conv(image, kernel, backend="triton")
+    result = by("triton", ops.kernel_conv)(image, kernel)
     assert result.shape == image.shape
     assert torch.autograd.grad(result.sum(), image)[0].shape == image.shape
 
@@ -172,10 +172,10 @@ def test_infinite_logits_are_the_limit_of_large_ones() -> None:
     image, logits = torch.tensor([1.0, 2.0, 4.0]).reshape(1, 1, 1, 3), torch.zeros(1, 9, 1, 3)
     logits[:, 3] = torch.inf
     logits[:, 5] = -torch.inf
-    result = ops.cross_bilateral_filter(image, logits, border="replicate", backend="triton")
+    result = by("triton", ops.cross_bilateral_filter)(image, logits, border="replicate")
     assert result.flatten().tolist() == [1.0, 1.0, 2.0]
 
 
 def test_the_interpreter_is_no_default() -> None:
-    assert _backend.choose_backend("triton", torch.rand(1, 3, 4, 5)) == "triton"
-    assert _backend.choose_backend(None, torch.rand(1, 3, 256, 256)) != "triton"
+    assert by("triton", _backend.choose_backend)(["triton"], [torch.rand(1, 3, 4, 5)]) == "triton"
+    assert _backend.choose_backend(["triton"], [torch.rand(1, 3, 256, 256)]) != "triton"

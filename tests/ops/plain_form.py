@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from mcdenoise.ops import use
+from mcdenoise.ops._backend import Backend
 from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
 
 FAST = [op for op in OPS if op.name in ("kernel_conv", "kernel_splat", "cross_bilateral_filter")]
@@ -18,6 +21,16 @@ TOLERANCE = {
     torch.bfloat16: torch.finfo(torch.bfloat16).eps,
     torch.float16: torch.finfo(torch.float16).eps,
 }
+
+
+def by(backend: Backend, function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function in one backend."""
+
+    def run(*arguments: Any, **settings: Any) -> Any:
+        with use(backend):
+            return function(*arguments, **settings)
+
+    return run
 
 
 def leaves_of(inputs: Inputs, case: Case) -> list[Tensor]:
@@ -32,7 +45,7 @@ def leaves_of(inputs: Inputs, case: Case) -> list[Tensor]:
 def outcomes(op: Op, case: Case, inputs: Inputs, backend: str) -> list[Tensor]:
     """The result and, times a random upstream gradient, each derivative."""
     leaves = leaves_of(inputs, case)
-    result = op.function(**inputs, **case.settings, backend=backend)
+    result = by(backend, op.function)(**inputs, **case.settings)
     upstream = torch.randn(result.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     return [result.detach(), *torch.autograd.grad(result, leaves, upstream.to(result.dtype))]
 

@@ -5,6 +5,7 @@ from typing import Any
 import kornia
 import pytest
 import torch
+from plain_form import by
 from torch import Tensor
 
 from mcdenoise.ops import cross_bilateral_filter, cross_bilateral_weights, kernel_conv
@@ -128,7 +129,7 @@ def test_empty_images_have_empty_results_and_derivatives(shape: tuple[int, ...],
     image = torch.zeros(shape, requires_grad=True)
     batch, _, *size = shape
     kernel, guide, scale = (torch.ones(batch, count, *size, requires_grad=True) for count in (9, 3, 1))
-    result = cross_bilateral_filter(image, kernel, [guide], [scale], scale, backend=backend)
+    result = by(backend, cross_bilateral_filter)(image, kernel, [guide], [scale], scale)
     assert result.shape == shape
     for gradient in torch.autograd.grad(result.sum(), (image, kernel, guide, scale)):
         assert not gradient.any()

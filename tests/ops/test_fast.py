@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,6 +17,7 @@ from plain_form import (
     FAST,
     TOLERANCE,
     assert_same,
+    by,
     channels_last,
     drawn,
     every_other_column,
@@ -26,7 +31,7 @@ from torch import Tensor
 from mcdenoise import ops
 from mcdenoise.ops import _backend
 from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
-from mcdenoise.ops._fast import _numba_filter
+from mcdenoise.ops._numba import _filter, _runtime
 
 every_op = pytest.mark.parametrize("op", FAST, ids=lambda op: op.name)
 every_dtype = pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
@@ -68,7 +73,7 @@ def test_sizes(op: Op, border: str, size: tuple[int, int, int, int, int]) -> Non
 @pytest.mark.parametrize("border", ["replicate", "zeros", "renormalize"])
 @every_op
 def test_threads_change_nothing(op: Op, border: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_numba_filter, "_PIXELS_A_THREAD", 1)
+    monkeypatch.setattr(_runtime, "PIXELS_A_THREAD", 1)
     case = drawn(2, 3, 9, 6, 5, op, border=border)
     threads, results = torch.get_num_threads(), []
     try:
@@ -100,12 +105,12 @@ def test_what_is_spread_is_the_same_without_the_slopes_of_the_kernel(border: Any
     inputs = drawn(2, 3, 9, 300, 5, FAST[1]).inputs(dtype)
     image, kernel = inputs["image"], inputs["kernel"]
     alone, with_slopes = (
-        _numba_filter.derivatives(image, image, kernel, (), (), None, False, border, of_kernel=wanted)
+        _filter.derivatives(image, image, kernel, (), (), None, False, border, of_kernel=wanted)
         for wanted in (False, True)
     )
     assert torch.equal(alone[0], with_slopes[0])
     assert [of_kernel.numel() for of_kernel in (alone[1], with_slopes[1])] == [0, kernel.numel()]
-    assert torch.equal(ops.kernel_splat(image, kernel, border=border, backend="numba"), alone[0])
+    assert torch.equal(by("numba", ops.kernel_splat)(image, kernel, border=border), alone[0])
 
 
 @every_op
@@ -130,7 +135,7 @@ def test_first_derivatives_are_difference_quotients_and_second_ones_go_the_plain
 
         def function(*tensors: Tensor, inputs: Inputs = inputs, case: Case = case) -> Tensor:
             rest = iter(tensors)
-            return op.function(**map_tensors(lambda _: next(rest), inputs), **case.settings, backend="numba")
+            return by("numba", op.function)(**map_tensors(lambda _: next(rest), inputs), **case.settings)
 
         assert torch.autograd.gradcheck(function, leaves, fast_mode=False)
         assert torch.autograd.gradgradcheck(function, leaves, fast_mode=False)
@@ -140,7 +145,7 @@ def test_second_derivatives_where_one_argument_is_computed_from_another() -> Non
     image = torch.rand(1, 1, 3, 3, dtype=torch.float64, requires_grad=True)
 
     def function(image: Tensor) -> Tensor:
-        return ops.kernel_conv(image, image.expand(1, 9, 3, 3) * 2, backend="numba")
+        return by("numba", ops.kernel_conv)(image, image.expand(1, 9, 3, 3) * 2)
 
     assert torch.autograd.gradgradcheck(function, image, fast_mode=False)
 
@@ -157,22 +162,18 @@ def test_goes_through_the_compiler(op: Op) -> None:
 
 
 class _Filter(torch.nn.Module):
-    def __init__(self, backend: Any) -> None:
-        super().__init__()
-        self.filter = ops.CrossBilateralFilter(backend=backend)
-
     def forward(self, image: Tensor, kernel: Tensor, guide: Tensor, scale: Tensor) -> Tensor:
-        return self.filter(image, kernel, [guide], [scale])
+        return ops.cross_bilateral_filter(image, kernel, [guide], [scale])
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_is_exported_where_it_is_named() -> None:
     # Large enough that it would run compiled.
     arguments = (torch.rand(1, 3, 96, 96), torch.rand(1, 9, 96, 96), torch.rand(1, 2, 96, 96), torch.rand(1, 1, 96, 96))
-    for backend, there in (("numba", True), (None, False)):
-        program = torch.export.export(_Filter(backend), arguments)
-        assert ("mcdenoise.cross_bilateral_filter" in str(program.graph)) is there
-        torch.testing.assert_close(program.module()(*arguments), _Filter("torch")(*arguments))
+    for export, there in ((by("numba", torch.export.export), True), (torch.export.export, False)):
+        program = export(_Filter(), arguments)
+        assert ("mcdenoise.numba_cross_bilateral_filter" in str(program.graph)) is there
+        torch.testing.assert_close(program.module()(*arguments), by("torch", _Filter())(*arguments))
 
 
 @pytest.mark.parametrize("needed", [("image",), ("kernel",), ("scales",), ("guides",)])
@@ -187,33 +188,50 @@ def test_derivatives_of_some_arguments_only(needed: tuple[str, ...]) -> None:
 
 def test_an_empty_batch() -> None:
     image, kernel = torch.rand(0, 3, 4, 5, requires_grad=True), torch.rand(0, 9, 4, 5)
-    result = ops.kernel_conv(image, kernel, backend="numba")
+    result = by("numba", ops.kernel_conv)(image, kernel)
     assert result.shape == image.shape
     assert torch.autograd.grad(result.sum(), image)[0].shape == image.shape
 
 
+def chosen(image: Tensor) -> str:
+    return _backend.choose_backend(["numba"], [image])
+
+
 def test_what_runs_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
     large, small = torch.rand(2, 3, 64, 64), torch.rand(1, 3, 64, 64)
-    assert _backend.choose_backend(None, large) == "numba"
-    assert _backend.choose_backend(None, small) == "torch"
-    assert _backend.choose_backend("torch", large) == "torch"
-    assert _backend.choose_backend(None, large.to("meta")) == "torch"
-    assert _backend.choose_backend("numba", small) == "numba"
+    assert chosen(large) == "numba"
+    assert chosen(small) == "torch"
+    assert chosen(large.to("meta")) == "torch"
+    assert _backend.choose_backend(["triton"], [large]) == "torch"
+    assert by("torch", chosen)(large) == "torch"
+    assert by("numba", chosen)(small) == "numba"
     monkeypatch.setattr(_backend, "_missing", lambda backend: "cannot be imported")
-    assert _backend.choose_backend(None, large) == "torch"
+    assert chosen(large) == "torch"
 
 
-def test_another_backend_may_be_preferred_for_a_while() -> None:
+def test_another_backend_may_be_used_for_a_while() -> None:
     large, small = torch.rand(2, 3, 64, 64), torch.rand(1, 3, 4, 4)
-    with _backend.preferred("torch"):
-        assert _backend.choose_backend(None, large) == "torch"
-        assert _backend.choose_backend("numba", large) == "numba"
-        with pytest.raises(ValueError, match="backend: expected one of"), _backend.preferred("c"):  # type: ignore[arg-type]
+    with ops.use("torch"):
+        assert chosen(large) == "torch"
+        with pytest.raises(ValueError, match="backend: expected one of"), ops.use("c"):  # type: ignore[arg-type]
             pytest.fail("entered")
-        with _backend.preferred("numba"):
-            assert _backend.choose_backend(None, small) == "numba"
-            assert _backend.choose_backend(None, small.to("meta")) == "torch"
-    assert _backend.choose_backend(None, large) == "numba"
+        with ops.use("numba", strict=False):
+            assert chosen(small) == "numba"
+            assert chosen(small.to("meta")) == "torch"
+        assert chosen(large) == "torch"
+    assert chosen(large) == "numba"
+
+
+def test_the_size_of_one_image_may_decide_for_all() -> None:
+    large, small = torch.rand(2, 3, 64, 64), torch.rand(1, 3, 4, 4)
+    with _backend.one_backend(large):
+        assert chosen(small) == "numba"
+        with _backend.one_backend(small):
+            assert chosen(large) == "numba"
+    with _backend.one_backend(small):
+        assert chosen(large) == "torch"
+    with ops.use("torch"), _backend.one_backend(large):
+        assert chosen(large) == "torch"
 
 
 def test_denormal_numbers_are_flushed_in_derivatives_and_nowhere_else() -> None:
@@ -221,10 +239,10 @@ def test_denormal_numbers_are_flushed_in_derivatives_and_nowhere_else() -> None:
     for flush in (False, True):
         torch.set_flush_denormal(flush)
         try:
-            assert ops.kernel_splat(image, kernel, backend="numba").eq(0).all()
+            assert by("numba", ops.kernel_splat)(image, kernel).eq(0).all()
             # Where all numbers are small, denormal ones count.
-            assert bool(ops.kernel_splat(1e-20 * image, 1e20 * kernel, backend="numba").eq(0).all()) is flush
-            assert bool(ops.kernel_conv(image, kernel, backend="numba").eq(0).all()) is flush
+            assert bool(by("numba", ops.kernel_splat)(1e-20 * image, 1e20 * kernel).eq(0).all()) is flush
+            assert bool(by("numba", ops.kernel_conv)(image, kernel).eq(0).all()) is flush
             assert bool((image * kernel[:, :1] == 0).all()) is flush
         finally:
             torch.set_flush_denormal(False)
@@ -233,12 +251,9 @@ def test_denormal_numbers_are_flushed_in_derivatives_and_nowhere_else() -> None:
 def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
     image, kernel = torch.rand(1, 3, 4, 5), torch.rand(1, 9, 4, 5)
     with pytest.raises(ValueError, match="backend: expected one of torch, numba, triton, found 'cuda'"):
-        ops.kernel_conv(image, kernel, backend="cuda")  # type: ignore[arg-type]
-    for module in (ops.KernelConv, ops.KernelSplat, ops.CrossBilateralFilter, ops.Accumulate):
-        with pytest.raises(ValueError, match="backend: expected one of torch, numba, triton, found 'c'"):
-            module(backend="c")
+        by("cuda", ops.kernel_conv)(image, kernel)
     with pytest.raises(ValueError, match="found 'numba', which runs on the CPU, not on meta"):
-        ops.kernel_conv(image.to("meta"), kernel.to("meta"), backend="numba")
+        by("numba", ops.kernel_conv)(image.to("meta"), kernel.to("meta"))
 
     def gone(name: str) -> None:
         raise ImportError("gone")
@@ -248,7 +263,7 @@ def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPa
     with pytest.raises(
         ValueError, match=r"found 'numba', which cannot be imported \(gone\); install mcdenoise\[fast\]"
     ):
-        ops.cross_bilateral_filter(image, kernel, backend="numba")
+        by("numba", ops.cross_bilateral_filter)(image, kernel)
     _backend._tried_import.cache_clear()
 
 
@@ -259,8 +274,8 @@ ACCUMULATE = next(op for op in OPS if op.name == "accumulate")
 @pytest.mark.parametrize("case", ACCUMULATE.cases, ids=lambda case: case.name)
 def test_accumulation_is_that_of_the_plain_form(case: Case, dtype: torch.dtype) -> None:
     inputs = case.inputs(dtype)
-    actual = ops.accumulate(**inputs, **case.settings, backend="numba")
-    for result, plain in zip(actual, ops.accumulate(**inputs, **case.settings, backend="torch"), strict=True):
+    actual = by("numba", ops.accumulate)(**inputs, **case.settings)
+    for result, plain in zip(actual, by("torch", ops.accumulate)(**inputs, **case.settings), strict=True):
         assert result.dtype == dtype
         # Both round to half precision once.
         eps = torch.finfo(dtype).eps
@@ -272,16 +287,16 @@ def test_accumulation_is_that_of_the_plain_form(case: Case, dtype: torch.dtype) 
 def test_accumulation_of_any_layout_and_by_any_number_of_threads(
     layout: Callable[[Tensor], Tensor], rule: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_numba_filter, "_PIXELS_A_THREAD", 1)
+    monkeypatch.setattr(_runtime, "PIXELS_A_THREAD", 1)
     case = next(case for case in ACCUMULATE.cases if "all buffers" in case.name)
     inputs = case.inputs()
     limits: dict[str, Any] = {"rule": rule, "position_limit": 0.05, "normal_limit": 0.3}
-    plain = ops.accumulate(**inputs, **limits, backend="torch")
+    plain = by("torch", ops.accumulate)(**inputs, **limits)
     threads = torch.get_num_threads()
     try:
         for count in (1, 3):
             torch.set_num_threads(count)
-            results = ops.accumulate(**map_tensors(layout, inputs), **limits, backend="numba")
+            results = by("numba", ops.accumulate)(**map_tensors(layout, inputs), **limits)
             for result, expected in zip(results, plain, strict=True):
                 torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-12)
     finally:
@@ -293,7 +308,7 @@ def test_accumulation_goes_through_the_compiler() -> None:
     case = ACCUMULATE.cases[1]
     torch.compiler.reset()
     compiled = torch.compile(ops.accumulate, fullgraph=True, backend="aot_eager")
-    results = compiled(**case.inputs(), **case.settings, backend="numba")
+    results = by("numba", compiled)(**case.inputs(), **case.settings)
     for result, expected in zip(results, ops.accumulate(**case.inputs(), **case.settings), strict=True):
         torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-12)
 
@@ -303,7 +318,7 @@ def test_accumulation_with_derivatives_is_plain() -> None:
     inputs = case.inputs()
     leaves_of(inputs, case)
     with pytest.raises(ValueError, match="found 'numba', which has no derivatives of this op"):
-        ops.accumulate(**inputs, **case.settings, backend="numba")
+        by("numba", ops.accumulate)(**inputs, **case.settings)
     color = torch.rand(1, 3, 96, 96, requires_grad=True)
     result, _ = ops.accumulate(color, color.detach(), color.detach()[:, :1] + 1, torch.zeros(1, 2, 96, 96))
     assert torch.autograd.grad(result.sum(), color)[0].shape == color.shape
@@ -314,7 +329,7 @@ def test_accumulation_refuses_what_the_plain_form_refuses(settings: dict[str, An
     inputs = ACCUMULATE.cases[1].inputs()
     for backend in ("torch", "numba"):
         with pytest.raises(ValueError, match=message):
-            ops.accumulate(**inputs, **settings, backend=backend)
+            by(backend, ops.accumulate)(**inputs, **settings)
 
 
 MOTION = next(op for op in OPS if op.name == "motion_from_position")
@@ -324,10 +339,10 @@ MOTION = next(op for op in OPS if op.name == "motion_from_position")
 @pytest.mark.parametrize("case", [case for case in MOTION.cases if case.kind != "extreme"], ids=lambda case: case.name)
 def test_motion_is_that_of_the_plain_form(case: Case, dtype: torch.dtype) -> None:
     inputs = case.inputs(dtype)
-    plain = ops.motion_from_position(**inputs, backend="torch")
+    plain = by("torch", ops.motion_from_position)(**inputs)
     for layout in (torch.clone, channels_last, transposed):
         position = layout(inputs["position"])
-        motion = ops.motion_from_position(position, inputs["previous_view_projection"], backend="numba")
+        motion = by("numba", ops.motion_from_position)(position, inputs["previous_view_projection"])
         assert motion.dtype == plain.dtype
         assert torch.equal(motion.isinf(), plain.isinf())
         eps, largest = torch.finfo(motion.dtype).eps, plain[plain.isfinite()].abs().max().item()
@@ -340,7 +355,7 @@ def test_motion_of_what_was_not_seen_is_infinite() -> None:
     position = torch.tensor(
         [[0.0, 0, 1], [0, 0, -1], [0, 0, 0], [torch.inf, 0, 1], [0, torch.nan, 1], [0, 0, torch.inf]]
     )
-    motion = ops.motion_from_position(position.T.reshape(1, 3, 1, 6), matrix, backend="numba")
+    motion = by("numba", ops.motion_from_position)(position.T.reshape(1, 3, 1, 6), matrix)
     assert motion.isinf().all(1).flatten().tolist() == [False, True, True, True, True, True]
 
 
@@ -352,9 +367,33 @@ def test_without_a_folder_for_compiled_code_it_is_compiled_anew() -> None:
         "    if hasattr(kind, '_locator_classes'):\n"
         "        kind._locator_classes = []\n"
         "from mcdenoise.ops import kernel_conv\n"
-        "image, kernel = torch.rand(1, 3, 4, 5), torch.rand(1, 9, 4, 5)\n"
-        "found, expected = (kernel_conv(image, kernel, backend=name) for name in ('numba', 'torch'))\n"
+        "from mcdenoise.ops._op import plain\n"
+        "image, kernel = torch.rand(1, 3, 96, 96), torch.rand(1, 9, 96, 96)\n"
+        "found, expected = (by(image, kernel) for by in (kernel_conv, plain(kernel_conv)))\n"
         "torch.testing.assert_close(found, expected)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_change_in_any_file_that_a_kernel_has_built_in_compiles_it_again(tmp_path: Path) -> None:
+    """Numba itself looks at the file of the kernel alone."""
+    shutil.copytree(Path(ops.__file__).parent, tmp_path / "mcdenoise" / "ops", ignore=shutil.ignore_patterns("__py*"))
+    (tmp_path / "mcdenoise" / "__init__.py").touch()
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    code = (
+        "import torch\n"
+        "from mcdenoise.ops._numba.network import softplus\n"
+        "print(softplus(torch.ones(1, 1, 1, 1, dtype=torch.float64), [1.0]).item())\n"
+    )
+
+    def run() -> float:
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        return float(done.stdout)
+
+    runtime = tmp_path / "mcdenoise" / "ops" / "_numba" / "_runtime.py"
+    assert run() == pytest.approx(math.log1p(math.e))
+    runtime.write_text(runtime.read_text().replace("return math.log1p(value)", "return 2 * math.log1p(value)"))
+    assert run() == pytest.approx(1 + 2 * math.log1p(math.exp(-1)))

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 import torch
-from plain_form import channels_last, every_other_column, slice_of_pixels, transposed
+from plain_form import by, channels_last, every_other_column, slice_of_pixels, transposed
 from torch import Tensor
 
 from mcdenoise.ops import downsample
-from mcdenoise.ops._fast import _numba_filter
+from mcdenoise.ops._numba import _runtime
 from mcdenoise.ops._steps import network
 
 # Of the largest number in a result: a few roundings of sums of up to 54 products.
@@ -57,7 +57,7 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
     radiance = layout(draw(3, batch, 3, height, width, dtype).exp())
     depth = draw(4, batch, 1, height, width, dtype).exp() * 20
     depth[..., 0, -1] = torch.inf
-    scale = network.depth_scale(depth, backend="torch")
+    scale = by("torch", network.depth_scale)(depth)
     depth = layout(depth)
     exposure = top * 0.7
     buffers = [some(5, 3), some(6, 3), depth, radiance]
@@ -87,7 +87,7 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
 
 def results(call: Call, backend: str) -> list[Tensor]:
     function, arguments, settings = call
-    found = function(*arguments, **settings, backend=backend)
+    found = by(backend, function)(*arguments, **settings)
     return [found] if isinstance(found, Tensor) else list(found)
 
 
@@ -114,7 +114,7 @@ def test_layout_in_memory_changes_nothing(layout: Callable[[Tensor], Tensor]) ->
 
 
 def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_numba_filter, "_PIXELS_A_THREAD", 1)
+    monkeypatch.setattr(_runtime, "PIXELS_A_THREAD", 1)
     threads, found = torch.get_num_threads(), []
     try:
         for count in (1, 2, 5):
@@ -150,8 +150,8 @@ def test_the_input_of_a_network_has_the_precision_of_autocast(size: tuple[int, i
     image, features = (draw(seed, batch, count, height, width, torch.float32) for seed, count in ((1, 3), (2, 11)))
     for logarithms in (False, True):
         with torch.autocast("cpu", torch.bfloat16):
-            found = network.network_input(image.exp(), features, logarithms=logarithms, backend="numba")
-        plain = network.network_input(image.exp(), features, logarithms=logarithms, backend="torch")
+            found = by("numba", network.network_input)(image.exp(), features, logarithms=logarithms)
+        plain = by("torch", network.network_input)(image.exp(), features, logarithms=logarithms)
         assert found.dtype == torch.bfloat16
         assert found.is_contiguous(memory_format=torch.channels_last)
         if logarithms:
@@ -171,12 +171,12 @@ def test_the_input_from_buffers_is_that_of_their_features(size: tuple[int, int, 
         factor = settings.pop("image_factor", None)
         with torch.autocast("cpu", torch.bfloat16, enabled=precision == torch.bfloat16):
             found = results(call, "numba")[0]
-            features = network.network_features(*buffers, backend="numba")
+            features = by("numba", network.network_features)(*buffers)
             image = image if factor is None else image * factor
-            expected = network.network_input(image, features, **settings, backend="numba")
+            expected = by("numba", network.network_input)(image, features, **settings)
         assert torch.equal(found, expected)
         assert found.stride() == expected.stride()
-        guides = network.network_guides(buffers[1], buffers[2], buffers[-1], backend="numba")
+        guides = by("numba", network.network_guides)(buffers[1], buffers[2], buffers[-1])
         assert torch.equal(guides, features[:, 3:7])
 
 
@@ -196,7 +196,7 @@ def test_a_coarse_scale_that_agrees_changes_nothing(backend: str) -> None:
     fine[:, :, :5], fine[:, :, 5:] = 0.1 * fine[:, :, :5], 3 * fine[:, :, 5:]
     weight, bias = draw(2, 1, 6, 3, 3, torch.float64), torch.tensor([0.2], dtype=torch.float64)
     coarse = torch.log1p(downsample(fine))
-    fused = network.gated_fusion(fine, coarse, weight, bias, logarithms=True, backend=backend)
+    fused = by(backend, network.gated_fusion)(fine, coarse, weight, bias, logarithms=True)
     torch.testing.assert_close(fused, torch.log1p(fine), rtol=0, atol=1e-13)
 
 
@@ -207,7 +207,7 @@ def test_fusion_of_logarithms_pixel_by_pixel(height: int, width: int, backend: s
     fine = draw(1, 1, 3, height, width, torch.float64).exp()
     coarse = draw(2, 1, 3, (height + 1) // 2, (width + 1) // 2, torch.float64)
     weight, bias = draw(3, 1, 6, 3, 3, torch.float64), torch.tensor([-0.3], dtype=torch.float64)
-    fused = network.gated_fusion(fine, coarse, weight, bias, logarithms=True, backend=backend)
+    fused = by(backend, network.gated_fusion)(fine, coarse, weight, bias, logarithms=True)
     for y, x in itertools.product(range(height), range(width)):
         total = float(bias)
         for c, dy, dx in itertools.product(range(3), (-1, 0, 1), (-1, 0, 1)):
@@ -235,13 +235,13 @@ def test_numbers_of_any_size() -> None:
     image = torch.tensor([0, 1e-40, 1e-30, 1e-8, 0.3, 0.5, 1, 7, 3e5, 1e20, 1e38, torch.inf, torch.nan])
     image = image.reshape(1, 1, 1, -1).expand(1, 3, 2, -1)
     nothing = torch.zeros(1, 0, 2, image.shape[-1])
-    found = network.network_input(image, nothing, backend="numba")
+    found = by("numba", network.network_input)(image, nothing)
     torch.testing.assert_close(found, torch.log1p(image), rtol=4e-7, atol=0, equal_nan=True)
     # And back again, where a fusion changes nothing: alpha is 0.
     logs = torch.log1p(image.nan_to_num(0, 1e38))
     weight, bias, top = torch.zeros(1, 6, 3, 3), torch.tensor([-1e4]), torch.full((1, 1, 1, 1), 80.0)
     given = (logs, downsample(logs), weight, bias)
-    fast, plain = (network.gated_fusion(*given, top=top, backend=name) for name in ("numba", "torch"))
+    fast, plain = (by(name, network.gated_fusion)(*given, top=top) for name in ("numba", "torch"))
     torch.testing.assert_close(fast, plain, rtol=1e-5, atol=0)
     torch.testing.assert_close(fast[..., :10], image[..., :10], rtol=1e-5, atol=1e-37)
 
@@ -250,7 +250,7 @@ def test_nan_stays_where_it_is_and_below_zero_is_zero() -> None:
     fine = torch.full((1, 3, 6, 9), -1.0)
     fine[..., 2, 4] = torch.nan
     weight, bias, top = torch.zeros(1, 6, 3, 3), torch.tensor([-1e4]), torch.ones(1, 1, 1, 1)
-    fused = network.gated_fusion(fine, torch.zeros(1, 3, 3, 5), weight, bias, top=top, backend="numba")
+    fused = by("numba", network.gated_fusion)(fine, torch.zeros(1, 3, 3, 5), weight, bias, top=top)
     assert fused[..., 2, 4].isnan().all()
     assert fused[..., 3:, 6:].unique().tolist() == [0]
 
@@ -259,7 +259,7 @@ def test_nan_stays_where_it_is_and_below_zero_is_zero() -> None:
 def test_where_nothing_was_hit_there_is_no_depth(backend: str) -> None:
     depth = torch.full((2, 1, 3, 4), torch.inf)
     depth[1, 0, 1] = torch.tensor([1.0, 4.0, torch.inf, 2.0])
-    near, typical = (part.flatten().tolist() for part in network.depth_scale(depth, backend=backend))
+    near, typical = (part.flatten().tolist() for part in by(backend, network.depth_scale)(depth))
     # The mean of 1 / sqrt(d) is (1 + 1 / 2 + 1 / sqrt(2)) / 3, the geometric mean of d is 2.
     assert near == pytest.approx([1, (9 / (1.5 + math.sqrt(0.5)) ** 2)])
     assert [unit * each for unit, each in zip(near, typical, strict=True)] == pytest.approx([1, 2])
@@ -274,7 +274,7 @@ def test_normalised_depth_is_that_of_the_geometric_mean(unit: float, backend: st
     means = [torch.exp(torch.log(image[hit]).mean()) for image, hit in zip(depth, hits, strict=True)]
     expected = torch.where(hits, 1 - 1 / (1 + depth / torch.stack(means).reshape(2, 1, 1, 1)), 1)
     depth = (depth * unit).float()
-    found = network.normalized_depth(depth, *network.depth_scale(depth, backend=backend))
+    found = network.normalized_depth(depth, *by(backend, network.depth_scale)(depth))
     torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=0)
 
 
@@ -285,12 +285,12 @@ def test_a_far_sky_hides_no_differences_of_what_is_near(rows: int, sky: float, b
     """Blender writes 1e10 where nothing was hit, others 1e30; here and there one of these is beside infinity."""
     depth = draw(1, 1, 1, 100, 8, torch.float32).exp() * 5
     depth[..., :rows, :] = torch.inf
-    expected = network.normalized_depth(depth, *network.depth_scale(depth, backend=backend))
+    expected = network.normalized_depth(depth, *by(backend, network.depth_scale)(depth))
     depth[..., :rows, :-1] = sky
-    scale = network.depth_scale(depth, backend=backend)
+    scale = by(backend, network.depth_scale)(depth)
     for found in (
         network.normalized_depth(depth, *scale),
-        network.network_guides(depth.expand(1, 3, -1, -1), depth, scale, backend=backend)[:, 3:],
+        by(backend, network.network_guides)(depth.expand(1, 3, -1, -1), depth, scale)[:, 3:],
     ):
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
 
@@ -301,7 +301,7 @@ def test_depths_of_zero_are_finite(backend: str) -> None:
     depth = torch.ones(1, 1, 4, 6)
     depth[..., 0] = 0
     for image in (depth, torch.zeros_like(depth), torch.full_like(depth, 1e-38)):
-        found = network.normalized_depth(image, *network.depth_scale(image, backend=backend))
+        found = network.normalized_depth(image, *by(backend, network.depth_scale)(image))
         assert found.isfinite().all()
         assert 0 <= found.min() <= found.max() <= 1
 
@@ -326,14 +326,14 @@ def test_where_derivatives_are_asked_for_it_is_plain() -> None:
         result = found if isinstance(found, Tensor) else found[1]
         assert torch.autograd.grad(result.sum(), leaf)[0].shape == leaf.shape
         with pytest.raises(ValueError, match="found 'numba', which has no derivatives of this op"):
-            function(leaf, *arguments[1:], **settings, backend="numba")
+            by("numba", function)(leaf, *arguments[1:], **settings)
 
 
 def test_an_empty_batch() -> None:
     for function, arguments, settings in calls((1, 4, 6), torch.float32):
         empty = [x[:0] if isinstance(x, Tensor) and x.ndim == 4 and x.shape[1] != 6 else x for x in arguments]
         if function in (network.softplus, network.network_input, downsample):
-            assert 0 in function(*empty, **settings, backend="numba").shape
+            assert 0 in by("numba", function)(*empty, **settings).shape
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

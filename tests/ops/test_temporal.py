@@ -5,6 +5,7 @@ from typing import Any
 import kornia
 import pytest
 import torch
+from plain_form import by
 from torch import Tensor
 
 from mcdenoise.ops import Surface, accumulate, motion_from_position, reproject
@@ -373,10 +374,11 @@ class TestNothingMoves:
         changed = draw(2, 1, 96, 110, seed=5) < 0.5
         there = there._replace(normal=torch.where(changed, -there.normal, there.normal))
         limits = {"position_limit": 0.1, "normal_limit": 0.3} if rule == "bmfr" else {}
-        arguments, settings = (color, previous, length.to(dtype)), {"rule": rule, "backend": backend, **limits}
+        arguments, settings = (color, previous, length.to(dtype)), {"rule": rule, **limits}
         zeros = still(96, 110, 2).to(dtype)
-        expected = accumulate(*arguments, zeros, here, there, **settings)
-        for result, known in zip(accumulate(*arguments, None, here, there, **settings), expected, strict=True):
+        function = by(backend, accumulate)
+        expected = function(*arguments, zeros, here, there, **settings)
+        for result, known in zip(function(*arguments, None, here, there, **settings), expected, strict=True):
             assert torch.equal(result, known)
         assert 0.4 < (expected[1] == 1).float().mean() < 0.6
 
@@ -396,6 +398,6 @@ def test_motion_keeps_its_precision_under_autocast() -> None:
     position = 100 + torch.rand(1, 3, 36, 64)
     matrix = torch.eye(4)[None] * 0.5
     matrix[:, 3, 3] = 6
-    expected = motion_from_position(position, matrix, backend="torch")
+    expected = by("torch", motion_from_position)(position, matrix)
     with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(motion_from_position(position, matrix, backend="torch"), expected)
+        assert torch.equal(by("torch", motion_from_position)(position, matrix), expected)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from plain_form import by
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -131,9 +132,9 @@ def test_default_arguments_at_a_size_where_fast_forms_are_chosen() -> None:
 def test_a_named_fast_form_refuses() -> None:
     x = torch.rand(1, 3, 4, 5)
     calls: list[Callable[[], Any]] = [
-        lambda: torch.func.jvp(lambda x: ops.downsample(x, backend="numba"), (x,), (x,)),
-        lambda: torch.func.vmap(lambda x: ops.downsample(x, backend="numba"))(x[None]),
-        lambda: torch.func.grad(lambda x: ops.downsample(x, backend="numba").sum())(x),
+        lambda: torch.func.jvp(lambda x: by("numba", ops.downsample)(x), (x,), (x,)),
+        lambda: torch.func.vmap(lambda x: by("numba", ops.downsample)(x))(x[None]),
+        lambda: torch.func.grad(lambda x: by("numba", ops.downsample)(x).sum())(x),
     ]
     for call in calls:
         with pytest.raises(ValueError, match=NO_RULE):
@@ -142,4 +143,4 @@ def test_a_named_fast_form_refuses() -> None:
         forward_ad.dual_level(),
         pytest.raises(ValueError, match=NO_RULE),
     ):
-        ops.kernel_conv(forward_ad.make_dual(x, x), torch.ones(1, 9, 4, 5), backend="numba")
+        by("numba", ops.kernel_conv)(forward_ad.make_dual(x, x), torch.ones(1, 9, 4, 5))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from plain_form import by
 
 from mcdenoise import ops
 
@@ -48,6 +49,6 @@ def test_it_says_why_it_cannot_run() -> None:
     image, kernel = torch.rand(1, 3, 4, 5), torch.rand(1, 9, 4, 5)
     for function in (ops.kernel_conv, ops.kernel_splat, ops.cross_bilateral_filter):
         with pytest.raises(ValueError, match="found 'triton', which runs on an NVIDIA GPU, not on cpu"):
-            function(image, kernel, backend="triton")
+            by("triton", function)(image, kernel)
     with pytest.raises(ValueError, match="found 'triton', which has no form of this op"):
-        ops.accumulate(image, image, image[:, :1], None, backend="triton")
+        by("triton", ops.accumulate)(image, image, image[:, :1], None)

@@ -4,38 +4,59 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._backend import Backend, choose_backend
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._constants import (
+    BRIGHTER,
+    EVEN,
+    LIGHT_WINDOW,
+    NO_ALBEDO,
+    RECENT_ALPHA,
+    RECENT_FRAMES,
+    STILL,
+)
+from mcdenoise.ops._history import COLOR, MEAN, RECENT, RECENT_MEAN, SQUARE, Blended
+from mcdenoise.ops._op import op, plain
 from mcdenoise.ops._rows import by_rows
 from mcdenoise.ops._window import corner
-from mcdenoise.ops.demodulation import NO_ALBEDO, demodulate
+from mcdenoise.ops._surface import Rule, Surface
+from mcdenoise.ops.demodulation import demodulate
 from mcdenoise.ops.fireflies import KERNEL_SIZE, LIMIT, clamp_fireflies
 from mcdenoise.ops.lag import KERNEL_SIZE as LAG_KERNEL_SIZE
 from mcdenoise.ops.lag import history_lag
-from mcdenoise.ops.temporal import Rule, Shorter, Surface, accumulate, accumulate_numba, check_alpha
+from mcdenoise.ops.temporal import accumulate, check_accumulate
 
-# The channels of a history in which lag is looked for: color, mean of the compressed radiance and of its square, and
-# color and compressed radiance of a second, shorter history. A frame enters with the first five.
-COLOR, MEAN, SQUARE, RECENT, RECENT_MEAN = slice(0, 3), slice(3, 4), slice(4, 5), slice(5, 9), slice(8, 9)
-# Smallest weight of a frame in the shorter history: four frames have half the noise of one.
-_RECENT_ALPHA = 0.25
-# As many equally weighted frames have the noise of that history, once it is full: (2 - alpha) / alpha.
-_RECENT_FRAMES = 7
-# What moves by no more stands still, in pixels.
-_STILL = 0.05
-# A light that is seen: how far the compressed radiance of 3x3 pixels may differ, and how bright they are beside the
-# mean of a window. Fewer pixels are often alike by chance where one of a few lights is drawn for each, and some of the
-# light is lost to that.
-_EVEN, _BRIGHTER, _LIGHT_WINDOW = 0.03, 1.2, 9
-_FORMS: tuple[Backend, ...] = ("torch", "numba")
+__all__ = [
+    "COLOR",
+    "MEAN",
+    "RECENT",
+    "RECENT_MEAN",
+    "SQUARE",
+    "Blended",
+    "blend",
+    "incoming",
+    "lights",
+    "without_history",
+]
 
 
+def _check_incoming(
+    color: Tensor,
+    albedo: Tensor | None = None,
+    limit: float | Tensor = LIMIT,
+    kernel_size: int = KERNEL_SIZE,
+    *,
+    compared: bool = True,
+) -> None:
+    images = {"color": (color, "B 3 H W")} | ({} if albedo is None else {"albedo": (albedo, "B 3 H W")})
+    check_shapes(**images, **({"limit": (limit, "B 1 1 1")} if isinstance(limit, Tensor) else {}))
+
+
+@op("numba", check=_check_incoming)
 def incoming(
     color: Tensor,
     albedo: Tensor | None = None,
@@ -43,7 +64,6 @@ def incoming(
     kernel_size: int = KERNEL_SIZE,
     *,
     compared: bool = True,
-    backend: Backend | None = None,
 ) -> Tensor:
     """A frame as it enters a history: without albedo and fireflies.
 
@@ -57,25 +77,10 @@ def incoming(
         limit: see :func:`mcdenoise.ops.clamp_fireflies`; a number, or ``(B, 1, 1, 1)`` of each image.
         kernel_size: see :func:`mcdenoise.ops.clamp_fireflies`.
         compared: whether the two channels for the test for lag are wanted; they have no derivative.
-        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
         ``(B, 5, H, W)``, or ``(B, 3, H, W)`` without the two; at least float32, in which half precision is computed.
     """
-    images = {"color": (color, "B 3 H W")} | ({} if albedo is None else {"albedo": (albedo, "B 3 H W")})
-    given = {"limit": (limit, "B 1 1 1")} if isinstance(limit, Tensor) else {}
-    check_shapes(**images, **given)
-    tensors = [tensor for tensor, _ in (images | given).values()]
-    if choose_backend(backend, *tensors, differentiable=False, forms=_FORMS) == "numba":
-        from mcdenoise.ops._fast import history as fast
-
-        dtype = torch.promote_types(color.dtype, torch.float32)
-        if isinstance(limit, Tensor):
-            limits = limit.to(dtype).flatten()
-        else:
-            limits = color.new_full((len(color),), limit, dtype=dtype)
-        result: Tensor = fast.incoming(color, albedo, limits, kernel_size, compared)
-        return result
 
     def clamped(color: Tensor, albedo: Tensor | None = None) -> Tensor:
         color = color.to(torch.promote_types(color.dtype, torch.float32))
@@ -89,7 +94,12 @@ def incoming(
     return torch.cat([color, root, root.square()], 1)
 
 
-def lights(root: Tensor, *, backend: Backend | None = None) -> Tensor:
+def _check_lights(root: Tensor) -> None:
+    check_shapes(root=(root, "B 1 H W"))
+
+
+@op("numba", check=_check_lights)
+def lights(root: Tensor) -> Tensor:
     """Where, by one frame, a light is seen: in blocks of 3x3 pixels that are alike and brighter than what is around.
 
     A block is alike if its fourth roots of radiance differ by at most 3 % of the largest; a pixel is bright if its own
@@ -97,43 +107,21 @@ def lights(root: Tensor, *, backend: Backend | None = None) -> Tensor:
 
     Args:
         root: ``(B, 1, H, W)`` fourth root of the radiance, as :func:`incoming` has it; non-negative.
-        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
         ``(B, 1, H, W)`` of 0 and 1 in the dtype of ``root``; no derivative.
     """
-    check_shapes(root=(root, "B 1 H W"))
-    root = root.detach()
-    if choose_backend(backend, root, differentiable=False, forms=_FORMS) == "numba":
-        from mcdenoise.ops._fast import history as fast
-
-        result: Tensor = fast.lights(root, _EVEN, _BRIGHTER, _LIGHT_WINDOW)
-        return result
-    return by_rows(_lights, root, reach=_LIGHT_WINDOW // 2)
+    return by_rows(_lights, root.detach(), reach=LIGHT_WINDOW // 2)
 
 
 def _lights(root: Tensor) -> Tensor:
     if min(root.shape[-2:]) < 3 or root.numel() == 0:
         return torch.zeros_like(root)
     largest, smallest = F.max_pool2d(root, 3, 1), -F.max_pool2d(-root, 3, 1)
-    even = (largest - smallest <= _EVEN * largest).to(root.dtype)
+    even = (largest - smallest <= EVEN * largest).to(root.dtype)
     some = F.max_pool2d(F.pad(even, (2, 2, 2, 2)), 3, 1)
-    around = F.avg_pool2d(root, _LIGHT_WINDOW, 1, _LIGHT_WINDOW // 2, count_include_pad=False)
-    return some * (root > _BRIGHTER * around)
-
-
-class Blended(NamedTuple):
-    """A frame with its history.
-
-    Args:
-        color: ``(B, C, H, W)``, the channels of a history.
-        length: ``(B, 1, H, W)`` of the history with this frame, in frames.
-        kept: ``(B,)`` fraction of each image's pixels that found their surface in the previous frame, float32.
-    """
-
-    color: Tensor
-    length: Tensor
-    kept: Tensor
+    around = F.avg_pool2d(root, LIGHT_WINDOW, 1, LIGHT_WINDOW // 2, count_include_pad=False)
+    return some * (root > BRIGHTER * around)
 
 
 def without_history(entering: Tensor) -> Tensor:
@@ -148,6 +136,41 @@ def without_history(entering: Tensor) -> Tensor:
     return torch.cat([entering, entering[:, : SQUARE.start]], 1) if entering.shape[1] > SQUARE.start else entering
 
 
+def _check_blend(
+    entering: Tensor,
+    previous: Tensor,
+    previous_length: Tensor,
+    motion: Tensor | None,
+    surface: Surface | None = None,
+    previous_surface: Surface | None = None,
+    *,
+    alpha_min: float = 0.1,
+    rule: str = "relative",
+    position_limit: float | None = None,
+    normal_limit: float | None = None,
+    albedo: Tensor | None = None,
+    specular_length: float = math.inf,
+    lag_threshold: float = math.inf,
+    lag_kernel_size: int = LAG_KERNEL_SIZE,
+) -> None:
+    if not specular_length >= 0:
+        raise ValueError(f"specular_length: expected at least 0, found {specular_length}")
+    channels = ("C", "C") if math.isinf(lag_threshold) else (str(SQUARE.stop), str(RECENT.stop))
+    check_shapes(
+        entering=(entering, f"B {channels[0]} H W"),
+        previous=(previous, f"B {channels[1]} H W"),
+        **({} if albedo is None else {"albedo": (albedo, "B 3 H W")}),
+    )
+    check_accumulate(
+        *(previous, previous, previous_length, motion, surface, previous_surface),
+        alpha_min=alpha_min,
+        rule=rule,
+        position_limit=position_limit,
+        normal_limit=normal_limit,
+    )
+
+
+@op("numba", check=_check_blend)
 def blend(
     entering: Tensor,
     previous: Tensor,
@@ -164,7 +187,6 @@ def blend(
     specular_length: float = math.inf,
     lag_threshold: float = math.inf,
     lag_kernel_size: int = LAG_KERNEL_SIZE,
-    backend: Backend | None = None,
 ) -> Blended:
     """Accumulate a frame, with a shorter history where that is known to be wrong.
 
@@ -194,42 +216,25 @@ def blend(
         specular_length: in frames, at least 0.
         lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test.
         lag_kernel_size: see :func:`mcdenoise.ops.history_lag`, in half the resolution.
-        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
         See :class:`Blended`; the dtypes of ``entering`` and of ``previous_length``.
 
     Raises:
         TypeError: as :func:`mcdenoise.ops.accumulate`.
-        ValueError: as :func:`mcdenoise.ops.accumulate`.
+        ValueError: as :func:`mcdenoise.ops.accumulate`, or ``specular_length`` is negative.
     """
     tests = not math.isinf(lag_threshold)
-    _check_blend(entering, previous, previous_length, motion, albedo, tests)
-    check_alpha(alpha_min)
-    images = (entering, previous, previous_length)
-    surfaces = (*(surface or ()), *(previous_surface or ()))
-    chosen = choose_backend(backend, *images, motion, albedo, *surfaces, differentiable=False, forms=_FORMS)
-    recent_alpha = max(alpha_min, _RECENT_ALPHA)
-    pixels = max(previous_length.shape[-2] * previous_length.shape[-1], 1)
-    if chosen == "numba":
-        from mcdenoise.ops._fast import history as fast
-
-        color, length, counts = accumulate_numba(
-            *(*images, motion, surface, previous_surface, alpha_min, rule, position_limit, normal_limit),
-            Shorter(recent_alpha, albedo, specular_length + 1, _STILL),
-        )
-        if tests:
-            fast.give_up_lag(color, length, entering, lag_threshold, lag_kernel_size, recent_alpha, _RECENT_FRAMES)
-        return Blended(color, length, counts.sum(1) / pixels)
+    recent_alpha = max(alpha_min, RECENT_ALPHA)
     both = without_history(entering) if tests else entering
-    color, length = accumulate(
+    color, length = plain(accumulate)(
         *(both, previous, previous_length, motion, surface, previous_surface),
         alpha_min=alpha_min,
         rule=rule,
         position_limit=position_limit,
         normal_limit=normal_limit,
-        backend="torch",
     )
+    pixels = max(length.shape[-2] * length.shape[-1], 1)
     kept = (length > 1).sum((1, 2, 3)) / pixels
     if albedo is not None and motion is not None and specular_length < math.inf:
         shorten = partial(_shortened, specular_length + 1, alpha_min)
@@ -243,24 +248,6 @@ def blend(
     return Blended(color, length.to(previous_length.dtype), kept)
 
 
-def _check_blend(
-    entering: Tensor,
-    previous: Tensor,
-    previous_length: Tensor,
-    motion: Tensor | None,
-    albedo: Tensor | None,
-    tests: bool,
-) -> None:
-    channels = ("5", str(RECENT.stop)) if tests else ("C", "C")
-    images = {"motion": (motion, "B 2 H W"), "albedo": (albedo, "B 3 H W")}
-    check_shapes(
-        entering=(entering, f"B {channels[0]} H W"),
-        previous=(previous, f"B {channels[1]} H W"),
-        previous_length=(previous_length, "B 1 H W"),
-        **{name: (image, axes) for name, (image, axes) in images.items() if image is not None},
-    )
-
-
 def _weight_of_history(length: Tensor, alpha_min: float) -> Tensor:
     """In a result of that length, see :func:`mcdenoise.ops.accumulate`."""
     return 1 - (1 / length).clamp_min(alpha_min)
@@ -271,7 +258,7 @@ def _shortened(
 ) -> Tensor:
     """Color and length if the history of mirrors and glass that move is no longer than that."""
     # A reduction over the channels takes a hundred times as long.
-    moves = torch.hypot(motion[:, :1], motion[:, 1:]) > _STILL
+    moves = torch.hypot(motion[:, :1], motion[:, 1:]) > STILL
     specular = albedo.amax(1, keepdim=True) < NO_ALBEDO
     too_long = moves & specular & (length > longest)
     weight = _weight_of_history(length.clamp_max(longest), alpha_min)
@@ -298,7 +285,7 @@ def _without_lag(
     recent = torch.lerp(color[:, RECENT], blended[:, RECENT], weight)
     lag = partial(_lag, threshold, kernel_size)
     recent = torch.lerp(recent, color[:, RECENT], lag(recent[:, 3:], color[:, RECENT_MEAN], variance))
-    given_up = lag(mean, recent[:, 3:], variance / length.clamp_max(_RECENT_FRAMES))
+    given_up = lag(mean, recent[:, 3:], variance / length.clamp_max(RECENT_FRAMES))
     shorter = torch.cat([recent, recent[:, 3:].square() + variance], 1)
     longer = torch.lerp(blended[:, : RECENT.start], shorter, given_up)
     return torch.cat([longer, recent, torch.lerp(length, length.clamp_max(1 / recent_alpha), given_up)], 1)

@@ -8,45 +8,42 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._backend import Backend, choose_backend
+from mcdenoise.ops._constants import BLOCK, DARK, FARTHEST, SHORTEST
+from mcdenoise.ops._op import op, plain
 from mcdenoise.ops._rows import by_rows
 from mcdenoise.ops._window import accumulator_dtype, corner
 from mcdenoise.ops.fusion import downsample, laplacian_fusion, upsample
 
-# Side of the blocks whose means are an image's low frequencies, in pixels. Below this share of a typical radiance they
-# are left alone.
-BLOCK = 8
-_DARK = 1e-3
-# The least number that a depth counts as, and how many near depths away the scene ends.
-SHORTEST, FARTHEST = 1e-30, 1e4
-_FORMS: tuple[Backend, ...] = ("torch", "numba")
+__all__ = [
+    "BLOCK",
+    "buffers_input",
+    "depth_scale",
+    "gated_fusion",
+    "low_frequencies_of",
+    "network_features",
+    "network_guides",
+    "network_input",
+    "normalized_depth",
+    "softplus",
+]
 
 
-def network_input(
-    image: Tensor, features: Tensor, *, logarithms: bool = True, backend: Backend | None = None
-) -> Tensor:
+@op("numba")
+def network_input(image: Tensor, features: Tensor, *, logarithms: bool = True) -> Tensor:
     """``torch.cat([torch.log1p(image), features], 1)`` as a convolution takes it: channels-last, precision of autocast.
 
     Args:
         image: ``(B, C, H, W)`` radiance; or logarithms of radiance already.
         features: ``(B, F, H, W)`` of the same dtype.
         logarithms: whether to take them.
-        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
         ``(B, C + F, H, W)``. The plain form leaves layout and precision to the convolution.
     """
-    chosen = choose_backend(backend, image, features, differentiable=False, forms=_FORMS)
-    device = image.device.type
-    dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else image.dtype
-    if chosen == "torch" or torch.float16 in (image.dtype, features.dtype, dtype):
-        return torch.cat([torch.log1p(image) if logarithms else image, features], 1)
-    from mcdenoise.ops._fast import fused as fast
-
-    result: Tensor = fast.network_input(image, features, logarithms, dtype)
-    return result
+    return torch.cat([torch.log1p(image) if logarithms else image, features], 1)
 
 
+@op("numba")
 def buffers_input(
     image: Tensor,
     albedo: Tensor,
@@ -59,7 +56,6 @@ def buffers_input(
     *,
     logarithms: bool = True,
     image_factor: Tensor | None = None,
-    backend: Backend | None = None,
 ) -> Tensor:
     """An image and its buffers as a convolution takes them: channels-last, precision of autocast.
 
@@ -76,50 +72,32 @@ def buffers_input(
         scale: see :func:`network_features`.
         logarithms: whether to take those of the image.
         image_factor: ``(B, 1, 1, 1)`` factor of the image, before any logarithm; 1 by default.
-        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
         ``(B, 14, H, W)``: the image, then the features. The plain form leaves layout and precision to the convolution.
     """
-    buffers = (albedo, normal, depth, current, length, exposure, *scale)
-    given = (image, *buffers, image_factor)
-    chosen = choose_backend(backend, *given, differentiable=False, forms=_FORMS)
-    device = image.device.type
-    dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else image.dtype
-    if chosen == "torch" or torch.float16 in (image.dtype, albedo.dtype, dtype):
-        features = network_features(albedo, normal, depth, current, length, exposure, scale, backend="torch")
-        image = image if image_factor is None else image * image_factor
-        return network_input(image, features, logarithms=logarithms, backend="torch")
-    from mcdenoise.ops._fast import fused as fast
-
-    result: Tensor = fast.buffers_input(image, *buffers, image_factor, logarithms, dtype)
-    return result
+    features = plain(network_features)(albedo, normal, depth, current, length, exposure, scale)
+    image = image if image_factor is None else image * image_factor
+    return plain(network_input)(image, features, logarithms=logarithms)
 
 
-def network_guides(
-    normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor], *, backend: Backend | None = None
-) -> Tensor:
+@op("numba")
+def network_guides(normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor]) -> Tensor:
     """Normal and depth as :func:`network_features` has them, to guide a filter.
 
     Args:
         normal: ``(B, 3, H, W)`` in [-1, 1].
         depth: ``(B, 1, H, W)`` distance, ``inf`` where nothing was hit.
         scale: of :func:`depth_scale`.
-        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
         ``(B, 4, H, W)``: ``normal / 2 + 1 / 2``, and :func:`normalized_depth`.
     """
-    chosen = choose_backend(backend, normal, depth, *scale, differentiable=False, forms=_FORMS)
-    if chosen != "torch" and normal.dtype in (torch.float32, torch.float64):
-        from mcdenoise.ops._fast import fused as fast
-
-        result: Tensor = fast.network_guides(normal, depth, *scale)
-        return result
     return torch.cat([normal * 0.5 + 0.5, normalized_depth(depth, *scale)], 1)
 
 
-def depth_scale(depth: Tensor, *, backend: Backend | None = None) -> tuple[Tensor, Tensor]:
+@op("numba")
+def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
     """A near depth to count depths in, and the typical one in that unit: the geometric mean of what was hit.
 
     The near depth is ``1 / mean(1 / sqrt(d))^2``, which far depths hardly change. What is 10,000 times as far is no
@@ -128,19 +106,12 @@ def depth_scale(depth: Tensor, *, backend: Backend | None = None) -> tuple[Tenso
 
     Args:
         depth: ``(B, 1, H, W)`` distance, any unit, ``inf`` where nothing was hit.
-        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
         ``(B, 1, 1, 1)`` each, at least float32; 1 where there is nothing to count. Depths below 1e-30, such as zeros,
         tell nothing of the near depth, and none counts as less than 1e-30 of it. The near depth is a mere unit and has
         no derivative.
     """
-    if choose_backend(backend, depth, differentiable=False, forms=_FORMS) != "torch":
-        from mcdenoise.ops._fast import fused as fast
-
-        scale: tuple[Tensor, Tensor] = fast.depth_scale(depth)
-        return scale
-
     dtype = accumulator_dtype(depth.dtype)
 
     def totals(values: Tensor, count: Tensor) -> Tensor:
@@ -178,6 +149,7 @@ def normalized_depth(depth: Tensor, near: Tensor, typical: Tensor) -> Tensor:
     return torch.where(torch.isfinite(depth), in_units / (in_units + typical), 1).to(depth.dtype)
 
 
+@op("numba")
 def network_features(
     albedo: Tensor,
     normal: Tensor,
@@ -186,8 +158,6 @@ def network_features(
     length: Tensor | None,
     exposure: Tensor,
     scale: tuple[Tensor, Tensor],
-    *,
-    backend: Backend | None = None,
 ) -> Tensor:
     """Buffers as a network sees them, each in a range from 0 to about 1.
 
@@ -199,23 +169,16 @@ def network_features(
         length: ``(B, 1, H, W)`` at least 1; 1 by default.
         exposure: ``(B, 1, 1, 1)`` factor of the radiance.
         scale: of :func:`depth_scale`.
-        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
         ``(B, 11, H, W)``: albedo, normal, depth, logarithm of the radiance, and one over the length.
     """
-    given = (albedo, normal, depth, current, length, exposure, *scale)
-    chosen = choose_backend(backend, *given, differentiable=False, forms=_FORMS)
-    if chosen != "torch" and albedo.dtype in (torch.float32, torch.float64):
-        from mcdenoise.ops._fast import fused as fast
-
-        result: Tensor = fast.network_features(*given)
-        return result
     share = torch.ones_like(depth) if length is None else 1 / length
     near = normalized_depth(depth, *scale)
     return torch.cat([albedo, normal * 0.5 + 0.5, near, torch.log1p(current * exposure), share], 1)
 
 
+@op("numba")
 def gated_fusion(
     fine: Tensor,
     coarse: Tensor,
@@ -225,7 +188,6 @@ def gated_fusion(
     residual: Tensor | None = None,
     top: Tensor | None = None,
     logarithms: bool = False,
-    backend: Backend | None = None,
 ) -> Tensor:
     """Fuse two scales with an ``alpha`` that a convolution of both predicts.
 
@@ -243,7 +205,6 @@ def gated_fusion(
         top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result, which is then handed out as radiance:
             ``expm1`` of what is brought to the range from 0 to ``top``.
         logarithms: whether to take those of ``fine``, which then is radiance: ``log1p``.
-        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
         ``(B, C, H, W)``, at least float32. The fast form computes ``alpha`` in the dtype of the result, also under
@@ -254,13 +215,6 @@ def gated_fusion(
     """
     if logarithms and residual is not None:
         raise ValueError("residual: expected None where logarithms are taken, found a tensor")
-    given = (fine, coarse, weight, bias, residual, top)
-    chosen = choose_backend(backend, *given, differentiable=False, forms=_FORMS)
-    if chosen != "torch":
-        from mcdenoise.ops._fast import fused as fast
-
-        result: Tensor = fast.gated_fusion(*given, logarithms)
-        return result
     size = (fine.shape[-2], fine.shape[-1])
     detail = torch.log1p(fine) if logarithms else fine
     if residual is not None:
@@ -274,14 +228,8 @@ def gated_fusion(
     return fused if top is None else torch.expm1(torch.minimum(fused.clamp_min(0), top))
 
 
-def low_frequencies_of(
-    fine: Tensor,
-    coarse: Tensor,
-    top: Tensor,
-    exposure: Tensor | None = None,
-    *,
-    backend: Backend | None = None,
-) -> Tensor:
+@op("numba")
+def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor, exposure: Tensor | None = None) -> Tensor:
     """An image with the means of another in the place of its own, over blocks of 8x8 pixels.
 
     ``fine * (U m(coarse) + e) / (U m(fine) + e)`` with the means ``m`` of blocks, interpolated bilinearly by ``U``.
@@ -292,7 +240,6 @@ def low_frequencies_of(
         coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` of the same unit and dtype.
         top: ``(B, 1, 1, 1)`` largest logarithm of the exposed radiance of the result.
         exposure: ``(B, 1, 1, 1)`` factor that brings the radiance to units of a typical one; 1 by default.
-        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
 
     Returns:
         ``(B, C, H, W)`` radiance, at most ``expm1(top) / exposure``.
@@ -302,28 +249,18 @@ def low_frequencies_of(
         means, coarse = downsample(means), downsample(coarse)
     if exposure is not None:
         means, coarse, most = means * exposure, coarse * exposure, most / exposure
-    if choose_backend(backend, fine, means, coarse, most, differentiable=False, forms=_FORMS) != "torch":
-        from mcdenoise.ops._fast import fused as fast
-
-        result: Tensor = fast.low_frequencies_of(fine, means, coarse, most, _DARK)
-        return result
-    wide = F.interpolate(torch.cat([coarse, means], 1), scale_factor=BLOCK, mode="bilinear") + _DARK
+    wide = F.interpolate(torch.cat([coarse, means], 1), scale_factor=BLOCK, mode="bilinear") + DARK
     wanted, found = corner(wide, fine.shape[-2], fine.shape[-1]).chunk(2, 1)
     return torch.minimum(fine * (wanted / found), most)
 
 
-def softplus(x: Tensor, units: Sequence[float], *, backend: Backend | None = None) -> Tensor:
+@op("numba")
+def softplus(x: Tensor, units: Sequence[float]) -> Tensor:
     """``F.softplus(x)`` in units of its own for each channel, as contiguous planes of at least float32.
 
     Args:
         x: ``(B, C, H, W)`` of any layout, such as some channels of a network's prediction.
         units: factor of each channel of the result.
-        backend: see :func:`mcdenoise.ops._backend.choose_backend`.
     """
-    if choose_backend(backend, x, differentiable=False, forms=_FORMS) == "torch":
-        planes = F.softplus(x.to(accumulator_dtype(x.dtype)).contiguous())
-        return planes * planes.new_tensor(units).reshape(-1, 1, 1)
-    from mcdenoise.ops._fast import fused as fast
-
-    result: Tensor = fast.softplus(x, list(units))
-    return result
+    planes = F.softplus(x.to(accumulator_dtype(x.dtype)).contiguous())
+    return planes * planes.new_tensor(units).reshape(-1, 1, 1)

@@ -1,22 +1,22 @@
-"""The fast forms of motion and accumulation as torch operators, without derivatives.
+"""Motion and accumulation as torch operators, without derivatives.
 
-Nothing is trained through them, and pixel by pixel the taps of a history lie anywhere: there is nothing to vectorise,
-only forty passes over the image to save. So one pass does all that :class:`mcdenoise.history.History` asks of it, too.
+Pixel by pixel the taps of a history lie anywhere: there is nothing to vectorise, only forty passes over the image to
+save. So one pass does all that :func:`mcdenoise.ops._steps.history.blend` asks of it, too.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._fast._numba_filter import compiled, share_rows, source
-from mcdenoise.ops._fast._operator import custom_op
-from mcdenoise.ops.demodulation import NO_ALBEDO
-from mcdenoise.ops.temporal import LABEL_WEIGHT
+from mcdenoise.ops._constants import DEPTH_LIMIT, LABEL_WEIGHT, NO_ALBEDO, NORMAL_LIMIT_SQUARED, PLANE_LIMIT
+from mcdenoise.ops._numba._runtime import compiled, share_rows, source
+from mcdenoise.ops._operator import custom_op
+from mcdenoise.ops._surface import Surface, comparable
 
 # Pixels whose taps are held at a time: they stay in the first-level cache.
 _CHUNK = 128
@@ -72,6 +72,56 @@ def _motion(motion: Any, position: Any, matrices: Any, b: int, first: int, last:
             along[i] = (v + one) * high - down if in_front else infinite
 
 
+class Shorter(NamedTuple):
+    """Where a history is to be shorter, see :func:`mcdenoise.ops._steps.history.blend`.
+
+    Args:
+        recent_alpha: smallest weight of the current frame in a second, shorter history of the first channels.
+        albedo: ``(B, 3, H, W)``, which says where a mirror or glass is seen.
+        longest: the longest history of what is seen there while it moves, in frames.
+        still: what moves by no more does not move, in pixels.
+    """
+
+    recent_alpha: float = 1.0
+    albedo: Tensor | None = None
+    longest: float = math.inf
+    still: float = 0.0
+
+
+def accumulate(*arguments: Any) -> tuple[Tensor, Tensor]:
+    """See :func:`mcdenoise.ops.accumulate`."""
+    return blended(*arguments)[:2]
+
+
+def blended(
+    color: Tensor,
+    previous: Tensor,
+    previous_length: Tensor,
+    motion: Tensor | None,
+    surface: Surface | None,
+    previous_surface: Surface | None,
+    alpha_min: float,
+    rule: str,
+    position_limit: float | None,
+    normal_limit: float | None,
+    shorter: Shorter = Shorter(),  # noqa: B008
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As ``accumulate``, with a history that is shorter in places or channels; and how many pixels of a row have one.
+
+    Channels that ``previous`` has more than ``color`` are the second history of the first of them.
+    """
+    here, there = comparable(surface, previous_surface)
+    if position_limit is None:
+        position_limit = DEPTH_LIMIT if here.position is None else PLANE_LIMIT
+    if normal_limit is None:
+        normal_limit = NORMAL_LIMIT_SQUARED
+    settings = (alpha_min, rule == "bmfr", position_limit, normal_limit, *shorter)
+    result: tuple[Tensor, Tensor, Tensor] = _blend(
+        color, previous, previous_length, motion, list(here), list(there), *settings
+    )
+    return result
+
+
 @custom_op(
     "mcdenoise::accumulate",
     device_types="cpu",
@@ -79,7 +129,7 @@ def _motion(motion: Any, position: Any, matrices: Any, b: int, first: int, last:
     "Tensor?[] previous_surface, float alpha_min, bool bmfr, float position_limit, float normal_limit, "
     "float recent_alpha, Tensor? albedo, float longest, float still) -> (Tensor, Tensor, Tensor)",
 )
-def accumulate(
+def _blend(
     color: Tensor,
     previous: Tensor,
     previous_length: Tensor,
@@ -95,7 +145,7 @@ def accumulate(
     longest: float,
     still: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """See :func:`mcdenoise.ops.temporal.accumulate_numba`; the surfaces have the same buffers."""
+    """The surfaces have the same buffers."""
     dtype = torch.promote_types(color.dtype, torch.float32)
     accumulated = torch.empty(previous.shape, dtype=dtype)
     length = torch.empty(previous_length.shape, dtype=dtype)
@@ -119,7 +169,7 @@ def accumulate(
     return accumulated.to(color.dtype), length.to(previous_length.dtype), kept
 
 
-@accumulate.register_fake
+@_blend.register_fake
 def _(color: Tensor, previous: Tensor, previous_length: Tensor, *_: Any) -> tuple[Tensor, Tensor, Tensor]:
     kept = previous.new_empty((previous.shape[0], previous.shape[2]), dtype=torch.int64)
     return color.new_empty(previous.shape), previous_length.new_empty(previous_length.shape), kept

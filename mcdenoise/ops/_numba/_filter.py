@@ -8,33 +8,35 @@ Rows of all images wait in a ring as long as a window needs them, with their bor
 sums; kernels are read once, in whatever layout and precision they have. So no argument is copied as a whole, and the
 ``K*K`` weights exist for ``_CHUNK`` pixels at a time; the derivatives compute them once more. Rows are shared out among
 threads of our own, as many as torch uses: numba's would be a second OpenMP beside torch's.
-
-All its kernels are in this file: numba compiles them again when their own file changes, but not when another does.
 """
 
 from __future__ import annotations
 
-import functools
-import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
-from numba import types
-from numba.extending import overload
 from torch import Tensor
 
+from mcdenoise.ops._numba._runtime import (
+    Source,
+    add,
+    compiled,
+    copy_row,
+    exp,
+    load,
+    readable,
+    rounded,
+    share_rows,
+    source,
+)
 from mcdenoise.ops._window import BORDERS, Border, accumulator_dtype, kernel_size_of
 
 # Pixels whose weights are held at a time: 25 taps of 256 floats stay in the first-level cache.
 _CHUNK = 256
-# A thread of its own for fewer pixels costs more than it saves.
-_PIXELS_A_THREAD = 4096
 _SMALLEST = sys.float_info.min
 _ORDINARY = 1e-15
 
@@ -42,9 +44,6 @@ _ORDINARY = 1e-15
 _GUIDES = 4
 
 _REPLICATE, _ZEROS, _RENORMALIZE = range(len(BORDERS))
-
-# A tensor as numba sees it: its memory from the first element on, strides in elements, and number of channels.
-Source = tuple[Any, tuple[int, ...], int]
 
 
 class _Inputs(NamedTuple):
@@ -60,16 +59,6 @@ class _Inputs(NamedTuple):
     kernel_size: int
     log_domain: bool
     border: int
-
-
-def compiled(function: Callable[..., Any]) -> Any:
-    """``function`` compiled, once for all runs: beside this file or, failing that, in the user's cache folder."""
-    compiler = functools.partial(numba.njit, nogil=True, error_model="numpy", fastmath={"contract"})
-    try:
-        return compiler(cache=True)(function)
-    except RuntimeError:
-        # No such folder can be written to: compiled anew in every run.
-        return compiler()(function)
 
 
 def filtered(
@@ -118,7 +107,7 @@ def derivatives(
     of_distance = torch.empty((batch, 0 if distance_scale is None else 1, height, width), dtype=dtype)
     planes = [image, *(guides if of_guides else ())]
     scattered = torch.empty((batch, sum(plane.shape[1] for plane in planes), height, width), dtype=dtype)
-    slopes = torch.empty_like(kernel if of_kernel else kernel[:, :0], dtype=_readable(kernel, dtype).dtype)
+    slopes = torch.empty_like(kernel if of_kernel else kernel[:, :0], dtype=readable(kernel, dtype).dtype)
     if not image.numel():
         for result in (scattered, slopes, of_distance, *of_scales):
             result.zero_()
@@ -158,21 +147,6 @@ def _compute_dtype(image: Tensor, kernel: Tensor) -> torch.dtype:
     return accumulator_dtype(torch.promote_types(image.dtype, kernel.dtype))
 
 
-def _readable(tensor: Tensor, dtype: torch.dtype) -> Tensor:
-    """``tensor`` in a dtype that the kernels read: bfloat16 as it is, where sums are float32; else that of the sums."""
-    return tensor if tensor.dtype == torch.bfloat16 and dtype == torch.float32 else tensor.to(dtype)
-
-
-def source(tensor: Tensor) -> Source:
-    """Any layout is fine: strides go with the memory."""
-    strides = tensor.stride()
-    extent = 1 + sum((size - 1) * stride for size, stride in zip(tensor.shape, strides, strict=True))
-    memory = tensor.detach().as_strided((extent if tensor.numel() else 0,), (1,))
-    if memory.dtype == torch.bfloat16:
-        memory = memory.view(torch.uint16)
-    return memory.numpy(), strides, tensor.shape[1]
-
-
 def _inputs(
     dtype: torch.dtype,
     image: Tensor,
@@ -185,7 +159,7 @@ def _inputs(
 ) -> _Inputs:
     nothing = source(torch.empty((0, 0, 0, 0), dtype=dtype))
     return _Inputs(
-        source(_readable(kernel, dtype)),
+        source(readable(kernel, dtype)),
         source(image.to(dtype)),
         _filled_up([source(guide.to(dtype)) for guide in guides], nothing),
         _filled_up([source(scale.to(dtype)) for scale in scales], nothing),
@@ -202,30 +176,6 @@ def _filled_up(values: list[Any], nothing: Any) -> tuple[Any, ...]:
     return (*values, *[nothing] * (-len(values) % _GUIDES or (0 if values else _GUIDES)))
 
 
-def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
-    """``run(b, first, last)`` for all rows of all images of the batch, on as many threads as torch uses."""
-    batch, _, height, width = image.shape
-    rows = batch * height
-    threads = max(1, min(torch.get_num_threads(), rows, rows * width // _PIXELS_A_THREAD))
-
-    def share(number: int) -> None:
-        row, end = rows * number // threads, rows * (number + 1) // threads
-        while row < end:
-            b, first = divmod(row, height)
-            last = min(height, first + end - row)
-            run(b, first, last)
-            row += last - first
-
-    if threads == 1:
-        share(0)
-        return
-    with ThreadPoolExecutor(threads - 1) as pool:
-        others = [pool.submit(share, number) for number in range(1, threads)]
-        share(0)
-        for other in others:
-            other.result()
-
-
 @contextmanager
 def _denormals_flushed() -> Iterator[None]:
     """Numbers below the smallest normal one are 0 in this thread: small weights of small gradients take far longer."""
@@ -235,90 +185,6 @@ def _denormals_flushed() -> Iterator[None]:
         yield
     finally:
         torch.set_flush_denormal(already)
-
-
-def _load(value: Any) -> Any:
-    """A number of a source, in the dtype of the sums."""
-
-
-def _unchanged(value: Any) -> Any:
-    return value
-
-
-@overload(_load)
-def _load_overload(value: Any) -> Any:
-    if value != types.uint16:
-        return _unchanged
-
-    def from_bfloat16(value: Any) -> Any:
-        return np.uint32(np.uint32(value) << np.uint32(16)).view(np.float32)
-
-    return from_bfloat16
-
-
-def _rounded(value: Any, memory: Any) -> Any:
-    """A number as ``memory`` stores it."""
-
-
-@overload(_rounded)
-def _rounded_overload(value: Any, memory: Any) -> Any:
-    def unchanged(value: Any, memory: Any) -> Any:
-        return value
-
-    def to_bfloat16(value: Any, memory: Any) -> Any:
-        # To the nearest, of two equally near to the even one; a NaN must not carry over into an infinity.
-        bits = np.float32(value).view(np.uint32)
-        odd = np.uint32(np.uint32(bits >> np.uint32(16)) & np.uint32(1))
-        up = np.uint32(np.uint32(bits + np.uint32(0x7FFF)) + odd)
-        return np.uint16(np.uint32(up >> np.uint32(16))) if value == value else np.uint16(0x7FC0)
-
-    return to_bfloat16 if memory.dtype == types.uint16 else unchanged
-
-
-def _exp(value: Any) -> Any:
-    """``exp``, which LLVM vectorises for float32 in this form only."""
-
-
-def _math_exp(value: Any) -> Any:
-    return math.exp(value)
-
-
-@overload(_exp)
-def _exp_overload(value: Any) -> Any:
-    if value != types.float32:
-        return _math_exp
-    # Cephes' expf: exp(x) = 2^n exp(r) with r = x - n log(2) in two parts and a polynomial for exp(r). Adding and
-    # subtracting 1.5 * 2^23 rounds to the nearest whole number. Results below the smallest normal number are 0.
-    log2_e, high, low = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
-    magic, one, zero = np.float32(12582912.0), np.float32(1), np.float32(0)
-    least, most, infinity = np.float32(-87.0), np.float32(88.3), np.float32(np.inf)
-    c0, c1, c2 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
-    c3, c4, c5 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1), np.float32(5.0000001201e-1)
-    bias, mantissa = np.int32(127), np.int32(23)
-
-    def exp(value: Any) -> Any:
-        x = max(min(value, most), least)
-        n = (x * log2_e + magic) - magic
-        r = (x - n * high) - n * low
-        p = ((((c0 * r + c1) * r + c2) * r + c3) * r + c4) * r + c5
-        power = np.int32(np.int32(np.int32(n) + bias) << mantissa).view(np.float32)
-        result = (p * r * r + r + one) * power
-        # A comparison with a NaN is false, and the NaN stays.
-        return zero if value < least else infinity if value > most else result + (value - value)
-
-    return exp
-
-
-@compiled
-def _copy_row(row: Any, source: Any, start: int, stride: int) -> None:
-    memory = source[0]
-    if stride == 1:
-        values = memory[start : start + row.size]
-        for x in range(row.size):
-            row[x] = _load(values[x])
-    else:
-        for x in range(row.size):
-            row[x] = _load(memory[start + x * stride])
 
 
 @compiled
@@ -333,7 +199,7 @@ def _fetch(rows: Any, source: Any, b: int, y: int, height: int, radius: int, bor
             continue
         nearest = min(max(y, 0), height - 1)
         inner = row[radius : radius + width]
-        _copy_row(inner, source, b * strides[0] + c * strides[1] + nearest * strides[2], strides[3])
+        copy_row(inner, source, b * strides[0] + c * strides[1] + nearest * strides[2], strides[3])
         if border == _REPLICATE:
             row[:radius] = inner[0]
             row[radius + width :] = inner[width - 1]
@@ -359,10 +225,10 @@ def _read_taps(taps: Any, kernel: Any, b: int, y: int, x0: int, n: int) -> None:
         for x in range(n):
             values = memory[start + x * strides[3] : start + x * strides[3] + count]
             for t in range(count):
-                taps[t, x] = _load(values[t])
+                taps[t, x] = load(values[t])
     else:
         for t in range(count):
-            _copy_row(taps[t, :n], kernel, start + t * strides[1], strides[3])
+            copy_row(taps[t, :n], kernel, start + t * strides[1], strides[3])
 
 
 @compiled
@@ -374,11 +240,11 @@ def _write_taps(kernel: Any, taps: Any, b: int, y: int, x0: int, n: int) -> None
         for x in range(n):
             values = memory[start + x * strides[3] : start + x * strides[3] + count]
             for t in range(count):
-                values[t] = _rounded(taps[t, x], memory)
+                values[t] = rounded(taps[t, x], memory)
     else:
         for t in range(count):
             for x in range(n):
-                memory[start + t * strides[1] + x * strides[3]] = _rounded(taps[t, x], memory)
+                memory[start + t * strides[1] + x * strides[3]] = rounded(taps[t, x], memory)
 
 
 @compiled
@@ -465,7 +331,7 @@ def _weigh(
         inverse[:] = 0
         for t in range(taps):
             _exponential(weights[t, :n], top)
-            _add(inverse, weights[t, :n])
+            add(inverse, weights[t, :n])
     else:
         top[:] = 0
         inverse[:] = 0 if border == _RENORMALIZE else 1
@@ -473,7 +339,7 @@ def _weigh(
             _exponential(factors[t, :n], top)
             _multiply(weights[t, :n], factors[t, :n])
             if border == _RENORMALIZE:
-                _add(inverse, weights[t, :n])
+                add(inverse, weights[t, :n])
     # A plain 1 would make this a division in float64.
     one, zero = inverse.dtype.type(1), inverse.dtype.type(0)
     for x in range(n):
@@ -485,17 +351,17 @@ def _read_scales(falloff: Any, scales: Any, distance: Any, b: int, y: int, x0: i
     for g in range(len(scales)):
         if scales[g][2] > 0:
             strides = scales[g][1]
-            _copy_row(falloff[g, :n], scales[g], b * strides[0] + y * strides[2] + x0 * strides[3], strides[3])
+            copy_row(falloff[g, :n], scales[g], b * strides[0] + y * strides[2] + x0 * strides[3], strides[3])
     if distance[2] > 0:
         strides = distance[1]
         start = b * strides[0] + y * strides[2] + x0 * strides[3]
-        _copy_row(falloff[len(scales), :n], distance, start, strides[3])
+        copy_row(falloff[len(scales), :n], distance, start, strides[3])
 
 
 @compiled
 def _exponential(values: Any, offset: Any) -> None:
     for x in range(values.size):
-        values[x] = _exp(values[x] - offset[x])
+        values[x] = exp(values[x] - offset[x])
 
 
 @compiled
@@ -510,12 +376,6 @@ def _make_finite(values: Any) -> None:
 def _maximum(total: Any, values: Any) -> None:
     for x in range(total.size):
         total[x] = max(total[x], values[x])
-
-
-@compiled
-def _add(total: Any, values: Any) -> None:
-    for x in range(total.size):
-        total[x] += values[x]
 
 
 @compiled
@@ -609,7 +469,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
             strides = gradient[1]
             for c in range(channels):
                 start = b * strides[0] + c * strides[1] + y * strides[2] + x0 * strides[3]
-                _copy_row(upstream[c, :n], gradient, start, strides[3])
+                copy_row(upstream[c, :n], gradient, start, strides[3])
                 _multiply(upstream[c, :n], scale)
             # The slope of each weight; where weights are normalised, less what all of them share.
             shared[:] = 0
@@ -730,7 +590,7 @@ def _guide_slopes(
                     for x in range(n):
                         there[x] -= pull[x]
                 if first <= y < last:
-                    _add(sums[y % kernel_size, c, begin : begin + n], pull)
+                    add(sums[y % kernel_size, c, begin : begin + n], pull)
             channel += guides[g][2]
 
 

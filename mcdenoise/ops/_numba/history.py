@@ -12,10 +12,67 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._fast._numba_filter import _copy_row, compiled, share_rows, source
-from mcdenoise.ops._fast._operator import custom_op
-from mcdenoise.ops.demodulation import FLOOR, NO_ALBEDO
-from mcdenoise.ops.lag import SMALLEST
+from mcdenoise.ops._constants import (
+    BRIGHTER,
+    EVEN,
+    FLOOR,
+    LIGHT_WINDOW,
+    NO_ALBEDO,
+    RECENT_ALPHA,
+    RECENT_FRAMES,
+    SMALLEST_LAG,
+    STILL,
+)
+from mcdenoise.ops._history import Blended
+from mcdenoise.ops._numba._runtime import add, compiled, copy_row, share_rows, source
+from mcdenoise.ops._numba.temporal import Shorter, blended
+from mcdenoise.ops._operator import custom_op
+from mcdenoise.ops._surface import Surface
+
+
+def incoming(color: Tensor, albedo: Tensor | None, limit: float | Tensor, kernel_size: int, compared: bool) -> Tensor:
+    """See :func:`mcdenoise.ops._steps.history.incoming`."""
+    dtype = torch.promote_types(color.dtype, torch.float32)
+    if isinstance(limit, Tensor):
+        limits = limit.to(dtype).flatten()
+    else:
+        limits = color.new_full((len(color),), limit, dtype=dtype)
+    result: Tensor = _enter(color, albedo, limits, kernel_size, compared)
+    return result
+
+
+def lights(root: Tensor) -> Tensor:
+    """See :func:`mcdenoise.ops._steps.history.lights`."""
+    result: Tensor = _find_lights(root, EVEN, BRIGHTER, LIGHT_WINDOW)
+    return result
+
+
+def blend(
+    entering: Tensor,
+    previous: Tensor,
+    previous_length: Tensor,
+    motion: Tensor | None,
+    surface: Surface | None,
+    previous_surface: Surface | None,
+    alpha_min: float,
+    rule: str,
+    position_limit: float | None,
+    normal_limit: float | None,
+    albedo: Tensor | None,
+    specular_length: float,
+    lag_threshold: float,
+    lag_kernel_size: int,
+) -> Blended:
+    """See :func:`mcdenoise.ops._steps.history.blend`."""
+    recent_alpha = max(alpha_min, RECENT_ALPHA)
+    color, length, counts = blended(
+        *(entering, previous, previous_length, motion, surface, previous_surface),
+        *(alpha_min, rule, position_limit, normal_limit),
+        Shorter(recent_alpha, albedo, specular_length + 1, STILL),
+    )
+    if not math.isinf(lag_threshold):
+        _give_up_lag(color, length, entering, lag_threshold, lag_kernel_size, recent_alpha, RECENT_FRAMES)
+    return Blended(color, length, counts.sum(1) / max(length.shape[-2] * length.shape[-1], 1))
 
 
 @custom_op(
@@ -23,8 +80,8 @@ from mcdenoise.ops.lag import SMALLEST
     device_types="cpu",
     schema="(Tensor color, Tensor? albedo, Tensor limits, int kernel_size, bool roots) -> Tensor",
 )
-def incoming(color: Tensor, albedo: Tensor | None, limits: Tensor, kernel_size: int, roots: bool) -> Tensor:
-    """See :func:`mcdenoise.ops._steps.history.incoming`; with the limit of each image, in the dtype of the result."""
+def _enter(color: Tensor, albedo: Tensor | None, limits: Tensor, kernel_size: int, roots: bool) -> Tensor:
+    """With the limit of each image, in the dtype of the result."""
     dtype = limits.dtype
     batch, channels, height, width = color.shape
     out = torch.empty((batch, channels + 2 * roots, height, width), dtype=dtype)
@@ -36,7 +93,7 @@ def incoming(color: Tensor, albedo: Tensor | None, limits: Tensor, kernel_size: 
     return out
 
 
-@incoming.register_fake
+@_enter.register_fake
 def _(color: Tensor, albedo: Tensor | None, limits: Tensor, kernel_size: int, roots: bool) -> Tensor:
     batch, channels, height, width = color.shape
     return color.new_empty((batch, channels + 2 * roots, height, width), dtype=limits.dtype)
@@ -50,14 +107,14 @@ def _demodulate(
     channels, width = row.shape
     strides = color[1]
     for c in range(channels):
-        _copy_row(row[c], color, b * strides[0] + c * strides[1] + y * strides[2], strides[3])
+        copy_row(row[c], color, b * strides[0] + c * strides[1] + y * strides[2], strides[3])
     _, strides, tints = albedo
     if tints == 0:
         return
     most = divisor[channels]
     for c in range(channels):
         tint = divisor[c]
-        _copy_row(tint, albedo, b * strides[0] + c * strides[1] + y * strides[2], strides[3])
+        copy_row(tint, albedo, b * strides[0] + c * strides[1] + y * strides[2], strides[3])
         for x in range(width):
             most[x] = tint[x] if c == 0 else max(most[x], tint[x])
     one = row.dtype.type(1)
@@ -119,9 +176,9 @@ def _incoming(
                     sides, whole = beside[k, place], across[k, place]
                     for d in range(size):
                         if d != radius:
-                            _add(sides, light[k, place, d : d + width])
+                            add(sides, light[k, place, d : d + width])
                     whole[:] = light[k, place, radius : radius + width]
-                    _add(whole, sides)
+                    add(whole, sides)
         y = ahead - reach
         if y < first:
             continue
@@ -162,8 +219,8 @@ def _incoming(
     device_types="cpu",
     schema="(Tensor root, float even, float brighter, int window) -> Tensor",
 )
-def lights(root: Tensor, even: float, brighter: float, window: int) -> Tensor:
-    """See :func:`mcdenoise.ops._steps.history.lights`.
+def _find_lights(root: Tensor, even: float, brighter: float, window: int) -> Tensor:
+    """Of what a light is seen by.
 
     Args:
         root: ``(B, 1, H, W)``, float32 or float64.
@@ -178,7 +235,7 @@ def lights(root: Tensor, even: float, brighter: float, window: int) -> Tensor:
     return found
 
 
-@lights.register_fake
+@_find_lights.register_fake
 def _(root: Tensor, *_: Any) -> Tensor:
     return root.new_empty(root.shape)
 
@@ -196,7 +253,7 @@ def _lights(found: Any, root: Any, even: float, brighter: float, radius: int, b:
     for ahead in range(max(first - radius, 0), last + radius):
         if ahead < height:
             values, high, low = ring[ahead % size], brightest[ahead % size], darkest[ahead % size]
-            _copy_row(values, root, b * strides[0] + ahead * strides[2], strides[3])
+            copy_row(values, root, b * strides[0] + ahead * strides[2], strides[3])
             for x in range(2, width):
                 high[x] = max(values[x - 2], max(values[x - 1], values[x]))
                 low[x] = min(values[x - 2], min(values[x - 1], values[x]))
@@ -206,9 +263,9 @@ def _lights(found: Any, root: Any, even: float, brighter: float, radius: int, b:
         top, bottom = max(y - radius, 0), min(y + radius + 1, height)
         middle[:], total[:] = zero, zero
         for row in range(top, bottom):
-            _add(middle, ring[row % size])
+            add(middle, ring[row % size])
         for d in range(size):
-            _add(total, column[d : d + width])
+            add(total, column[d : d + width])
         here, out = ring[y % size], found[b, 0, y]
         for start in range(max(y - 2, 0), min(y + 1, height - 2)):
             r0, r1, r2 = start % size, (start + 1) % size, (start + 2) % size
@@ -229,7 +286,7 @@ def _lights(found: Any, root: Any, even: float, brighter: float, radius: int, b:
     schema="(Tensor(a!) past, Tensor(b!) length, Tensor color, float threshold, int kernel_size, float recent_alpha, "
     "float recent_frames) -> ()",
 )
-def give_up_lag(
+def _give_up_lag(
     past: Tensor,
     length: Tensor,
     color: Tensor,
@@ -253,7 +310,7 @@ def give_up_lag(
     # Of blocks of four pixels: the roots of recent past, frame and past, the variances of the first two's noise; then
     # the recent past without lag, and both shares.
     halves = past.new_empty((batch, 8, (height + 1) // 2, (width + 1) // 2))
-    settings = past.new_tensor([threshold, SMALLEST, recent_alpha, recent_frames]).numpy()
+    settings = past.new_tensor([threshold, SMALLEST_LAG, recent_alpha, recent_frames]).numpy()
     limits, alpha, frames = settings[:2], settings[2], settings[3]
     blocks, image, lengths, radius = halves.numpy(), past.numpy(), length.numpy(), kernel_size // 2
     share_rows(halves, lambda *rows: _halve(blocks, image, lengths, color.numpy(), frames, *rows))
@@ -261,7 +318,7 @@ def give_up_lag(
     share_rows(halves, lambda *rows: _find_lag(blocks, image, lengths, color.numpy(), *limits, alpha, radius, *rows))
 
 
-@give_up_lag.register_fake
+@_give_up_lag.register_fake
 def _(past: Tensor, *_: Any) -> None:
     return None
 
@@ -297,13 +354,13 @@ def _halve(
         for row in range(2 * y, 2 * y + count):
             length = lengths[b, 0, row]
             _variance(variance, past[b, 3, row], past[b, 4, row], length)
-            _add(rows[0, :width], past[b, 8, row])
-            _add(rows[1, :width], color[b, 3, row])
-            _add(rows[2, :width], past[b, 3, row])
-            _add(rows[3, :width], variance)
+            add(rows[0, :width], past[b, 8, row])
+            add(rows[1, :width], color[b, 3, row])
+            add(rows[2, :width], past[b, 3, row])
+            add(rows[3, :width], variance)
             for x in range(width):
                 variance[x] /= min(length[x], recent_frames)
-            _add(rows[4, :width], variance)
+            add(rows[4, :width], variance)
         if width % 2:
             for k in range(5):
                 rows[k, width] = rows[k, width - 1]
@@ -312,12 +369,6 @@ def _halve(
             part, block, pixels = number((0.5 if k < 3 else 0.125) / count), halves[b, k, y], rows[k]
             for x in range(columns):
                 block[x] = part * (pixels[2 * x] + pixels[2 * x + 1])
-
-
-@compiled
-def _add(total: Any, values: Any) -> None:
-    for x in range(total.size):
-        total[x] += values[x]
 
 
 @compiled
@@ -345,11 +396,11 @@ def _lag(
         for x in range(width):
             recents[x] += short[x]
             changes[x] += short[x] - long[x]
-        _add(noises, variance[row])
+        add(noises, variance[row])
     for d in range(2 * radius + 1):
-        _add(means, sums[0, d : d + width])
-        _add(differences, sums[1, d : d + width])
-        _add(errors, sums[2, d : d + width])
+        add(means, sums[0, d : d + width])
+        add(differences, sums[1, d : d + width])
+        add(errors, sums[2, d : d + width])
     square = threshold * threshold
     for x in range(width):
         inverse = one / number((bottom - top) * (min(x + radius + 1, width) - max(x - radius, 0)))

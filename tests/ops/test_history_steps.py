@@ -5,24 +5,39 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
-from plain_form import channels_last, every_other_column, slice_of_pixels, transposed
+from plain_form import by, channels_last, every_other_column, slice_of_pixels, transposed
 from torch import Tensor
 
-from mcdenoise.frame import Frame
-from mcdenoise.history import Accumulated, History
-from mcdenoise.ops import Accumulate, ClampFireflies, HistoryLag, Surface, clamp_fireflies, demodulate
-from mcdenoise.ops._fast import _numba_filter
-from mcdenoise.ops._fast import history as fast
-from mcdenoise.ops._fast.temporal import accumulate, motion_from_position
+from mcdenoise.ops import Surface, clamp_fireflies, demodulate, motion_from_position, use
+from mcdenoise.ops._numba import _runtime, temporal
+from mcdenoise.ops._numba import history as fast
 from mcdenoise.ops._steps import history as steps
 
 SIZE = (37, 23)
 FRAMES = 9
 BMFR = {"alpha_min": 0.2, "rule": "bmfr", "position_limit": 0.01, "normal_limit": 0.3}
+
+
+class Picture(NamedTuple):
+    color: Tensor
+    albedo: Tensor | None = None
+    normal: Tensor | None = None
+    depth: Tensor | None = None
+    position: Tensor | None = None
+    previous_position: Tensor | None = None
+    motion: Tensor | None = None
+    view_projection: Tensor | None = None
+
+
+class Past(NamedTuple):
+    color: Tensor
+    current: Tensor
+    length: Tensor
+    kept: Tensor
 
 
 @pytest.fixture(autouse=True)
@@ -42,7 +57,7 @@ def camera(shift: float) -> Tensor:
 
 def shot(
     *without: str, size: tuple[int, int] = SIZE, batch: int = 1, speed: float = 0.07, dtype: torch.dtype = torch.float64
-) -> list[Frame]:
+) -> list[Picture]:
     """A rough wall with a lamp before a sky, partly without albedo, seen in passing; left the light goes down."""
     g = torch.Generator().manual_seed(0)
     height, width = size
@@ -71,20 +86,60 @@ def shot(
             "view_projection": camera(x).expand(batch, 4, 4),
         }
         color = torch.where(lamp, 300.0, light * noise)
-        frame = Frame(color=color, **{name: value for name, value in buffers.items() if name not in without})
-        frames.append(frame.to(dtype))
+        given = {name: value.to(dtype) for name, value in buffers.items() if name not in without}
+        frames.append(Picture(color.to(dtype), **given))
     return frames
 
 
-def passed(frames: list[Frame], backend: Any, rule: dict[str, Any] | None = None, **settings: Any) -> list[Accumulated]:
-    history = History(Accumulate(**(rule or {}), backend=backend), **settings)
-    return [history.update(frame) for frame in frames]
+def passed(
+    frames: list[Picture],
+    backend: Any,
+    rule: dict[str, Any] | None = None,
+    *,
+    limit: float = 15.0,
+    window: int = 7,
+    specular_length: float = 2,
+    lag_threshold: float = 2.0,
+    lag_kernel_size: int = 5,
+    still: bool = False,
+) -> list[Past]:
+    """Every frame of a shot with its past."""
+    results: list[Past] = []
+    before, history, length = Surface(), torch.empty(0), torch.empty(0)
+    tests = lag_threshold < math.inf
+    for number, frame in enumerate(frames):
+        position = frame.position
+        # The camera looks along z.
+        depth = position[:, 2:] if frame.depth is None and position is not None else frame.depth
+        with use(backend):
+            entering = steps.incoming(frame.color, frame.albedo, limit, window, compared=tests)
+            seen = steps.lights(entering[:, steps.MEAN]) if tests else None
+            if number == 0:
+                history, length = steps.without_history(entering), torch.ones_like(entering[:, :1])
+                kept = torch.zeros(len(length))
+            else:
+                motion = frame.motion
+                past = position if frame.previous_position is None or position is None else frame.previous_position
+                if motion is None and past is not None and not still:
+                    camera = frames[number - 1].view_projection
+                    assert camera is not None
+                    motion = motion_from_position(past, camera)
+                history, length, kept = steps.blend(
+                    *(entering, history, length, motion, Surface(past, frame.normal, depth, seen), before),
+                    **(rule or {}),
+                    albedo=frame.albedo,
+                    specular_length=specular_length,
+                    lag_threshold=lag_threshold,
+                    lag_kernel_size=lag_kernel_size,
+                )
+        before = Surface(position, frame.normal, depth, seen)
+        results.append(Past(history[:, steps.COLOR].clone(), entering[:, steps.COLOR], length.clone(), kept))
+    return results
 
 
-def assert_same(found: list[Accumulated], expected: list[Accumulated], tolerance: float) -> None:
+def assert_same(found: list[Past], expected: list[Past], tolerance: float) -> None:
     for a, b in zip(found, expected, strict=True):
-        assert a.reset == b.reset
-        for image, plain in zip(a[:3], b[:3], strict=True):
+        for image, plain in zip(a, b, strict=True):
             assert image.dtype == plain.dtype
             torch.testing.assert_close(image, plain, rtol=tolerance, atol=tolerance * plain.abs().mean().item())
 
@@ -121,14 +176,14 @@ def test_the_past_is_that_of_the_plain_form(way: str, rule: dict[str, Any]) -> N
 @pytest.mark.parametrize(
     "settings",
     [
-        {"anti_lag": HistoryLag(math.inf)},
-        {"anti_lag": HistoryLag(0.1, 3)},
-        {"anti_lag": HistoryLag(1.0, 9)},
+        {"lag_threshold": math.inf},
+        {"lag_threshold": 0.1, "lag_kernel_size": 3},
+        {"lag_threshold": 1.0, "lag_kernel_size": 9},
         {"specular_length": 0},
         {"specular_length": math.inf},
-        {"fireflies": ClampFireflies(math.inf)},
-        {"fireflies": ClampFireflies(2.0, 3)},
-        {"fireflies": ClampFireflies(5.0, 11)},
+        {"limit": math.inf},
+        {"limit": 2.0, "window": 3},
+        {"limit": 5.0, "window": 11},
     ],
     ids=str,
 )
@@ -141,7 +196,7 @@ def test_settings(settings: dict[str, Any], rule: dict[str, Any]) -> None:
 @pytest.mark.parametrize("way", ["nothing", "motion"])
 def test_some_of_these_pasts_are_short(way: str) -> None:
     """Otherwise there would be nothing to compare."""
-    lagging, past = passed(WAYS[way], "torch", anti_lag=HistoryLag(math.inf))[-1], passed(WAYS[way], "torch")[-1]
+    lagging, past = passed(WAYS[way], "torch", lag_threshold=math.inf)[-1], passed(WAYS[way], "torch")[-1]
     assert 0.1 < (past.length < lagging.length).double().mean() < 0.9
     alike = passed(WAYS["motion"], "torch", specular_length=math.inf)[5]
     assert 0.05 < (passed(WAYS["motion"], "torch")[5].length < alike.length).double().mean() < 0.9
@@ -160,7 +215,7 @@ def test_other_dtypes(dtype: torch.dtype) -> None:
     found = passed(frames, "numba")
     assert found[-1].color.dtype == torch.float32
     # The plain form rounds what is demodulated, and what is clamped, to the dtype of the frame.
-    same = [frame.to(torch.float32) for frame in frames]
+    same = [Picture(*(None if image is None else image.float() for image in frame)) for frame in frames]
     assert_same(found, passed(same, "torch"), 1e-3)
 
 
@@ -168,49 +223,31 @@ def test_other_dtypes(dtype: torch.dtype) -> None:
 def test_layout_in_memory_and_threads_change_nothing(
     layout: Callable[[Tensor], Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_numba_filter, "_PIXELS_A_THREAD", 1)
+    monkeypatch.setattr(_runtime, "PIXELS_A_THREAD", 1)
     threads, expected = torch.get_num_threads(), passed(WAYS["two images"], "numba")
     laid_out = [
-        frame.replace(**{name: layout(image) for name, image in frame.items() if name != "view_projection"})
+        Picture(*(image if image is None or image.ndim < 4 else layout(image) for image in frame))
         for frame in WAYS["two images"]
     ]
     try:
         for count in (1, 2, 5):
             torch.set_num_threads(count)
             for a, b in zip(passed(laid_out, "numba"), expected, strict=True):
-                assert all(map(torch.equal, a[:3], b[:3]))
+                assert all(map(torch.equal, a, b))
     finally:
         torch.set_num_threads(threads)
-
-
-def test_a_cut_another_size_and_what_is_not_kept() -> None:
-    frames = WAYS["motion"]
-    turned = frames[3].replace(normal=-frames[3].normal)
-    mixed = [*frames[:3], turned, frames[4], shot("previous_position", size=(8, 9))[5], frames[6]]
-    expected = passed(mixed, "torch")
-    assert [past.reset for past in expected] == ["first frame", "", "", "cut", "cut", "size change", "size change"]
-    assert_same(passed(mixed, "numba"), expected, 1e-9)
-    histories = [History(Accumulate(backend=backend)) for backend in ("numba", "torch")]
-    for frame, keeps in zip(frames, [True, False, False, True, True, False, True, True, True], strict=True):
-        assert_same(*([history.update(frame, keeps=keeps)] for history in histories), 1e-9)
-
-
-def test_the_result_of_a_frame_is_not_changed_by_the_next() -> None:
-    history = History(Accumulate(backend="numba"))
-    first = history.update(WAYS["motion"][0])
-    before = [image.clone() for image in first[:3]]
-    for frame in WAYS["motion"][1:]:
-        history.update(frame)
-    assert all(map(torch.equal, first[:3], before))
 
 
 def test_frames_with_derivatives_take_the_plain_form() -> None:
     frames = shot("previous_position", size=(96, 96), dtype=torch.float32)[:3]
     color = frames[1].color.requires_grad_()
-    history = History()
-    for frame in frames:
-        past = history.update(frame)
-    gradient = torch.autograd.grad(past.color.sum(), color)[0]
+    entering = steps.incoming(color, frames[1].albedo)
+    history = steps.without_history(steps.incoming(frames[0].color, frames[0].albedo))
+    surface = Surface(frames[1].position, frames[1].normal, frames[1].depth)
+    blended = steps.blend(
+        entering, history, torch.ones_like(color[:, :1]), frames[1].motion, surface, surface, lag_threshold=2.0
+    )
+    gradient = torch.autograd.grad(blended.color.sum(), color)[0]
     assert gradient.isfinite().all()
     assert gradient.abs().max() > 0
     with pytest.raises(ValueError, match="found 'numba', which has no derivatives of this op"):
@@ -227,7 +264,7 @@ def test_what_enters_is_demodulated_and_clamped(limit: float, with_albedo: bool)
     given = frame.albedo if with_albedo else None
     for limits in (limit, torch.full((1, 1, 1, 1), limit)):
         for backend in ("numba", "torch"):
-            found = steps.incoming(frame.color, given, limits, 7, backend=backend)
+            found = by(backend, steps.incoming)(frame.color, given, limits, 7)
             assert_enters(found, expected)
 
 
@@ -240,7 +277,7 @@ def test_every_image_has_its_own_limit_of_fireflies() -> None:
     assert not torch.equal(alone[0], frame.color[:1])
     assert torch.equal(clamp_fireflies(frame.color, limit=limits), torch.cat(alone))
     for backend in ("numba", "torch"):
-        assert_enters(steps.incoming(frame.color, None, limits, 7, backend=backend), torch.cat(alone))
+        assert_enters(by(backend, steps.incoming)(frame.color, None, limits, 7), torch.cat(alone))
 
 
 def assert_enters(found: Tensor, expected: Tensor) -> None:
@@ -254,7 +291,7 @@ def test_any_exposure(scale: float) -> None:
     frames = shot("previous_position", dtype=torch.float32)
     expected = passed(frames, "numba")
     for past, dark in zip(
-        expected, passed([frame.replace(color=frame.color * scale) for frame in frames], "numba"), strict=True
+        expected, passed([frame._replace(color=frame.color * scale) for frame in frames], "numba"), strict=True
     ):
         torch.testing.assert_close(dark.color / scale, past.color, rtol=1e-3, atol=1e-3)
 
@@ -283,7 +320,7 @@ def test_lights(size: tuple[int, int]) -> None:
     assert expected.any() == (min(size) > 4)
     for strided in (root, transposed(root), every_other_column(root)):
         for backend in ("numba", "torch"):
-            assert torch.equal(steps.lights(strided, backend=backend), expected)
+            assert torch.equal(by(backend, steps.lights)(strided), expected)
 
 
 def step(
@@ -311,7 +348,7 @@ class Step(torch.nn.Module):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_step_is_traced_without_a_break() -> None:
-    frames = [frame.to(torch.float32) for frame in WAYS["two images"]]
+    frames = [Picture(*(None if image is None else image.float() for image in frame)) for frame in WAYS["two images"]]
     history = steps.without_history(steps.incoming(frames[3].color, frames[3].albedo))
     names = ("motion", "position", "normal", "depth")
     buffers = [getattr(frames[4], name) for name in names]
@@ -333,7 +370,7 @@ def test_pixels_that_found_their_surface_are_counted_image_by_image(backend: Any
     before = depth.clone()
     before[1, :, :3] = 5.0
     surfaces = (Surface(depth=depth), Surface(depth=before))
-    blended = steps.blend(color, color, depth, None, *surfaces, backend=backend)
+    blended = by(backend, steps.blend)(color, color, depth, None, *surfaces)
     torch.testing.assert_close(blended.kept, torch.tensor([1.0, 0.7]))
 
 
@@ -344,10 +381,10 @@ def test_they_are_what_their_schemas_say() -> None:
     surface = [frame.position, frame.normal, frame.depth, length.round()]
     blended = (image[0, :, :5], image[1], length, frame.motion, surface, surface, 0.1, False, 0.02, 0.5, 0.25)
     for operator, arguments in (
-        (fast.incoming, (frame.color, frame.albedo, length.new_full((1,), 30.0), 7, True)),
-        (motion_from_position, (frame.position, frame.view_projection)),
-        (accumulate, (*blended, frame.albedo, 3.0, 0.05)),
-        (fast.lights, (image[0, :, 3:4], 0.03, 1.2, 9)),
-        (fast.give_up_lag, (image[0], length, image[1, :, :5].contiguous(), 2.0, 5, 0.25, 7.0)),
+        (fast._enter, (frame.color, frame.albedo, length.new_full((1,), 30.0), 7, True)),
+        (temporal.motion_from_position, (frame.position, frame.view_projection)),
+        (temporal._blend, (*blended, frame.albedo, 3.0, 0.05)),
+        (fast._find_lights, (image[0, :, 3:4], 0.03, 1.2, 9)),
+        (fast._give_up_lag, (image[0], length, image[1, :, :5].contiguous(), 2.0, 5, 0.25, 7.0)),
     ):
         torch.library.opcheck(operator._overload, arguments, test_utils=("test_schema", "test_faketensor"))

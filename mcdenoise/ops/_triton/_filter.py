@@ -1,4 +1,4 @@
-"""The filter of :mod:`mcdenoise.ops._fast._numba_filter` and its derivatives, in Triton, for NVIDIA GPUs.
+"""The filter of :mod:`mcdenoise.ops._numba._filter` and its derivatives, in Triton, for NVIDIA GPUs.
 
 Checked with Triton's interpreter, and compiled for several generations of GPUs; not yet timed on a GPU.
 
@@ -19,8 +19,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from mcdenoise.ops._guides import guide_gradient
 from mcdenoise.ops._window import BORDERS, Border, accumulator_dtype, kernel_size_of, unpad
-from mcdenoise.ops.bilateral import guide_gradient
 
 # A pixel for each thread of four warps, a warp for each row: neighbours are near, and rows are read at once.
 _COLUMNS, _ROWS = 32, 4

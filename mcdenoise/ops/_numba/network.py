@@ -11,25 +11,40 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import types
-from numba.extending import overload
 from torch import Tensor
 
-from mcdenoise.ops._fast._numba_filter import (
-    _copy_row,
-    _exp,
-    _readable,
-    _rounded,
+from mcdenoise.ops._constants import BLOCK, DARK, FARTHEST, SHORTEST
+from mcdenoise.ops._numba._runtime import (
     compiled,
+    exp,
+    expm1,
+    log,
+    log1p,
+    read_row,
+    readable,
+    rounded,
     share_rows,
     source,
 )
-from mcdenoise.ops._fast._operator import custom_op
-from mcdenoise.ops._steps.network import BLOCK, FARTHEST, SHORTEST
+from mcdenoise.ops._numba.fusion import downsample
+from mcdenoise.ops._operator import custom_op
 from mcdenoise.ops._window import accumulator_dtype
 
 # Pixels whose channels are gathered at a time: they stay in the second-level cache.
 _CHUNK = 1024
+
+
+def _precision(image: Tensor) -> torch.dtype:
+    """Of a convolution's input."""
+    return torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else image.dtype
+
+
+def network_input(image: Tensor, features: Tensor, logarithms: bool) -> Any:
+    """See :func:`mcdenoise.ops._steps.network.network_input`."""
+    dtype = _precision(image)
+    if torch.float16 in (image.dtype, features.dtype, dtype):
+        return NotImplemented
+    return _network_input(image, features, logarithms, dtype)
 
 
 @custom_op(
@@ -37,18 +52,17 @@ _CHUNK = 1024
     device_types="cpu",
     schema="(Tensor image, Tensor features, bool logarithms, ScalarType dtype) -> Tensor",
 )
-def network_input(image: Tensor, features: Tensor, logarithms: bool, dtype: torch.dtype) -> Tensor:
-    """See :func:`mcdenoise.ops._steps.network.network_input`."""
+def _network_input(image: Tensor, features: Tensor, logarithms: bool, dtype: torch.dtype) -> Tensor:
     result = _empty_input(image, features, logarithms, dtype)
     if result.numel():
         sums = torch.promote_types(dtype, torch.float32)
-        arguments = (source(result), source(_readable(image, sums)), source(_readable(features, sums)))
+        arguments = (source(result), source(readable(image, sums)), source(readable(features, sums)))
         buffer = np.empty((result.shape[1], _CHUNK), torch.empty((), dtype=sums).numpy().dtype)
         share_rows(image, lambda *rows: _stack(*arguments, logarithms, np.empty_like(buffer), result.shape[3], *rows))
     return result
 
 
-@network_input.register_fake
+@_network_input.register_fake
 def _empty_input(image: Tensor, features: Tensor, _: bool, dtype: torch.dtype) -> Tensor:
     batch, channels, height, width = image.shape
     shape = (batch, channels + features.shape[1], height, width)
@@ -66,15 +80,35 @@ def _stack(
         for x0 in range(0, width, rows.shape[1]):
             n = min(rows.shape[1], width - x0)
             for c in range(own):
-                _read_row(rows[c, :n], image, b, c, y, x0)
+                read_row(rows[c, :n], image, b, c, y, x0)
                 if logarithms:
                     _to_logarithms(rows[c, :n], one)
             for c in range(own, channels):
-                _read_row(rows[c, :n], features, b, c - own, y, x0)
+                read_row(rows[c, :n], features, b, c - own, y, x0)
             for c in range(channels):
                 _round(bits[c, :n], rows[c])
             start = b * strides[0] + y * strides[2] + x0 * strides[3]
             _interleave(memory[start : start + n * channels], bits)
+
+
+def buffers_input(
+    image: Tensor,
+    albedo: Tensor,
+    normal: Tensor,
+    depth: Tensor,
+    current: Tensor,
+    length: Tensor | None,
+    exposure: Tensor,
+    scale: tuple[Tensor, Tensor],
+    logarithms: bool,
+    image_factor: Tensor | None,
+) -> Any:
+    """See :func:`mcdenoise.ops._steps.network.buffers_input`."""
+    dtype = _precision(image)
+    if torch.float16 in (image.dtype, albedo.dtype, dtype):
+        return NotImplemented
+    buffers = (albedo, normal, depth, current, length, exposure, *scale)
+    return _buffers_input(image, *buffers, image_factor, logarithms, dtype)
 
 
 @custom_op(
@@ -84,7 +118,7 @@ def _stack(
     "Tensor exposure, Tensor near, Tensor typical, Tensor? image_factor, bool logarithms, ScalarType dtype) "
     "-> Tensor",
 )
-def buffers_input(
+def _buffers_input(
     image: Tensor,
     albedo: Tensor,
     normal: Tensor,
@@ -98,14 +132,13 @@ def buffers_input(
     logarithms: bool,
     dtype: torch.dtype,
 ) -> Tensor:
-    """See :func:`mcdenoise.ops._steps.network.buffers_input`."""
     batch, _, height, width = image.shape
     result = torch.empty((batch, 14, height, width), dtype=dtype, memory_format=torch.channels_last)
     if result.numel():
         sums = torch.promote_types(dtype, torch.float32)
         nothing = source(torch.empty((0, 0, 0, 0), dtype=sums))
-        images = tuple(source(_readable(buffer, sums)) for buffer in (image, albedo, normal, depth, current))
-        lengths = nothing if length is None else source(_readable(length, sums))
+        images = tuple(source(readable(buffer, sums)) for buffer in (image, albedo, normal, depth, current))
+        lengths = nothing if length is None else source(readable(length, sums))
         factor = torch.ones_like(exposure) if image_factor is None else image_factor
         factors = torch.cat([each.to(sums).expand(batch, 1, 1, 1) for each in (exposure, near, typical, factor)], 1)
         buffer = np.empty((14, _CHUNK), factors.numpy().dtype)
@@ -114,7 +147,7 @@ def buffers_input(
     return result
 
 
-@buffers_input.register_fake
+@_buffers_input.register_fake
 def _(image: Tensor, *arguments: Any) -> Tensor:
     batch, _, height, width = image.shape
     shape = (batch, 14, height, width)
@@ -144,26 +177,26 @@ def _stack_buffers(
             n = min(rows.shape[1], width - x0)
             for c in range(3):
                 row = rows[c, :n]
-                _read_row(row, image, b, c, y, x0)
+                read_row(row, image, b, c, y, x0)
                 if logarithms:
                     _to_logarithms(row, factor)
                 else:
                     for x in range(n):
                         row[x] *= factor
-                _read_row(rows[3 + c, :n], albedo, b, c, y, x0)
+                read_row(rows[3 + c, :n], albedo, b, c, y, x0)
                 row = rows[6 + c, :n]
-                _read_row(row, normal, b, c, y, x0)
+                read_row(row, normal, b, c, y, x0)
                 for x in range(n):
                     row[x] = row[x] * half + half
                 row = rows[10 + c, :n]
-                _read_row(row, current, b, c, y, x0)
+                read_row(row, current, b, c, y, x0)
                 _to_logarithms(row, exposure)
             row = rows[9, :n]
-            _read_row(row, depth, b, 0, y, x0)
+            read_row(row, depth, b, 0, y, x0)
             _normalize(row, near, typical)
             row = rows[13, :n]
             if length[2]:
-                _read_row(row, length, b, 0, y, x0)
+                read_row(row, length, b, 0, y, x0)
                 for x in range(n):
                     row[x] = one / row[x]
             else:
@@ -174,13 +207,19 @@ def _stack_buffers(
             _interleave(memory[start : start + n * channels], bits)
 
 
+def network_guides(normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor]) -> Any:
+    """See :func:`mcdenoise.ops._steps.network.network_guides`."""
+    if normal.dtype not in (torch.float32, torch.float64):
+        return NotImplemented
+    return _network_guides(normal, depth, *scale)
+
+
 @custom_op(
     "mcdenoise::network_guides",
     device_types="cpu",
     schema="(Tensor normal, Tensor depth, Tensor near, Tensor typical) -> Tensor",
 )
-def network_guides(normal: Tensor, depth: Tensor, near: Tensor, typical: Tensor) -> Tensor:
-    """See :func:`mcdenoise.ops._steps.network.network_guides`."""
+def _network_guides(normal: Tensor, depth: Tensor, near: Tensor, typical: Tensor) -> Tensor:
     result = _empty_guides(normal)
     if result.numel():
         images = tuple(source(image.to(result.dtype)) for image in (normal, depth))
@@ -190,7 +229,7 @@ def network_guides(normal: Tensor, depth: Tensor, near: Tensor, typical: Tensor)
     return result
 
 
-@network_guides.register_fake
+@_network_guides.register_fake
 def _empty_guides(normal: Tensor, *_: Any) -> Tensor:
     return normal.new_empty((normal.shape[0], 4, *normal.shape[2:]))
 
@@ -202,23 +241,23 @@ def _guide(out: Any, normal: Any, depth: Any, scales: Any, b: int, first: int, l
     for y in range(first, last):
         for c in range(3):
             row = out[b, c, y]
-            _read_row(row, normal, b, c, y, 0)
+            read_row(row, normal, b, c, y, 0)
             for x in range(row.size):
                 row[x] = row[x] * half + half
-        _read_row(out[b, 3, y], depth, b, 0, y, 0)
+        read_row(out[b, 3, y], depth, b, 0, y, 0)
         _normalize(out[b, 3, y], near, typical)
 
 
 @compiled
 def _to_logarithms(values: Any, factor: Any) -> None:
     for x in range(values.size):
-        values[x] = _log1p(values[x] * factor)
+        values[x] = log1p(values[x] * factor)
 
 
 @compiled
 def _round(bits: Any, values: Any) -> None:
     for x in range(bits.size):
-        bits[x] = _rounded(values[x], bits)
+        bits[x] = rounded(values[x], bits)
 
 
 @compiled
@@ -232,11 +271,19 @@ def _interleave(pixels: Any, rows: Any) -> None:
             pixels[x * channels + c] = row[x]
 
 
-@compiled
-def _read_row(row: Any, image: Any, b: int, c: int, y: int, x0: int) -> None:
-    """A run of pixels of one channel."""
-    strides = image[1]
-    _copy_row(row, image, b * strides[0] + c * strides[1] + y * strides[2] + x0 * strides[3], strides[3])
+def network_features(
+    albedo: Tensor,
+    normal: Tensor,
+    depth: Tensor,
+    current: Tensor,
+    length: Tensor | None,
+    exposure: Tensor,
+    scale: tuple[Tensor, Tensor],
+) -> Any:
+    """See :func:`mcdenoise.ops._steps.network.network_features`."""
+    if albedo.dtype not in (torch.float32, torch.float64):
+        return NotImplemented
+    return _network_features(albedo, normal, depth, current, length, exposure, *scale)
 
 
 @custom_op(
@@ -245,7 +292,7 @@ def _read_row(row: Any, image: Any, b: int, c: int, y: int, x0: int) -> None:
     schema="(Tensor albedo, Tensor normal, Tensor depth, Tensor current, Tensor? length, Tensor exposure, "
     "Tensor near, Tensor typical) -> Tensor",
 )
-def network_features(
+def _network_features(
     albedo: Tensor,
     normal: Tensor,
     depth: Tensor,
@@ -255,7 +302,6 @@ def network_features(
     near: Tensor,
     typical: Tensor,
 ) -> Tensor:
-    """See :func:`mcdenoise.ops._steps.network.network_features`."""
     result = _empty_features(albedo)
     if result.numel():
         nothing = source(torch.empty((0, 0, 0, 0), dtype=result.dtype))
@@ -266,7 +312,7 @@ def network_features(
     return result
 
 
-@network_features.register_fake
+@_network_features.register_fake
 def _empty_features(albedo: Tensor, *_: Any) -> Tensor:
     return albedo.new_empty((albedo.shape[0], 11, *albedo.shape[2:]))
 
@@ -278,20 +324,20 @@ def _assemble(out: Any, images: Any, length: Any, factors: Any, b: int, first: i
     exposure, near, typical = factors[b]
     for y in range(first, last):
         for c in range(3):
-            _read_row(out[b, c, y], albedo, b, c, y, 0)
+            read_row(out[b, c, y], albedo, b, c, y, 0)
             row = out[b, 3 + c, y]
-            _read_row(row, normal, b, c, y, 0)
+            read_row(row, normal, b, c, y, 0)
             for x in range(row.size):
                 row[x] = row[x] * half + half
             row = out[b, 7 + c, y]
-            _read_row(row, current, b, c, y, 0)
+            read_row(row, current, b, c, y, 0)
             _to_logarithms(row, exposure)
         row = out[b, 6, y]
-        _read_row(row, depth, b, 0, y, 0)
+        read_row(row, depth, b, 0, y, 0)
         _normalize(row, near, typical)
         row = out[b, 10, y]
         if length[2]:
-            _read_row(row, length, b, 0, y, 0)
+            read_row(row, length, b, 0, y, 0)
             for x in range(row.size):
                 row[x] = one / row[x]
         else:
@@ -313,7 +359,7 @@ def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
     """See :func:`mcdenoise.ops._steps.network.depth_scale`."""
     batch, _, height, _ = depth.shape
     dtype = accumulator_dtype(depth.dtype)
-    image = source(_readable(depth, dtype))
+    image = source(readable(depth, dtype))
     rows = torch.zeros((2, batch, height), dtype=dtype)
     arguments = (rows.numpy(), image, depth.shape[3])
     share_rows(depth, lambda *share: _roots_of_rows(*arguments, *share))
@@ -341,7 +387,7 @@ def _roots_of_rows(out: Any, depth: Any, width: int, b: int, first: int, last: i
     zero, one, infinity = out.dtype.type(0), out.dtype.type(1), out.dtype.type(np.inf)
     shortest = out.dtype.type(SHORTEST)
     for y in range(first, last):
-        _read_row(row, depth, b, 0, y, 0)
+        read_row(row, depth, b, 0, y, 0)
         count = 0
         for x in range(width):
             known = (row[x] >= shortest) & (row[x] < infinity)
@@ -369,13 +415,13 @@ def _logarithms_of_rows(out: Any, depth: Any, width: int, near: Any, b: int, fir
     row, unit, zero = np.empty(width, out.dtype), near[b], out.dtype.type(0)
     infinity, shortest, farthest = out.dtype.type(np.inf), out.dtype.type(SHORTEST), out.dtype.type(FARTHEST)
     for y in range(first, last):
-        _read_row(row, depth, b, 0, y, 0)
+        read_row(row, depth, b, 0, y, 0)
         count = 0
         for x in range(width):
             in_units = max(row[x] / unit, shortest)
             known = (row[x] < infinity) & (in_units <= farthest)
             count += known
-            row[x] = _log(in_units) if known else zero
+            row[x] = log(in_units) if known else zero
         out[0, b, y] = _sum(row)
         out[1, b, y] = count
 
@@ -385,7 +431,7 @@ def softplus(x: Tensor, units: list[float]) -> Tensor:
     """See :func:`mcdenoise.ops._steps.network.softplus`."""
     result = _empty_planes(x)
     if result.numel():
-        arguments = (result.numpy(), source(_readable(x, result.dtype)), result.new_tensor(units).numpy())
+        arguments = (result.numpy(), source(readable(x, result.dtype)), result.new_tensor(units).numpy())
         share_rows(x, lambda *rows: _softplus_rows(*arguments, *rows))
     return result
 
@@ -400,42 +446,10 @@ def _softplus_rows(out: Any, x: Any, units: Any, b: int, first: int, last: int) 
     for y in range(first, last):
         for c in range(out.shape[1]):
             row = out[b, c, y]
-            _read_row(row, x, b, c, y, 0)
+            read_row(row, x, b, c, y, 0)
             zero = row.dtype.type(0)
             for i in range(row.size):
-                row[i] = units[c] * (max(row[i], zero) + _log1p(_exp(-abs(row[i]))))
-
-
-@custom_op("mcdenoise::downsample", device_types="cpu", schema="(Tensor image) -> Tensor")
-def downsample(image: Tensor) -> Tensor:
-    """See :func:`mcdenoise.ops.downsample`."""
-    result = _empty_half(image).to(accumulator_dtype(image.dtype))
-    if result.numel():
-        arguments = (result.numpy(), source(_readable(image, result.dtype)), *image.shape[2:])
-        share_rows(result, lambda *rows: _halve(*arguments, *rows))
-    return result.to(image.dtype)
-
-
-@downsample.register_fake
-def _empty_half(image: Tensor) -> Tensor:
-    batch, channels, height, width = image.shape
-    return image.new_empty((batch, channels, (height + 1) // 2, (width + 1) // 2))
-
-
-@compiled
-def _halve(out: Any, image: Any, height: int, width: int, b: int, first: int, last: int) -> None:
-    channels = out.shape[1]
-    upper, lower = np.empty(width, out.dtype), np.empty(width, out.dtype)
-    quarter, half = out.dtype.type(0.25), out.dtype.type(0.5)
-    for y in range(first, last):
-        for c in range(channels):
-            _read_row(upper, image, b, c, 2 * y, 0)
-            _read_row(lower, image, b, c, min(2 * y + 1, height - 1), 0)
-            row = out[b, c, y]
-            for x in range(width // 2):
-                row[x] = (upper[2 * x] + upper[2 * x + 1] + lower[2 * x] + lower[2 * x + 1]) * quarter
-            if width % 2:
-                row[width // 2] = (upper[width - 1] + lower[width - 1]) * half
+                row[i] = units[c] * (max(row[i], zero) + log1p(exp(-abs(row[i]))))
 
 
 @custom_op(
@@ -461,9 +475,9 @@ def gated_fusion(
         limits = torch.empty(0, dtype=dtype) if top is None else top.to(dtype).expand(len(fine), 1, 1, 1).flatten()
         arguments = (
             result.numpy(),
-            source(_readable(fine, dtype)),
-            nothing if residual is None else source(_readable(residual, dtype)),
-            source(_readable(coarse, dtype)),
+            source(readable(fine, dtype)),
+            nothing if residual is None else source(readable(residual, dtype)),
+            source(readable(coarse, dtype)),
             weight.detach().to(dtype).contiguous().numpy(),
             bias.detach().to(dtype).numpy(),
             limits.numpy(),
@@ -510,8 +524,8 @@ def _fuse(
             low = ring[y % 4, channels + c, 1 : width + 1]
             if logarithms:
                 # Of the means of radiance, which is read once more.
-                _read_row(above, fine, b, c, y, 0)
-                _read_row(below, fine, b, c, min(y + 1, height - 1), 0)
+                read_row(above, fine, b, c, y, 0)
+                read_row(below, fine, b, c, min(y + 1, height - 1), 0)
                 _mean_of_blocks(half, above, below)
                 _to_logarithms(half, dtype.type(1))
                 _double(change[c], half)
@@ -554,14 +568,14 @@ def _fetch_both(
         return
     for c in range(channels):
         row = rows[c, 1 : width + 1]
-        _read_row(row, fine, b, c, y, 0)
+        read_row(row, fine, b, c, y, 0)
         if logarithms:
             _to_logarithms(row, row.dtype.type(1))
         if residual[2]:
-            _read_row(buffer, residual, b, c, y, 0)
+            read_row(buffer, residual, b, c, y, 0)
             for x in range(width):
                 row[x] += buffer[x]
-        _read_row(half, coarse, b, c, y // 2, 0)
+        read_row(half, coarse, b, c, y // 2, 0)
         _double(rows[channels + c, 1 : width + 1], half)
 
 
@@ -596,7 +610,7 @@ def _correlate(total: Any, row: Any, weights: Any) -> None:
 def _sigmoid(values: Any) -> None:
     one = values.dtype.type(1)
     for x in range(values.size):
-        values[x] = one / (one + _exp(-values[x]))
+        values[x] = one / (one + exp(-values[x]))
 
 
 @compiled
@@ -611,7 +625,18 @@ def _to_radiance(values: Any, top: Any) -> None:
     for x in range(values.size):
         # A comparison with a NaN is false, and the NaN stays.
         value = zero if values[x] < zero else values[x]
-        values[x] = _expm1(top if value > top else value)
+        values[x] = expm1(top if value > top else value)
+
+
+def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor, exposure: Tensor | None) -> Tensor:
+    """See :func:`mcdenoise.ops._steps.network.low_frequencies_of`."""
+    means, most = downsample(fine), torch.expm1(top)
+    for _ in range(BLOCK.bit_length() - 2):
+        means, coarse = downsample(means), downsample(coarse)
+    if exposure is not None:
+        means, coarse, most = means * exposure, coarse * exposure, most / exposure
+    result: Tensor = _low_frequencies_of(fine, means, coarse, most, DARK)
+    return result
 
 
 @custom_op(
@@ -619,20 +644,20 @@ def _to_radiance(values: Any, top: Any) -> None:
     device_types="cpu",
     schema="(Tensor fine, Tensor means, Tensor coarse, Tensor most, float dark) -> Tensor",
 )
-def low_frequencies_of(fine: Tensor, means: Tensor, coarse: Tensor, most: Tensor, dark: float) -> Tensor:
-    """See :func:`mcdenoise.ops._steps.network.low_frequencies_of`; ``means`` and ``coarse`` are of blocks already."""
+def _low_frequencies_of(fine: Tensor, means: Tensor, coarse: Tensor, most: Tensor, dark: float) -> Tensor:
+    """With ``means`` and ``coarse`` of blocks."""
     result = _empty_planes(fine)
     dtype = result.dtype
     if result.numel():
         blocks = [image.to(dtype).contiguous().numpy() for image in (means, coarse)]
         limits = most.to(dtype).expand(len(fine), 1, 1, 1).flatten()
         settings = limits.new_tensor([dark]).numpy()
-        arguments = (result.numpy(), source(_readable(fine, dtype)), *blocks, limits.numpy(), *settings)
+        arguments = (result.numpy(), source(readable(fine, dtype)), *blocks, limits.numpy(), *settings)
         share_rows(fine, lambda *rows: _replace_means(*arguments, *rows))
     return result
 
 
-@low_frequencies_of.register_fake
+@_low_frequencies_of.register_fake
 def _(fine: Tensor, *_: Any) -> Tensor:
     return _empty_planes(fine)
 
@@ -656,7 +681,7 @@ def _replace_means(
                 found[x] = means[b, c, upper, x] + part * (means[b, c, lower, x] - means[b, c, upper, x]) + dark
                 wanted[x] = coarse[b, c, upper, x] + part * (coarse[b, c, lower, x] - coarse[b, c, upper, x]) + dark
             row, limit = out[b, c, y], most[b]
-            _read_row(row, fine, b, c, y, 0)
+            read_row(row, fine, b, c, y, 0)
             for x in range(width):
                 i, k, s = left[x], right[x], share[x]
                 new, old = wanted[i] + s * (wanted[k] - wanted[i]), found[i] + s * (found[k] - found[i])
@@ -671,90 +696,3 @@ def _between_blocks(pixel: int, blocks: int, zero: Any) -> Any:
         return 0, 0, zero
     first = doubled // (2 * BLOCK)
     return first, min(first + 1, blocks - 1), type(zero)((doubled - 2 * BLOCK * first) / (2 * BLOCK))
-
-
-def _log(value: Any) -> Any:
-    """``log`` of a positive number, which LLVM vectorises for float32 in this form only."""
-
-
-def _math_log(value: Any) -> Any:
-    return math.log(value)
-
-
-@overload(_log)
-def _log_overload(value: Any) -> Any:
-    if value != types.float32:
-        return _math_log
-    # Cephes' logf: of 2^n (1 + f) with 1 + f from sqrt(1/2) to sqrt(2), n log(2) in two parts and a polynomial.
-    c0, c1, c2 = np.float32(7.0376836292e-2), np.float32(-1.1514610310e-1), np.float32(1.1676998740e-1)
-    c3, c4, c5 = np.float32(-1.2420140846e-1), np.float32(1.4249322787e-1), np.float32(-1.6668057665e-1)
-    c6, c7, c8 = np.float32(2.0000714765e-1), np.float32(-2.4999993993e-1), np.float32(3.3333331174e-1)
-    high, low = np.float32(0.693359375), np.float32(-2.12194440e-4)
-    one, half, infinity = np.float32(1), np.float32(0.5), np.float32(np.inf)
-    bits_of_root, mantissa = np.int32(0x3F3504F3), np.int32(23)
-
-    def log(value: Any) -> Any:
-        bits = np.float32(value).view(np.int32)
-        n = np.int32(np.int32(bits - bits_of_root) >> mantissa)
-        f = np.int32(bits - np.int32(n << mantissa)).view(np.float32) - one
-        p = ((((((((c0 * f + c1) * f + c2) * f + c3) * f + c4) * f + c5) * f + c6) * f + c7) * f + c8) * f
-        exponent, square = np.float32(n), f * f
-        result = f + (p * square + (exponent * low - half * square)) + exponent * high
-        # Neither infinity nor a NaN is less.
-        return result if value < infinity else value
-
-    return log
-
-
-def _log1p(value: Any) -> Any:
-    """``log1p`` of what is not negative, which LLVM vectorises for float32 in this form only."""
-
-
-def _math_log1p(value: Any) -> Any:
-    return math.log1p(value)
-
-
-@overload(_log1p)
-def _log1p_overload(value: Any) -> Any:
-    if value != types.float32:
-        return _math_log1p
-    one, infinity = np.float32(1), np.float32(np.inf)
-
-    def log1p(value: Any) -> Any:
-        u = value + one
-        # With what the sum lost by rounding.
-        return _log(u) + (value - (u - one)) / u if value < infinity else value
-
-    return log1p
-
-
-def _expm1(value: Any) -> Any:
-    """``expm1``, which LLVM vectorises for float32 in this form only."""
-
-
-def _math_expm1(value: Any) -> Any:
-    return math.expm1(value)
-
-
-@overload(_expm1)
-def _expm1_overload(value: Any) -> Any:
-    if value != types.float32:
-        return _math_expm1
-    # exp(x) - 1 = 2^n (exp(r) - 1) + (2^n - 1), with the polynomial of Cephes' expf.
-    log2_e, high, low = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
-    magic, one, infinity = np.float32(12582912.0), np.float32(1), np.float32(np.inf)
-    least, most = np.float32(-87.0), np.float32(88.3)
-    c0, c1, c2 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
-    c3, c4, c5 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1), np.float32(5.0000001201e-1)
-    bias, mantissa = np.int32(127), np.int32(23)
-
-    def expm1(value: Any) -> Any:
-        x = max(min(value, most), least)
-        n = (x * log2_e + magic) - magic
-        r = (x - n * high) - n * low
-        p = (((((c0 * r + c1) * r + c2) * r + c3) * r + c4) * r + c5) * r * r + r
-        power = np.int32(np.int32(np.int32(n) + bias) << mantissa).view(np.float32)
-        result = p * power + (power - one)
-        return infinity if value > most else result + (value - value)
-
-    return expm1

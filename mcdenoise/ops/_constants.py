@@ -1,0 +1,35 @@
+"""Numbers that an op and its fast forms share; compiled kernels have them built in."""
+
+from __future__ import annotations
+
+# What a smooth dielectric reflects at normal incidence: on a darker surface most of the light is gloss, which no albedo
+# tints, and dividing it by a smaller number would give sparse, coloured, huge values.
+FLOOR = 4e-2
+# Below this there is no texture: less than half of the darkest 8-bit sRGB step above black.
+NO_ALBEDO = 1e-4
+
+# Of the depth: how far a tap's point may lie off the tangent plane, and (no positions) how far its depth may differ.
+PLANE_LIMIT = 0.02
+DEPTH_LIMIT = 0.1
+# Of two unit normals: |difference|^2 < 0.5 allows an angle of 41 degrees.
+NORMAL_LIMIT_SQUARED = 0.5
+# What taps of a pixel's own label must weigh to be enough; a tap in the pixel itself, which stands still, weighs 1.
+LABEL_WEIGHT = 1e-3
+
+# Of the local mean: a difference that no eye sees is no lag, however little noise there is.
+SMALLEST_LAG = 1e-3
+# Of a second, shorter history: the smallest weight of a frame, so that four frames have half the noise of one; and how
+# many equally weighted frames have its noise once it is full, (2 - alpha) / alpha.
+RECENT_ALPHA, RECENT_FRAMES = 0.25, 7
+# What moves by no more stands still, in pixels.
+STILL = 0.05
+# A light that is seen: how far the compressed radiance of 3x3 pixels may differ, and how bright they are beside the
+# mean of a window. Fewer pixels are often alike by chance where one of a few lights is drawn for each, and some of the
+# light is lost to that.
+EVEN, BRIGHTER, LIGHT_WINDOW = 0.03, 1.2, 9
+
+# Side of the blocks whose means are an image's low frequencies, in pixels. Below this fraction of a typical radiance
+# they are left alone.
+BLOCK, DARK = 8, 1e-3
+# The least number that a depth counts as, and how many near depths away the scene ends.
+SHORTEST, FARTHEST = 1e-30, 1e4

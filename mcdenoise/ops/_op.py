@@ -1,0 +1,155 @@
+"""The one dispatch of all ops: which form runs, and what it does to derivatives.
+
+An op is a page with a contract and a plain form in torch, which is the truth. ``@op`` takes a fast form of the same
+name from the file of the same name in ``_numba/`` or ``_triton/`` where one can run and pays. Such a form takes the
+arguments of the op, one after the other, and may return ``NotImplemented`` for what it was not written for.
+
+- Derivatives: a form ``NAME`` beside which there is ``NAME_gradients`` is an operator with derivatives; those are
+  differentiated again by way of the plain form. Any other form is chosen only where none are asked for.
+- Under ``torch.func``, ``vmap`` and forward mode the plain form runs: no compiled form has rules for them.
+- While a model is exported the plain form runs, so that what is exported needs neither numba nor Triton.
+- Autocast: plain forms consist of products and sums in place of matrix products, so that nothing is rounded but what a
+  contract says.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, ParamSpec, TypeVar, cast
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from mcdenoise.ops._backend import Backend, choose_backend
+from mcdenoise.ops._operator import Operator
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+# The fast forms that have been loaded, by backend and op.
+_forms: dict[tuple[str, str], Callable[..., Any]] = {}
+
+
+def op(
+    *backends: Backend, check: Callable[..., None] | None = None, differentiable: bool = False
+) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
+    """Make an op of its plain form.
+
+    Args:
+        backends: what it has a fast form in.
+        check: takes the arguments of the op, and raises for what its contract refuses; run before any form.
+        differentiable: whether the fast forms have derivatives.
+    """
+
+    def decorate(plain: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+        parameters = inspect.signature(plain).parameters.values()
+        names = [parameter.name for parameter in parameters]
+        defaults = {each.name: each.default for each in parameters if each.default is not inspect.Parameter.empty}
+        page = plain.__module__.rpartition(".")[2]
+
+        @functools.wraps(plain)
+        def dispatched(*arguments: _Arguments.args, **settings: _Arguments.kwargs) -> _Result:
+            if check is not None:
+                check(*arguments, **settings)
+            tensors = list(_tensors((*arguments, *settings.values())))
+            chosen = choose_backend(backends, tensors, differentiable=differentiable)
+            if chosen != "torch":
+                given = {**defaults, **dict(zip(names, arguments, strict=False)), **settings}
+                _load(chosen, page, plain)
+                result = _forms[chosen, plain.__name__](*[given[name] for name in names])
+                if result is not NotImplemented:
+                    return cast(_Result, result)
+            return plain(*arguments, **settings)
+
+        dispatched.plain = plain  # type: ignore[attr-defined]
+        dispatched.backends = ("torch", *backends)  # type: ignore[attr-defined]
+        return dispatched
+
+    return decorate
+
+
+def plain(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """The plain form of an op."""
+    form: Callable[_Arguments, _Result] = getattr(function, "plain", function)
+    return form
+
+
+def backends_of(function: Callable[..., Any]) -> tuple[Backend, ...]:
+    """What an op has forms in."""
+    found: tuple[Backend, ...] = getattr(function, "backends", ("torch",))
+    return found
+
+
+def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
+    for value in values:
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, (list, tuple)):
+            yield from _tensors(value)
+
+
+def _load(backend: str, page: str, plain: Callable[..., Any]) -> None:
+    """Make sure that the fast form of an op is there."""
+    name = plain.__name__
+    if (backend, name) in _forms:
+        return
+    module = importlib.import_module(f"mcdenoise.ops._{backend}.{page}")
+    form: Callable[..., Any] = getattr(module, name)
+    gradients = getattr(module, f"{name}_gradients", None)
+    if gradients is not None and isinstance(form, Operator):
+        _differentiate(form, gradients, plain)
+    _forms[backend, name] = form
+
+
+# What the compiler traces holds the form, not the way to it: this runs while it traces.
+_load._dynamo_marked_constant = True  # type: ignore[attr-defined]
+
+
+def _differentiate(operator: Operator, gradients: Callable[..., Any], plain: Callable[..., Any]) -> None:
+    """Give an operator its gradients, and gradients of those by way of the plain form."""
+
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        leaves, ctx.structure = pytree.tree_flatten(inputs)
+        ctx.others = [None if isinstance(leaf, Tensor) else leaf for leaf in leaves]
+        ctx.save_for_backward(*(leaf if isinstance(leaf, Tensor) else None for leaf in leaves))
+
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
+        tensors = ctx.saved_tensors
+        needed = ctx.needs_input_grad
+
+        def arguments(tensors: Sequence[Tensor | None]) -> Any:
+            leaves = [other if tensor is None else tensor for tensor, other in zip(tensors, ctx.others, strict=True)]
+            return pytree.tree_unflatten(leaves, ctx.structure)
+
+        if not torch.is_grad_enabled():
+            return tuple(gradients(needed, gradient, *arguments(tensors)))
+        names = inspect.signature(plain).parameters
+        wanted = _plain_gradients(
+            lambda *tensors: plain(**dict(zip(names, arguments(tensors), strict=True))),
+            tensors,
+            pytree.tree_leaves(needed),
+            gradient,
+        )
+        return tuple(pytree.tree_unflatten(wanted, ctx.structure))
+
+    operator.register_autograd(backward, setup_context=setup_context)
+
+
+def _plain_gradients(
+    function: Callable[..., Tensor], tensors: Sequence[Tensor | None], needed: Sequence[bool], gradient: Tensor
+) -> list[Tensor | None]:
+    """Of ``function(*tensors)``, times ``gradient``, for the tensors that need one; on record."""
+    with torch.enable_grad():
+        # An argument may be computed from another one, and only its direct part is asked for: hence the aliases.
+        aliases = [None if tensor is None else tensor.view_as(tensor) for tensor in tensors]
+        wanted = [alias for alias, need in zip(aliases, needed, strict=True) if alias is not None and need]
+        found = iter(
+            torch.autograd.grad(function(*aliases), wanted, gradient, create_graph=True, materialize_grads=True)
+        )
+        return [
+            next(found) if alias is not None and need else None for alias, need in zip(aliases, needed, strict=True)
+        ]

@@ -1,0 +1,265 @@
+"""The fused steps and the inputs to try each of them on: what :mod:`mcdenoise.ops._cases` is for the public ops.
+
+The reference of a step is its formula, written out in float64 of torch's primitives or of other references.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Generator, Tensor
+
+from mcdenoise.ops import _reference
+from mcdenoise.ops._case import Case, Inputs, Op, Rounding, normal, uniform
+from mcdenoise.ops._extreme_cases import history_rounding
+from mcdenoise.ops._steps import history, network
+
+Size = tuple[int, int, int]
+SIZES: tuple[tuple[str, Size], ...] = (
+    ("5x7", (1, 5, 7)),
+    ("batch of 2", (2, 3, 4)),
+    ("one row", (1, 1, 6)),
+    ("one pixel", (1, 1, 1)),
+)
+
+
+def _cases(
+    tensors: Callable[[Size, Generator], Inputs], differentiable: tuple[str, ...], /, **settings: Any
+) -> tuple[Case, ...]:
+    return tuple(Case(name, "ordinary", partial(tensors, size), differentiable, dict(settings)) for name, size in SIZES)
+
+
+def _positive(size: Size, g: Generator, channels: int = 3) -> Tensor:
+    return uniform(g, size[0], channels, *size[1:], low=0.1, high=3.0)
+
+
+def _factor(size: Size, g: Generator) -> Tensor:
+    return uniform(g, size[0], 1, 1, 1, low=0.5, high=2.0)
+
+
+def _depth(size: Size, g: Generator) -> Tensor:
+    depth = uniform(g, size[0], 1, *size[1:], low=1.0, high=20.0)
+    depth[..., 0, -1] = torch.inf
+    return depth
+
+
+def _buffers(size: Size, g: Generator) -> Inputs:
+    depth = _depth(size, g)
+    return {
+        "albedo": uniform(g, size[0], 3, *size[1:]),
+        "normal": normal(g, size[0], 3, *size[1:]),
+        "depth": depth,
+        "current": _positive(size, g),
+        "length": 1 + _positive(size, g, 1),
+        "exposure": _factor(size, g),
+        "scale": [_factor(size, g), _factor(size, g)],
+    }
+
+
+def _input(size: Size, g: Generator) -> Inputs:
+    return {"image": _positive(size, g), "features": normal(g, size[0], 11, *size[1:])}
+
+
+def _buffers_input(size: Size, g: Generator) -> Inputs:
+    return {"image": _positive(size, g), **_buffers(size, g)}
+
+
+def _guides(size: Size, g: Generator) -> Inputs:
+    return {name: value for name, value in _buffers(size, g).items() if name in ("normal", "depth", "scale")}
+
+
+def _half(size: Size) -> Size:
+    return size[0], (size[1] + 1) // 2, (size[2] + 1) // 2
+
+
+def _fusion(size: Size, g: Generator) -> Inputs:
+    return {
+        "fine": _positive(size, g),
+        "coarse": normal(g, size[0], 3, *_half(size)[1:]),
+        "weight": 0.3 * normal(g, 1, 6, 3, 3),
+        "bias": normal(g, 1),
+    }
+
+
+def _low(size: Size, g: Generator) -> Inputs:
+    return {"fine": _positive(size, g), "coarse": _positive(_half(size), g), "top": 20 * _factor(size, g)}
+
+
+def _planes(size: Size, g: Generator) -> Inputs:
+    return {"x": 5 * normal(g, size[0], 3, *size[1:])}
+
+
+def _entering(size: Size, g: Generator) -> Inputs:
+    color = _positive(size, g)
+    color[..., 0, 0] = 400
+    return {"color": color, "albedo": uniform(g, size[0], 3, *size[1:], low=0.1, high=0.9)}
+
+
+def _root(size: Size, g: Generator) -> Inputs:
+    root = _positive(size, g, 1)
+    root[..., : size[1] // 2 + 1, : size[2] // 2 + 1] = 6
+    return {"root": root}
+
+
+def _past(channels: tuple[int, int], size: Size, g: Generator) -> Inputs:
+    entering, previous = _positive((size[0], *size[1:]), g, channels[0]), _positive(size, g, channels[1])
+    return {
+        "entering": entering,
+        "previous": previous,
+        "previous_length": uniform(g, size[0], 1, *size[1:], low=1.0, high=6.0),
+        # Away from whole pixels, where the derivative jumps.
+        "motion": uniform(g, size[0], 2, *size[1:], low=0.1, high=0.4),
+    }
+
+
+def _network_input(image: Tensor, features: Tensor, *, logarithms: bool = True) -> Tensor:
+    image, features = image.double(), features.double()
+    return torch.cat([torch.log(1 + image) if logarithms else image, features], 1)
+
+
+def _normalized(depth: Tensor, scale: list[Tensor]) -> Tensor:
+    near, typical = (each.double() for each in scale)
+    depth = depth.double()
+    return torch.where(depth.isinf(), 1, 1 - 1 / (1 + torch.where(depth.isinf(), 1, depth) / (near * typical)))
+
+
+def _network_guides(normal: Tensor, depth: Tensor, scale: list[Tensor]) -> Tensor:
+    return torch.cat([(normal.double() + 1) / 2, _normalized(depth, scale)], 1)
+
+
+def _network_features(
+    albedo: Tensor,
+    normal: Tensor,
+    depth: Tensor,
+    current: Tensor,
+    length: Tensor,
+    exposure: Tensor,
+    scale: list[Tensor],
+) -> Tensor:
+    lit = torch.log(1 + current.double() * exposure.double())
+    return torch.cat([albedo.double(), _network_guides(normal, depth, scale), lit, 1 / length.double()], 1)
+
+
+def _of_buffers(image: Tensor, **buffers: Any) -> Tensor:
+    return _network_input(image, _network_features(**buffers))
+
+
+def _depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
+    near, typical = [], []
+    for image in depth.double():
+        hit = image[image.isfinite()]
+        near.append(torch.tensor(1.0) if not len(hit) else 1 / (1 / hit.sqrt()).mean() ** 2)
+        typical.append(torch.tensor(1.0) if not len(hit) else torch.exp(torch.log(hit).mean()) / near[-1])
+    return torch.stack(near).double().reshape(-1, 1, 1, 1), torch.stack(typical).double().reshape(-1, 1, 1, 1)
+
+
+def _gated_fusion(fine: Tensor, coarse: Tensor, weight: Tensor, bias: Tensor, *, logarithms: bool = False) -> Tensor:
+    fine, coarse, weight, bias = fine.double(), coarse.double(), weight.double(), bias.double()
+    size = (fine.shape[-2], fine.shape[-1])
+    wide, low = _reference.upsample(coarse, size), _reference.upsample(_reference.downsample(fine), size)
+    detail = torch.log(1 + fine) if logarithms else fine
+    alpha = torch.sigmoid(F.conv2d(torch.cat([detail, wide], 1), weight, bias, padding=1))
+    return detail + alpha * (wide - (torch.log(1 + low) if logarithms else low))
+
+
+def _low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor) -> Tensor:
+    fine, coarse, top = fine.double(), coarse.double(), top.double()
+    means = _reference.downsample(_reference.downsample(_reference.downsample(fine)))
+    wanted = _reference.downsample(_reference.downsample(coarse))
+    wide, found = (F.interpolate(each, scale_factor=8.0, mode="bilinear") + 1e-3 for each in (wanted, means))
+    rows, columns = slice(fine.shape[-2]), slice(fine.shape[-1])
+    return torch.minimum(fine * wide[..., rows, columns] / found[..., rows, columns], torch.exp(top) - 1)
+
+
+def _softplus(x: Tensor, *, units: tuple[float, ...]) -> Tensor:
+    x = x.double()
+    return torch.logaddexp(x, torch.zeros_like(x)) * torch.tensor(units, dtype=torch.float64).reshape(-1, 1, 1)
+
+
+def _incoming(color: Tensor, albedo: Tensor) -> Tensor:
+    clamped = _reference.clamp_fireflies(_reference.demodulate(color, albedo))
+    mean = clamped.mean(1, keepdim=True)
+    return torch.cat([clamped, mean**0.25, mean**0.5], 1)
+
+
+def _lights(root: Tensor) -> Tensor:
+    root = root.double()
+    batch, _, height, width = root.shape
+    found = torch.zeros_like(root)
+    for b in range(batch):
+        image = root[b, 0]
+        for top in range(height - 2):
+            for left in range(width - 2):
+                block = image[top : top + 3, left : left + 3]
+                if block.max() - block.min() <= 0.03 * block.max():
+                    found[b, 0, top : top + 3, left : left + 3] = 1
+        for y in range(height):
+            for x in range(width):
+                window = image[max(y - 4, 0) : y + 5, max(x - 4, 0) : x + 5]
+                found[b, 0, y, x] *= image[y, x] > 1.2 * window.mean()
+    return found
+
+
+def _blend(
+    entering: Tensor, previous: Tensor, previous_length: Tensor, motion: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    color, length = _reference.accumulate(entering, previous, previous_length, motion)
+    return color, length, (length > 1).double().mean((1, 2, 3))
+
+
+def _low_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
+    """A pixel's own mean cancels against it: what is left of ``w / f - f w / f^2`` may be small beside both."""
+    fine, coarse = inputs["fine"], inputs["coarse"]
+    assert isinstance(fine, Tensor)
+    assert isinstance(coarse, Tensor)
+    return Rounding(gradients={"fine": torch.full_like(fine, float(coarse.max() / fine.min()))})
+
+
+_BUFFERS = ("albedo", "normal", "current", "length", "exposure", "scale")
+
+# A frame is in float32 between its accumulation and a network's convolutions, and no step promises more.
+STEPS: tuple[Op, ...] = tuple(
+    replace(step, half=False)
+    for step in (
+        Op(network.network_input, _network_input, _cases(_input, ("image", "features"))),
+        Op(network.network_features, _network_features, _cases(_buffers, _BUFFERS)),
+        Op(network.buffers_input, _of_buffers, _cases(_buffers_input, ("image", *_BUFFERS))),
+        Op(network.network_guides, _network_guides, _cases(_guides, ("normal", "scale"))),
+        Op(network.depth_scale, _depth_scale, _cases(lambda size, g: {"depth": _depth(size, g)}, ())),
+        # Its weights are of no batch, as the tests of stability take all tensors to be.
+        Op(
+            network.gated_fusion,
+            _gated_fusion,
+            (
+                *_cases(_fusion, ("fine", "coarse", "weight", "bias")),
+                Case(
+                    "logarithms",
+                    "ordinary",
+                    partial(_fusion, (1, 3, 5)),
+                    ("fine", "coarse", "weight", "bias"),
+                    {"logarithms": True},
+                ),
+            ),
+        ),
+        Op(
+            network.low_frequencies_of,
+            _low_frequencies_of,
+            _cases(_low, ("fine", "coarse")),
+            rounding=_low_rounding,
+        ),
+        Op(network.softplus, _softplus, _cases(_planes, ("x",), units=(1.0, 10.0, 1000.0))),
+        Op(history.incoming, _incoming, _cases(_entering, ()), least_dtype=torch.float32),
+        Op(history.lights, _lights, _cases(_root, ())),
+        Op(
+            history.blend,
+            _blend,
+            _cases(partial(_past, (3, 3)), ("entering", "previous", "motion")),
+            rounding=lambda inputs, settings: history_rounding({**inputs, "color": inputs["entering"]}, settings),
+        ),
+    )
+)

@@ -1,0 +1,72 @@
+"""What tells one surface from another in two frames, and by which rule."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+from torch import Tensor
+
+from mcdenoise.ops._check import check_shapes
+
+Rule = Literal["relative", "bmfr"]
+
+
+class Surface(NamedTuple):
+    """What tells one surface from another; each ``(B, C, H, W)`` or ``None``.
+
+    Args:
+        position: ``(B, 3, H, W)`` world-space hit points, scene units.
+        normal: ``(B, 3, H, W)`` world-space unit normals.
+        depth: ``(B, 1, H, W)`` distance along the view axis, scene units, ``inf`` where nothing was hit.
+        label: ``(B, 1, H, W)`` a number for each kind of what is seen, such as the index of an object.
+    """
+
+    position: Tensor | None = None
+    normal: Tensor | None = None
+    depth: Tensor | None = None
+    label: Tensor | None = None
+
+
+def comparable(surface: Surface | None, previous: Surface | None) -> tuple[Surface, Surface]:
+    """Both surfaces, reduced to what both have and free of gradients."""
+    if surface is None or previous is None:
+        return Surface(), Surface()
+    pairs = [
+        (None, None) if a is None or b is None else (a.detach(), b.detach())
+        for a, b in zip(surface, previous, strict=True)
+    ]
+    return Surface(*(a for a, _ in pairs)), Surface(*(b for _, b in pairs))
+
+
+def check_surfaces(
+    surface: Surface | None,
+    previous: Surface | None,
+    like: Tensor,
+    rule: str,
+    position_limit: float | None,
+    normal_limit: float | None,
+) -> None:
+    """``TypeError`` or ``ValueError`` for surfaces that cannot be compared by a rule.
+
+    What a rule cannot do without must not be missing in silence: it would accept everything.
+    """
+    if rule not in ("relative", "bmfr"):
+        raise ValueError(f"rule: expected 'relative' or 'bmfr', found {rule!r}")
+    if surface is None or previous is None:
+        return
+    here, there = comparable(surface, previous)
+    for name, channels, a, b in zip(Surface._fields, (3, 3, 1, 1), here, there, strict=True):
+        if a is not None and b is not None:
+            check_shapes(
+                previous=(like, "B C H W"),
+                **{f"surface.{name}": (a, f"B {channels} H W"), f"previous_surface.{name}": (b, f"B {channels} H W")},
+            )
+    if rule == "bmfr":
+        for name, buffer in (("position", here.position), ("normal", here.normal)):
+            if buffer is None:
+                raise ValueError(f"surface.{name}: the rule 'bmfr' needs it in both frames, found None")
+        for name, limit in (("position_limit", position_limit), ("normal_limit", normal_limit)):
+            if limit is None:
+                raise ValueError(f"{name}: the rule 'bmfr' needs the scene's squared limit, found None")
+    elif here.position is not None and here.depth is None:
+        raise ValueError("surface.depth: the rule 'relative' needs it beside position in both frames, found None")

@@ -1,0 +1,56 @@
+"""What holds for every fused step: its formula, its derivatives, and its stability."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+import torch
+from plain_form import by
+from torch import Tensor
+
+from mcdenoise import gradcheck
+from mcdenoise.ops._case import Case, Op
+from mcdenoise.ops._op import backends_of
+from mcdenoise.ops._step_cases import STEPS
+from mcdenoise.ops._steps import history, network
+from mcdenoise.stability._ops import check_op, select
+
+every_step = pytest.mark.parametrize("step", STEPS, ids=lambda step: step.name)
+every_case = pytest.mark.parametrize(
+    ("step", "case"), [pytest.param(step, case, id=f"{step.name}-{case.name}") for step in STEPS for case in step.cases]
+)
+
+
+def test_every_step_is_in_the_table() -> None:
+    functions = [
+        function
+        for module in (history, network)
+        for name, function in inspect.getmembers(module, inspect.isfunction)
+        if not name.startswith("_") and function.__module__ == module.__name__
+    ]
+    assert {step.function for step in STEPS} == {each for each in functions if len(backends_of(each)) > 1}
+
+
+@every_case
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_is_its_formula(step: Op, case: Case, backend: str) -> None:
+    found = by(backend, step.function)(**case.inputs(), **case.settings)
+    expected = step.reference(**case.inputs(), **case.settings)
+    pairs = [(found, expected)] if isinstance(found, Tensor) else zip(found, expected, strict=True)
+    for result, formula in pairs:
+        # The plain softplus is the number itself from 20 on.
+        torch.testing.assert_close(result.double(), formula, rtol=1e-6 if result.ndim == 1 else 1e-9, atol=1e-12)
+
+
+@every_step
+def test_gradcheck(step: Op) -> None:
+    results = gradcheck.check([step.name])
+    assert not [f"{result.case}: {result.message}" for result in results if not result.passed]
+
+
+@pytest.mark.parametrize("step", [step for step in select() if step in STEPS], ids=lambda step: step.name)
+def test_stability(step: Op) -> None:
+    checks = list(check_op(step))
+    assert checks
+    assert not [str(check) for check in checks if not check.passed]
