@@ -441,7 +441,7 @@ def transforms() -> tuple[Case, ...]:
     return (
         *(case(*tried) for tried in _tried()),
         case("taps 64 pixels apart", size, radiance, step=64),
-        case("no noise at 1e4", size, _constant(1e4), noise=0.0),
+        case("radiance without noise", size, radiance, noise=0.0),
         case("noise of 1e15 times the light", size, radiance, noise=1e15),
         *(case(f"depth {value:g}", size, radiance, depth=_constant(value)) for value in (0.0, 1e-30, 1e30, math.inf)),
         case("depths of forty decades", size, radiance, depth=_forty_decades),
@@ -460,11 +460,11 @@ def transform_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     if not light.numel():
         return Rounding()
     limits = torch.finfo(torch.float32)
-    size = light.abs().amax() + variance.amax()
-    deviation = torch.sqrt(variance.amin() + 1e-20)
-    slopes = {"light": 1 / deviation, "variance": 1e4 / deviation.square(), "normal": 128.0, "depth": 1e4 / 1e-30}
+    size = float(light.abs().amax() + variance.amax())
+    least = float(variance.amin()) + 1e-20
+    slopes = {"light": least**-0.5, "variance": 1e4 / least, "normal": 128.0, "depth": 1e4 / 1e-30}
     lost = 25 * limits.tiny / limits.eps * size
-    return Rounding(gradients={name: torch.ones_like(tensors[name]) * lost * slopes[name] for name in tensors})
+    return Rounding(gradients={name: torch.full_like(tensors[name], lost * slopes[name]) for name in tensors})
 
 
 def luminances() -> tuple[Case, ...]:
