@@ -10,17 +10,33 @@ from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import show, write_json
 from mcdenoise.models import overview
 
+# What tells motion: a model takes whichever of it there is.
+_MOTION = {"motion", "position", "previous_position", "view_projection"}
+
 
 def models(json: Json = None) -> None:
-    """List the models with parameters, operations per pixel, and whether weights are shipped.
+    """List the models: what they need and use, weights, parameters, operations per pixel, and whether they learn.
+
+    A model uses `motion` if it takes motion, or positions with cameras, or whichever of them there is.
 
     Args:
         json: write the list to this file too.
     """
     entries = overview()
-    table = Table("model", "parameters", "kMAC per pixel", "weights", "what")
-    for entry in entries:
-        shipped = "shipped" if entry.pretrained else "-"
-        table.add_row(entry.name, f"{entry.parameters:,}", f"{entry.kmacs_per_pixel:.1f}", shipped, entry.description)
-    show(table)
+    columns = ("model", "needs", "uses", "weights", "parameters", "kMAC per pixel", "learns", "what")
+    for group in dict.fromkeys(entry.group for entry in entries):
+        table = Table(*columns, title=group, title_justify="left")
+        for entry in (each for each in entries if each.group == group):
+            motion = ["motion"] if _MOTION & set(entry.uses) else []
+            table.add_row(
+                entry.name,
+                ", ".join(entry.needs) or "-",
+                ", ".join([*(name for name in entry.uses if name not in _MOTION), *motion]) or "-",
+                "shipped" if entry.pretrained else "-",
+                f"{entry.parameters:,}" if entry.parameters else "-",
+                "-" if entry.kmacs_per_pixel is None else f"{entry.kmacs_per_pixel:.1f}",
+                "yes" if entry.trainable else "no",
+                entry.reason or entry.description,
+            )
+        show(table)
     write_json(json, [asdict(entry) for entry in entries])

@@ -1,8 +1,5 @@
 """The zoo: denoisers assembled from the operators, by name, and the wrappers that any method may wear."""
 
-import importlib
-import pkgutil
-
 from mcdenoise.models._adapter import FromBuffers, as_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._journal import Journal, Stage, listening, note, summarize, timed
@@ -19,11 +16,6 @@ from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Region, Tiled
 
 DEFAULT = "cascaded_v2"
-
-# A page registers its models when it is imported, so that a new one touches no other file.
-for _page in pkgutil.iter_modules(__path__, f"{__name__}."):
-    if not _page.name.rpartition(".")[2].startswith("_"):
-        importlib.import_module(_page.name)
 
 __all__ = [
     "DEFAULT",

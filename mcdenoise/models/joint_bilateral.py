@@ -88,7 +88,7 @@ class JointBilateral(nn.Module):
 
 
 def scale_of_depth(frame: Frame) -> dict[str, Tensor]:
-    """``depth_scale`` of a whole image as :func:`mcdenoise.nn.inputs.image_statistics` gives it; nothing without one."""
+    """``depth_scale`` of a whole image as of :func:`mcdenoise.nn.inputs.image_statistics`; nothing without a depth."""
     if frame.depth is None or "depth_scale" in frame.statistics:
         return {}
     return {"depth_scale": torch.cat(depth_scale(frame.depth), 1)}

@@ -3,6 +3,7 @@
 from mcdenoise.ops._backend import use
 from mcdenoise.ops._constants import NO_ALBEDO
 from mcdenoise.ops._surface import Surface
+from mcdenoise.ops.atrous import Atrous, atrous
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
 from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
@@ -10,11 +11,13 @@ from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
+from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
 from mcdenoise.ops.temporal import Accumulate, accumulate, motion_from_position, reproject
 
 __all__ = [
     "NO_ALBEDO",
     "Accumulate",
+    "Atrous",
     "ClampFireflies",
     "CrossBilateralFilter",
     "CrossBilateralWeights",
@@ -23,9 +26,11 @@ __all__ = [
     "KernelConv",
     "KernelSplat",
     "LaplacianFusion",
+    "MomentsVariance",
     "Remodulate",
     "Surface",
     "accumulate",
+    "atrous",
     "clamp_fireflies",
     "cross_bilateral_filter",
     "cross_bilateral_weights",
@@ -35,6 +40,8 @@ __all__ = [
     "kernel_conv",
     "kernel_splat",
     "laplacian_fusion",
+    "luminance_moments",
+    "moments_variance",
     "motion_from_position",
     "remodulate",
     "reproject",

@@ -24,6 +24,7 @@ from mcdenoise.ops._case import Case, Inputs, Kind, Op, map_tensors
 from mcdenoise.ops._case import normal as _normal
 from mcdenoise.ops._case import radiance as _radiance
 from mcdenoise.ops._case import uniform as _uniform
+from mcdenoise.ops.atrous import Atrous, atrous
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
 from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
@@ -31,6 +32,7 @@ from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
+from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
 from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
 
 __all__ = ["OPS", "Case", "Inputs", "Kind", "Op", "map_tensors"]
@@ -355,6 +357,127 @@ def _lag_cases() -> tuple[Case, ...]:
     )
 
 
+def _wall(g: Generator, batch: int, height: int, width: int) -> Inputs:
+    """Normals and depths of a rough surface: a tap's weights are neither 0 nor 1."""
+    toward = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64).reshape(1, 3, 1, 1)
+    normal = toward + 0.05 * _normal(g, batch, 3, height, width)
+    depth = _uniform(g, batch, 1, height, width, low=4, high=5)
+    return {"normal": normal / normal.norm(dim=1, keepdim=True), "depth": depth}
+
+
+def _bright(g: Generator, *shape: int) -> Tensor:
+    return 100 * _uniform(g, *shape)
+
+
+def _dim(g: Generator, *shape: int) -> Tensor:
+    return _radiance(g, *shape) / 100
+
+
+def _atrous_cases() -> tuple[Case, ...]:
+    everything = ("light", "variance", "normal", "depth")
+
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int],
+        inputs: tuple[str, ...] = everything,
+        draw: Callable[..., Tensor] = _uniform,
+        noise: float = 0.3,
+        smooth: tuple[str, ...] | None = None,
+        change: Callable[[dict[str, Any]], None] | None = None,
+        **settings: float,
+    ) -> Case:
+        batch, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            light = draw(g, batch, 3, height, width)
+            # Of the local mean, as that of a sample is.
+            spread = noise * _uniform(g, batch, 1, height, width, low=0.5) * light.mean(1, keepdim=True)
+            drawn: dict[str, Any] = {"light": light, "variance": spread.square(), **_wall(g, *size)}
+            if change is not None:
+                change(drawn)
+            return {argument: drawn[argument] for argument in inputs}
+
+        return Case(name, kind, tensors, inputs if smooth is None else smooth, settings)
+
+    def sky(drawn: dict[str, Any]) -> None:
+        drawn["depth"][..., 0, :] = torch.inf
+        drawn["normal"][..., 0, :] = 0
+
+    def corner(drawn: dict[str, Any]) -> None:
+        drawn["normal"][..., 2:] = torch.tensor([0.8, 0.0, 0.6], dtype=torch.float64).reshape(3, 1, 1)
+        drawn["depth"][..., 2:] *= 2
+
+    return (
+        case("2x3", "ordinary", (1, 2, 3)),
+        case("batch of 2", "ordinary", (2, 1, 2)),
+        case("light alone", "ordinary", (1, 2, 2), ("light", "variance")),
+        case("one row, normals", "ordinary", (1, 1, 3), ("light", "variance", "normal")),
+        case("one pixel", "ordinary", (1, 1, 1)),
+        case("taps 2 pixels apart", "ordinary", (1, 1, 4), step=2),
+        case("taps beyond the image", "ordinary", (1, 1, 2), step=16),
+        case("other tolerances", "ordinary", (1, 1, 3), sigma_z=3.0, sigma_n=8.0, sigma_l=1.0),
+        # No difference quotient is fine enough for deviations of 1e-4 beside those of 1e2.
+        case("fireflies", "stiff", (1, 1, 4), draw=_dim, smooth=("normal", "depth")),
+        case("little noise", "stiff", (1, 1, 3), draw=_bright, noise=0.02),
+        case("an edge", "stiff", (1, 1, 4), change=corner, smooth=("light", "variance")),
+        # Infinity has no difference quotient.
+        case("sky", "extreme", (1, 2, 2), change=sky, smooth=("light", "variance", "normal")),
+        # Half a difference quotient would be of a negative variance.
+        case("no noise", "extreme", (1, 1, 3), noise=0.0, smooth=("light", "normal", "depth")),
+    )
+
+
+def _luminance_cases() -> tuple[Case, ...]:
+    def case(
+        name: str, kind: Kind, batch: int, height: int, width: int, draw: Callable[..., Tensor] = _uniform
+    ) -> Case:
+        return Case(name, kind, lambda g: {"light": draw(g, batch, 3, height, width)}, ("light",))
+
+    return (
+        case("5x7", "ordinary", 1, 5, 7),
+        case("batch of 2", "ordinary", 2, 2, 3),
+        case("one row", "ordinary", 1, 1, 5),
+        case("one pixel", "ordinary", 1, 1, 1),
+        case("fireflies", "stiff", 1, 3, 4, _radiance),
+    )
+
+
+def _moments_cases() -> tuple[Case, ...]:
+    everything = ("moments", "normal", "depth")
+
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int],
+        kernel_size: int,
+        inputs: tuple[str, ...] = everything,
+        draw: Callable[..., Tensor] = _uniform,
+        spread: float = 1.0,
+        **settings: float,
+    ) -> Case:
+        batch, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            mean = draw(g, batch, 1, height, width)
+            more = spread * _uniform(g, batch, 1, height, width, low=0.5)
+            drawn: Inputs = {"moments": torch.cat([mean, mean.square() * (1 + more)], 1), **_wall(g, *size)}
+            return {argument: drawn[argument] for argument in inputs}
+
+        return Case(name, kind, tensors, inputs, {"kernel_size": kernel_size, **settings})
+
+    return (
+        case("the pixel alone", "ordinary", (1, 3, 4), 1, ("moments",)),
+        case("window of 3", "ordinary", (1, 2, 2), 3),
+        case("window of 7, batch of 2", "ordinary", (2, 1, 2), 7),
+        case("moments alone", "ordinary", (1, 2, 5), 3, ("moments",)),
+        case("one pixel", "ordinary", (1, 1, 1), 7),
+        case("one row, other tolerances", "ordinary", (1, 1, 6), 5, sigma_z=3.0, sigma_n=8.0),
+        case("fireflies", "stiff", (1, 2, 3), 3, draw=_dim),
+        case("moments that cancel", "stiff", (1, 3, 3), 1, ("moments",), spread=1e-3),
+    )
+
+
 def _camera(batch: int, eye_z: float, unit: float) -> Tensor:
     """Row-vector world-to-clip matrices that look along +z, with a little of everything in every entry."""
     matrix = torch.tensor(
@@ -587,6 +710,25 @@ OPS: tuple[Op, ...] = (
         rounding=extreme.firefly_rounding,
     ),
     Op(history_lag, _reference.history_lag, _lag_cases() + extreme.lags(), HistoryLag),
+    Op(
+        atrous,
+        _reference.atrous,
+        _atrous_cases() + extreme.transforms(),
+        Atrous,
+        rounding=extreme.transform_rounding,
+    ),
+    Op(
+        luminance_moments,
+        _reference.luminance_moments,
+        _luminance_cases() + extreme.luminances(),
+        least_dtype=torch.float32,
+    ),
+    Op(
+        moments_variance,
+        _reference.moments_variance,
+        _moments_cases() + extreme.moments(),
+        MomentsVariance,
+    ),
     Op(
         motion_from_position,
         _reference.motion_from_position,

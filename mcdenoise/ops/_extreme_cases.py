@@ -7,6 +7,7 @@ Where a case has ``differentiable`` inputs its numbers are scaled so that a diff
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -412,6 +413,88 @@ def lags() -> tuple[Case, ...]:
         case("1e30 and 1e-30", size, _constant(1e30), _constant(1e-30)),
         case("radiance without noise", size, radiance, noise=0.0),
         case("noise of 1e15 times the light", size, _constant(1.0), noise=1e15),
+    )
+
+
+def transforms() -> tuple[Case, ...]:
+    """Of ``atrous``."""
+
+    def case(
+        name: str,
+        size: tuple[int, int, int, int],
+        light: Draw,
+        normals: Draw = normal,
+        depth: Draw = lambda g, *shape: uniform(g, *shape, low=1, high=9),
+        noise: float = 0.5,
+        step: int = 1,
+    ) -> Case:
+        batch, _, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            image, shape = light(g, batch, 3, height, width), (batch, 1, height, width)
+            variance = (noise * image.abs().mean(1, keepdim=True)).square().clamp_max(1e34)
+            return {"light": image, "variance": variance, "normal": normals(g, *image.shape), "depth": depth(g, *shape)}
+
+        return Case(name, "extreme", tensors, (), {"step": step})
+
+    size = (1, 3, 3, 5)
+    return (
+        *(case(*tried) for tried in _tried()),
+        case("taps 64 pixels apart", size, radiance, step=64),
+        case("radiance without noise", size, radiance, noise=0.0),
+        case("noise of 1e15 times the light", size, radiance, noise=1e15),
+        *(case(f"depth {value:g}", size, radiance, depth=_constant(value)) for value in (0.0, 1e-30, 1e30, math.inf)),
+        case("depths of forty decades", size, radiance, depth=_forty_decades),
+        case("no normals", size, radiance, normals=_constant(0.0)),
+    )
+
+
+def transform_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
+    """A weight below the smallest number of float32 is 0, however large the number it would have been multiplied with.
+
+    Of these there are 25 a pixel. A derivative multiplies them with the range of the images, and with that of the
+    exponent in the argument, which is at most 1e4 where it counts.
+    """
+    tensors = {name: value for name, value in inputs.items() if isinstance(value, Tensor)}
+    light, variance = tensors["light"], tensors["variance"]
+    if not light.numel():
+        return Rounding()
+    limits = torch.finfo(torch.float32)
+    size = float(light.abs().amax() + variance.amax())
+    least = float(variance.amin()) + 1e-20
+    slopes = {"light": least**-0.5, "variance": 1e4 / least, "normal": 128.0, "depth": 1e4 / 1e-30}
+    lost = 25 * limits.tiny / limits.eps * size
+    return Rounding(gradients={name: torch.full_like(tensors[name], lost * slopes[name]) for name in tensors})
+
+
+def luminances() -> tuple[Case, ...]:
+    """Of ``luminance_moments``."""
+    return tuple(
+        Case(name, "extreme", lambda g, draw=draw, size=size: {"light": draw(g, size[0], 3, *size[2:])}, ())  # type: ignore[misc]
+        for name, size, draw in _tried()
+    )
+
+
+def moments() -> tuple[Case, ...]:
+    """Of ``moments_variance``."""
+
+    def case(name: str, size: tuple[int, int, int, int], draw: Draw, spread: float = 1.0, kernel_size: int = 3) -> Case:
+        batch, _, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            mean = draw(g, batch, 1, height, width)
+            return {
+                "moments": torch.cat([mean, mean.square() * (1 + spread)], 1),
+                "normal": normal(g, batch, 3, height, width),
+                "depth": uniform(g, batch, 1, height, width, low=1, high=9),
+            }
+
+        return Case(name, "extreme", tensors, (), {"kernel_size": kernel_size})
+
+    return (
+        *(case(*tried) for tried in _tried()),
+        case("moments that cancel altogether", (1, 3, 3, 5), radiance, 0.0, 1),
+        case("window of 21", (1, 3, 3, 4), radiance, kernel_size=21),
     )
 
 

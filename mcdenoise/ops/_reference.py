@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal, localcontext
 from typing import Any
 
@@ -195,6 +195,119 @@ def clamp_fireflies(image: Tensor, *, limit: float = 15.0, kernel_size: int = 7)
         for c in range(channels):
             out[b][c][y][x] = source[b][c][y][x] * factor
     return _tensor(out, image.shape)
+
+
+def atrous(
+    light: Tensor,
+    variance: Tensor,
+    normal: Tensor | None = None,
+    depth: Tensor | None = None,
+    *,
+    step: int = 1,
+    sigma_z: float = 1.0,
+    sigma_n: float = 128.0,
+    sigma_l: float = 4.0,
+) -> tuple[Tensor, Tensor]:
+    """SVGF, Eqs. 1 to 5: weighted means over 5x5 taps ``step`` pixels apart, of the light and of its variance."""
+    source, noise, bright = light.tolist(), variance.tolist(), luminance_moments(light).tolist()
+    out, out_noise = _zeros(light.shape), _zeros(variance.shape)
+    kernel = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
+    batch, _, height, width = light.shape
+    same_surface = _edge_stopping(normal, depth, sigma_z, sigma_n)
+    for b, y, x in itertools.product(range(batch), range(height), range(width)):
+        blurred = sum(
+            (2 - abs(dy)) * (2 - abs(dx)) / 16 * noise[b][0][_clamp(y + dy, height)][_clamp(x + dx, width)]
+            for dy, dx in itertools.product((-1, 0, 1), repeat=2)
+        )
+        deviation = sigma_l * math.sqrt(blurred + 1e-20)
+        taps = []
+        for i, j in itertools.product(range(5), repeat=2):
+            row, column = y + step * (i - 2), x + step * (j - 2)
+            if 0 <= row < height and 0 <= column < width:
+                w = same_surface(b, y, x, row, column)
+                w *= math.exp(-abs(bright[b][0][row][column] - bright[b][0][y][x]) / deviation)
+                taps.append((row, column, kernel[i] * kernel[j] * w))
+        total = sum(weight for _, _, weight in taps)
+        for c in range(3):
+            out[b][c][y][x] = sum(weight * source[b][c][row][column] for row, column, weight in taps) / total
+        out_noise[b][0][y][x] = sum(weight**2 * noise[b][0][row][column] for row, column, weight in taps) / total**2
+    return _tensor(out, light.shape), _tensor(out_noise, variance.shape)
+
+
+def luminance_moments(light: Tensor) -> Tensor:
+    """``(l, l^2)`` with ``l = 0.2126 R + 0.7152 G + 0.0722 B``."""
+    batch, _, height, width = light.shape
+    shape = (batch, 2, height, width)
+    source, out = light.tolist(), _zeros(shape)
+    for b, y, x in itertools.product(range(batch), range(height), range(width)):
+        red, green, blue = (source[b][c][y][x] for c in range(3))
+        out[b][0][y][x] = bright = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+        out[b][1][y][x] = bright * bright
+    return _tensor(out, shape)
+
+
+def moments_variance(
+    moments: Tensor,
+    normal: Tensor | None = None,
+    depth: Tensor | None = None,
+    *,
+    kernel_size: int = 1,
+    sigma_z: float = 1.0,
+    sigma_n: float = 128.0,
+) -> Tensor:
+    """``max(0, m2 - m1^2)`` of the weighted mean ``m`` of the moments over a window."""
+    batch, _, height, width = moments.shape
+    source, out = moments.tolist(), _zeros((batch, 1, height, width))
+    same_surface, radius = _edge_stopping(normal, depth, sigma_z, sigma_n), kernel_size // 2
+    for b, y, x in itertools.product(range(batch), range(height), range(width)):
+        taps = [
+            (row, column, same_surface(b, y, x, row, column))
+            for row in range(max(y - radius, 0), min(y + radius + 1, height))
+            for column in range(max(x - radius, 0), min(x + radius + 1, width))
+        ]
+        total = sum(weight for _, _, weight in taps)
+        first, second = (sum(w * source[b][c][row][column] for row, column, w in taps) / total for c in range(2))
+        out[b][0][y][x] = max(0.0, second - first * first)
+    return _tensor(out, (batch, 1, height, width))
+
+
+def _edge_stopping(
+    normal: Tensor | None, depth: Tensor | None, sigma_z: float, sigma_n: float
+) -> Callable[[int, int, int, int, int], float]:
+    """SVGF, Eqs. 3 and 4: ``w_z w_n`` of a pixel and a tap; background is like background."""
+    normals, depths = (None if image is None else image.tolist() for image in (normal, depth))
+
+    def slope(z: list[list[float]], y: int, x: int, dy: int, dx: int) -> float:
+        steps = [math.inf]
+        for start in (-1, 0):
+            ends = [(y + (start + 1) * dy, x + (start + 1) * dx), (y + start * dy, x + start * dx)]
+            if all(0 <= row < len(z) and 0 <= column < len(z[0]) for row, column in ends):
+                after, before = (z[row][column] for row, column in ends)
+                if math.isfinite(after) and math.isfinite(before):
+                    steps.append(after - before)
+        smallest = min(steps, key=abs)
+        return 0.0 if math.isinf(smallest) else smallest
+
+    def weight(b: int, y: int, x: int, row: int, column: int) -> float:
+        result = 1.0
+        if depths is not None:
+            z = depths[b][0]
+            here, there = z[y][x], z[row][column]
+            if math.isfinite(here) != math.isfinite(there):
+                return 0.0
+            if math.isfinite(here):
+                along = slope(z, y, x, 0, 1) * (column - x) + slope(z, y, x, 1, 0) * (row - y)
+                result *= math.exp(-abs(there - here) / (sigma_z * abs(along) + 1e-3 * here + 1e-30))
+        if normals is not None:
+            squared = sum((channel[row][column] - channel[y][x]) ** 2 for channel in normals[b])
+            result *= max(0.0, 1 - squared / 2) ** sigma_n
+        return result
+
+    return weight
+
+
+def _clamp(place: int, size: int) -> int:
+    return min(max(place, 0), size - 1)
 
 
 def history_lag(

@@ -1,0 +1,157 @@
+"""SVGF, a filter without weights that follows the variance of the light.
+
+Schied et al. 2017, "Spatiotemporal Variance-Guided Filtering: Real-Time Reconstruction for Path-Traced Global
+Illumination", High Performance Graphics. What the paper leaves open: the epsilons of its edge-stopping functions
+(:func:`mcdenoise.ops.atrous`), the test of surfaces (that of :func:`mcdenoise.ops.reproject`), and how a history
+begins: with an average, ``alpha = 1 / n`` until that is less than ``alpha``. The authors' published code, not the
+paper, counts the spatial estimate of the variance ``4 / n`` times at a history of ``n`` frames. Direct and indirect
+light are one here, and there is no antialiasing afterwards.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import MOTION, Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._journal import journal, timed
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.accumulated import motion_to_previous, surface_before
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.ops import Surface, accumulate, atrous, luminance_moments, moments_variance
+
+# With fewer frames than these, moments in time say little.
+_FEW_FRAMES, _WINDOW = 4, 7
+# Brighter light counts as this in the moments: float32 holds the square.
+_BRIGHTEST = 1e18
+
+
+class History(NamedTuple):
+    """What is kept of a shot.
+
+    Args:
+        light: ``(B, 3, H, W)`` accumulated and filtered once.
+        moments: ``(B, 2, H, W)`` of the luminance, accumulated.
+        length: ``(B, 1, H, W)`` in frames.
+        surface: what was seen.
+        view_projection: ``(B, 4, 4)`` by which camera.
+    """
+
+    light: Tensor
+    moments: Tensor
+    length: Tensor
+    surface: Surface
+    view_projection: Tensor | None
+
+
+class Svgf(nn.Module):
+    """Accumulates light and its moments, and filters it as far as its variance asks for.
+
+    Args:
+        alpha: smallest weight of the current frame, of light and of moments, in (0, 1].
+        levels: of the a-trous transform, whose taps lie 1, 2, 4, ... pixels apart.
+        sigma_z: see :func:`mcdenoise.ops.atrous`.
+        sigma_n: likewise.
+        sigma_l: likewise.
+
+    Raises:
+        InputError: a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        *,
+        alpha: float = 0.2,
+        levels: int = 5,
+        sigma_z: float = 1.0,
+        sigma_n: float = 128.0,
+        sigma_l: float = 4.0,
+    ) -> None:
+        super().__init__()
+        if not 0 < alpha <= 1:
+            raise InputError(f"alpha: expected in (0, 1], found {alpha}")
+        if levels < 1:
+            raise InputError(f"levels: expected at least 1, found {levels}")
+        for name, sigma, least in (("sigma_z", sigma_z, 0), ("sigma_n", sigma_n, 1), ("sigma_l", sigma_l, 0)):
+            if not max(sigma, 1e-30) == sigma >= least:
+                raise InputError(f"{name}: expected a positive number of at least {least}, found {sigma}")
+        self.alpha, self.levels = alpha, levels
+        self.sigma_z, self.sigma_n, self.sigma_l = sigma_z, sigma_n, sigma_l
+
+    @property
+    def needs(self) -> Needs:
+        """Normals and depths, at which it stops; whatever tells motion is of use."""
+        return Needs(frozenset({"color", "normal", "depth"}), MOTION | {"view_projection"}, trainable=False)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        history: History | None = state
+        normal, depth = frame.normal, frame.depth
+        with timed("accumulate", frame.color.device):
+            light, moments, length = self._accumulate(frame, history)
+            # Sec. 4.2: the variance, from neighbours where there are few frames.
+            few = moments_variance(moments, normal, depth, kernel_size=_WINDOW) * (_FEW_FRAMES / length)
+            variance = torch.where(length < _FEW_FRAMES, few, moments_variance(moments))
+        filtered, kept = light, light
+        with timed("filter", frame.color.device):
+            for level in range(self.levels):
+                # Eqs. 1 and 2.
+                filtered, variance = atrous(
+                    filtered,
+                    variance,
+                    normal,
+                    depth,
+                    step=1 << level,
+                    sigma_z=self.sigma_z,
+                    sigma_n=self.sigma_n,
+                    sigma_l=self.sigma_l,
+                )
+                # Sec. 4.3: the first level feeds the history.
+                kept = filtered if level == 0 else kept
+        surface = Surface(frame.position, normal, depth)
+        after = History(kept, moments, length, surface, frame.view_projection)
+        return Output(filtered, {"accumulated": light}), after
+
+    def _accumulate(self, frame: Frame, history: History | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Sec. 4.1: light, moments and length with the history, where there is one."""
+        light = frame.color
+        entering = torch.cat([light, luminance_moments(light.clamp_max(_BRIGHTEST)).to(light.dtype)], 1)
+        reset, motion = "first frame", None
+        if history is not None:
+            motion = motion_to_previous(frame, history.view_projection)
+            alike = history.length.shape == light[:, :1].shape and history.length.device == light.device
+            reset = "size change" if not alike else "" if motion is not None else "no motion"
+        if (found := journal()) is not None:
+            found.reset = reset
+        if reset or history is None:
+            return light, entering[:, 3:], torch.ones_like(light[:, :1])
+        both, length = accumulate(
+            entering,
+            torch.cat([history.light, history.moments], 1),
+            history.length,
+            motion,
+            surface_before(frame),
+            history.surface,
+            alpha_min=self.alpha,
+        )
+        return both[:, :3], both[:, 3:], length
+
+
+@register_model("svgf")
+def svgf(
+    *, alpha: float = 0.2, levels: int = 5, sigma_z: float = 1.0, sigma_n: float = 128.0, sigma_l: float = 4.0
+) -> Model:
+    """Spatiotemporal variance-guided filtering of Schied et al. 2017, on demodulated light.
+
+    Args:
+        alpha: see :class:`Svgf`.
+        levels: likewise.
+        sigma_z: see :func:`mcdenoise.ops.atrous`.
+        sigma_n: likewise.
+        sigma_l: likewise.
+    """
+    return Demodulated(Svgf(alpha=alpha, levels=levels, sigma_z=sigma_z, sigma_n=sigma_n, sigma_l=sigma_l))

@@ -1,0 +1,140 @@
+"""One level of the edge-avoiding a-trous wavelet transform, with the edge-stopping functions of SVGF."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, bounded_quotient, check_sigmas, edge_stopping, layouts
+from mcdenoise.ops._window import accumulator_dtype, offsets, pad, shifted
+from mcdenoise.ops.moments import luminance
+
+SIGMA_L = 4.0
+# h of Eq. 1 and the Gaussian of Eq. 5, each along one axis.
+_KERNEL, _GAUSSIAN = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16), (1 / 4, 1 / 2, 1 / 4)
+# What stands for no deviation: the paper's epsilon of Eq. 5, which it leaves open.
+_LEAST_DEVIATION = 1e-10
+
+
+def atrous(
+    light: Tensor,
+    variance: Tensor,
+    normal: Tensor | None = None,
+    depth: Tensor | None = None,
+    *,
+    step: int = 1,
+    sigma_z: float = SIGMA_Z,
+    sigma_n: float = SIGMA_N,
+    sigma_l: float = SIGMA_L,
+) -> tuple[Tensor, Tensor]:
+    """Filter light by 5x5 taps that lie ``step`` pixels apart and stop at edges, and its variance along with it.
+
+    With the kernel ``h = (1, 4, 6, 4, 1) / 16`` along each axis and the sums over the taps ``q`` inside the image,
+
+    - ``out[p] = sum h w light[q] / sum h w`` (Eq. 1) and ``sum (h w)^2 variance[q] / (sum h w)^2`` (Eq. 2),
+    - ``w = w_z w_n w_l``,
+    - ``w_z = exp(-|z[p] - z[q]| / (sigma_z |slope[p] . (p - q)| + 0.001 z[p]))`` (Eq. 3),
+    - ``w_n = max(0, n[p] . n[q])^sigma_n`` (Eq. 4), as ``max(0, 1 - |n[p] - n[q]|^2 / 2)^sigma_n``, which is the same
+      for unit normals, and 1 for two pixels without one,
+    - ``w_l = exp(-|l[p] - l[q]| / (sigma_l sqrt(g(variance)[p])))`` (Eq. 5), with the luminance ``l`` of
+      :func:`mcdenoise.ops.luminance_moments` and the 3x3 Gaussian ``g``; a deviation is at least 1e-10.
+
+    ``slope`` is the difference of the depths of two neighbouring pixels, on that side on which it is smaller: the other
+    may lie beyond an edge. Pixels that hit nothing are alike in depth, and unlike all others.
+
+    Args:
+        light: ``(B, 3, H, W)`` scene-linear radiance, usually demodulated, finite.
+        variance: ``(B, 1, H, W)`` of its luminance, 0 to 1e34, in its unit squared.
+        normal: ``(B, 3, H, W)`` unit normals, 0 where nothing was hit; without them ``w_n = 1``.
+        depth: ``(B, 1, H, W)`` distance, any unit, 0 to 1e35, ``inf`` where nothing was hit; without it ``w_z = 1``.
+        step: pixels between taps, at least 1: 1, 2, 4, 8, 16 for the levels of the transform.
+        sigma_z: tolerance of depths, above 0: how many times the slope they may differ.
+        sigma_n: exponent of the cosine between normals, at least 1.
+        sigma_l: tolerance of luminance, above 0, in standard deviations.
+
+    Returns:
+        ``(B, 3, H, W)`` filtered light and ``(B, 1, H, W)`` variance of its luminance, each in its argument's dtype.
+        Half precision is computed in float32. A mean of the input, whatever the weights: the pixel itself has the
+        weight ``h`` at least.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: a shape or a setting does not fit.
+
+    Differentiable in ``light``, ``variance``, ``normal`` and ``depth``, to any order, where no two luminances or depths
+    within reach are equal and no two slopes of a pixel.
+
+    Source: Schied et al. 2017 (SVGF), Secs. 4.3 and 4.4, Eqs. 1 to 5; the transform is that of Dammertz et al. 2010.
+
+    Example:
+        >>> light = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+        >>> filtered, variance = atrous(light, torch.full((1, 1, 8, 8), 0.1))
+        >>> bool(filtered.var() < light.var() / 2), bool(variance.max() < 0.05)
+        (True, True)
+    """
+    sizes = check_shapes(light=(light, "B 3 H W"), variance=(variance, "B 1 H W"), **layouts(normal, depth))
+    _check_settings(step, sigma_z, sigma_n, sigma_l)
+    if light.numel() == 0:
+        return light, variance
+    dtype = accumulator_dtype(light.dtype)
+    height, width = sizes["H"], sizes["W"]
+    image, noise = light.to(dtype), variance.to(dtype)
+    bright = luminance(image)
+    deviation = sigma_l * torch.sqrt(_blurred(noise) + _LEAST_DEVIATION**2)
+    radius = 2 * step
+    edge_weight = edge_stopping(normal, depth, dtype, radius, sigma_z, sigma_n)
+    padded = pad(torch.cat([image, noise, bright, torch.ones_like(bright)], 1), radius, "zeros")
+    total, light_sum, variance_sum = torch.zeros_like(bright), torch.zeros_like(image), torch.zeros_like(noise)
+    for _, dy, dx in offsets(5):
+        dy, dx, h = dy * step, dx * step, _KERNEL[dy + 2] * _KERNEL[dx + 2]
+        tap = shifted(padded, radius, dy, dx, height, width)
+        tap_light, tap_variance, tap_bright, inside = tap.split([3, 1, 1, 1], 1)
+        weight = h * inside * edge_weight(dy, dx)
+        weight = weight * torch.exp(-bounded_quotient((tap_bright - bright).abs(), deviation))  # Eq. 5
+        total = total + weight
+        light_sum = light_sum + weight * tap_light
+        variance_sum = variance_sum + weight.square() * tap_variance
+    return (light_sum / total).to(light.dtype), (variance_sum / total.square()).to(variance.dtype)
+
+
+class Atrous(nn.Module):
+    """:func:`atrous` with its settings stored.
+
+    Args:
+        step: see :func:`atrous`.
+        sigma_z: see :func:`atrous`.
+        sigma_n: see :func:`atrous`.
+        sigma_l: see :func:`atrous`.
+    """
+
+    def __init__(
+        self, step: int = 1, sigma_z: float = SIGMA_Z, sigma_n: float = SIGMA_N, sigma_l: float = SIGMA_L
+    ) -> None:
+        super().__init__()
+        _check_settings(step, sigma_z, sigma_n, sigma_l)
+        self.step = step
+        self.sigma_z, self.sigma_n, self.sigma_l = sigma_z, sigma_n, sigma_l
+
+    def forward(
+        self, light: Tensor, variance: Tensor, normal: Tensor | None = None, depth: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """See :func:`atrous`."""
+        sigmas = {"sigma_z": self.sigma_z, "sigma_n": self.sigma_n, "sigma_l": self.sigma_l}
+        return atrous(light, variance, normal, depth, step=self.step, **sigmas)
+
+
+def _blurred(variance: Tensor) -> Tensor:
+    """``g`` of Eq. 5; the border is repeated."""
+    # All of kornia comes with it, which takes as long to import as a single frame to denoise.
+    from kornia.filters import filter2d_separable
+
+    kernel = variance.new_tensor([_GAUSSIAN])
+    result: Tensor = filter2d_separable(variance, kernel, kernel, border_type="replicate")
+    return result
+
+
+def _check_settings(step: int, sigma_z: float, sigma_n: float, sigma_l: float) -> None:
+    if step < 1:
+        raise ValueError(f"step: expected at least 1, found {step}")
+    check_sigmas(sigma_z, sigma_n, sigma_l)

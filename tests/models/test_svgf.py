@@ -1,0 +1,207 @@
+"""SVGF: what its accumulation, its variance and its transform promise."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from mcdenoise.denoiser import Denoiser
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models import create_model
+from mcdenoise.models.svgf import History, Svgf
+from mcdenoise.ops import atrous, luminance_moments, moments_variance
+
+HEIGHT, WIDTH = 24, 40
+
+
+def frame(light: Tensor | None = None, seed: int = 0, **changes: Tensor) -> Frame:
+    """A still corner of two walls, lit by noise of mean 1."""
+    generator = torch.Generator().manual_seed(seed)
+    if light is None:
+        light = -torch.log(torch.rand(1, 3, HEIGHT, WIDTH, generator=generator).clamp_min(1e-6))
+    right = (torch.arange(light.shape[-1]) >= light.shape[-1] // 2).expand(1, 1, *light.shape[-2:])
+    normal = torch.cat([right, torch.zeros_like(right), ~right], 1).to(light.dtype)
+    buffers = {
+        "color": light,
+        "normal": normal,
+        "depth": torch.full_like(light[:, :1], 3.0),
+        "motion": torch.zeros_like(light[:, :2]),
+    }
+    return Frame(**{**buffers, **changes})
+
+
+def test_a_constant_image_stays() -> None:
+    denoiser = Denoiser("svgf")
+    given = frame(torch.full((1, 3, HEIGHT, WIDTH), 0.7), albedo=torch.full((1, 3, HEIGHT, WIDTH), 0.5))
+    for _ in range(6):
+        torch.testing.assert_close(denoiser(given), given.color, rtol=1e-5, atol=0)
+
+
+def test_noise_falls_in_space_and_in_time() -> None:
+    """The first frame is smoother than accumulation alone is after as many as its weight allows: nine."""
+    denoiser = Denoiser("svgf")
+    variances = [denoiser(frame(seed=seed)).var().item() for seed in range(8)]
+    assert variances[0] < 1 / 9
+    assert variances[-1] < variances[0] / 2
+    assert denoiser.report.reset == ""
+
+
+def test_the_weight_of_a_frame_is_one_over_their_number_down_to_alpha() -> None:
+    """Moments are not filtered: those of n frames, of which the first is lit, have alpha times its own."""
+    model, state, rest = Svgf(alpha=0.2), None, 1.0
+    dark, lit = frame(torch.zeros(1, 3, HEIGHT, WIDTH)), frame(torch.full((1, 3, HEIGHT, WIDTH), 2.0))
+    for number in range(1, 9):
+        _, state = model(lit if number == 1 else dark, state)
+        rest *= 1 if number == 1 else 1 - max(1 / number, 0.2)
+        expected = rest * torch.tensor([2.0, 4.0]).reshape(1, 2, 1, 1).expand_as(state.moments)
+        torch.testing.assert_close(state.moments, expected)
+        assert state.length.unique().tolist() == [number]
+
+
+def test_the_first_level_feeds_the_history() -> None:
+    given = frame()
+    output, state = Svgf()(given)
+    variance = 4 * moments_variance(luminance_moments(given.color), given.normal, given.depth, kernel_size=7)
+    light = given.color
+    for level in range(5):
+        light, variance = atrous(light, variance, given.normal, given.depth, step=2**level)
+        if level == 0:
+            torch.testing.assert_close(state.light, light)
+    torch.testing.assert_close(output.image, light)
+    assert torch.equal(output.stages["accumulated"], given.color)
+
+
+def test_the_variance_is_that_of_neighbours_where_the_history_is_short() -> None:
+    """After three equal frames the variance in time is zero, and so would the filter be; after four it is."""
+    noise = frame()
+    model, state, images = Svgf(), None, []
+    for _ in range(6):
+        kept = None if state is None else state._replace(light=noise.color)
+        output, state = model(noise, kept)
+        images.append(output.image)
+    for image in images[:3]:
+        assert image.var() < 0.2 * noise.color.var()
+    for image in images[3:]:
+        torch.testing.assert_close(image, noise.color, rtol=1e-3, atol=1e-3)
+
+
+def test_no_edge_of_normals_or_depths_is_crossed() -> None:
+    noise = frame().color
+    right = (torch.arange(WIDTH) >= WIDTH // 2).expand_as(noise[:, :1])
+    lit = torch.where(right, noise, 0)
+    image = Svgf()(frame(lit))[0].image
+    assert not image[..., : WIDTH // 2].any()
+    flat = torch.zeros_like(noise)
+    flat[:, 2] = 1
+    apart = frame(lit, normal=flat, depth=torch.where(right, 3.0, 6.0))
+    # What is left is exp(-1000): a step of the depth itself, beside a thousandth of it.
+    assert not Svgf()(apart)[0].image[..., : WIDTH // 2].any()
+    together = frame(lit, normal=flat)
+    assert Svgf()(together)[0].image[..., : WIDTH // 2].any()
+
+
+def test_motion_comes_from_positions_and_cameras_too() -> None:
+    """A camera that shifts the image by two pixels, seen once in motion and once in positions."""
+    ys, xs = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+
+    def view(shift: float) -> tuple[Tensor, Tensor]:
+        """Parallel rays: world x and y are pixels, and the camera moves along x."""
+        camera = torch.zeros(1, 4, 4)
+        camera[0, 0, 0], camera[0, 1, 1], camera[0, 3, 3] = 2 / WIDTH, 2 / HEIGHT, 1.0
+        camera[0, 3, 0], camera[0, 3, 1] = -1 - 2 * shift / WIDTH, -1.0
+        position = torch.stack([xs + 0.5 + shift, ys + 0.5, torch.full_like(xs, 3.0, dtype=torch.float32)])[None]
+        return position, camera
+
+    moved = torch.zeros(1, 2, HEIGHT, WIDTH)
+    moved[:, 0] = 2
+    results = []
+    for positions in (False, True):
+        model, state = Svgf(), None
+        for number, shift in enumerate((0.0, 2.0)):
+            position, camera = view(shift)
+            given = frame(seed=number, position=position, view_projection=camera, motion=moved * number)
+            if positions:
+                given = given.replace(motion=None)
+            output, state = model(given, state)
+        results.append((output.image, state.length))
+    torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-3, atol=1e-3)
+    # What came into view at the right has no history, and the corner moves over the wall.
+    assert results[0][1][..., -2:].unique().tolist() == [1.0]
+    assert results[0][1][..., :10].unique().tolist() == [2.0]
+
+
+def test_state_survives_a_cut_and_a_resize() -> None:
+    denoiser = Denoiser("svgf")
+    for seed in range(3):
+        denoiser(frame(seed=seed))
+    given = frame(seed=5)
+    given = given.replace(normal=-given.normal)
+    torch.testing.assert_close(denoiser(given), Denoiser("svgf")(given))
+    small = frame(torch.rand(1, 3, 9, 11))
+    torch.testing.assert_close(denoiser(small), Denoiser("svgf")(small))
+    assert denoiser.report.reset == "size change"
+
+
+def test_a_frame_that_says_nothing_of_motion_stands_alone() -> None:
+    denoiser = Denoiser("svgf")
+    for seed in (0, 1):
+        given = frame(seed=seed).replace(motion=None)
+        torch.testing.assert_close(denoiser(given), Denoiser("svgf")(given))
+    assert denoiser.report.reset == "no motion"
+
+
+def test_extremes_stay_finite() -> None:
+    light = frame().color.clone()
+    light[..., ::5, ::7] = 1e30
+    light[..., ::3, ::4] = 0
+    depth = torch.full((1, 1, HEIGHT, WIDTH), 1e30)
+    depth[..., :4, :] = torch.inf
+    given = frame(light, depth=depth)
+    given.normal[..., :4, :] = 0
+    denoiser = Denoiser("svgf")
+    for _ in range(5):
+        image = denoiser(given)
+        assert image.isfinite().all()
+        assert image.min() >= 0
+
+
+def test_differentiable_through_time() -> None:
+    frames = [
+        frame(0.5 + torch.rand(1, 3, 2, 3, generator=torch.Generator().manual_seed(seed)).double()) for seed in range(2)
+    ]
+    model = Svgf(levels=1)
+
+    def last(first: Tensor) -> Tensor:
+        _, state = model(frames[0].replace(color=first))
+        return model(frames[1], state)[0].image
+
+    assert torch.autograd.gradcheck(last, (frames[0].color.requires_grad_(),))
+
+
+def test_is_pure_and_batches() -> None:
+    both = frame(torch.rand(2, 3, HEIGHT, WIDTH), normal=frame().normal.repeat(2, 1, 1, 1))
+    model = Svgf()
+    _, state = model(both)
+    output, after = model(both, state)
+    again, _ = model(both, state)
+    assert torch.equal(output.image, again.image)
+    assert isinstance(after, History)
+    second = both.map(lambda image: image[1:])
+    alone, _ = model(second, model(second)[1])
+    torch.testing.assert_close(output.image[1:], alone.image)
+
+
+def test_has_nothing_to_train_and_says_what_it_needs() -> None:
+    model = create_model("svgf")
+    assert not list(model.parameters())
+    assert not model.needs.trainable
+    assert model.needs.buffers == {"color", "normal", "depth"}
+    for absent in ("normal", "depth"):
+        with pytest.raises(InputError, match=f"buffer '{absent}': the model needs it, found only"):
+            Denoiser("svgf")(frame().replace(**{absent: None}))
+    wrong = {"alpha": 0.0, "levels": 0, "sigma_z": 0.0, "sigma_n": 0.5, "sigma_l": -1.0}
+    for name, value in wrong.items():
+        with pytest.raises(InputError, match=f"{name}: expected .*, found {value}"):
+            create_model("svgf", **{name: value})
