@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -260,7 +261,7 @@ def test_a_chain_is_tiled_if_no_later_method_depends_on_the_whole_image() -> Non
 
 def test_after_accumulation_statistics_are_of_what_was_accumulated() -> None:
     watching, color = Watching(), torch.rand(2, 1, 3, 20, 24)
-    model = Accumulated(Chain(first=Brightest(), second=watching))
+    model = Accumulated(Chain(first=Brightest(), second=watching), lag_threshold=math.inf)
     _, state = model(still(color[0]))
     frame = still(2 * color[1])
     model(frame.replace(statistics=Brightest().statistics(frame)), state)
