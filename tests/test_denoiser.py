@@ -9,19 +9,22 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.utils import _pytree as pytree
 
 from mcdenoise import Denoiser, Frame, InputError, create_model
 from mcdenoise.data import open_sequence
-from mcdenoise.models import Denoised, save_weights
+from mcdenoise.models import Accumulated, Chain, Demodulated, Needs, Output, Stage, Tiled, parts_of, save_weights
+from mcdenoise.models.cascaded_v2 import PixelNetwork
 
-STAGES = ["validate", "plan", "accumulate", "network", "remodulate"]
+STAGES = ["validate", "accumulate", "plan", "network", "remodulate"]
 
 
 def small_model() -> nn.Module:
     """A small cascade with random weights, also in the heads that start at zero."""
     torch.manual_seed(0)
-    model = create_model("cascaded", width=8)
-    for head in model.first.heads:
+    model = create_model("cascaded_v2", width=8)
+    assert isinstance(model, nn.Module)
+    for head in next(parts_of(model, PixelNetwork)).heads:
         nn.init.normal_(head.weight, std=0.02)
     return model
 
@@ -29,7 +32,7 @@ def small_model() -> nn.Module:
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
     path = tmp_path / "small.safetensors"
-    path.write_bytes(save_weights(small_model(), "cascaded", {"width": 8}, {}))
+    path.write_bytes(save_weights(small_model(), "cascaded_v2", {"width": 8}, {}))
     return path
 
 
@@ -49,9 +52,27 @@ def refused(action: Callable[[], object]) -> str:
 class Keep(nn.Module):
     """A network that changes nothing, and remembers what it saw."""
 
-    def forward(self, color: Tensor, albedo: Tensor, normal: Tensor, depth: Tensor) -> Denoised:
+    def forward(
+        self, color: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None, depth: Tensor | None = None
+    ) -> Output:
         self.seen = {"color": color, "albedo": albedo, "normal": normal, "depth": depth}
-        return Denoised(color * 2, color)
+        return Output(color, {"initial": color * 2})
+
+
+class Mean(nn.Module):
+    """The mean of all frames of a shot, and what it was handed as its state."""
+
+    needs = Needs(trainable=False)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.states: list[Any] = []
+
+    def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+        self.states.append(state)
+        total, count = (0 * frame.color, 0 * frame.color[:, :1]) if state is None else (state["total"], state["count"])
+        state = {"total": total + frame.color, "count": count + 1}
+        return Output(state["total"] / state["count"]), state
 
 
 def test_a_shot_is_streamed(frames: list[Frame]) -> None:
@@ -88,27 +109,51 @@ def test_the_past_matters_until_it_is_reset(frames: list[Frame]) -> None:
 
 
 def test_a_module_of_your_own(frames: list[Frame]) -> None:
+    """It may wear what the zoo wears."""
     network = Keep()
-    images = Denoiser(network).images(frames[0])
+    output = Denoiser(Demodulated(Accumulated(network))).output(frames[0])
     assert frames[0].albedo is not None
-    torch.testing.assert_close(images.denoised, frames[0].color)
-    torch.testing.assert_close(images.accumulated, frames[0].color)
-    torch.testing.assert_close(images.initial, frames[0].color * 2)
+    assert list(output.stages) == ["noisy", "accumulated", "initial"]
+    torch.testing.assert_close(output.image, frames[0].color)
+    assert torch.equal(output.stages["noisy"], frames[0].color)
+    torch.testing.assert_close(output.stages["accumulated"], frames[0].color)
+    torch.testing.assert_close(output.stages["initial"], frames[0].color * 2)
     # Where there is a texture, the network does not see it.
     textured = (frames[0].albedo >= 0.04).all(1, keepdim=True)
     expected = torch.where(textured, frames[0].color / frames[0].albedo.clamp_min(0.04), frames[0].color)
     torch.testing.assert_close(network.seen["color"], expected)
     assert torch.equal(network.seen["depth"], frames[0].depth)
+    # Without, it sees the frame as it is.
+    output = Denoiser(network).output(frames[0])
+    assert list(output.stages) == ["noisy", "initial"]
+    assert torch.equal(network.seen["color"], frames[0].color)
 
 
-def test_missing_features_are_told_and_constant() -> None:
+def test_missing_features_are_told() -> None:
     network = Keep()
     denoiser = Denoiser(network)
     denoiser(Frame(color=torch.rand(1, 3, 9, 7)))
-    assert denoiser.report.missing == ["albedo", "normal", "depth"]
-    assert [network.seen[name].unique().tolist() for name in ("albedo", "normal", "depth")] == [[1], [0], [1]]
+    assert denoiser.report.missing == ["albedo", "depth", "normal"]
+    assert [network.seen[name] for name in ("albedo", "normal", "depth")] == [None] * 3
     denoiser(Frame(color=torch.rand(1, 3, 9, 7), normal=torch.zeros(1, 3, 9, 7)))
     assert denoiser.report.missing == ["albedo", "depth"]
+    # What tells motion is one thing, whichever buffers say it.
+    denoiser = Denoiser(small_model())
+    denoiser(Frame(color=torch.rand(1, 3, 9, 7)))
+    assert denoiser.report.missing == ["albedo", "depth", "motion", "normal"]
+    position, camera = torch.rand(1, 3, 9, 7), torch.eye(4)[None]
+    denoiser(Frame(color=torch.rand(1, 3, 9, 7), position=position, view_projection=camera))
+    assert denoiser.report.missing == ["albedo", "normal"]
+
+
+def test_a_buffer_that_is_needed_is_asked_for() -> None:
+    def method(color: Tensor, specular: Tensor) -> Tensor:
+        return color + specular
+
+    denoiser, color = Denoiser(method), torch.rand(1, 3, 9, 7)
+    message = refused(lambda: denoiser(Frame(color=color, depth=torch.ones(1, 1, 9, 7))))
+    assert message.startswith("buffer 'specular': the model needs it, found only color, depth;")
+    assert torch.equal(denoiser(Frame(color=color, specular=color)), 2 * color)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), -1.0])
@@ -181,11 +226,11 @@ def test_a_device_that_is_not_there(device: str) -> None:
 
 
 def test_models_by_name(weights: Path, frames: list[Frame]) -> None:
-    by_name, by_module = Denoiser("cascaded", weights=weights), Denoiser(small_model())
+    by_name, by_module = Denoiser("cascaded_v2", weights=weights), Denoiser(small_model())
     # Weights are stored in half precision.
     torch.testing.assert_close(by_name(frames[0]), by_module(frames[0]), rtol=1e-2, atol=1e-2)
-    assert "expected one of" in refused(lambda: Denoiser("oidn"))
-    assert "expected weights of model 'pixel'" in refused(lambda: Denoiser("pixel", weights=weights))
+    assert "expected one of" in refused(lambda: Denoiser("nothing"))
+    assert "expected weights of model 'cascaded'" in refused(lambda: Denoiser("cascaded", weights=weights))
 
 
 # Precision
@@ -194,12 +239,11 @@ def test_models_by_name(weights: Path, frames: list[Frame]) -> None:
 def test_bfloat16_is_close_to_float32(frames: list[Frame]) -> None:
     exact, rounded = Denoiser(small_model()), Denoiser(small_model(), precision="bfloat16")
     for frame in frames:
-        images, half = exact.images(frame), rounded.images(frame)
+        output, half = exact.output(frame), rounded.output(frame)
         # Only the network is rounded.
-        assert torch.equal(half.noisy, images.noisy)
-        assert torch.equal(half.accumulated, images.accumulated)
-        for name in ("initial", "denoised"):
-            expected, image = getattr(images, name), getattr(half, name)
+        assert torch.equal(half.stages["noisy"], output.stages["noisy"])
+        assert torch.equal(half.stages["accumulated"], output.stages["accumulated"])
+        for expected, image in ((output.stages["initial"], half.stages["initial"]), (output.image, half.image)):
             assert image.dtype == torch.float32
             error = (image - expected).abs()
             # Measured at most: 6e-4 of the mean, and 9e-4 of the largest value.
@@ -214,22 +258,258 @@ def test_a_network_that_hands_out_bfloat16_still_gives_float32() -> None:
             super().__init__()
             self.conv = nn.Conv2d(3, 3, 1)
 
-        def forward(self, color: Tensor, albedo: Tensor, normal: Tensor, depth: Tensor) -> Denoised:
+        def forward(self, color: Tensor) -> Tensor:
             image = self.conv(color)
             self.seen = image.dtype
-            return Denoised(image, image)
+            return image.square()
 
     for buffers in ({}, {"albedo": torch.rand(1, 3, 9, 7)}):
-        model = Copy()
-        images = Denoiser(model, precision="bfloat16").images(Frame(color=torch.rand(1, 3, 9, 7), **buffers))
-        assert model.seen == torch.bfloat16
-        assert images.initial.dtype == images.denoised.dtype == images.accumulated.dtype == torch.float32
+        network = Copy()
+        for model in (network, Demodulated(Accumulated(Chain(initial=network, final=network)))):
+            output = Denoiser(model, precision="bfloat16").output(Frame(color=torch.rand(1, 3, 9, 7), **buffers))
+            assert network.seen == torch.bfloat16
+            assert output.image.dtype == torch.float32
+            if buffers:
+                assert {image.dtype for image in output.stages.values()} == {torch.float32}
 
 
 @pytest.mark.parametrize("precision", ["float16", ""])
 def test_an_unknown_precision_is_refused(precision: Any) -> None:
     message = refused(lambda: Denoiser(Keep(), precision=precision))
     assert message == f"precision: expected one of float32, bfloat16, found '{precision}'"
+
+
+# The state
+
+
+def test_a_recurrent_method_gets_its_state_back(frames: list[Frame]) -> None:
+    model = Mean()
+    denoiser = Denoiser(model)
+    images = [denoiser(frame) for frame in frames]
+    for count, image in enumerate(images, start=1):
+        torch.testing.assert_close(image, torch.stack([frame.color for frame in frames[:count]]).mean(0))
+    assert [state is None for state in model.states] == [True, False, False, False]
+    denoiser.reset()
+    assert torch.equal(denoiser(frames[2]), frames[2].color)
+    assert model.states[-1] is None
+
+
+def test_what_is_handed_out_and_what_is_kept_share_no_memory() -> None:
+    """A method's state may hold the frame and the image themselves."""
+
+    class Last(nn.Module):
+        needs = Needs(trainable=False)
+
+        def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+            image = frame.color if state is None else state[0]
+            return Output(image, {"frame": frame.color}), (frame.color, image, frame.color[:, :1])
+
+    colors = torch.rand(4, 1, 3, 9, 7)
+    place = colors[0].clone()
+    denoiser, expected = Denoiser(Last()), [colors[0], colors[0], colors[1], colors[2]]
+    for color, image in zip(colors, expected, strict=True):
+        place.copy_(color)
+        output = denoiser.output(Frame(color=place))
+        assert torch.equal(output.image, image)
+        assert torch.equal(place, color)
+        for one in (output.image, *output.stages.values()):
+            one.fill_(7.0)
+
+
+def test_a_method_that_raises_in_mid_frame_leaves_the_state_as_it_was(frames: list[Frame]) -> None:
+    fails = False
+
+    class Failing(Mean):
+        def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+            result = super().forward(frame, state)
+            if fails:
+                raise RuntimeError("out of memory")
+            return result
+
+    denoiser, expected = Denoiser(Failing()), Denoiser(Mean())
+    for frame in frames:
+        fails = True
+        with pytest.raises(RuntimeError, match="out of memory"):
+            denoiser(frame)
+        fails = False
+        assert torch.equal(denoiser(frame), expected(frame))
+
+
+BAD: dict[str, tuple[Callable[[Frame, Any], Any], str]] = {
+    "shape": (lambda frame, state: (Output(frame.color[..., 1:]), None), "found an image of (1, 3, 9, 6)"),
+    "channels": (lambda frame, state: (Output(frame.color[:, :1]), None), "found an image of (1, 1, 9, 7)"),
+    "no image": (lambda frame, state: (Output(None), None), "found Output"),
+    "no output": (lambda frame, state: (frame.color, None), "found Tensor"),
+    "nan": (lambda frame, state: (Output(frame.color * torch.nan), None), "found NaN or infinite values"),
+    "infinite": (lambda frame, state: (Output(frame.color / 0), None), "found NaN or infinite values"),
+    "state of text": (lambda frame, state: (Output(frame.color), "state"), "found str"),
+    "state of numbers": (lambda frame, state: (Output(frame.color), {"count": 1}), "found int"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_result_that_is_none_is_refused_in_one_line_and_not_kept(name: str) -> None:
+    step, expected = BAD[name]
+    broken = False
+
+    class Breaking(Mean):
+        def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+            return step(frame, state) if broken else super().forward(frame, state)
+
+    denoiser, color = Denoiser(Breaking()), torch.rand(2, 1, 3, 9, 7) + 1
+    denoiser(Frame(color=color[0]))
+    broken = True
+    assert expected in refused(lambda: denoiser(Frame(color=color[1])))
+    broken = False
+    torch.testing.assert_close(denoiser(Frame(color=color[1])), color.mean(0))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "same"),
+    [
+        ({"a": 4}, {"a": 4}, True),
+        ({"a": 4}, {"a": 3}, False),
+        ({"a": 4}, {"b": 4}, False),
+        ({"a": 4}, {"a": 4, "b": 4}, False),
+        ((4, 4), (4, 4), True),
+        ((4, 4), (4,), False),
+        ([4, 4], (4, 4), False),
+        ((4, None), (4, 4), True),
+        ((4, 4), (4, None), True),
+        (None, {"a": 4}, True),
+        ({"a": (4, None)}, {"a": (4, {"b": 3})}, True),
+        ({"a": (4, {"b": 3})}, {"a": (4, {"b": 4})}, False),
+        ({"a": 4}, {"a": {"b": 4}}, False),
+    ],
+)
+def test_a_state_keeps_its_structure(first: Any, second: Any, same: bool) -> None:
+    """Numbers of axes stand for tensors; what is not there may come and go."""
+
+    class Changing(nn.Module):
+        needs = Needs(trainable=False)
+
+        def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+            shape = second if self.second else first
+            return Output(frame.color), pytree.tree_map(lambda n: None if n is None else torch.rand([1] * n), shape)
+
+    model = Changing()
+    denoiser, frame = Denoiser(model), Frame(color=torch.rand(1, 3, 9, 7))
+    model.second = False
+    denoiser(frame)
+    model.second = True
+    if same:
+        assert torch.equal(denoiser(frame), frame.color)
+    else:
+        assert "expected a state of the same structure as for the frame before" in refused(lambda: denoiser(frame))
+
+
+# Settings and reports
+
+
+def test_settings_are_those_of_the_model(weights: Path) -> None:
+    denoiser = Denoiser("cascaded_v2_micro", alpha_min=0.3, anti_lag=False)
+    accumulated = next(parts_of(denoiser.model, Accumulated))
+    assert (accumulated.alpha_min, accumulated.lag_threshold) == (0.3, float("inf"))
+    for make in (
+        lambda: Denoiser("cascaded_v2", nonsense=1),
+        lambda: Denoiser("cascaded_v2", weights=weights, nonsense=1),
+    ):
+        message = refused(make)
+        assert "model 'cascaded_v2': got an unexpected keyword argument 'nonsense'; it takes width" in message
+    assert refused(lambda: Denoiser(Keep(), width=8)) == "width: expected a model's name, found a model"
+    assert refused(lambda: Denoiser(Keep(), weights=weights)) == "weights: expected a model's name, found a model"
+    assert "alpha_min: expected in (0, 1], found 2.0" in refused(lambda: Denoiser("cascaded_v2", alpha_min=2.0))
+
+
+def test_the_report_of_a_frame(frames: list[Frame]) -> None:
+    denoiser = Denoiser(small_model())
+    denoiser.reset(frames=2)
+    for frame in frames[:2]:
+        denoiser(frame)
+    report = denoiser.report
+    assert report.stages == {
+        "demodulate": Stage("demodulate", 0, "albedo"),
+        "accumulate": Stage("accumulate", 0, "positions and cameras"),
+        "reproject": Stage("reproject", 0, "positions and cameras"),
+        "remember": Stage("remember", 1, "last frame"),
+        "noise-free pixels": Stage("noise-free pixels", 0, "there are none"),
+        "converged tiles": Stage("converged tiles", 0, "there are none", exact=False),
+        "unchanged tiles": Stage("unchanged tiles", 0, "there are none", exact=False),
+        "network": Stage("network", 0, "on 100% of the pixels"),
+    }
+    assert all(name == stage.name for name, stage in report.stages.items())
+    assert list(report.milliseconds) == STAGES
+    denoiser = Denoiser(Keep())
+    denoiser(frames[0])
+    assert denoiser.report.stages == {}
+    assert list(denoiser.report.milliseconds) == ["validate"]
+
+
+def test_history_is_of_use_to_more_than_one_frame_that_tells_motion() -> None:
+    denoiser = Denoiser(small_model())
+    moving, cameras, still = {"color", "motion"}, {"color", "position", "view_projection"}, {"color", "position"}
+    for frames, expected in ((None, True), (2, True), (1, False)):
+        denoiser.reset(frames=frames)
+        assert [denoiser.has_history(each) for each in (moving, cameras, still)] == [expected, expected, False]
+    denoiser = Denoiser(small_model(), keep_all=True)
+    denoiser.reset(frames=1)
+    assert denoiser.has_history(still)
+
+
+def test_hints_go_to_the_method(frames: list[Frame]) -> None:
+    seen: list[Frame] = []
+
+    class Watching(Mean):
+        def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+            seen.append(frame)
+            return super().forward(frame, state)
+
+    for keep_all in (False, True):
+        denoiser = Denoiser(Watching(), keep_all=keep_all)
+        denoiser.reset(frames=2)
+        denoiser(frames[0])
+        denoiser.output(frames[1])
+        first, second = (frame.hints for frame in seen[-2:])
+        assert (first.last, second.last) == (False, True)
+        assert (first.stages, second.stages) == (False, True)
+        assert first.keep_all is second.keep_all is keep_all
+
+
+# Derivatives
+
+
+def test_derivatives_go_through_the_state_and_leave_the_images_as_they_are(frames: list[Frame]) -> None:
+    model = small_model()
+    color = frames[0].color.clone().requires_grad_()
+    ordinary, differentiable = Denoiser(model), Denoiser(model, differentiable=True)
+    shot = [frames[0].replace(color=color), *frames[1:]]
+    for frame in shot:
+        expected, image = ordinary(frame), differentiable(frame)
+        assert not expected.requires_grad
+        # One step or two of a convolution with its ReLU sum in orders of their own.
+        torch.testing.assert_close(image.detach(), expected, rtol=1e-4, atol=1e-5)
+    (gradient,) = torch.autograd.grad(image.sum(), color)
+    assert torch.isfinite(gradient).all()
+    assert gradient.abs().sum() > 0
+    assert all(parameter.grad is None for parameter in model.parameters())
+
+
+def test_the_derivative_through_time_of_a_method_written_out() -> None:
+    """Of the mean of three frames, a third in each."""
+    denoiser = Denoiser(Mean(), differentiable=True)
+    colors = [torch.rand(1, 3, 9, 7, requires_grad=True) for _ in range(3)]
+    for color in colors:
+        image = denoiser(Frame(color=color))
+    for gradient in torch.autograd.grad(image.sum(), colors):
+        torch.testing.assert_close(gradient, torch.full_like(gradient, 1 / 3))
+
+
+def test_tiles_are_those_that_were_asked_for(frames: list[Frame]) -> None:
+    model = small_model()
+    denoiser = Denoiser(model, tile=64)
+    denoiser(frames[0])
+    assert denoiser.report.tiles == "1 x 1 tiles of up to 24x20 pixels: as asked for"
+    assert {tiled.side for tiled in parts_of(model, Tiled)} == {64}
 
 
 def test_depth_comes_from_positions_and_camera(small_sequence: Path) -> None:

@@ -7,9 +7,10 @@ import math
 import pytest
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
-from mcdenoise.frame import BUFFERS, LARGEST_RADIANCE, Frame, replace_invalid
 from mcdenoise.errors import InputError
+from mcdenoise.frame import BUFFERS, LARGEST_RADIANCE, MOTION, Frame, Hints, Skip, replace_invalid
 
 NAN, INF = float("nan"), float("inf")
 SIZE = (5, 7)
@@ -62,6 +63,10 @@ def test_color_alone_is_a_frame() -> None:
         ("motion", plane(3), "(2, 2, 5, 7)", "(2, 3, 5, 7)"),
         ("view_projection", torch.eye(4), "(2, 4, 4)", "(4, 4)"),
         ("reference", plane(3).mT, "(2, 3, 5, 7)", "(2, 3, 7, 5)"),
+        ("roughness", plane(3), "(2, 1, 5, 7)", "(2, 3, 5, 7)"),
+        ("variance", plane(1), "(2, 3, 5, 7)", "(2, 1, 5, 7)"),
+        ("samples", plane(3), "(2, 3, 3, 5, 7)", "(2, 3, 5, 7)"),
+        ("samples", plane(3)[:, None, ..., 1:].expand(2, 4, 3, 5, 6), "(2, 4, 3, 5, 7)", "(2, 4, 3, 5, 6)"),
     ],
 )
 def test_a_mismatch_names_buffer_expected_and_found(name: str, value: object, expected: str, found: str) -> None:
@@ -156,6 +161,9 @@ def test_depth_may_be_infinite() -> None:
 @pytest.mark.parametrize(
     ("name", "bad"),
     [
+        ("roughness", NAN),
+        ("hit_distance", -INF),
+        ("variance", INF),
         ("albedo", NAN),
         ("albedo", INF),
         ("normal", NAN),
@@ -194,6 +202,9 @@ def test_a_matrix_that_is_not_finite_is_refused_with_its_place() -> None:
         ("normal", 1.0005, 1.0),
         ("normal", -1.0005, -1.0),
         ("depth", -0.001, 0.0),
+        ("roughness", 1.005, 1.0),
+        ("specular_albedo", 1.5, 1.0),
+        ("variance", -0.001, 0.0),
         ("reference", -0.001, 0.0),
     ],
 )
@@ -258,3 +269,157 @@ def test_frames_can_be_compared_and_hashed() -> None:
 def test_frames_cannot_be_changed() -> None:
     with pytest.raises(AttributeError):
         full_frame().color = plane(3)  # type: ignore[misc]
+
+
+# The whole vocabulary
+
+
+def test_every_buffer_of_the_vocabulary_has_a_field_and_a_meaning() -> None:
+    names = {name for name, _ in full_frame().items()}
+    assert set(BUFFERS) <= names
+    assert set(BUFFERS) >= MOTION
+    for name, spec in BUFFERS.items():
+        assert spec.low < spec.high, name
+        assert spec.meaning
+        assert spec.channels in (1, 2, 3)
+
+
+def test_buffers_are_found_by_name_also_those_that_nobody_foresaw() -> None:
+    crypto, samples = plane(5), torch.rand(2, 4, 3, *SIZE)
+    frame = Frame(color=plane(3), samples=samples, extra={"crypto": crypto})
+    assert frame.buffers == {"color", "samples", "crypto"}
+    assert frame.buffer("crypto") is crypto
+    assert frame.buffer("samples") is samples
+    assert frame.buffer("depth") is None
+    assert frame.buffer("nothing") is None
+    # Fields that are no buffers are not found.
+    assert frame.buffer("extra") is None
+    assert frame.buffer("hints") is None
+    assert [name for name, _ in frame.items()] == ["color", "samples", "crypto"]
+
+
+def test_an_extra_buffer_is_checked_for_its_size_and_its_values() -> None:
+    with pytest.raises(InputError, match="buffer 'crypto'"):
+        Frame(color=plane(3), extra={"crypto": plane(5)[..., 1:]})
+    with pytest.raises(InputError, match="buffer 'crypto': expected a floating-point dtype"):
+        Frame(color=plane(3), extra={"crypto": plane(5).long()})
+    with pytest.raises(InputError, match="buffer 'crypto'"):
+        Frame(color=plane(3), extra={"crypto": plane(5, NAN)}).validate()
+    assert Frame(color=plane(3), extra={"crypto": plane(5, -INF)}).validate()[1] == 0
+
+
+def test_a_function_reaches_every_buffer() -> None:
+    frame = full_frame().replace(samples=torch.rand(2, 4, 3, *SIZE), extra={"crypto": plane(5)})
+    mapped = frame.map(lambda value: 2 * value)
+    assert mapped.buffers == frame.buffers
+    for name, value in mapped.items():
+        assert torch.equal(value, 2 * dict(frame.items())[name]), name
+    assert {value.dtype for _, value in frame.to(torch.float64).items()} == {torch.float64}
+
+
+def test_a_part_of_a_frame_is_a_view_with_the_statistics_of_the_whole() -> None:
+    statistics = {"exposure": torch.ones(2, 1, 1, 1)}
+    skip = Skip(torch.ones(2, 1, *SIZE, dtype=torch.bool), {"image": plane(3)})
+    samples, crypto = torch.rand(2, 4, 3, *SIZE), torch.rand(2, 5, *SIZE)
+    frame = full_frame().replace(samples=samples, extra={"crypto": crypto}, statistics=statistics, skip=skip)
+    part = frame.crop(slice(1, 4), slice(2, 7))
+    assert part.size == (3, 5)
+    assert part.buffers == frame.buffers
+    assert part.view_projection is frame.view_projection
+    assert torch.equal(part.samples, samples[..., 1:4, 2:7])
+    assert torch.equal(part.extra["crypto"], crypto[..., 1:4, 2:7])
+    for name, value in part.items():
+        assert value.untyped_storage().data_ptr() == dict(frame.items())[name].untyped_storage().data_ptr(), name
+    assert part.statistics is statistics
+    assert part.skip is None
+
+
+def test_depth_is_the_clip_w_of_positions() -> None:
+    camera = torch.eye(4).repeat(2, 1, 1)
+    camera[:, :, 3] = torch.tensor([0.0, 0.0, 2.0, -1.0])
+    position = torch.rand(2, 3, *SIZE)
+    position[:, 2, 0] = -1
+    frame = Frame(color=plane(3), position=position, view_projection=camera)
+    depth = 2 * position[:, 2:] - 1
+    assert torch.equal(frame.with_depth().depth, torch.where(depth > 0, depth, INF))
+    # It goes no further than what it needs, and never before a depth that is there.
+    for other in (frame.replace(position=None), frame.replace(view_projection=None), frame.replace(depth=plane(1))):
+        assert other.with_depth() is other
+
+
+def test_what_tells_motion_can_be_left_behind() -> None:
+    frame = full_frame().without_past()
+    assert frame.buffers == {*BUFFERS, "view_projection"} - MOTION
+
+
+def test_what_is_known_of_a_stage_or_else_of_the_last() -> None:
+    first, last = plane(3, 1.0), plane(3, 2.0)
+    skip = Skip(torch.ones(2, 1, *SIZE, dtype=torch.bool), {"initial": first, "image": last})
+    assert skip.of("initial") is first
+    assert skip.of("image") is skip.of("other") is last
+    assert Skip(skip.mask, {}).of("image") is None
+
+
+# A frame is a pytree
+
+
+def loaded_frame() -> Frame:
+    return full_frame().replace(
+        samples=torch.rand(2, 4, 3, *SIZE),
+        extra={"crypto": plane(5), "id": plane(1)},
+        statistics={"exposure": torch.ones(2, 1, 1, 1)},
+        skip=Skip(torch.ones(2, 1, *SIZE, dtype=torch.bool), {"image": plane(3)}),
+        hints=Hints(still=True, stages=False),
+    )
+
+
+@pytest.mark.parametrize("make", [full_frame, loaded_frame, lambda: Frame(color=plane(3))])
+def test_a_frame_comes_apart_and_together(make: object) -> None:
+    frame = make()  # type: ignore[operator]
+    leaves, spec = pytree.tree_flatten(frame)
+    assert all(isinstance(leaf, Tensor) for leaf in leaves)
+    again = pytree.tree_unflatten(leaves, spec)
+    assert isinstance(again, Frame)
+    assert again.hints == frame.hints
+    assert again.buffers == frame.buffers
+    for (name, one), (other, two) in zip(again.items(), frame.items(), strict=True):
+        assert name == other
+        assert one is two
+    assert again.statistics.keys() == frame.statistics.keys()
+    assert (again.skip is None) is (frame.skip is None)
+    # The structure of what a renderer hands over can be written to a file, as torch.export does.
+    spec = pytree.tree_structure(frame.replace(skip=None))
+    assert pytree.treespec_loads(pytree.treespec_dumps(spec)) == spec
+    paths = [pytree.keystr(path) for path, _ in pytree.tree_flatten_with_path(frame)[0]]
+    assert paths[0] == ".color"
+    assert len(set(paths)) == len(leaves)
+
+
+def test_hints_and_buffers_are_its_structure() -> None:
+    def spec(frame: Frame) -> pytree.TreeSpec:
+        return pytree.tree_structure(frame)
+
+    frame = full_frame()
+    assert spec(frame) == spec(full_frame().map(lambda value: value + 1))
+    assert spec(frame) != spec(frame.replace(hints=Hints(last=True)))
+    assert spec(frame) != spec(frame.replace(depth=None))
+
+
+def test_a_tree_of_something_else_is_not_checked() -> None:
+    shapes = pytree.tree_map(lambda value: tuple(value.shape), full_frame())
+    assert shapes.color == (2, 3, *SIZE)
+    assert shapes.view_projection == (2, 4, 4)
+
+
+def test_torch_func_takes_frames() -> None:
+    def loss(frame: Frame) -> Tensor:
+        assert frame.depth is not None
+        return (frame.color.square() * frame.depth).sum()
+
+    frame = Frame(color=torch.rand(2, 3, *SIZE), depth=plane(1, 3.0))
+    gradient = torch.func.grad(loss)(frame)
+    assert isinstance(gradient, Frame)
+    torch.testing.assert_close(gradient.color, 6 * frame.color)
+    torch.testing.assert_close(gradient.depth, frame.color.square().sum(1, keepdim=True))
+    mapped = torch.func.vmap(lambda each: 2 * each.color)(pytree.tree_map(lambda value: value[:, None], frame))
+    assert torch.equal(mapped[:, 0], 2 * frame.color)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -126,6 +127,10 @@ class Accumulated(Wrapper):
         uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth", "albedo"}
         return Needs(needs.buffers - given, uses, needs.trainable, None)
 
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """None: those of the method inside are of the accumulated radiance."""
+        return {}
+
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         history, inner = (None, None) if state is None else state
@@ -180,8 +185,9 @@ class Accumulated(Wrapper):
             surface = Surface(frame.position, frame.normal, frame.depth, label)
             after = History(color, length, surface, frame.view_projection, limit)
         hints = frame.hints._replace(still=not compiling and bool(still))
-        accumulated = frame.replace(color=color[:, COLOR], current=entering[:, COLOR], length=length, hints=hints)
-        return accumulated, after, inner
+        # What was found of another image is not handed on.
+        seen_inside = {"color": color[:, COLOR], "current": entering[:, COLOR], "length": length, "statistics": {}}
+        return frame.replace(**seen_inside, hints=hints), after, inner
 
     def _blend(
         self, frame: Frame, entering: Tensor, seen: Tensor | None, history: History, still: bool | Tensor

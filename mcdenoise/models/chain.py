@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame, Skip
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
+from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.models.exposed import Exposed
 
 
 class Chain(nn.Module):
@@ -33,9 +35,14 @@ class Chain(nn.Module):
 
     @property
     def needs(self) -> Needs:
-        """What any of them needs; the reach is that of all in a row."""
-        every = [getattr(self, name).needs for name in self._names]
-        reaches = [needs.reach for needs in every]
+        """What any of them needs; the reach is that of all in a row.
+
+        It is that of the whole image where a later one depends on statistics: those are of an image that the ones
+        before it have made, which a tile is not.
+        """
+        first, *later = (getattr(self, name) for name in self._names)
+        every = [method.needs for method in (first, *later)]
+        reaches = [needs.reach for needs in every] + ([None] if any(map(_has_statistics, later)) else [])
         return Needs(
             frozenset().union(*(needs.buffers for needs in every)),
             frozenset().union(*(needs.uses for needs in every)),
@@ -57,7 +64,8 @@ class Chain(nn.Module):
             method: Model = getattr(self, name)
             known = None if skip is None else skip.of("image" if name == last else name)
             part = None if skip is None else Skip(skip.mask, {} if known is None else {"image": known})
-            frame = prepared(method, frame)
+            # Of a tile, the first one has been given those of the whole image.
+            frame = frame if name == self._names[0] and frame.statistics else prepared(method, frame)
             output, states[name] = method(frame.replace(skip=part), states[name])
             image = output.image
             if skip is not None and known is not None:
@@ -67,3 +75,12 @@ class Chain(nn.Module):
                 stages[name] = image
             frame = frame.replace(color=image)
         return Output(image, stages), states if any(each is not None for each in states.values()) else None
+
+
+def _has_statistics(model: Model) -> bool:
+    """Whether a model's pixels depend on something of the whole image besides; most wrappers only pass that on."""
+    parts = model.modules() if isinstance(model, nn.Module) else [model]
+    passing = (Wrapper, Chain)
+    return any(
+        hasattr(part, "statistics") and (isinstance(part, Exposed) or not isinstance(part, passing)) for part in parts
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -32,6 +34,10 @@ class Demodulated(Wrapper):
         needs = self.inner.needs
         return Needs(needs.buffers, needs.uses | {"albedo"}, needs.trainable, needs.reach, needs.stride)
 
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """What the model inside finds of the demodulated frame."""
+        return super().statistics(frame if _why_not(frame.albedo) else _without_albedo(frame))
+
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         albedo, device = frame.albedo, frame.color.device
@@ -40,21 +46,28 @@ class Demodulated(Wrapper):
         if albedo is None or reason:
             return self.inner(frame, state)
         with timed("accumulate", device):
-            changes = {
-                name: by_rows(demodulate, image, albedo)
-                for name, image in (("color", frame.color), ("current", frame.current))
-                if image is not None
-            }
-            if frame.variance is not None:
-                # That of a quotient is the variance over the square of the divisor.
-                changes["variance"] = demodulate(demodulate(frame.variance, albedo), albedo)
+            frame = _without_albedo(frame)
         wanted = frame.hints.stages
-        output, state = self.inner(frame.replace(**changes), state)
-        del frame, changes
+        output, state = self.inner(frame, state)
+        del frame
         with timed("remodulate", device):
             # A network that ends with a convolution hands out its precision.
             stages = {name: _with(albedo, image) for name, image in output.stages.items() if wanted}
             return Output(_with(albedo, output.image), stages), state
+
+
+def _without_albedo(frame: Frame) -> Frame:
+    albedo = frame.albedo
+    assert albedo is not None
+    changes = {
+        name: by_rows(demodulate, image, albedo)
+        for name, image in (("color", frame.color), ("current", frame.current))
+        if image is not None
+    }
+    if frame.variance is not None:
+        # That of a quotient is the variance over the square of the divisor.
+        changes["variance"] = demodulate(demodulate(frame.variance, albedo), albedo)
+    return frame.replace(**changes)
 
 
 def _with(albedo: Tensor, image: Tensor) -> Tensor:

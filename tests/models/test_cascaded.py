@@ -1,0 +1,297 @@
+"""The paper's network against its equations, written out in float64 with loops."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from toys import refused, small, whole_frame
+
+from mcdenoise.frame import Frame
+from mcdenoise.models import Accumulated, Chain, Demodulated, Exposed, Tiled, create_model, parts_of
+from mcdenoise.models.cascaded import KernelNetwork, PixelNetwork
+from mcdenoise.nn import auto_exposure
+
+SIZE = (7, 9)
+
+
+def networks(model: Any) -> list[PixelNetwork | KernelNetwork]:
+    chain = next(parts_of(model, Chain))
+    return [part for part in chain.modules() if isinstance(part, PixelNetwork | KernelNetwork)]
+
+
+def drawn(network: nn.Module) -> Any:
+    """With weights in float64 of which every part of the equations is felt."""
+    torch.manual_seed(3)
+    for name, parameter in network.named_parameters():
+        nn.init.normal_(parameter, std=0.3 if "fusions" in name or "heads" in name else 0.15)
+    return network.double()
+
+
+def frame_of_doubles(height: int, width: int, batch: int = 1) -> Frame:
+    generator = torch.Generator().manual_seed(5)
+
+    def image(channels: int) -> Tensor:
+        return torch.rand(batch, channels, height, width, generator=generator, dtype=torch.float64)
+
+    depth = 1 + 9 * image(1)
+    depth[..., 0, 0] = torch.inf
+    return Frame(4 * image(3).square(), albedo=image(3), normal=F.normalize(image(3) - 0.5, dim=1), depth=depth)
+
+
+def halved(image: Tensor) -> Tensor:
+    """D of Eq. 2: means of 2x2 pixels, of those that there are."""
+    height, width = image.shape[-2:]
+    result = image.new_zeros(*image.shape[:2], -(-height // 2), -(-width // 2))
+    for y in range(result.shape[-2]):
+        for x in range(result.shape[-1]):
+            result[..., y, x] = image[..., 2 * y : 2 * y + 2, 2 * x : 2 * x + 2].mean((-2, -1))
+    return result
+
+
+def doubled(image: Tensor, height: int, width: int) -> Tensor:
+    """U of Eq. 2."""
+    result = image.new_zeros(*image.shape[:2], height, width)
+    for y in range(height):
+        for x in range(width):
+            result[..., y, x] = image[..., y // 2, x // 2]
+    return result
+
+
+def fused(network: Any, images: list[Tensor]) -> Tensor:
+    """Eq. 2 from the coarsest scale to the finest: o = i_f - alpha U D i_f + alpha U i_c."""
+    coarse = images[-1]
+    for fine, module in zip((images[1], images[0]), network.fusions, strict=True):
+        above = doubled(coarse, *fine.shape[-2:])
+        alpha = 1 / (
+            1 + torch.exp(-F.conv2d(torch.cat([fine, above], 1), module.conv.weight, module.conv.bias, padding=1))
+        )
+        assert alpha.shape[1] == 1
+        coarse = fine - alpha * doubled(halved(fine), *fine.shape[-2:]) + alpha * above
+    return coarse
+
+
+def features(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+    """Albedo, normal and depth in the range from 0 to 1."""
+    assert frame.albedo is not None
+    assert frame.normal is not None
+    assert frame.depth is not None
+    depth = frame.depth
+    hit = torch.isfinite(depth)
+    typical = torch.exp(torch.log(depth[hit]).mean())
+    near = torch.where(hit, depth / (depth + typical), 1)
+    return frame.albedo, (frame.normal + 1) / 2, near
+
+
+def adjusted(logits: Tensor, f: Tensor | None, normal: Tensor, depth: Tensor, normalize: str) -> Tensor:
+    """Eqs. 5-8, pixel by pixel and tap by tap; a tap outside the image sees the pixel of the edge that is next."""
+    _, taps, height, width = logits.shape
+    side = math.isqrt(taps)
+    exponent = logits.clone()
+    for y in range(height):
+        for x in range(width):
+            for tap in range(taps):
+                dy, dx = tap // side - side // 2, tap % side - side // 2
+                qy, qx = min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)
+                if f is not None:
+                    f1, f2, f3 = f[:, 0, y, x], f[:, 1, y, x], f[:, 2, y, x]
+                    dn = (normal[..., y, x] - normal[..., qy, qx]).square().sum(1)
+                    dd = (depth[:, 0, y, x] - depth[:, 0, qy, qx]).square()
+                    factor = -f1 * dn - f2 * dd - f3 * (dy**2 + dx**2)
+                    exponent[:, tap, y, x] = (
+                        exponent[:, tap, y, x] + factor
+                        if normalize == "softmax"
+                        else logits[:, tap, y, x] * torch.exp(factor)
+                    )
+    if normalize == "none":
+        return exponent
+    weights = torch.exp(exponent)
+    return weights / weights.sum(1, keepdim=True)
+
+
+def filtered(image: Tensor, weights: Tensor) -> Tensor:
+    """Eq. 4."""
+    _, taps, height, width = weights.shape
+    side = math.isqrt(taps)
+    result = torch.zeros_like(image)
+    for y in range(height):
+        for x in range(width):
+            for tap in range(taps):
+                qy = min(max(y + tap // side - side // 2, 0), height - 1)
+                qx = min(max(x + tap % side - side // 2, 0), width - 1)
+                result[..., y, x] += weights[:, tap, y, x, None] * image[..., qy, qx]
+    return result
+
+
+def predictions(network: Any, frame: Frame) -> list[Tensor]:
+    """Of the heads, from the ten channels that the paper names."""
+    levels = network.unet(torch.cat([frame.color, *features(frame)], 1))
+    return [
+        F.conv2d(level, head.weight, head.bias, padding=1) for level, head in zip(levels, network.heads, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("size", [SIZE, (8, 8), (1, 1)])
+@torch.no_grad()
+def test_the_pixel_network_written_out(size: tuple[int, int]) -> None:
+    """Eqs. 1 and 2."""
+    network, frame = drawn(PixelNetwork(8)), frame_of_doubles(*size, batch=2 if size == (8, 8) else 1)
+    if size == (1, 1):
+        frame = frame.replace(depth=torch.full((1, 1, 1, 1), 3.0, dtype=torch.float64))
+    if len(frame.color) == 2:
+        # The typical depth is that of each image.
+        single = [frame.map(lambda image, i=i: image[i : i + 1]) for i in (0, 1)]
+        expected = torch.cat([fused(network, predictions(network, one)) for one in single])
+    else:
+        expected = fused(network, predictions(network, frame))
+    output, state = network(frame)
+    assert state is None
+    torch.testing.assert_close(output.image, expected, rtol=1e-9, atol=1e-10)
+    assert expected.abs().max() > 0.1
+
+
+@pytest.mark.parametrize("normalize", ["softmax", "none"])
+@pytest.mark.parametrize("bilateral", [True, False])
+@pytest.mark.parametrize("kernel_size", [3, 5])
+@torch.no_grad()
+def test_the_kernel_network_written_out(kernel_size: int, bilateral: bool, normalize: Any) -> None:
+    """Eqs. 3 to 8, and their fusion by Eq. 2."""
+    network = drawn(KernelNetwork(8, kernel_size, bilateral, normalize))
+    frame = frame_of_doubles(*SIZE)
+    image, (_, normal, depth) = frame.color, features(frame)
+    images = []
+    for scale, predicted in enumerate(predictions(network, frame)):
+        if scale:
+            image, normal, depth = halved(image), halved(normal), halved(depth)
+        logits, rest = predicted[:, : kernel_size**2], predicted[:, kernel_size**2 :]
+        assert rest.shape[1] == (3 if bilateral else 0)
+        f = torch.log1p(torch.exp(rest)) if bilateral else None
+        images.append(filtered(image, adjusted(logits, f, normal, depth, normalize)))
+    output, _ = network(frame)
+    torch.testing.assert_close(output.image, fused(network, images), rtol=1e-9, atol=1e-10)
+
+
+@torch.no_grad()
+def test_the_whole_method_written_out() -> None:
+    """A first frame: demodulation, exposure, P, K, and what is below zero is cut off."""
+    model = create_model("cascaded", width=8)
+    drawn(model)
+    frame = frame_of_doubles(*SIZE)
+    assert frame.albedo is not None
+    textured = (frame.albedo >= 1e-4).any(1, keepdim=True)
+    assert textured.all()
+    divisor = frame.albedo.clamp_min(0.04)
+    pixel, kernel = networks(model)
+    demodulated = frame.color / divisor
+    exposure = auto_exposure(demodulated)
+    seen = frame.replace(color=demodulated * exposure)
+    initial = fused(pixel, predictions(pixel, seen))
+    final = kernel(seen.replace(color=initial))[0].image
+    output, _ = model(frame)
+    assert list(output.stages) == ["accumulated", "initial"]
+    torch.testing.assert_close(output.stages["accumulated"], frame.color, rtol=1e-9, atol=1e-10)
+    torch.testing.assert_close(output.stages["initial"], initial / exposure * divisor, rtol=1e-9, atol=1e-10)
+    assert (final < 0).any()
+    torch.testing.assert_close(output.image, (final / exposure).clamp_min(0) * divisor, rtol=1e-9, atol=1e-10)
+
+
+def test_the_numbers_of_channels_are_those_of_the_paper() -> None:
+    pixel, kernel = networks(create_model("cascaded"))
+    for network, channels in ((pixel, 3), (kernel, 28)):
+        assert network.unet.encoder[0][0].in_channels == 10
+        assert [head.out_channels for head in network.heads] == [channels] * 3
+        assert {head.in_channels for head in network.heads} == {40}
+        assert {head.kernel_size for head in network.heads} == {(3, 3)}
+        assert [layer.kernel_size for layer in network.unet.up] == [(2, 2)] * 3
+        assert len(network.unet.encoder) == 4
+        assert [fusion.conv.in_channels for fusion in network.fusions] == [6, 6]
+        assert [fusion.conv.out_channels for fusion in network.fusions] == [1, 1]
+
+
+@pytest.mark.parametrize("normalize", ["softmax", "none"])
+@pytest.mark.parametrize("bilateral", [True, False])
+@pytest.mark.parametrize("cascade", ["P", "K", "P+K", "K+P", "K+K"])
+@torch.no_grad()
+def test_the_ablations(cascade: str, bilateral: bool, normalize: Any) -> None:
+    model = small("cascaded", cascade=cascade, bilateral=bilateral, normalize=normalize)
+    parts = networks(model)
+    assert "+".join("P" if isinstance(part, PixelNetwork) else "K" for part in parts) == cascade
+    for part in parts:
+        if isinstance(part, KernelNetwork):
+            assert (part.bilateral, part.normalize) == (bilateral, normalize)
+            assert {head.out_channels for head in part.heads} == {28 if bilateral else 25}
+    frame = whole_frame(model, 17, 20)
+    output, _ = model(frame)
+    assert list(output.stages) == ["accumulated", *(["initial"] if len(parts) > 1 else [])]
+    assert torch.isfinite(output.image).all()
+    assert (output.image >= 0).all()
+    assert not torch.equal(output.image, frame.color)
+
+
+@pytest.mark.parametrize("cascade", ["", "P+P", "p", "K+P+K"])
+def test_a_cascade_that_is_none_is_refused(cascade: str) -> None:
+    expected = f"cascade: expected one of P, K, P+K, K+P, K+K, found '{cascade}'"
+    assert refused(lambda: create_model("cascaded", cascade=cascade)) == expected
+
+
+def test_without_bilateral_weights_features_matter_to_the_u_net_alone() -> None:
+    """With a U-Net that is blind, normals change what is filtered with the weights, and not without them."""
+    frame = frame_of_doubles(*SIZE)
+    assert frame.normal is not None
+    other = frame.replace(normal=frame.normal.flip(3))
+    for bilateral, same in ((True, False), (False, True)):
+        network = drawn(KernelNetwork(8, bilateral=bilateral))
+        nn.init.zeros_(network.unet.encoder[0][0].weight)
+        assert torch.equal(network(frame)[0].image, network(other)[0].image) is same
+
+
+def test_kernels_keep_a_constant_image() -> None:
+    """Weights have the sum 1, and Eq. 2 returns what both scales agree on."""
+    for bilateral in (True, False):
+        network = drawn(KernelNetwork(8, bilateral=bilateral))
+        frame = frame_of_doubles(13, 18)
+        frame = frame.replace(color=torch.full_like(frame.color, 0.7))
+        torch.testing.assert_close(network(frame)[0].image, frame.color, rtol=0, atol=1e-12)
+    network = drawn(KernelNetwork(8, normalize="none"))
+    assert not torch.allclose(network(frame)[0].image, frame.color, rtol=0.1)
+
+
+def test_what_it_wears() -> None:
+    """The published accumulation with alpha 0.2, on demodulated radiance, without what came later."""
+    model = create_model("cascaded")
+    kinds = [type(part) for part in model.modules() if isinstance(part, Demodulated | Accumulated | Exposed | Chain)]
+    assert kinds == [Demodulated, Accumulated, Exposed, Chain]
+    accumulated = next(parts_of(model, Accumulated))
+    assert (accumulated.alpha_min, accumulated.rule) == (0.2, "bmfr")
+    assert (accumulated.position_limit, accumulated.normal_limit) == (0.01, 1.0)
+    assert accumulated.firefly_limit == accumulated.specular_length == accumulated.lag_threshold == math.inf
+    assert len(list(parts_of(model, Tiled))) == 2
+    changed = next(parts_of(create_model("cascaded", alpha_min=0.5, position_limit=2.0), Accumulated))
+    assert (changed.alpha_min, changed.position_limit) == (0.5, 2.0)
+
+
+@torch.no_grad()
+def test_accumulation_is_the_published_average() -> None:
+    model, state = small("cascaded"), None
+    frames = [whole_frame(model, 12, 14, seed=seed).replace(motion=torch.zeros(1, 2, 12, 14)) for seed in range(7)]
+    expected = frames[0].color
+    for number, frame in enumerate(frames):
+        output, state = model(frame, state)
+        expected = torch.lerp(expected, frame.color, max(1 / (number + 1), 0.2))
+        torch.testing.assert_close(output.stages["accumulated"], expected, rtol=1e-5, atol=1e-6)
+
+
+@torch.no_grad()
+def test_large_images_have_the_pixels_of_small_ones() -> None:
+    """Where the compiled form of the filter is chosen, with each way of normalising."""
+    for normalize in ("softmax", "none"):
+        network = drawn(KernelNetwork(8, 3, normalize=normalize)).float()
+        frame = frame_of_doubles(96, 110).to(torch.float32)
+        whole = network(frame)[0].image
+        part = network(frame.replace(statistics=network.statistics(frame)).crop(slice(0, 80), slice(0, 96)))[0].image
+        scale = float(whole.abs().mean())
+        torch.testing.assert_close(part[..., :16, :32], whole[..., :16, :32], rtol=1e-4, atol=1e-4 * scale)

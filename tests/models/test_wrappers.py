@@ -1,0 +1,378 @@
+"""What any method may wear: demodulation, exposure, another method before it, lower resolutions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+from toys import Blur, Brightest, Mean, Same, Watching, frame_of, still
+
+from mcdenoise.frame import Frame, Hints, Skip
+from mcdenoise.models import (
+    Accumulated,
+    Chain,
+    CoarseToFine,
+    Demodulated,
+    Exposed,
+    FromBuffers,
+    Journal,
+    Model,
+    Needs,
+    Output,
+    Skipping,
+    Tiled,
+    Wrapper,
+    listening,
+    parts_of,
+    prepared,
+)
+from mcdenoise.nn import auto_exposure
+from mcdenoise.ops import demodulate, downsample, remodulate
+from mcdenoise.ops._steps.network import low_frequencies_of
+
+
+def double(color: Tensor) -> Tensor:
+    return 2 * color
+
+
+class Staged(Same):
+    """Twice the color, by way of half of it."""
+
+    def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+        return Output(2 * frame.color, {"half": frame.color / 2}), None
+
+
+# All of them
+
+WRAPPERS: dict[str, Callable[[Any], Any]] = {
+    "nothing": Wrapper,
+    "demodulated": Demodulated,
+    "exposed": Exposed,
+    "accumulated": Accumulated,
+    "skipping": Skipping,
+    "tiled": Tiled,
+    "chain": lambda inner: Chain(only=inner),
+}
+# Exposures divide what they have multiplied.
+ROUNDING = {"rtol": 1e-5, "atol": 1e-6}
+
+
+@pytest.mark.parametrize("name", WRAPPERS)
+def test_whoever_changes_nothing_is_not_changed(name: str) -> None:
+    frame = frame_of(24, 40, batch=2)
+    output, _ = WRAPPERS[name](Same())(frame)
+    torch.testing.assert_close(output.image, frame.color, **ROUNDING)
+
+
+@pytest.mark.parametrize("outer", WRAPPERS)
+@pytest.mark.parametrize("inner", WRAPPERS)
+def test_a_chain_of_one_method_is_that_method(outer: str, inner: str) -> None:
+    """Also where the method's pixels depend on statistics, which are those of what the method itself sees."""
+    frame = frame_of(40, 48)
+    model = WRAPPERS[outer](WRAPPERS[inner](Brightest()))
+    expected, _ = model(frame)
+    output, _ = Chain(only=model)(frame)
+    torch.testing.assert_close(output.image, expected.image, **ROUNDING)
+
+
+@pytest.mark.parametrize("name", ["nothing", "demodulated", "exposed", "chain"])
+def test_statistics_come_from_the_whole_image_through_what_is_worn(name: str) -> None:
+    frame = frame_of(64, 96)
+    whole, _ = WRAPPERS[name](Brightest())(frame)
+    for model in (Tiled(WRAPPERS[name](Brightest()), 32), WRAPPERS[name](Tiled(Brightest(), 32))):
+        output, _ = model(frame)
+        torch.testing.assert_close(output.image, whole.image, **ROUNDING)
+
+
+@pytest.mark.parametrize("name", ["nothing", "demodulated", "exposed", "skipping", "chain"])
+def test_what_is_inside_keeps_its_state(name: str) -> None:
+    model, state, colors = WRAPPERS[name](Mean()), None, torch.rand(3, 1, 3, 8, 8)
+    for number, color in enumerate(colors, start=1):
+        # Exposed anew in each frame, a mean is that of exposed ones.
+        expected = color if name == "exposed" else colors[:number].mean(0)
+        output, state = model(Frame(color), state)
+        if name != "exposed":
+            torch.testing.assert_close(output.image, expected)
+        assert state is not None
+
+
+def test_needs_go_outwards() -> None:
+    inner = Same()
+    inner.needs = Needs(frozenset({"color", "roughness"}), frozenset({"alpha"}), trainable=True, reach=3, stride=4)
+    for model in (Wrapper(inner), Exposed(inner), Skipping(inner), Tiled(inner)):
+        assert model.needs == inner.needs
+    assert Demodulated(inner).needs == Needs(inner.needs.buffers, frozenset({"alpha", "albedo"}), True, 3, 4)
+    chain = Chain(first=Blur(), second=inner)
+    assert chain.needs == Needs(frozenset({"color", "roughness"}), frozenset({"alpha", "albedo"}), True, 5, 4)
+    assert Chain(first=Blur(), second=FromBuffers(double)).needs.reach is None
+
+
+def test_parts_are_found_outermost_first() -> None:
+    inner = Exposed(Same())
+    model = Exposed(Chain(first=inner, second=Demodulated(Exposed(double))))
+    assert next(parts_of(model, Exposed)) is model
+    assert len(list(parts_of(model, Exposed))) == 3
+    assert list(parts_of(model, Chain)) == [model.inner]
+    assert not list(parts_of(model, Skipping))
+    for part in parts_of(model, Wrapper):
+        assert isinstance(part, Model)
+
+
+# Demodulated
+
+
+def test_what_is_demodulated_sees_no_albedo_in_its_light() -> None:
+    watching, frame = Watching(), frame_of(9, 7, variance=torch.rand(1, 3, 9, 7))
+    frame = frame.replace(current=frame.color / 2)
+    assert frame.albedo is not None
+    output, _ = Demodulated(watching)(frame)
+    seen = watching.frames[0]
+    assert torch.equal(seen.color, demodulate(frame.color, frame.albedo))
+    assert torch.equal(seen.current, demodulate(frame.color / 2, frame.albedo))
+    # Var(x / a) = Var(x) / a^2, with the divisor of the color.
+    divisor = frame.color / demodulate(frame.color, frame.albedo)
+    torch.testing.assert_close(seen.variance, frame.variance / divisor.square(), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(output.image, frame.color)
+    assert seen.albedo is frame.albedo
+
+
+def test_every_image_of_the_result_is_remodulated() -> None:
+    frame = frame_of(9, 7)
+    assert frame.albedo is not None
+    output, _ = Demodulated(Staged())(frame)
+    light = demodulate(frame.color, frame.albedo)
+    torch.testing.assert_close(output.image, remodulate(2 * light, frame.albedo))
+    torch.testing.assert_close(output.stages["half"], remodulate(light / 2, frame.albedo))
+    output, _ = Demodulated(Staged())(frame.replace(hints=Hints(stages=False)))
+    assert output.stages == {}
+
+
+@pytest.mark.parametrize(
+    ("albedo", "reason"),
+    [(None, "no albedo"), (1.0, "albedo is one everywhere"), (0.0, "no albedo anywhere"), (5e-5, "no albedo anywhere")],
+)
+def test_where_there_is_nothing_to_divide_out_nothing_is_done(albedo: float | None, reason: str) -> None:
+    watching, journal = Watching(), Journal()
+    frame = frame_of(9, 7)
+    frame = frame.replace(albedo=None if albedo is None else torch.full((1, 3, 9, 7), albedo))
+    with listening(journal):
+        output, _ = Demodulated(watching)(frame)
+    assert watching.frames[0].color is frame.color
+    assert output.image is frame.color
+    assert (journal.stages["demodulate"].skipped, journal.stages["demodulate"].reason) == (1, reason)
+    if albedo is not None:
+        with listening(journal):
+            output, _ = Demodulated(watching)(frame.replace(hints=Hints(keep_all=True)))
+        assert journal.stages["demodulate"].skipped == 0
+        torch.testing.assert_close(output.image, frame.color, rtol=0, atol=0)
+
+
+def test_a_result_of_half_precision_is_remodulated_in_that_of_the_albedo() -> None:
+    frame = frame_of(9, 7)
+    assert Demodulated(lambda color: color.bfloat16())(frame)[0].image.dtype == torch.float32
+
+
+# Exposed
+
+
+@pytest.mark.parametrize("factor", [1e-3, 7.0, 1e3])
+@pytest.mark.parametrize("curve", [torch.log1p, torch.square, lambda color: color.clamp_max(0.5)])
+def test_exposed_methods_do_not_depend_on_the_unit_of_radiance(
+    curve: Callable[[Tensor], Tensor], factor: float
+) -> None:
+    """model(s x) = s model(x), whatever the method is."""
+
+    def method(color: Tensor) -> Output:
+        return Output(curve(color), {"stage": curve(2 * color)})
+
+    frame, model = frame_of(20, 24, batch=2), Exposed(method)
+    expected, _ = model(frame)
+    scaled, _ = model(frame.replace(color=factor * frame.color))
+    for one, other in ((scaled.image, expected.image), (scaled.stages["stage"], expected.stages["stage"])):
+        torch.testing.assert_close(one / factor, other, rtol=1e-5, atol=1e-6)
+    bare = FromBuffers(method)
+    unlike = bare(frame.replace(color=factor * frame.color))[0].image / factor
+    assert not torch.allclose(unlike, bare(frame)[0].image, rtol=0.1)
+
+
+def test_all_radiance_is_exposed_alike_and_variance_by_the_square() -> None:
+    watching = Watching()
+    frame = frame_of(20, 24, variance=torch.rand(1, 3, 20, 24))
+    frame = frame.replace(
+        current=frame.color / 2, skip=Skip(torch.zeros(1, 1, 20, 24, dtype=torch.bool), {"image": 3 * frame.color})
+    )
+    Exposed(watching)(frame)
+    seen, exposure = watching.frames[0], auto_exposure(frame.color)
+    assert torch.equal(seen.statistics["exposure"], exposure)
+    torch.testing.assert_close(seen.color, frame.color * exposure)
+    torch.testing.assert_close(seen.current, frame.color / 2 * exposure)
+    torch.testing.assert_close(seen.variance, frame.variance * exposure.square())
+    assert seen.skip is not None
+    torch.testing.assert_close(seen.skip.images["image"], 3 * frame.color * exposure)
+
+
+# Chain
+
+
+def test_each_method_sees_the_image_of_the_one_before() -> None:
+    frame, watching = frame_of(9, 7), Watching()
+    output, state = Chain(first=double, second=Staged(), third=watching)(frame)
+    assert torch.equal(output.image, 4 * frame.color)
+    assert list(output.stages) == ["first", "second.half", "second"]
+    assert torch.equal(output.stages["first"], 2 * frame.color)
+    assert torch.equal(output.stages["second.half"], frame.color)
+    assert torch.equal(output.stages["second"], 4 * frame.color)
+    assert torch.equal(watching.frames[0].color, 4 * frame.color)
+    assert watching.frames[0].albedo is frame.albedo
+    # States are kept by name, and none where nobody has one.
+    assert {name: each is None for name, each in state.items()} == {"first": True, "second": True, "third": False}
+    Chain(first=double, second=Staged(), third=watching)(frame, state)
+    assert torch.equal(watching.states[-1]["seen"], torch.ones_like(frame.color))
+    assert Chain(first=double, second=Staged())(frame)[1] is None
+
+
+def test_statistics_go_down_the_chain_anew_for_each() -> None:
+    """Of what a method sees itself; what another found before is there beside it."""
+    frame, watching = frame_of(9, 7), Watching()
+    Chain(first=Brightest(), second=Exposed(watching))(frame)
+    assert watching.frames[0].statistics.keys() == {"brightest", "exposure"}
+    output, _ = Chain(first=double, second=Brightest())(frame)
+    assert torch.equal(output.image, torch.minimum(4 * frame.color, 2 * frame.color.amax()))
+    assert prepared(Chain(first=Brightest(), second=double), frame).statistics["brightest"].item() == frame.color.max()
+
+
+def test_a_chain_is_tiled_if_no_later_method_depends_on_the_whole_image() -> None:
+    frame = frame_of(64, 96)
+    for second, divided in (
+        (Blur(), True),
+        (Demodulated(Blur()), True),
+        (Brightest(), False),
+        (Exposed(Blur()), False),
+    ):
+        model = Chain(first=Brightest(), second=second)
+        assert (Tiled(model).halo is not None) is divided
+        torch.testing.assert_close(Tiled(model, 32)(frame)[0].image, model(frame)[0].image, **ROUNDING)
+
+
+def test_after_accumulation_statistics_are_of_what_was_accumulated() -> None:
+    watching, color = Watching(), torch.rand(2, 1, 3, 20, 24)
+    model = Accumulated(Chain(first=Brightest(), second=watching), lag_threshold=math.inf)
+    _, state = model(still(color[0]))
+    frame = still(2 * color[1])
+    model(frame.replace(statistics=Brightest().statistics(frame)), state)
+    seen = color[0] / 2 + color[1]
+    torch.testing.assert_close(watching.frames[-1].statistics["brightest"], seen.amax().reshape(1, 1, 1, 1))
+    assert prepared(model, frame).statistics == {}
+
+
+def test_what_is_known_of_each_stage_stands_in_its_place() -> None:
+    frame = frame_of(9, 7)
+    mask = torch.rand(1, 1, 9, 7) > 0.5
+    known = {"first": torch.full_like(frame.color, 5.0), "image": torch.full_like(frame.color, 9.0)}
+    output, _ = Chain(first=double, second=double)(frame.replace(skip=Skip(mask, known)))
+    assert torch.equal(output.stages["first"], torch.where(mask, 5, 2 * frame.color))
+    assert torch.equal(output.image, torch.where(mask, 9, 4 * frame.color))
+    # The last result stands for stages of which nothing is known.
+    output, _ = Chain(first=double, second=double)(frame.replace(skip=Skip(mask, {"image": known["image"]})))
+    assert torch.equal(output.stages["first"], torch.where(mask, 9, 2 * frame.color))
+
+
+def test_a_chain_of_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="methods: expected one at least, found none"):
+        Chain()
+
+
+# CoarseToFine
+
+
+class Constant(nn.Module):
+    """The mean of the whole frame that it sees, and how large that was."""
+
+    needs = Needs(trainable=False, reach=0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sizes: list[tuple[int, int]] = []
+
+    def statistics(self, frame: Frame) -> dict[str, Tensor]:
+        top = torch.log1p(frame.color.amax((1, 2, 3), keepdim=True))
+        return {"exposure": torch.ones_like(top), "top": top}
+
+    def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+        self.sizes.append(frame.size)
+        return Output(frame.color + len(self.sizes)), None
+
+
+def test_a_method_sees_the_image_at_each_size_coarsest_first() -> None:
+    toy, frame = Constant(), frame_of(37, 51)
+    output, state = CoarseToFine(toy, 3)(frame)
+    assert toy.sizes == [(10, 13), (19, 26), (37, 51)]
+    assert state is None
+    exposure, top = torch.ones(1, 1, 1, 1), torch.log1p(frame.color.amax((1, 2, 3), keepdim=True))
+    half = downsample(frame.color)
+    expected = downsample(half) + 1
+    expected = low_frequencies_of(half + 2, expected, top, exposure)
+    expected = low_frequencies_of(frame.color + 3, expected, top, exposure)
+    torch.testing.assert_close(output.image, expected)
+    toy.sizes.clear()
+    output, _ = CoarseToFine(toy, 1)(frame)
+    assert torch.equal(output.image, frame.color + 1)
+
+
+def test_lower_resolutions_are_not_computed_where_all_is_known() -> None:
+    toy, frame = Constant(), frame_of(37, 51)
+    mask = torch.ones(1, 1, 37, 51, dtype=torch.bool)
+    output, _ = CoarseToFine(Tiled(toy), 3)(frame.replace(skip=Skip(mask, {"image": 2 * frame.color})))
+    assert torch.equal(output.image, 2 * frame.color)
+    assert toy.sizes == []
+
+
+def test_its_reach_is_that_of_the_coarsest_size() -> None:
+    toy = Constant()
+    toy.needs = Needs(reach=5, stride=8)
+    assert CoarseToFine(toy, 1).needs.stride == 8
+    assert CoarseToFine(toy, 3).needs == Needs(reach=(5 + 8) * 4, stride=32)
+
+
+def test_low_frequencies_are_those_of_the_coarse_image() -> None:
+    fine, coarse = 0.5 + torch.rand(2, 3, 40, 48, dtype=torch.float64), torch.full((2, 3, 20, 24), 3.0).double()
+    # Every block has the same mean, so that nothing is interpolated.
+    fine[..., 8:, :] = fine[..., :8, :].repeat(1, 1, 4, 1)
+    fine[..., 8:] = fine[..., :8].repeat(1, 1, 1, 5)
+    result = low_frequencies_of(fine, coarse, torch.full((2, 1, 1, 1), 9.0).double())
+    mean = fine[..., :8, :8].mean((-2, -1), keepdim=True)
+    torch.testing.assert_close(result, fine * (3 + 1e-3) / (mean + 1e-3), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("size", [(40, 48), (37, 51), (1, 9), (8, 1)])
+def test_low_frequencies_of_its_own_change_nothing(size: tuple[int, int]) -> None:
+    fine = torch.rand(1, 3, *size, dtype=torch.float64)
+    result = low_frequencies_of(fine, downsample(fine), torch.log1p(fine.amax((1, 2, 3), keepdim=True)))
+    torch.testing.assert_close(result, fine, rtol=1e-12, atol=0)
+
+
+def test_low_frequencies_of_a_lamp_stay_off_the_wall_beside_it() -> None:
+    """The lamp grows by a tenth; the wall, a millionth of it, does not grow by a tenth of the lamp."""
+    fine = torch.full((1, 3, 32, 32), 1e-2, dtype=torch.float64)
+    fine[..., 8:16, 8:16] = 1e4
+    coarse = downsample(fine)
+    coarse[..., 4:8, 4:8] *= 1.1
+    result = low_frequencies_of(fine, coarse, torch.full((1, 1, 1, 1), 9.0).double())
+    lamp = torch.zeros(32, 32, dtype=torch.bool)
+    lamp[8:16, 8:16] = True
+    assert result[..., lamp].unique().tolist() == [pytest.approx(np.expm1(9.0))]
+    assert result[..., ~lamp].min() > 1e-2 * (1 - 1e-9)
+    assert result[..., ~lamp].max() < 1.1e-2 * (1 + 1e-9)
+
+
+def test_low_frequencies_are_differentiable() -> None:
+    fine, coarse = (torch.rand(1, 1, side, 9 if side > 5 else 5, dtype=torch.float64) + 0.1 for side in (10, 5))
+    top = torch.full((1, 1, 1, 1), 5.0, dtype=torch.float64)
+    arguments = (fine.requires_grad_(), coarse.requires_grad_())
+    assert torch.autograd.gradcheck(lambda *images: low_frequencies_of(*images, top), arguments)
+    assert torch.autograd.gradgradcheck(lambda *images: low_frequencies_of(*images, top), arguments)
