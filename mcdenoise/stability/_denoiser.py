@@ -174,9 +174,9 @@ def _exposure(denoiser: Denoiser, exposure: float, dtype: torch.dtype) -> Check:
     """``denoise(s x) = s denoise(x)``, after a history.
 
     Scaling rounds every pixel of every frame, and each stage once more: the bound is as of a model, so many times what
-    a relative change of all colors, albedos and normals by ``u``, up or down, does to the image, since the rounding of a
-    product of two is that of either. A single pattern of ups and downs tells too little of it (half of the largest, or
-    less): it is the largest of several.
+    a relative change of all colors, albedos and normals by ``u``, up or down, does to the image, since the rounding of
+    a product of two is that of either. A single pattern of ups and downs tells too little of it (half of the largest,
+    or less): it is the largest of several.
     """
 
     def image(change: Callable[[Frame], Frame]) -> Tensor:
