@@ -66,7 +66,7 @@ def denoise(color: Tensor, length: Tensor, guides: list[Tensor], scales: Tensor,
 class Composed:
     """The filter as a method, which any wrapper takes."""
 
-    needs = Needs(frozenset({"color", "albedo", "normal", "depth"}), frozenset({"length"}), trainable=False)
+    needs = Needs(frozenset({"color", "albedo", "normal", "depth", "length"}), trainable=False)
 
     def __call__(self, frame: Frame, state: None = None) -> tuple[Output, None]:
         """Filter the color that the wrappers hand in."""

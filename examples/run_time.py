@@ -90,7 +90,9 @@ def main() -> None:
     torch.manual_seed(0)
     normal = torch.nn.functional.normalize(torch.randn(1, 3, height, width))
     color, albedo, depth = (torch.rand(1, channels, height, width) for channels in (3, 3, 1))
-    frame = Frame(color=color, albedo=albedo, normal=normal, depth=depth)
+    # As the accumulation hands it on.
+    length = torch.ones(1, 1, height, width)
+    frame = Frame(color=color, albedo=albedo, normal=normal, depth=depth, current=color, length=length)
     calls: dict[str, Callable[[], object]] = {}
     for spelt in options.models:
         calls |= calls_of(spelt, frame, options.threads)

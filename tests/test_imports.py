@@ -27,13 +27,12 @@ LIBRARY = SIGNAL | {
     "nn",
     "models",
     "data",
-    "scenes",
     "demo_scene",
     "random_scene",
     "render",
     "denoiser",
 }
-REPORTS = {"benchmark", "check", "denoise", "evaluate", "folder", "ops_overview", "peers", "report", "run_folder"}
+REPORTS = {"benchmark", "evaluate", "folder", "methods", "ops_overview", "report", "run_folder"}
 TOOLS = REPORTS | {"budget", "demo", "export", "gradcheck", "stability", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
@@ -46,21 +45,18 @@ ALLOWED: dict[str, set[str]] = {
     "models": SIGNAL | {"nn"},
     # Leaves: what is read and rendered knows the frame, and no method.
     "data": SIGNAL,
-    "scenes": SIGNAL | {"data"},
     "demo_scene": SIGNAL | {"data"},
     "random_scene": SIGNAL | {"data"},
     "render": SIGNAL | {"data"},
     "denoiser": SIGNAL | {"models"},
-    "denoise": LIBRARY,
+    "methods": SIGNAL | {"models", "denoiser"},
     "folder": LIBRARY,
     "run_folder": SIGNAL | {"data"},
     "ops_overview": {"ops"},
-    "check": LIBRARY,
-    "peers": SIGNAL | {"models", "denoiser"},
-    "evaluate": LIBRARY | {"denoise", "folder", "peers"},
-    "results": SIGNAL | {"data"},
+    "evaluate": LIBRARY | {"folder"},
+    "results": SIGNAL | {"data", "denoiser"},
     "report": LIBRARY | {"evaluate", "results"},
-    "benchmark": LIBRARY | {"check", "evaluate", "ops_overview", "peers", "results", "run_folder"},
+    "benchmark": LIBRARY | {"evaluate", "methods", "ops_overview", "results", "run_folder"},
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"results"}),
     "cli": LIBRARY | TOOLS | {"heap"},
     "__main__": {"cli"},

@@ -174,23 +174,29 @@ def _exposure(denoiser: Denoiser, exposure: float, dtype: torch.dtype) -> Check:
     """``denoise(s x) = s denoise(x)``, after a history.
 
     Scaling rounds every pixel of every frame, and each stage once more: the bound is as of a model, so many times what
-    a relative change of all colors by ``u``, up or down, does to the image. A single pattern of ups and downs tells too
-    little of it (half of the largest, or less): it is the largest of several.
+    a relative change of all colors, albedos and normals by ``u``, up or down, does to the image, since the rounding of
+    a product of two is that of either. A single pattern of ups and downs tells too little of it (half of the largest,
+    or less): it is the largest of several.
     """
 
-    def image(change: Callable[[Tensor], Tensor]) -> Tensor:
+    def image(change: Callable[[Frame], Frame]) -> Tensor:
         denoiser.reset()
-        frames = [_frame(seed, dtype).to(torch.float32) for seed in range(FRAMES)]
-        return [denoiser(frame.replace(color=change(frame.color))) for frame in frames][-1]
+        return [denoiser(change(_frame(seed, dtype).to(torch.float32))) for seed in range(FRAMES)][-1]
 
     def response(seed: int) -> float:
-        signs = torch.randint(0, 2, (1, 3, *_SIZE), generator=torch.Generator().manual_seed(seed)) * 2 - 1
-        return relative_change(image(lambda color: color * (1 + _PROBE * eps * signs)), plain) / _PROBE / 2
+        names, generator = ("color", "albedo", "normal"), torch.Generator().manual_seed(seed)
+        signs = {name: torch.randint(0, 2, (1, 3, *_SIZE), generator=generator) * 2 - 1 for name in names}
+
+        def moved(frame: Frame) -> Frame:
+            buffers = dict(frame.items())
+            return frame.replace(**{name: buffers[name] * (1 + _PROBE * eps * own) for name, own in signs.items()})
+
+        return relative_change(image(moved), plain) / _PROBE / 2
 
     eps = torch.finfo(torch.bfloat16 if denoiser.precision == "bfloat16" else torch.float32).eps
-    plain = image(lambda color: color)
+    plain = image(lambda frame: frame)
     largest = max(response(seed) for seed in range(_PATTERNS))
-    error = relative_change(image(lambda color: color * exposure) / exposure, plain) / eps
+    error = relative_change(image(lambda frame: frame.replace(color=frame.color * exposure)) / exposure, plain) / eps
     allowed = ALLOWED * max(largest / eps, 1)
     message = "" if error <= allowed else f"error {error:.3g} eps, expected at most {allowed:.3g}"
     check = _found(f"exposure {exposure:g}", dtype, "exposure", message)
