@@ -15,6 +15,9 @@ from mcdenoise.ops._rows import by_rows
 
 # How far half floats and a renderer's own arithmetic may lead out of a range.
 _ROUNDING = 1e-2
+# Largest radiance that counts as such, in whatever unit. Divided by the smallest albedo (0.04), squared, and summed
+# over the 3 x 1024 numbers of the largest window of squares, it stays below the largest float32: (25e16)^2 3072 = 2e38.
+LARGEST_RADIANCE = 1e16
 
 
 @dataclass(frozen=True)
@@ -54,18 +57,18 @@ BUFFERS: dict[str, BufferSpec] = {
     "previous_position": BufferSpec(
         3, -_UNBOUNDED, _UNBOUNDED, "where the surface point seen now was in the previous frame, world space"
     ),
-    "diffuse": BufferSpec(3, 0.0, _UNBOUNDED, "noisy radiance that the camera sees by diffuse reflection, with albedo"),
-    "specular": BufferSpec(3, 0.0, _UNBOUNDED, "noisy radiance that the camera sees by specular reflection"),
+    "diffuse": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance that the camera sees by diffuse reflection, with albedo"),
+    "specular": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance that the camera sees by specular reflection"),
     "specular_albedo": BufferSpec(3, 0.0, 1.0, "specular reflectance, linear RGB", slack=1.0),
     "roughness": BufferSpec(1, 0.0, 1.0, "perceptual roughness: 0 is a mirror"),
     "hit_distance": BufferSpec(
         1, 0.0, _UNBOUNDED, "length of the first bounce, scene units; inf where it hit nothing", infinite=True
     ),
-    "emission": BufferSpec(3, 0.0, _UNBOUNDED, "radiance sent out by the surface itself, without noise"),
+    "emission": BufferSpec(3, 0.0, LARGEST_RADIANCE, "radiance sent out by the surface itself, without noise"),
     "variance": BufferSpec(3, 0.0, _UNBOUNDED, "variance of the mean that color is, of each channel"),
     "alpha": BufferSpec(1, 0.0, 1.0, "coverage: 0 where only background is seen"),
-    "reference": BufferSpec(3, 0.0, _UNBOUNDED, "converged radiance, scene-linear RGB"),
-    "current": BufferSpec(3, 0.0, _UNBOUNDED, "radiance of this frame alone, where color is accumulated"),
+    "reference": BufferSpec(3, 0.0, LARGEST_RADIANCE, "converged radiance, scene-linear RGB"),
+    "current": BufferSpec(3, 0.0, LARGEST_RADIANCE, "radiance of this frame alone, where color is accumulated"),
     "length": BufferSpec(1, 0.0, _UNBOUNDED, "history length of an accumulated color, in frames"),
 }
 
@@ -92,6 +95,9 @@ class Hints(NamedTuple):
     last: bool = False
     stages: bool = True
     keep_all: bool = False
+
+
+_NO_HINTS = Hints()
 
 
 class Skip(NamedTuple):
@@ -185,7 +191,7 @@ class Frame:
     extra: Mapping[str, Tensor] = field(default_factory=dict)
     statistics: Mapping[str, Tensor] = field(default_factory=dict)
     skip: Skip | None = None
-    hints: Hints = Hints()
+    hints: Hints = _NO_HINTS
 
     def __post_init__(self) -> None:
         _check_buffer("color", self.color)
@@ -235,7 +241,7 @@ class Frame:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Frame:
         """The same frame with a function applied to every buffer."""
-        changed = {name: function(value) for name, value in self.items() if name in _NAMES}
+        changed: dict[str, Any] = {name: function(value) for name, value in self.items() if name in _NAMES}
         extra = {name: function(value) for name, value in self.extra.items()}
         return replace(self, **changed, extra=extra)
 
@@ -244,8 +250,8 @@ class Frame:
         return self.map(lambda value: value.to(target))
 
     def crop(self, rows: slice, columns: slice) -> Frame:
-        """A rectangle of the frame, as views. Its statistics stay those of the whole image; nothing of it is skipped."""
-        cropped = {
+        """A rectangle of the frame, as views; its statistics stay those of the whole image, and nothing is skipped."""
+        cropped: dict[str, Any] = {
             name: value[..., rows, columns] for name, value in self.items() if name in _NAMES and name != _MATRIX_NAME
         }
         extra = {name: value[..., rows, columns] for name, value in self.extra.items()}
@@ -266,9 +272,9 @@ class Frame:
     def validate(self) -> tuple[Frame, int]:
         """Look at every value: repair what is a renderer's daily bread, refuse what would spoil the result.
 
-        Pixels of ``color`` with NaN, infinity or a negative value get the mean of their usable 3x3 neighbours (0 if
-        there is none), so that they never spread. Values of ``albedo`` and ``normal`` that overshoot their range by
-        rounding are clamped, and so are albedos up to 2 (rough conductors evaluated at the normal).
+        Pixels of ``color`` with NaN, infinity, a negative value or one above 1e16 get the mean of their usable 3x3
+        neighbours (0 if there is none), so that they never spread. Values of ``albedo`` and ``normal`` that overshoot
+        their range by rounding are clamped, and so are albedos up to 2 (rough conductors evaluated at the normal).
 
         Returns:
             The clean frame, and the number of pixels of ``color`` that were replaced.
@@ -344,7 +350,10 @@ class Inspected(NamedTuple):
 
 
 def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
-    """Replace pixels with NaN, infinite or negative radiance by the mean of their usable 3x3 neighbours.
+    """Replace pixels with NaN, infinite, negative or absurdly large radiance by the mean of usable 3x3 neighbours.
+
+    Absurdly large is what is above :data:`LARGEST_RADIANCE` (1e16), from which on arithmetic in float32 overflows: of
+    one such number a network makes an image of NaN.
 
     Args:
         color: ``(B, C, H, W)`` radiance.
@@ -361,10 +370,15 @@ def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
     """
     # One pass sees whether there is anything to look for: a NaN comes through.
     low, high = torch.aminmax(color)
-    if low >= 0 and high < torch.inf:
+    if low >= 0 and high <= LARGEST_RADIANCE and high < torch.inf:
         return color, 0
-    usable = by_rows(lambda rows: (torch.isfinite(rows) & (rows >= 0)).all(dim=1, keepdim=True), color)
+    usable = by_rows(_usable, color)
     return by_rows(_mended, color, usable, reach=1), int((~usable).sum())
+
+
+def _usable(color: Tensor) -> Tensor:
+    valid = torch.isfinite(color) & (color >= 0) & (color <= LARGEST_RADIANCE)
+    return valid.all(dim=1, keepdim=True)
 
 
 def _mended(color: Tensor, usable: Tensor) -> Tensor:
