@@ -23,7 +23,6 @@ MODULES = {
 SIGNAL = {"errors", "buffers", "ops"}
 LIBRARY = SIGNAL | {
     "metrics",
-    "losses",
     "models",
     "history",
     "data",
@@ -34,18 +33,18 @@ LIBRARY = SIGNAL | {
     "tiling",
     "denoiser",
 }
-REPORTS = {"benchmark", "denoise", "evaluate", "ops_overview", "peers", "report", "run_folder"}
+REPORTS = {"benchmark", "denoise", "evaluate", "ops_overview", "peers", "report"}
 TOOLS = REPORTS | {"budget", "demo", "export", "gradcheck", "stability", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),
+    "commit": set(),
     "ops": set(),
     "buffers": {"errors", "ops"},
     "metrics": SIGNAL,
-    "losses": SIGNAL | {"metrics"},
     "models": SIGNAL,
     "history": SIGNAL,
-    "data": SIGNAL | {"history"},
+    "data": SIGNAL,
     "plan": SIGNAL | {"data"},
     "demo_scene": SIGNAL | {"data"},
     "random_scene": SIGNAL | {"data"},
@@ -53,14 +52,13 @@ ALLOWED: dict[str, set[str]] = {
     "tiling": SIGNAL | {"models"},
     "denoiser": SIGNAL | {"models", "history", "plan", "tiling"},
     "denoise": LIBRARY,
-    "run_folder": SIGNAL | {"data"},
     "ops_overview": {"ops"},
     "peers": SIGNAL | {"models", "history", "denoiser"},
     "evaluate": LIBRARY | {"denoise", "peers"},
     "results": SIGNAL | {"data"},
     "report": LIBRARY | {"evaluate", "results"},
-    "benchmark": LIBRARY | {"evaluate", "ops_overview", "peers", "results", "run_folder"},
-    **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"results"}),
+    "benchmark": LIBRARY | {"evaluate", "ops_overview", "peers", "results", "commit"},
+    **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"commit", "results"}),
     "cli": LIBRARY | TOOLS | {"heap"},
     "__main__": {"cli"},
     # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.

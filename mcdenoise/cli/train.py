@@ -27,7 +27,7 @@ def train(
     """Train a model on sequences with references; the same command again resumes a run that was stopped.
 
     Args:
-        sequences: folders of sequences with references, albedo, normal and depth.
+        sequences: folders of sequences with references, and with the buffers that the model is better with.
         out: folder of the run: checkpoint, log, TensorBoard events, and at the end the weights.
         config: what to train.
         validation: folders of sequences that are used for nothing but validation.

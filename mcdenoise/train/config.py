@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
+from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
+from mcdenoise.models import DEFAULT
 
-Precision = Literal["32-true", "bf16-mixed"]
 Schedule = Literal["constant", "cosine"]
 
 _WARM_UP = 200
@@ -23,8 +25,11 @@ class TrainConfig:
     a learning rate of 1e-4, a temporal loss weight of 0.1.
 
     Args:
-        model: name of the model in the zoo.
-        width: feature channels; 0 takes the model's own, or that of the weights it starts from.
+        model: a name of the zoo, or path/to/file.py:factory or package.module:factory of your own.
+        settings: of the model's constructor, such as width=16,cascade=K+P.
+        width: feature channels, as in the settings; 0 takes the model's own, or that of the weights it starts from.
+        losses: weights of the result and of stages on the way to it in the loss, such as image=1,initial=0.5; 1 for the
+            result and for the stage initial, where the model has one, by default.
         steps: optimiser steps.
         batch: clips in a step, of all processes together.
         frames: frames in a clip.
@@ -35,25 +40,26 @@ class TrainConfig:
         gradient_norm: largest norm of a step's gradient; 0 does not limit it.
         ema: decay of an exponential moving average of the weights, such as 0.999, below it in the first steps; the
             average is what is validated and what the run ends with. 0 takes the weights themselves.
-        draw_resolutions: a cascade of several resolutions has, in each step, from one to all of them. With all in every
+        draw_resolutions: a model of several resolutions has, in each step, from one to all of them. With all in every
             step, the low frequencies of a larger one are never learnt from, since those of the smaller one take their
             place, and drift.
-        alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
-        start_every: a shot also starts at every n-th frame, to train on short histories.
+        start_every: a shot of a model that accumulates also starts at every n-th frame, to train on short histories.
         keep_fireflies: every n-th realisation of the noise keeps its fireflies as if they were caustics, see
-            :class:`mcdenoise.history.History`; 0 for none.
+            :class:`mcdenoise.models.Accumulated`; 0 for none.
         validation_frames: the last frames of each sequence, kept for validation (the paper's 4); none of a sequence
             that would be left with less than one clip.
         lamps: chance that a clip gets lamps: rectangles of constant radiance, without noise, brighter than the rest.
         exposure: the light of a clip is scaled by up to so many stops.
         tint: each colour channel of the light is scaled by up to so many stops.
         gloss: chance that what has no albedo in a clip (mirrors, glass, lamps) is darker, by up to six stops.
-        precision: bf16-mixed runs convolutions in bfloat16.
+        precision: bfloat16 runs convolutions in bfloat16.
         seed: of weights and clips.
     """
 
-    model: str = "cascaded"
+    model: str = DEFAULT
+    settings: str = ""
     width: int = 0
+    losses: str = ""
     steps: int = 10_000
     batch: int = 8
     frames: int = 8
@@ -63,8 +69,7 @@ class TrainConfig:
     temporal_weight: float = 0.1
     gradient_norm: float = 0.0
     ema: float = 0.0
-    draw_resolutions: bool = False
-    alpha_min: float = 0.1
+    draw_resolutions: bool = True
     start_every: int = 4
     keep_fireflies: int = 0
     validation_frames: int = 4
@@ -72,8 +77,30 @@ class TrainConfig:
     exposure: float = 0.0
     tint: float = 0.0
     gloss: float = 0.0
-    precision: Precision = "32-true"
+    precision: Precision = "float32"
     seed: int = 0
+
+    @property
+    def model_settings(self) -> dict[str, Any]:
+        """What the model's constructor is given.
+
+        Raises:
+            InputError: the settings are something else.
+        """
+        return parse_settings("settings", self.settings) | ({"width": self.width} if self.width else {})
+
+    @property
+    def loss_weights(self) -> dict[str, float]:
+        """The weights of the loss by stage, as far as they are asked for.
+
+        Raises:
+            InputError: one is no number.
+        """
+        found = parse_settings("losses", self.losses)
+        for stage, weight in found.items():
+            if isinstance(weight, bool) or not isinstance(weight, int | float):
+                raise InputError(f"losses: expected weights such as image=1,initial=0.5, found {stage}={weight}")
+        return found
 
     def rate(self, step: int) -> float:
         """The learning rate of a step, in parts of the highest."""
@@ -122,5 +149,30 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
     for name in ("lamps", "gloss"):
         if not 0 <= settings[name] <= 1:
             raise InputError(f"{name}: expected in [0, 1], found {settings[name]}")
-    if not 0 < config.alpha_min <= 1:
-        raise InputError(f"alpha_min: expected in (0, 1], found {config.alpha_min}")
+    _ = config.model_settings, config.loss_weights
+
+
+def parse_settings(name: str, text: str) -> dict[str, Any]:
+    """Read settings such as ``width=16,cascade=K+P,bilateral=false``: numbers, true, false, none, or else texts.
+
+    Args:
+        name: what they are, for the message.
+        text: separated by commas; empty for none.
+
+    Raises:
+        InputError: a part is no setting, or one is there twice.
+
+    Example:
+        >>> parse_settings("settings", "width=16, cascade=K+P, alpha_min=0.2, bilateral=false")
+        {'width': 16, 'cascade': 'K+P', 'alpha_min': 0.2, 'bilateral': False}
+    """
+    found: dict[str, Any] = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        key, equals, value = (each.strip() for each in part.partition("="))
+        if not (key and equals) or key in found:
+            raise InputError(f"{name}: expected NAME=VALUE,... with each name once, found '{text}'")
+        try:
+            found[key] = json.loads({"none": "null"}.get(value.lower(), value.lower()))
+        except ValueError:
+            found[key] = value
+    return found

@@ -7,11 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from mcdenoise.data import open_sequence
-from mcdenoise.data.cache import Shot, check_trainable, open_cached
-from mcdenoise.data.clips import ClipSampler, check_sizes
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
+from mcdenoise.models import Needs
+from mcdenoise.train.cache import NOISY, Shot, features_of, open_cached
+from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
+from mcdenoise.train.front import Front
+
+# A network that is better with these learns to do without them where they are missing, which nobody wants by mistake.
+_FEATURES = ("albedo", "normal", "depth")
 
 
 @dataclass(frozen=True)
@@ -35,27 +40,45 @@ class DataFolders:
 
     Args:
         config: of the run.
+        front: what is done to the frames before they are trained on.
+        features: names of the buffers without noise that are trained on.
         training: to train on, but for the frames that are held out.
         validation: used for nothing but validation.
     """
 
     config: TrainConfig
+    front: Front
+    features: frozenset[str]
     training: list[Sequence]
     validation: list[Sequence]
 
     @staticmethod
-    def open(config: TrainConfig, training: list[Path], validation: list[Path]) -> DataFolders:
+    def open(
+        config: TrainConfig, front: Front, needs: Needs, training: list[Path], validation: list[Path]
+    ) -> DataFolders:
         """Open the folders.
 
+        Args:
+            config: of the run.
+            front: of the model.
+            needs: of the rest of the model.
+            training: folders to train on.
+            validation: folders for nothing but validation.
+
         Raises:
-            InputError: there is none to train on, a sequence has no references or features, none is long enough, or
-                one is smaller than the crop.
+            InputError: there is none to train on, a sequence has no references or not the features that the model
+                needs, none is long enough, or one is smaller than the crop.
         """
         if not training:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
-        folders = DataFolders(config, [open_sequence(p) for p in training], [open_sequence(p) for p in validation])
-        for sequence in (*folders.training, *folders.validation):
-            check_trainable(sequence)
+        opened = [open_sequence(path) for path in (*training, *validation)]
+        # What has no albedo is glossy.
+        used = (needs.buffers | needs.uses | ({"albedo"} if config.gloss else set())) - NOISY.keys()
+        wanted = needs.buffers - (NOISY.keys() if front.accumulates else {"color"}) | (used & set(_FEATURES))
+        for sequence in opened:
+            _check_trainable(sequence, wanted)
+        features = used.intersection(*(features_of(sequence) for sequence in opened))
+        folders = DataFolders(config, front, features, opened[: len(training)], opened[len(training) :])
         lengths = [(len(s) - len(folders._held_out(s)), s.size) for s in folders.training]
         check_sizes(lengths, config.frames, config.crop)
         return folders
@@ -73,20 +96,26 @@ class DataFolders:
         for sequence in self.training:
             held = self._held_out(sequence)
             length = len(sequence) - len(held)
-            firsts = range(0, len(sequence), config.start_every)
+            # A clip may begin anywhere in a shot, so that further ones are of use for their shorter histories alone.
+            firsts = range(0, len(sequence), config.start_every if self.front.accumulates else len(sequence))
             # A shot without room for a clip would be kept for nothing; the first one also has the checksum.
             useful = [first for first in firsts if first == 0 or length - first >= config.frames]
             cached = open_cached(
-                sequence, cache, alpha_min=config.alpha_min, firsts=useful, keep_fireflies=config.keep_fireflies
+                sequence,
+                cache,
+                front=self.front,
+                features=self.features,
+                firsts=useful,
+                keep_fireflies=config.keep_fireflies,
             )
-            shots += [shot.until(length - first) for first, shot in zip(useful, cached.shots, strict=True)]
+            shots += [shot.cut(slice(length - first)) for first, shot in zip(useful, cached.shots, strict=True)]
             if held:
-                watched.append((sequence.name, cached.shots[0].last(len(held))))
+                watched.append((sequence.name, cached.shots[0].cut(slice(length, None))))
             realisations = len(cached.shots[0].colors)
             entries.append(_describe(sequence, cached.sha256, realisations=realisations, validation=held))
         description: dict[str, Any] = {"sequences": entries}
         for sequence in self.validation:
-            cached = open_cached(sequence, cache, alpha_min=config.alpha_min, firsts=[0], realisations=1)
+            cached = open_cached(sequence, cache, front=self.front, features=self.features, firsts=[0], realisations=1)
             watched.append((sequence.name, cached.shots[0]))
             description.setdefault("validation_sequences", []).append(_describe(sequence, cached.sha256))
         sampler = ClipSampler(
@@ -109,3 +138,17 @@ class DataFolders:
 def _describe(sequence: Sequence, sha256: str, **more: Any) -> dict[str, Any]:
     size = f"{sequence.size[1]}x{sequence.size[0]}"
     return {"name": sequence.name, "frames": len(sequence), "size": size, **more, "sha256": sha256}
+
+
+def _check_trainable(sequence: Sequence, wanted: frozenset[str]) -> None:
+    """See that a sequence has what training needs, from what is known without reading pixels."""
+    missing = sorted(wanted - features_of(sequence))
+    if missing:
+        names = ", ".join([*(name for name in _FEATURES if name in wanted), *sorted(wanted - set(_FEATURES))])
+        raise InputError(f"{sequence.root}: expected {names} to train this model on, found no {missing[0]}")
+    without = sorted(set(sequence.numbers) - set(sequence.reference_numbers))
+    if without:
+        raise InputError(
+            f"{sequence.root}: expected a reference for every frame to train on, found none for frame {without[0]}; "
+            "render it or choose other frames"
+        )

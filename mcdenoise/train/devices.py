@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
+from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
-from mcdenoise.train.config import Precision
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -44,7 +44,7 @@ def open_fabric(accelerator: str, precision: Precision, batch: int) -> Fabric:
             devices=here,
             num_nodes=processes // here,
             strategy="ddp" if processes > 1 else "auto",
-            precision=precision,
+            precision="bf16-mixed" if precision == "bfloat16" else "32-true",
         )
         fabric.launch()
     except (RuntimeError, ValueError, ImportError) as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,16 +16,19 @@ import torch
 from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from mcdenoise.data.clips import Clip
+from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
-from mcdenoise.losses import cascade_loss
-from mcdenoise.models import Cascade, create_model, describe_weights, save_weights
-from mcdenoise.run_folder import Provenance, RunFolder, about_weights, source_commit
+from mcdenoise.models import CoarseToFine, Model, Output, State, create_model, describe_weights, parts_of, save_weights
+from mcdenoise.train.clips import Clip
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.data import DataFolders, TrainingData
 from mcdenoise.train.devices import open_fabric
-from mcdenoise.train.validation import denoise_clip, validate
+from mcdenoise.train.front import split
+from mcdenoise.train.losses import stage_loss, stage_weights
+from mcdenoise.train.run_folder import Provenance, RunFolder, about_weights
+from mcdenoise.train.unroll import Unrolled
+from mcdenoise.train.validation import validate
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -69,6 +72,9 @@ def train(
 ) -> Path:
     """Train a model, from the start or from where an earlier run of the same config in ``out`` stopped.
 
+    A step unrolls the model over clips, with the gradient through its state. What comes first in it and has no weights,
+    such as its accumulation, is computed once into the cache, see :mod:`mcdenoise.train.front`.
+
     Every clip of every step has its own seed, so that a run that was interrupted and resumed computes the same as one
     that was not, and several processes (``torchrun``) the same as one, up to the rounding of sums. Processes on several
     machines need ``sequences``, ``out`` and ``cache`` on a disk that they share.
@@ -77,7 +83,7 @@ def train(
         config: what to train.
         sequences: folders of sequences with references and features.
         out: folder of the run: ``config.json``, ``data.json``, ``log.jsonl``, TensorBoard events, ``checkpoint.pt``,
-            and at the end ``MODEL.safetensors``.
+            and at the end ``MODEL.safetensors`` (of ``mine.py:factory``, ``factory.safetensors``).
         validation: folders of sequences that are used for nothing but validation.
         cache: folder of the decoded sequences, which several runs may share; ``out/cache`` by default. Nothing in it is
             needed once a run has ended.
@@ -96,26 +102,33 @@ def train(
     """
     check_config(config, checkpoint_every)
     fabric = open_fabric(accelerator, config.precision, config.batch)
-    folders = DataFolders.open(config, sequences, validation or [])
-
     torch.manual_seed(config.seed)
     start: dict[str, Any] = describe_weights(initial_weights) if initial_weights else {"settings": {}, "sha256": "none"}
-    settings: dict[str, Any] = {**start["settings"], **({"width": config.width} if config.width else {})}
-    network = create_model(config.model, weights=initial_weights, **settings).train()
+    settings: dict[str, Any] = {**start["settings"], **config.model_settings}
+    network = _trainable(config, create_model(config.model, weights=initial_weights, **settings))
+    front, rest = split(network)
+    if config.keep_fireflies and not front.accumulates:
+        raise InputError("keep_fireflies: expected a model that begins with Accumulated, found another")
+    folders = DataFolders.open(config, front, rest.needs, sequences, validation or [])
 
     run, settled = RunFolder(out), dataclasses.asdict(config)
     run.check(config=settled)
     with fabric.rank_zero_first():
         data = folders.load(cache or out / "cache")
     identity = {"credits": credits, "initial_weights": start["sha256"], **data.description}
+    first_clip = data.sampler.draw([config.seed])
+    network.eval()
+    output, state = _tried(config.model, rest, first_clip, fabric)
+    losses = stage_weights(config.loss_weights, output)
+    network.train()
     # Only now, so that input that cannot be trained on leaves no trace of a run.
     if fabric.is_global_zero:
         run.claim(config=settled, data=identity)
     fabric.barrier()
 
-    trainer = Trainer(config, network, fabric)
+    trainer = Trainer(config, network, fabric, losses, has_state=state is not None)
     first, provenance = run.load(*trainer.parts)
-    weights = out / f"{config.model}.safetensors"
+    weights = out / f"{config.model.rpartition(':')[2]}.safetensors"
     if first == config.steps and weights.exists():
         return weights
     # The source tree may change while the run goes on, and between its parts.
@@ -130,21 +143,53 @@ def train(
     return weights
 
 
+def _trainable(config: TrainConfig, model: Model) -> Any:
+    """The model in training mode, as a model and a module."""
+    if not isinstance(model, nn.Module) or not any(weight.requires_grad for weight in model.parameters()):
+        raise InputError(f"model '{config.model}': expected one that learns, found one without weights")
+    return model.train()
+
+
+def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> tuple[Output, State]:
+    """What a model gives for the first frames of a clip: what fails is to be known before the run begins."""
+    state: State = None
+    try:
+        with torch.no_grad(), fabric.autocast():
+            for frame in map(clip.frame, range(min(2, len(clip)))):
+                output, state = model(frame, state)
+            images = {"image": output.image, **output.stages}
+    except InputError:
+        raise
+    except Exception as error:
+        reason = next(iter(str(error).splitlines()), "")
+        found = f"{type(error).__name__}: {reason}"
+        raise InputError(f"model '{name}': fails on a frame of {', '.join(sorted(frame.buffers))}: {found}") from error
+    for stage, image in images.items():
+        if image.shape != frame.color.shape:
+            sizes = f"of {tuple(frame.color.shape)}, found {tuple(image.shape)}"
+            raise InputError(f"model '{name}': expected the stage '{stage}' {sizes}")
+    return output, state
+
+
 class Trainer:
-    """A network and what it learns with.
+    """A model and what it learns with.
 
     Args:
         config: of the run.
-        network: in training mode.
+        network: in training mode; its front is what the clips have been through.
         fabric: devices.
+        losses: weights of the loss by stage.
+        has_state: whether the model has a state.
     """
 
-    def __init__(self, config: TrainConfig, network: nn.Module, fabric: Fabric) -> None:
-        self.config, self.fabric = config, fabric
-        self.network: nn.Module = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    def __init__(
+        self, config: TrainConfig, network: Any, fabric: Fabric, losses: Mapping[str, float], *, has_state: bool
+    ) -> None:
+        self.config, self.fabric, self.losses = config, fabric, dict(losses)
+        self.network = network.to(memory_format=torch.channels_last)
         self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
         self.scheduler = torch.optim.lr_scheduler.LambdaLR(self.optimizer, config.rate)
-        self.model, self.stepper = fabric.setup(network, self.optimizer)
+        self.model, self.stepper = fabric.setup(Unrolled(split(network)[1], has_state=has_state), self.optimizer)
         self.average = _moving_average(network, config.ema) if config.ema else None
 
     @property
@@ -154,8 +199,8 @@ class Trainer:
         return [*parts, self.average] if self.average is not None else parts
 
     @property
-    def result(self) -> nn.Module:
-        """The network that is validated and kept."""
+    def result(self) -> Any:
+        """The model that is validated and kept."""
         return self.network if self.average is None else self.average.module
 
     def seeds(self, step: int) -> list[int]:
@@ -175,8 +220,8 @@ class Trainer:
         torch.manual_seed(self.config.seed * 1_000_003 + step)
         clip = clip.to(self.fabric.device)
         with _drawn_resolutions(self.network) if self.config.draw_resolutions else nullcontext():
-            initial, final = denoise_clip(self.model, clip)
-        loss = cascade_loss(initial, final, clip.reference, temporal_weight=self.config.temporal_weight)
+            output = self.model(clip.buffers)
+        loss = stage_loss(output, clip["reference"], self.losses, temporal_weight=self.config.temporal_weight)
         self.stepper.zero_grad()
         self.fabric.backward(loss)
         norm = self.fabric.clip_gradients(
@@ -196,19 +241,28 @@ class Trainer:
             self.average.update_parameters(self.network)
         return found["loss"], found["gradient"]
 
+    def validate(self, data: TrainingData, board: Any, step: int) -> dict[str, float]:
+        """Errors of the result, see :func:`mcdenoise.train.validation.validate`."""
+        result = self.result
+        training = result.training
+        result.eval()
+        scores = validate(split(result)[1], self.losses, data.watched, self.fabric, board, step)
+        result.train(training)
+        return scores
+
 
 @contextmanager
-def _drawn_resolutions(network: nn.Module) -> Iterator[None]:
-    """As many resolutions as are drawn, and then all of them again; a network that knows none stays as it is."""
-    if not isinstance(network, Cascade):
-        yield
-        return
-    every = network.resolutions
-    network.resolutions = int(torch.randint(1, every + 1, ()))
+def _drawn_resolutions(network: Any) -> Iterator[None]:
+    """As many resolutions as are drawn, and then all of them again; a model of one resolution stays as it is."""
+    parts = [part for part in parts_of(network, CoarseToFine) if part.resolutions > 1]
+    every = [part.resolutions for part in parts]
+    for part in parts:
+        part.resolutions = int(torch.randint(1, part.resolutions + 1, ()))
     try:
         yield
     finally:
-        network.resolutions = every
+        for part, resolutions in zip(parts, every, strict=True):
+            part.resolutions = resolutions
 
 
 def _moving_average(network: nn.Module, decay: float) -> AveragedModel:
@@ -249,7 +303,7 @@ def _run(
             history.clear()
             if not fabric.is_global_zero:
                 continue
-            scores = validate(trainer.result, data.watched, fabric, board, done) if save else {}
+            scores = trainer.validate(data, board, done) if save else {}
             progress = Progress(done, loss, norm, rate, time.monotonic() - started, scores)
             run.log(dataclasses.asdict(progress))
             for name in ("loss", "gradient_norm", "learning_rate"):

@@ -2,70 +2,73 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from mcdenoise.data.cache import Shot
-from mcdenoise.data.clips import Clip
 from mcdenoise.metrics import displayed, psnr_srgb, smape_linear
+from mcdenoise.models import Model, State
 from mcdenoise.ops import remodulate
+from mcdenoise.train.cache import Shot
+from mcdenoise.train.clips import Clip
+from mcdenoise.train.losses import RESULT
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
 
-def denoise_clip(model: nn.Module, clip: Clip) -> tuple[Tensor, Tensor]:
-    """Initial and final image of every frame, with albedo, ``(B, T, 3, H, W)``."""
-    batch = clip.color.shape[:2]
-    names = ("color", "albedo", "normal", "depth", "current", "length")
-    inputs = [getattr(clip, name).flatten(0, 1).contiguous(memory_format=torch.channels_last) for name in names]
-    initial, final = model(*inputs)
-    albedo = clip.albedo.flatten(0, 1)
-    return remodulate(initial, albedo).unflatten(0, batch), remodulate(final, albedo).unflatten(0, batch)
-
-
 @torch.no_grad()
 def validate(
-    network: nn.Module, watched: list[tuple[str, Shot]], fabric: Fabric, board: Any, step: int
+    model: Model,
+    stages: Iterable[str],
+    watched: list[tuple[str, Shot]],
+    fabric: Fabric,
+    board: Any,
+    step: int,
 ) -> dict[str, float]:
-    """Errors of a network on whole frames, one frame at a time, and pictures of them for TensorBoard.
+    """Errors of a model on whole frames, one frame after the other, and pictures of them for TensorBoard.
 
     Args:
-        network: not wrapped for several processes; only one of them validates.
-        watched: name and frames of each sequence; realisation 0 of the noise.
+        model: not wrapped for several processes; only one of them validates.
+        stages: those that the loss looks at.
+        watched: name and frames of each sequence; realisation 0 of the noise. A model with a state has none before the
+            first of them.
         fabric: device and precision.
         board: the TensorBoard writer.
         step: optimiser steps done.
 
     Returns:
-        SMAPE and display PSNR of the final and of the initial image, means over each sequence's frames and then over
-        the sequences; empty without sequences.
+        SMAPE and display PSNR of the result (``smape``, ``psnr``) and of stages (``initial_smape``, ...), means over
+        each sequence's frames and then over the sequences; empty without sequences.
     """
-    training = network.training
-    network.eval()
     totals: dict[str, float] = {}
     for i, (name, shot) in enumerate(watched):
+        state: State = None
         for t in range(len(shot)):
-            clip = Clip.from_stack(shot.read(slice(t, t + 1))[None]).to(fabric.device)
+            frame = Clip.of(shot.cut(slice(t, t + 1)).read()).to(fabric.device).frame(0)
             with fabric.autocast():
-                initial, final = denoise_clip(network, clip)
-            for key, score in _scores(initial.float(), final.float(), clip.reference).items():
-                totals[key] = totals.get(key, 0.0) + score / len(shot) / len(watched)
-        noisy = remodulate(clip.color[0], clip.albedo[0])[0]
-        shown = [displayed(image) for image in (noisy, final[0, 0].float(), clip.reference[0, 0])]
+                output, state = model(frame, state)
+            images = {RESULT: output.image, **output.stages}
+            for stage in stages:
+                for key, score in _scores(stage, images[stage].float(), frame.reference).items():
+                    totals[key] = totals.get(key, 0.0) + score / len(shot) / len(watched)
+        noisy = frame.color
+        if shot.demodulated and frame.albedo is not None:
+            noisy = remodulate(noisy, frame.albedo)
+        shown = [displayed(image)[0] for image in (noisy, output.image.float(), frame.reference) if image is not None]
         board.add_image(f"validation/{i}-{name}", torch.cat(shown, -1), step)
-    network.train(training)
     for key, score in totals.items():
         board.add_scalar(f"validation/{key}", score, step)
     return totals
 
 
-def _scores(initial: Tensor, final: Tensor, reference: Tensor) -> dict[str, float]:
+def _scores(stage: str, image: Tensor, reference: Tensor | None) -> dict[str, float]:
+    if reference is None:
+        return {}
+    prefix = "" if stage == RESULT else f"{stage}_"
     return {
-        "smape": smape_linear(final, reference).mean().item(),
-        "psnr": psnr_srgb(final, reference).mean().item(),
-        "initial_smape": smape_linear(initial, reference).mean().item(),
-        "initial_psnr": psnr_srgb(initial, reference).mean().item(),
+        f"{prefix}smape": smape_linear(image, reference).mean().item(),
+        f"{prefix}psnr": psnr_srgb(image, reference).mean().item(),
     }

@@ -13,7 +13,6 @@ from kornia.metrics import psnr
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from mcdenoise.losses import cascade_loss
 from mcdenoise.metrics import (
     UncomputableError,
     displayed,
@@ -253,48 +252,3 @@ def test_one_frame_has_no_temporal_error(metric: Callable[[Tensor, Tensor], Tens
     for shape in ((1, 1, 3, 4, 5), (3, 4, 5)):
         with pytest.raises(ValueError, match=r"clip: expected .* at least 2 frames"):
             metric(torch.rand(shape), torch.rand(shape))
-
-
-def test_the_loss_is_equation_11() -> None:
-    torch.manual_seed(0)
-    r1, r2, y = (torch.rand(2, 3, 3, 4, 5, dtype=torch.float64).tolist() for _ in range(3))
-
-    def spatial(r: list[list[list[float]]]) -> float:
-        terms = [abs(a - b) / (abs(a) + abs(b) + 1e-2) for a, b in zip(values(r), values(y), strict=True)]
-        return sum(terms) / len(terms)
-
-    def temporal(r: list[list[list[float]]]) -> float:
-        terms = []
-        for shot, true in zip(r, y, strict=True):
-            for i in range(1, 3):
-                moved = [abs(a - b) for a, b in zip(values(shot[i]), values(shot[i - 1]), strict=True)]
-                truth = [abs(a - b) for a, b in zip(values(true[i]), values(true[i - 1]), strict=True)]
-                terms += [abs(a - b) / (a + b + 1e-2) for a, b in zip(moved, truth, strict=True)]
-        return sum(terms) / len(terms)
-
-    initial, final, reference = (torch.tensor(x, dtype=torch.float64) for x in (r1, r2, y))
-    expected = spatial(r1) + spatial(r2) + 0.1 * temporal(r1) + 0.1 * temporal(r2)
-    assert cascade_loss(initial, final, reference).item() == pytest.approx(expected, rel=1e-12)
-    without = cascade_loss(initial, final, reference, temporal_weight=0)
-    assert without.item() == pytest.approx(spatial(r1) + spatial(r2), rel=1e-12)
-
-
-def values(nested: object) -> list[float]:
-    return torch.tensor(nested, dtype=torch.float64).flatten().tolist()
-
-
-def test_the_gradient_of_the_loss() -> None:
-    torch.manual_seed(0)
-    # Away from the kinks: no error, and no frame difference, is near zero.
-    frames = torch.arange(3, dtype=torch.float64).reshape(1, 3, 1, 1, 1)
-    reference = 1 + frames + torch.rand(1, 3, 3, 2, 3, dtype=torch.float64) * 0.1
-    initial = (3 * reference + torch.rand_like(reference) * 0.1).requires_grad_()
-    final = (0.4 * reference + torch.rand_like(reference) * 0.01).requires_grad_()
-    assert gradcheck(lambda a, b: cascade_loss(a, b, reference), (initial, final))
-
-
-def test_the_loss_of_one_frame() -> None:
-    one = torch.rand(1, 1, 3, 2, 2)
-    assert cascade_loss(one, one, one, temporal_weight=0).item() == 0
-    with pytest.raises(ValueError, match="at least 2 frames"):
-        cascade_loss(one, one, one)

@@ -8,17 +8,25 @@ import pytest
 import torch
 from torch import Tensor
 
-from mcdenoise.data.cache import PARTS, Shot
-from mcdenoise.data.clips import Clip, ClipSampler
 from mcdenoise.errors import InputError
-from mcdenoise.ops import remodulate
+from mcdenoise.ops import motion_from_position, remodulate
+from mcdenoise.train.cache import NOISY, Shot
+from mcdenoise.train.clips import Clip, ClipSampler
+
+PARTS = {**NOISY, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
 
 
 def shot_of(stack: Tensor, *more_colors: Tensor) -> Shot:
     """A shot that lies in memory, from ``(T, 17, H, W)`` and further realisations ``(T, 7, H, W)``."""
     color, *features = (part.numpy() for part in stack.split([7, *list(PARTS.values())[3:]], 1))
     names = list(PARTS)[3:]
-    return Shot((color, *(more.numpy() for more in more_colors)), dict(zip(names, features, strict=True)))
+    colors = (color, *(more.numpy() for more in more_colors))
+    return Shot(colors, dict(zip(names, features, strict=True)), demodulated=True)
+
+
+def clip_of(stack: Tensor) -> Clip:
+    """A clip from ``(B, T, 17, H, W)``."""
+    return Clip(dict(zip(PARTS, stack.split(list(PARTS.values()), 2), strict=True)))
 
 
 def numbered(length: int = 3, height: int = 6, width: int = 7) -> Tensor:
@@ -52,7 +60,7 @@ def test_clips_are_the_shot_turned_and_renamed() -> None:
         for left in range(4)
     }
     candidates = [
-        (place, orientation, Clip.from_stack(turned[None]))
+        (place, orientation, clip_of(turned[None]))
         for place, window in windows.items()
         for orientation, turned in enumerate(orbit(window))
     ]
@@ -60,18 +68,20 @@ def test_clips_are_the_shot_turned_and_renamed() -> None:
     places, orientations, orders = set(), set(), set()
     for seed in range(96):
         drawn = sampler.draw([seed])
-        found = [(p, o, source) for p, o, source in candidates if torch.equal(source.depth, drawn.depth)]
+        found = [(p, o, source) for p, o, source in candidates if torch.equal(source["depth"], drawn["depth"])]
         assert len(found) == 1
         place, orientation, source = found[0]
         # One order of the colour channels for radiance, albedo and reference.
-        order = [int((source.color[0, 0, :, 0, 0] == value).nonzero()) for value in drawn.color[0, 0, :, 0, 0]]
+        order = [int((source["color"][0, 0, :, 0, 0] == value).nonzero()) for value in drawn["color"][0, 0, :, 0, 0]]
         for name in ("color", "albedo", "reference"):
-            assert torch.equal(getattr(drawn, name), getattr(source, name)[:, :, order]), name
+            assert torch.equal(drawn[name], source[name][:, :, order]), name
         # Normals: the world's axes renamed and reversed, the same for all pixels and frames.
-        axes = [int((source.normal[0, 0, :, 0, 0] == value.abs()).nonzero()) for value in drawn.normal[0, 0, :, 0, 0]]
-        signs = drawn.normal[0, 0, :, 0, 0].sign().reshape(1, 1, 3, 1, 1)
+        axes = [
+            int((source["normal"][0, 0, :, 0, 0] == value.abs()).nonzero()) for value in drawn["normal"][0, 0, :, 0, 0]
+        ]
+        signs = drawn["normal"][0, 0, :, 0, 0].sign().reshape(1, 1, 3, 1, 1)
         assert sorted(axes) == [0, 1, 2]
-        assert torch.equal(drawn.normal, source.normal[:, :, axes] * signs)
+        assert torch.equal(drawn["normal"], source["normal"][:, :, axes] * signs)
         places.add(place)
         orientations.add(orientation)
         orders.add(tuple(order))
@@ -89,21 +99,21 @@ def test_a_clip_depends_on_its_seed_alone() -> None:
     batch = sampler.draw([7, 8, 9])
     # Whoever else draws random numbers does not notice.
     assert torch.equal(torch.random.get_rng_state(), before)
-    assert batch.color.shape == (3, 2, 3, 4, 4)
+    assert batch["color"].shape == (3, 2, 3, 4, 4)
     torch.manual_seed(2)
     for i, seed in ((2, 9), (0, 7)):
         alone = sampler.draw([seed])
-        assert all(torch.equal(getattr(alone, name)[0], getattr(batch, name)[i]) for name in PARTS)
-    assert not torch.equal(batch.color[0], batch.color[1])
+        assert all(torch.equal(alone[name][0], batch[name][i]) for name in PARTS)
+    assert not torch.equal(batch["color"][0], batch["color"][1])
 
 
 def test_every_realisation_of_the_noise_is_drawn_with_the_same_features() -> None:
     stack = numbered()
     others = [torch.full((3, 7, 6, 7), -1.0), torch.full((3, 7, 6, 7), -2.0)]
     clip = ClipSampler([shot_of(stack, *others)], 2, 4).draw(list(range(60)))
-    kinds = [-1 if value == -1 else -2 if value == -2 else 0 for value in clip.color[:, 0, 0, 0, 0].tolist()]
+    kinds = [-1 if value == -1 else -2 if value == -2 else 0 for value in clip["color"][:, 0, 0, 0, 0].tolist()]
     assert all(10 < kinds.count(kind) < 30 for kind in (0, -1, -2))
-    assert (clip.reference > 0).all()
+    assert (clip["reference"] > 0).all()
 
 
 def test_exposure_scales_light_and_nothing_else() -> None:
@@ -113,11 +123,11 @@ def test_exposure_scales_light_and_nothing_else() -> None:
     plain = ClipSampler([shot_of(stack)], 2, 4).draw(seeds)
     lit = ClipSampler([shot_of(stack)], 2, 4, exposure=2.0).draw(seeds)
     for name in ("length", "albedo", "normal", "depth"):
-        assert torch.equal(getattr(lit, name), getattr(plain, name)), name
-    factors = (lit.color / plain.color)[:, :1, :1, :1, :1]
-    torch.testing.assert_close(lit.color, plain.color * factors)
-    torch.testing.assert_close(lit.current, plain.current * factors)
-    torch.testing.assert_close(lit.reference, plain.reference * factors)
+        assert torch.equal(lit[name], plain[name]), name
+    factors = (lit["color"] / plain["color"])[:, :1, :1, :1, :1]
+    torch.testing.assert_close(lit["color"], plain["color"] * factors)
+    torch.testing.assert_close(lit["current"], plain["current"] * factors)
+    torch.testing.assert_close(lit["reference"], plain["reference"] * factors)
     stops = factors.log2()
     assert stops.abs().max() <= 2
     assert stops.min() < -1
@@ -128,11 +138,11 @@ def test_tint_scales_each_channel_alike_in_color_and_reference() -> None:
     stack, seeds = numbered(), list(range(20))
     plain = ClipSampler([shot_of(stack)], 2, 4).draw(seeds)
     lit = ClipSampler([shot_of(stack)], 2, 4, tint=0.5).draw(seeds)
-    factors = (lit.color / plain.color)[:, :1, :, :1, :1]
-    torch.testing.assert_close(lit.color, plain.color * factors)
-    torch.testing.assert_close(lit.current, plain.current * factors)
-    torch.testing.assert_close(lit.reference, plain.reference * factors)
-    assert torch.equal(lit.albedo, plain.albedo)
+    factors = (lit["color"] / plain["color"])[:, :1, :, :1, :1]
+    torch.testing.assert_close(lit["color"], plain["color"] * factors)
+    torch.testing.assert_close(lit["current"], plain["current"] * factors)
+    torch.testing.assert_close(lit["reference"], plain["reference"] * factors)
+    assert torch.equal(lit["albedo"], plain["albedo"])
     assert factors.log2().abs().max() <= 0.5
     assert (factors.std(2) > 0.01).all()
 
@@ -143,12 +153,12 @@ def test_gloss_darkens_what_has_no_albedo_and_nothing_else() -> None:
     stack[:, start : start + PARTS["albedo"], :, :3] = 0
     plain = ClipSampler([shot_of(stack)], 2, 4).draw(seeds)
     dark = ClipSampler([shot_of(stack)], 2, 4, gloss=1.0).draw(seeds)
-    black = (plain.albedo == 0).all(2, keepdim=True)
-    shares = dark.color / plain.color
-    assert torch.equal(dark.albedo, plain.albedo)
+    black = (plain["albedo"] == 0).all(2, keepdim=True)
+    shares = dark["color"] / plain["color"]
+    assert torch.equal(dark["albedo"], plain["albedo"])
     assert (shares.masked_select(~black) == 1).all()
-    torch.testing.assert_close(dark.current, plain.current * shares)
-    torch.testing.assert_close(dark.reference, plain.reference * shares)
+    torch.testing.assert_close(dark["current"], plain["current"] * shares)
+    torch.testing.assert_close(dark["reference"], plain["reference"] * shares)
     darkened = shares.masked_select(black)
     assert 2**-6 <= darkened.min() < 2**-4
     assert 2**-2 < darkened.max() <= 1
@@ -160,22 +170,22 @@ def test_lamps_shine_alike_in_color_and_reference() -> None:
     stack[:, 0:6], stack[:, 14:17] = 0.1, 0.5
     seeds = list(range(20))
     clip = ClipSampler([shot_of(stack)], frames=4, crop=16, lamps=1.0).draw(seeds)
-    radiance = remodulate(clip.color.flatten(0, 1), clip.albedo.flatten(0, 1)).unflatten(0, (20, 4))
-    lit = torch.isclose(radiance, clip.reference).all(2, keepdim=True)
+    radiance = remodulate(clip["color"].flatten(0, 1), clip["albedo"].flatten(0, 1)).unflatten(0, (20, 4))
+    lit = torch.isclose(radiance, clip["reference"]).all(2, keepdim=True)
     assert lit.flatten(1).any(1).all()
     assert (lit == lit[:, :1]).all()
     assert 0.02 < lit.float().mean() < 0.5
     assert (radiance[~lit.expand_as(radiance)] == torch.tensor(0.1)).all()
-    assert clip.reference.max() > 3
+    assert clip["reference"].max() > 3
     dark = ClipSampler([shot_of(stack)], frames=4, crop=16).draw(seeds)
-    assert torch.equal(clip.current, clip.color)
-    assert dark.reference.unique().tolist() == [0.5]
+    assert torch.equal(clip["current"], clip["color"])
+    assert dark["reference"].unique().tolist() == [0.5]
 
 
 def test_shots_are_drawn_in_proportion_to_their_frames() -> None:
     shots = [shot_of(torch.full((length, 17, 4, 4), float(length))) for length in (2, 6)]
     clip = ClipSampler(shots, 2, 4).draw(list(range(200)))
-    assert 0.65 < (clip.depth[:, 0, 0, 0, 0] == 6).float().mean() < 0.85
+    assert 0.65 < (clip["depth"][:, 0, 0, 0, 0] == 6).float().mean() < 0.85
 
 
 def test_clips_leave_the_shot_alone() -> None:
@@ -190,3 +200,57 @@ def test_shots_that_cannot_be_cut() -> None:
     assert "at least 5 pixels, found (2, 2)" in refused(lambda: ClipSampler([long, short], 2, 5))
     # One that is too short to be used may be small.
     assert len(ClipSampler([long, short], 3, 5).shots) == 1
+
+
+def test_motion_is_flipped_and_turned_with_the_image() -> None:
+    """Every pixel of a frame has a number; its motion says where that number was in the frame before, in any view."""
+    size = 9
+    rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
+    # Another motion for every pixel, in whole pixels, inside the image.
+    steps = torch.randint(-3, 4, (2, size, size))
+    x, y = (columns + steps[0]).clamp(0, size - 1), (rows + steps[1]).clamp(0, size - 1)
+    before = torch.arange(float(size * size)).reshape(size, size)
+    depth = torch.stack([before, before[y, x]])[:, None]
+    motion = torch.stack([torch.zeros(2, size, size), torch.stack([x - columns, y - rows]).float()])
+    motion[1, :, 4, 4] = torch.inf
+    features = {"motion": motion.numpy(), "depth": depth.numpy(), "reference": torch.ones(2, 3, size, size).numpy()}
+    shot = Shot((torch.ones(2, 3, size, size).numpy(),), features)
+    clip = ClipSampler([shot], 2, size).draw(list(range(40)))
+    views = {tuple(view[0, 0].flatten().tolist()) for view in clip["depth"]}
+    assert len(views) == 8
+    for numbers, vectors in zip(clip["depth"][:, :, 0], clip["motion"][:, 1], strict=True):
+        known = vectors.isfinite().all(0)
+        assert int((~known).sum()) == 1
+        # Still unknown, not NaN.
+        assert vectors[:, ~known].abs().isinf().all()
+        there = torch.where(known, vectors, 0).long() + torch.stack([columns, rows])
+        assert torch.equal(numbers[0][there[1], there[0]][known], numbers[1][known])
+
+
+def test_the_camera_sees_the_crop_as_the_motion_has_it() -> None:
+    """Positions seen from the previous camera of a clip are where its motion says, in pixels of the crop."""
+    height, width, crop = 18, 25, 8
+    torch.manual_seed(0)
+    view = torch.tensor([[1.1, 0.2, 0.1, 0.1], [-0.1, 1.3, 0.0, -0.2], [0.1, 0.1, 1.0, 1.0], [0.2, 0.3, 0.1, 1.5]])
+    views = torch.stack([view + 0.01 * t for t in range(3)])
+    position = 2 * torch.rand(3, 3, height, width) - 1
+    motion = torch.stack([motion_from_position(position[t : t + 1], views[max(t - 1, 0)][None])[0] for t in range(3)])
+    features = {"position": position, "motion": motion, "view_projection": views}
+    arrays = {name: value.numpy() for name, value in features.items()}
+    arrays["reference"] = torch.ones(3, 3, height, width).numpy()
+    shot = Shot((torch.ones(3, 3, height, width).numpy(),), arrays)
+    clip = ClipSampler([shot], 3, crop).draw(list(range(40)))
+    found = motion_from_position(clip["position"][:, 1].contiguous(), clip["view_projection"][:, 0].contiguous())
+    # Pixel coordinates of some 100, of which float32 knows 1e-5; measured: 2e-5.
+    torch.testing.assert_close(found, clip["motion"][:, 1], rtol=1e-4, atol=2e-4)
+
+
+def test_frames_of_a_clip() -> None:
+    clip = ClipSampler([shot_of(numbered())], 2, 4).draw([1, 2, 3])
+    assert (len(clip), clip.batch) == (2, 3)
+    frame = clip.frame(1)
+    assert frame.buffers == set(PARTS)
+    assert torch.equal(frame.color, clip["color"][:, 1])
+    assert torch.equal(clip.frame().color.unflatten(0, (3, 2)), clip["color"])
+    own = Clip({**clip.buffers, "curvature": clip["depth"]}).frame(0)
+    assert torch.equal(own.extra["curvature"], clip["depth"][:, 0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,15 +17,22 @@ import numpy as np
 import pytest
 import torch
 
-from mcdenoise.data import cache, open_sequence
+import mcdenoise
+from mcdenoise.data import open_sequence
 from mcdenoise.data.bmfr import write_buffer
-from mcdenoise.data.cache import CachedSequence, open_cached
-from mcdenoise.data.clips import Clip
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
-from mcdenoise.history import History
-from mcdenoise.ops import Accumulate
+from mcdenoise.frame import Frame
+from mcdenoise.models import Accumulated, Demodulated, Output, create_model
+from mcdenoise.ops import motion_from_position
+from mcdenoise.train import cache
+from mcdenoise.train.cache import CachedSequence, features_of, open_cached
+from mcdenoise.train.front import Front, split
+
+FEATURES = ("albedo", "normal", "depth")
+SETTINGS = f"front=Front(((Demodulated, {{}}), (Accumulated, {{}}))), features={FEATURES}"
+FRONT = Front(((Demodulated, {}), (Accumulated, {})))
 
 
 @pytest.fixture
@@ -54,8 +62,13 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
 
 
 def opened(path: Path, folder: Path, **changes: Any) -> CachedSequence:
-    settings: dict[str, Any] = {"alpha_min": 0.1, "firsts": [0, 2], **changes}
+    settings: dict[str, Any] = {"front": FRONT, "features": FEATURES, "firsts": [0, 2], **changes}
     return open_cached(open_sequence(path), folder, **settings)
+
+
+def pixels(cached: CachedSequence) -> torch.Tensor:
+    """All that is in the first shot."""
+    return torch.cat(list(cached.shots[0].read().values()), 1)
 
 
 def entries(folder: Path) -> list[str]:
@@ -68,24 +81,105 @@ def test_shots_start_anew_and_are_accumulated(noisy: Path, tmp_path: Path) -> No
     assert [(len(shot), len(shot.colors), shot.size) for shot in cached.shots] == [(4, 3, (20, 24)), (2, 3, (20, 24))]
     for first, shot in zip((0, 2), cached.shots, strict=True):
         for realisation in range(3):
-            clip = Clip.from_stack(shot.read(realisation=realisation)[None])
-            history = History(Accumulate(0.1))
+            clip = shot.read(realisation=realisation)
+            seen: list[Frame] = []
+            model, history = Demodulated(Accumulated(Recorder(seen))), None
             for i, number in enumerate(sequence.numbers[first:]):
                 frame = sequence.frame(number, realisation=realisation).validate()[0]
-                assert torch.equal(clip.color[0, i], history.update(frame).color[0])
-                for name in ("albedo", "normal", "depth", "reference"):
-                    assert torch.equal(getattr(clip, name)[0, i], getattr(frame, name)[0]), name
+                _, history = model(frame, history)
+                for name in ("color", "current", "length"):
+                    assert torch.equal(clip[name][i], seen[i].buffer(name)[0]), name
+                for name in (*FEATURES, "reference"):
+                    assert torch.equal(clip[name][i], frame.buffer(name)[0]), name
+            assert (clip["length"][-1] > 1).any()
+
+
+class Recorder:
+    """A method that does nothing to a frame and keeps it."""
+
+    needs = create_model("cascaded_v2_micro").needs
+
+    def __init__(self, seen: list[Frame]) -> None:
+        self.seen = seen
+
+    def __call__(self, frame: Frame, state: None = None) -> tuple[Output, None]:
+        self.seen.append(frame)
+        return Output(frame.color), None
+
+
+def test_noisy_frames_for_a_model_that_begins_with_weights(noisy: Path, tmp_path: Path) -> None:
+    shot = opened(noisy, tmp_path / "cache", front=Front(), features=["depth"], firsts=[0]).shots[0]
+    assert not shot.demodulated
+    frame = open_sequence(noisy).frame(2, realisation=1).validate()[0]
+    part = shot.read(slice(2, 3), realisation=1)
+    assert part.keys() == {"color", "depth", "reference"}
+    assert torch.equal(part["color"], frame.color)
+
+
+def test_motion_of_positions_and_cameras(noisy: Path, tmp_path: Path) -> None:
+    sequence = open_sequence(noisy)
+    assert features_of(sequence) == {*FEATURES, "position", "view_projection", "motion"}
+    clip = opened(noisy, tmp_path / "cache", features=["motion", "view_projection"]).shots[0].read()
+    frames = [sequence.frame(number) for number in sequence.numbers]
+    assert clip["motion"][0].isinf().all()
+    for i in (1, 2, 3):
+        expected = motion_from_position(frames[i].position, frames[i - 1].view_projection)
+        assert torch.equal(clip["motion"][i], expected[0])
+        assert torch.equal(clip["view_projection"][i], frames[i].view_projection[0])
+    assert clip["motion"][1].abs().median() > 0.1
+    inputs = noisy / "inputs"
+    for number in sequence.numbers:
+        write_buffer(inputs, number, "motion", torch.full((1, 2, 20, 24), 1.5))
+    # The sequence's own comes first.
+    own = opened(noisy, tmp_path / "cache", features=["motion"]).shots[1].read()
+    assert (own["motion"] == 1.5).all()
+
+
+@pytest.mark.parametrize("value", [3e38, np.inf, np.nan, -1.0])
+@pytest.mark.parametrize("stem", ["color2", "reference2"])
+def test_a_pixel_that_is_no_radiance_is_the_mean_of_its_neighbours(
+    small_sequence: Path, tmp_path: Path, stem: str, value: float
+) -> None:
+    for name in ("color2", "albedo2", "reference2"):
+        path = small_sequence / "inputs" / f"{name}.exr"
+        image = np.full((20, 24, 3), 0.5, np.float32)
+        if name == stem:
+            image[10, 10] = value
+        write_exr(path, image, ["R", "G", "B"], half=False)
+    part = opened(small_sequence, tmp_path / "cache", front=Front(), features=[]).shots[0].read(slice(2, 3))
+    assert (part["color"] == 0.5).all()
+    assert (part["reference"] == 0.5).all()
 
 
 def test_a_part_of_a_shot(noisy: Path, tmp_path: Path) -> None:
     shot = opened(noisy, tmp_path / "cache").shots[0]
     whole = shot.read(realisation=1)
     part = shot.read(slice(1, 3), slice(2, 9), slice(5, 24), realisation=1)
-    assert torch.equal(part, whole[1:3, :, 2:9, 5:24])
-    assert torch.equal(shot.read(channels=[9, 0], turn=lambda image: image[..., ::-1]), shot.read()[:, [9, 0]].flip(-1))
-    assert torch.equal(shot.until(3).read(), shot.read()[:3])
-    # The past stays: color was accumulated over the frames before.
-    assert torch.equal(shot.last(1).read(), shot.read()[3:])
+    assert part.keys() == whole.keys() == {"color", "current", "length", *FEATURES, "reference"}
+    for name, image in whole.items():
+        assert torch.equal(part[name], image[1:3, :, 2:9, 5:24]), name
+    turned = shot.read(channels={"normal": [2, 0, 1]}, turn=lambda image: image[..., ::-1])
+    assert torch.equal(turned["normal"], shot.read()["normal"][:, [2, 0, 1]].flip(-1))
+    assert torch.equal(turned["depth"], shot.read()["depth"].flip(-1))
+    # The history stays: color was accumulated over the frames before.
+    for frames in (slice(3), slice(3, None)):
+        assert torch.equal(shot.cut(frames).read()["color"], shot.read()["color"][frames])
+
+
+def test_what_a_model_begins_with() -> None:
+    model = create_model("cascaded_v2_micro", alpha_min=0.3)
+    front, rest = split(model)
+    assert front.settings[0] == ["Demodulated", {}]
+    assert front.settings[1][0] == "Accumulated"
+    assert front.settings[1][1]["alpha_min"] == 0.3
+    assert (front.accumulates, front.demodulates) == (True, True)
+    assert {id(weight) for weight in rest.parameters()} == {id(weight) for weight in model.parameters()}
+    network = model.inner.inner.inner
+    # What is demodulated within the accumulation stays there, and so does whatever has weights before it.
+    front, rest = split(Accumulated(Demodulated(network)))
+    assert (front.accumulates, front.demodulates, type(rest)) == (True, False, Demodulated)
+    for whole in (network, Demodulated(network)):
+        assert split(whole) == (Front(), whole)
 
 
 def test_features_are_kept_once_and_in_half_precision_where_nothing_is_lost(noisy: Path, tmp_path: Path) -> None:
@@ -100,7 +194,7 @@ def test_features_are_kept_once_and_in_half_precision_where_nothing_is_lost(nois
     assert kinds == {**colors, **features, "depth.npy": ("float16", 4)}
     expected = open_sequence(noisy).frame(2).validate()[0].albedo
     assert expected is not None
-    assert torch.equal(cached.shots[0].read()[2, 7:10], expected[0])
+    assert torch.equal(cached.shots[0].read()["albedo"][2], expected[0])
 
 
 def test_what_is_cached_is_not_decoded_again(noisy: Path, tmp_path: Path, reads: list[tuple[int, int]]) -> None:
@@ -112,7 +206,7 @@ def test_what_is_cached_is_not_decoded_again(noisy: Path, tmp_path: Path, reads:
     assert time.process_time() - started < 0.5
     assert not reads
     assert again.sha256 == first.sha256
-    assert torch.equal(again.shots[1].read(realisation=2), first.shots[1].read(realisation=2))
+    assert torch.equal(again.shots[1].read(realisation=2)["color"], first.shots[1].read(realisation=2)["color"])
 
 
 def test_fewer_realisations(noisy: Path, tmp_path: Path, reads: list[tuple[int, int]]) -> None:
@@ -141,9 +235,44 @@ def test_a_stale_cache_is_made_again(noisy: Path, tmp_path: Path, reads: list[tu
     again = opened(noisy, folder)
     assert len(reads) in (16, 24)  # twice four frames, two or three realisations
     assert again.sha256 == fresh.sha256
-    assert torch.equal(again.shots[0].read(), fresh.shots[0].read())
+    assert torch.equal(again.shots[0].read()["color"], fresh.shots[0].read()["color"])
     # What is stale is removed.
     assert not set(entries(folder)) & set(before)
+
+
+def test_a_change_of_any_source_makes_it_again(small_sequence: Path, tmp_path: Path) -> None:
+    """Each in a process of its own, with a copy of the package."""
+    root = tmp_path / "copy"
+    package = Path(mcdenoise.__file__).parent
+    shutil.copytree(package, root / "mcdenoise", ignore=shutil.ignore_patterns("weights", "__pycache__"))
+    folder = tmp_path / "cache"
+    script = f"""
+        import sys
+        from pathlib import Path
+        from mcdenoise.data import open_sequence
+        from mcdenoise.models import Accumulated, Demodulated
+        from mcdenoise.train.cache import open_cached
+        from mcdenoise.train.front import Front
+        open_cached(open_sequence(Path(sys.argv[1])), Path(sys.argv[2]), {SETTINGS}, firsts=[0])
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script), small_sequence, folder]
+
+    def made() -> set[Path]:
+        environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
+        subprocess.run(command, check=True, env=environment, cwd=root)
+        return {path.parent for path in folder.rglob("about.json")}
+
+    before = made()
+    assert made() == before
+    sources = sorted((root / "mcdenoise" / "ops").rglob("*.py"))
+    for source in (sources[0], sources[len(sources) // 2], sources[-1]):
+        source.write_text(source.read_text() + "\n")
+        after = made()
+        assert after != before, source
+        before = after
+    # A new file may take the place of another one.
+    (root / "mcdenoise" / "ops" / "new.py").write_text("")
+    assert made() != before
 
 
 def test_every_nth_realisation_keeps_its_fireflies(noisy: Path, tmp_path: Path) -> None:
@@ -154,20 +283,33 @@ def test_every_nth_realisation_keeps_its_fireflies(noisy: Path, tmp_path: Path) 
         write_exr(folder / "color0.exr", bright, ["R", "G", "B"])
         write_exr(folder / "albedo0.exr", np.ones((20, 24, 3), np.float32), ["R", "G", "B"])
     brightest = [
-        opened(noisy, tmp_path / "cache", keep_fireflies=n).shots[0].read(realisation=k)[0, :6].amax((1, 2)).tolist()
+        opened(noisy, tmp_path / "cache", keep_fireflies=n).shots[0].read(realisation=k)[name][0].amax((1, 2)).tolist()
         for n in (0, 2)
         for k in (0, 1)
+        for name in ("color", "current")
     ]
-    assert brightest == [[15.0] * 6, [15.0] * 6, [15.0] * 6, [120.0] * 6]
+    assert brightest == [[15.0] * 3] * 6 + [[120.0] * 3] * 2
 
 
-@pytest.mark.parametrize("changes", [{"alpha_min": 0.2}, {"firsts": [0, 1]}, {"firsts": [0]}, {"keep_fireflies": 1}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"front": Front(((Demodulated, {}), (Accumulated, {"alpha_min": 0.2})))},
+        {"front": Front()},
+        {"features": [*FEATURES, "motion"]},
+        {"firsts": [0, 1]},
+        {"firsts": [0]},
+        {"keep_fireflies": 1},
+    ],
+)
 def test_other_settings_have_their_own_place(
     small_sequence: Path, tmp_path: Path, reads: list[tuple[int, int]], changes: dict[str, Any]
 ) -> None:
     opened(small_sequence, tmp_path / "cache")
     other = opened(small_sequence, tmp_path / "cache", **changes)
-    assert torch.equal(other.shots[-1].read(), opened(small_sequence, tmp_path / "new", **changes).shots[-1].read())
+    assert torch.equal(
+        other.shots[-1].read()["color"], opened(small_sequence, tmp_path / "new", **changes).shots[-1].read()["color"]
+    )
     reads.clear()
     opened(small_sequence, tmp_path / "cache")
     assert not reads
@@ -186,25 +328,25 @@ def test_another_version_of_the_code_makes_it_again(
 @pytest.mark.parametrize("name", ["color-0-0.npy", "albedo.npy", "about.json"])
 @pytest.mark.parametrize("damage", ["cut", "empty", "removed", "other"])
 def test_a_damaged_cache_is_made_again(small_sequence: Path, tmp_path: Path, name: str, damage: str) -> None:
-    whole = opened(small_sequence, tmp_path / "cache").shots[0].read()
+    whole = pixels(opened(small_sequence, tmp_path / "cache"))
     path = next((tmp_path / "cache").rglob(name))
     content = path.read_bytes()
     if damage == "removed":
         path.unlink()
     else:
         path.write_bytes({"cut": content[:-20], "empty": b"", "other": b"[1, 2, 3]"}[damage])
-    assert torch.equal(opened(small_sequence, tmp_path / "cache").shots[0].read(), whole)
+    assert torch.equal(pixels(opened(small_sequence, tmp_path / "cache")), whole)
     assert path.read_bytes() == content
 
 
 def test_a_pickle_is_never_loaded(small_sequence: Path, tmp_path: Path) -> None:
-    whole = opened(small_sequence, tmp_path / "cache").shots[0].read()
+    whole = pixels(opened(small_sequence, tmp_path / "cache"))
     path = next((tmp_path / "cache").rglob("depth.npy"))
     with path.open("wb") as file:
         # An array of Python objects; loading it would run what follows.
         np.lib.format.write_array_header_1_0(file, {"descr": "|O", "fortran_order": False, "shape": (4, 1, 20, 24)})
         file.write(b"cos\nabort\n(tR.")
-    assert torch.equal(opened(small_sequence, tmp_path / "cache").shots[0].read(), whole)
+    assert torch.equal(pixels(opened(small_sequence, tmp_path / "cache")), whole)
 
 
 def test_a_damaged_frame_leaves_nothing_half_made(small_sequence: Path, tmp_path: Path) -> None:
@@ -218,7 +360,7 @@ def test_a_damaged_frame_leaves_nothing_half_made(small_sequence: Path, tmp_path
 
 
 def run_python(code: str, *arguments: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)]
+    command = [sys.executable, "-c", textwrap.dedent(code).replace("**SETTINGS", SETTINGS), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
@@ -228,11 +370,13 @@ def test_a_full_disk_leaves_nothing_half_made(small_sequence: Path, tmp_path: Pa
         import resource, sys
         from pathlib import Path
         from mcdenoise.data import open_sequence
-        from mcdenoise.data.cache import open_cached
+        from mcdenoise.models import Accumulated, Demodulated
+        from mcdenoise.train.cache import open_cached
+        from mcdenoise.train.front import Front
         from mcdenoise.errors import InputError
         resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
         try:
-            open_cached(open_sequence(Path(sys.argv[1])), Path(sys.argv[2]), alpha_min=0.1, firsts=[0])
+            open_cached(open_sequence(Path(sys.argv[1])), Path(sys.argv[2]), **SETTINGS, firsts=[0])
         except InputError as error:
             print(error)
     """
@@ -248,19 +392,22 @@ def test_a_killed_process_leaves_nothing_that_is_taken_for_whole(small_sequence:
     code = """
         import os, signal, sys
         from pathlib import Path
-        from mcdenoise.data import cache, open_sequence
+        from mcdenoise.data import open_sequence
+        from mcdenoise.models import Accumulated, Demodulated
+        from mcdenoise.train import cache
+        from mcdenoise.train.front import Front
         write = cache._smallest
         def killed(values):
             os.kill(os.getpid(), signal.SIGKILL)
         cache._smallest = killed
-        cache.open_cached(open_sequence(Path(sys.argv[1])), Path(sys.argv[2]), alpha_min=0.1, firsts=[0, 2])
+        cache.open_cached(open_sequence(Path(sys.argv[1])), Path(sys.argv[2]), **SETTINGS, firsts=[0, 2])
     """
     assert run_python(code, small_sequence, tmp_path / "cache").returncode == -signal.SIGKILL
     left = entries(tmp_path / "cache")
     assert left
     assert all("building" in name for name in left)
-    whole = opened(small_sequence, tmp_path / "new").shots[0].read()
-    assert torch.equal(opened(small_sequence, tmp_path / "cache").shots[0].read(), whole)
+    whole = pixels(opened(small_sequence, tmp_path / "new"))
+    assert torch.equal(pixels(opened(small_sequence, tmp_path / "cache")), whole)
     assert not any("building" in name for name in entries(tmp_path / "cache"))
 
 
@@ -269,14 +416,17 @@ def test_two_processes_fill_a_cache_once(small_sequence: Path, tmp_path: Path) -
         import sys
         from pathlib import Path
         from mcdenoise.data import open_sequence
-        from mcdenoise.data.cache import open_cached
+        from mcdenoise.models import Accumulated, Demodulated
+        from mcdenoise.train.cache import open_cached
+        from mcdenoise.train.front import Front
         from mcdenoise.data.sequences import Sequence
         read, seen = Sequence.frame, []
         Sequence.frame = lambda *a, **k: seen.append(1) or read(*a, **k)
-        cached = open_cached(open_sequence(Path(sys.argv[1])), Path(sys.argv[2]), alpha_min=0.1, firsts=[0, 2])
+        cached = open_cached(open_sequence(Path(sys.argv[1])), Path(sys.argv[2]), **SETTINGS, firsts=[0, 2])
         print(len(seen), cached.sha256)
     """
-    command = [sys.executable, "-c", textwrap.dedent(code), str(small_sequence), str(tmp_path / "cache")]
+    code = textwrap.dedent(code).replace("**SETTINGS", SETTINGS)
+    command = [sys.executable, "-c", code, str(small_sequence), str(tmp_path / "cache")]
     running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     outputs = [process.communicate()[0].split() for process in running]
     assert sorted(int(count) for count, _ in outputs) == [0, 4]
@@ -292,6 +442,6 @@ def test_a_folder_that_cannot_be_written(small_sequence: Path, tmp_path: Path) -
 def test_the_checksum_is_that_of_the_images(small_sequence: Path, tmp_path: Path) -> None:
     """The same whatever the settings, so that it says which data a run saw and nothing else."""
     first = opened(small_sequence, tmp_path / "cache").sha256
-    assert opened(small_sequence, tmp_path / "cache", alpha_min=0.5, firsts=[0]).sha256 == first
+    assert opened(small_sequence, tmp_path / "cache", front=Front(), firsts=[0]).sha256 == first
     about = json.loads(next((tmp_path / "cache").rglob("about.json")).read_text())
     assert about == {"sha256": first}

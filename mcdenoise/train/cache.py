@@ -1,5 +1,7 @@
 """Decoded sequences on disk: what training reads again and again, decoded and accumulated once, opened in an instant.
 
+What is kept is what a model sees behind its wrappers without weights, see :class:`mcdenoise.train.front.Front`.
+
 A cached sequence is a folder of plain ``.npy`` files, one array each, mapped into memory and read where a clip needs
 them. It lies in ``NAME-ID/KEY``: the id says which sequence and settings, the key what it was made from. Whoever finds
 another key makes the arrays anew.
@@ -14,7 +16,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
@@ -24,23 +26,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mcdenoise import frame, history
-from mcdenoise.frame import Frame
-from mcdenoise.data import bmfr, camera_matrices, exr
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
-from mcdenoise.history import CAUSTICS, History
-from mcdenoise.ops import Accumulate, ClampFireflies, demodulation, fireflies, temporal
+from mcdenoise.frame import Frame, replace_invalid
+from mcdenoise.models.accumulated import motion_to_previous
+from mcdenoise.train.front import Front
 
-# name, channels: what a training clip holds, in the order in which :meth:`Shot.read` stacks it
-PARTS = {"color": 3, "current": 3, "length": 1, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
-# Each realisation of the noise and each first frame has its own of these, in one array; all have the others in common.
-_NOISY = ("color", "current", "length")
-_FEATURES = {name: channels for name, channels in PARTS.items() if name not in _NOISY}
+# What each realisation of the noise and each first frame has of its own, in one array, with the number of channels; the
+# first alone where nothing is accumulated. All of them have the features in common.
+NOISY = {"color": 3, "current": 3, "length": 1}
+_CAMERA = frozenset({"position", "view_projection"})
 # The files that a reader of sequences looks at, and where they are in a sequence's folder.
 _SUFFIXES = {".exr", ".h", ".json"}
 _PLACES = ("*", "realisation*/*", "inputs/*", "inputs/realisation*/*")
-_FORMAT = 2
+_FORMAT = 3
 
 Array: TypeAlias = NDArray[Any]
 # First frame (an index) and realisation of the noise: each has a color of its own.
@@ -52,13 +51,15 @@ class Shot:
     """Successive frames as a network sees them, with one or more realisations of their noise.
 
     Args:
-        colors: for each realisation ``(T, 7, H, W)``: accumulated demodulated radiance, that of each frame alone, and
-            the history length.
-        features: ``(T, C, H, W)`` of ``albedo``, ``normal``, ``depth`` and ``reference``.
+        colors: for each realisation ``(T, 3, H, W)``: radiance; or ``(T, 7, H, W)``: accumulated radiance, that of each
+            frame alone, and the history length.
+        features: ``(T, C, H, W)`` of everything else, by the names of buffers; ``view_projection`` is ``(T, 4, 4)``.
+        demodulated: whether the radiance in ``colors`` has no albedo in it.
     """
 
     colors: tuple[Array, ...]
     features: Mapping[str, Array]
+    demodulated: bool = False
 
     def __len__(self) -> int:
         return len(self.colors[0])
@@ -69,13 +70,10 @@ class Shot:
         height, width = self.colors[0].shape[-2:]
         return int(height), int(width)
 
-    def until(self, length: int) -> Shot:
-        """The first frames of the shot."""
-        return self._cut(slice(0, length))
-
-    def last(self, length: int) -> Shot:
-        """The last frames of the shot, with the past that they have."""
-        return self._cut(slice(len(self) - length, None))
+    def cut(self, frames: slice) -> Shot:
+        """Some of the frames, with the history that they have."""
+        features = {name: feature[frames] for name, feature in self.features.items()}
+        return Shot(tuple(color[frames] for color in self.colors), features, self.demodulated)
 
     def read(
         self,
@@ -84,29 +82,37 @@ class Shot:
         columns: slice = slice(None),
         *,
         realisation: int = 0,
-        channels: Iterable[int] = range(sum(PARTS.values())),
-        turn: Callable[[Array], Array] = lambda channel: channel,
-    ) -> Tensor:
-        """Copy a part of the shot from disk: ``(T, 17, H, W)`` float32, stacked in the order of ``PARTS``.
+        channels: Mapping[str, list[int]] = {},
+        turn: Callable[[Array], Array] = lambda image: image,
+    ) -> dict[str, Tensor]:
+        """Copy a part of the shot from disk: ``(T, C, H, W)`` float32 by name.
 
         Args:
             frames: which frames.
             rows: which rows.
             columns: which columns.
             realisation: of the noise.
-            channels: which of the 17, in which order.
-            turn: gives another view of ``(T, H, W)``, flipped or turned.
+            channels: of some buffers, which channels, in which order.
+            turn: gives another view of ``(T, C, H, W)``, flipped or turned.
         """
-        sources = (self.colors[realisation], *(self.features[name] for name in _FEATURES))
-        # Views only: everything is moved at once, when it is copied.
-        every = [source[frames, i, rows, columns] for source in sources for i in range(source.shape[1])]
-        chosen = [turn(every[i]) for i in channels]
-        stack = np.empty((chosen[0].shape[0], len(chosen), *chosen[0].shape[1:]), np.float32)
-        return torch.from_numpy(np.stack(chosen, 1, out=stack))
-
-    def _cut(self, frames: slice) -> Shot:
-        features = {name: feature[frames] for name, feature in self.features.items()}
-        return Shot(tuple(color[frames] for color in self.colors), features)
+        color = self.colors[realisation]
+        sources: dict[str, Array] = {}
+        start = 0
+        for name, count in NOISY.items():
+            if start < color.shape[1]:
+                sources[name] = color[:, start : start + count]
+            start += count
+        parts = {}
+        for name, source in {**sources, **self.features}.items():
+            if source.ndim == 3:
+                parts[name] = torch.from_numpy(source[frames].astype(np.float32))
+                continue
+            # Views only: everything is moved at once, when it is copied.
+            image = turn(source[frames, :, rows, columns])
+            order = channels.get(name, range(image.shape[1]))
+            part = np.empty((image.shape[0], len(order), *image.shape[2:]), np.float32)
+            parts[name] = torch.from_numpy(np.stack([image[:, i] for i in order], 1, out=part))
+        return parts
 
 
 @dataclass(frozen=True)
@@ -127,67 +133,60 @@ class _Plan:
     """What is to be computed from a sequence."""
 
     sequence: Sequence
-    alpha_min: float
+    front: Front
+    features: tuple[str, ...]
     firsts: tuple[int, ...]
     realisations: int
     keep_fireflies: int
 
     @property
-    def settings(self) -> list[Any]:
-        return [_FORMAT, self.sequence.numbers, self.alpha_min, self.firsts, self.realisations, self.keep_fireflies]
-
-    @property
     def starts(self) -> list[_Start]:
         return [(first, realisation) for first in self.firsts for realisation in range(self.realisations)]
 
-    def history(self, realisation: int) -> History:
-        """A new one."""
+    @property
+    def noisy(self) -> list[str]:
+        return list(NOISY)[: None if self.front.accumulates else 1]
+
+    def begin(self, realisation: int) -> Callable[[Frame], Frame]:
         kept = self.keep_fireflies > 0 and (realisation + 1) % self.keep_fireflies == 0
-        return History(Accumulate(self.alpha_min), ClampFireflies(CAUSTICS) if kept else None)
+        return self.front.begin(keep_fireflies=kept)
 
     def color_shape(self, first: int) -> tuple[int, ...]:
-        return (len(self.sequence) - first, sum(PARTS[name] for name in _NOISY), *self.sequence.size)
+        return (len(self.sequence) - first, sum(NOISY[name] for name in self.noisy), *self.sequence.size)
 
 
-def check_trainable(sequence: Sequence) -> None:
-    """See that a sequence has what training needs, from what is known without reading pixels.
-
-    Raises:
-        InputError: a buffer or a reference is missing.
-    """
-    missing = sorted({"albedo", "normal", "depth"} - sequence.buffers)
-    if missing:
-        raise InputError(f"{sequence.root}: expected albedo, normal and depth to train on, found no {missing[0]}")
-    without = sorted(set(sequence.numbers) - set(sequence.reference_numbers))
-    if without:
-        raise InputError(
-            f"{sequence.root}: expected a reference for every frame to train on, found none for frame {without[0]}; "
-            "render it or choose other frames"
-        )
+def features_of(sequence: Sequence) -> frozenset[str]:
+    """Names of the buffers without noise that can be had of a sequence: motion also of positions and cameras."""
+    derived = {"motion"} if sequence.buffers >= _CAMERA else set()
+    return (sequence.buffers | derived) - {"color", "reference"}
 
 
 def open_cached(
     sequence: Sequence,
     folder: Path,
     *,
-    alpha_min: float,
+    front: Front,
+    features: Iterable[str],
     firsts: list[int],
     realisations: int | None = None,
     keep_fireflies: int = 0,
 ) -> CachedSequence:
     """A sequence as a network sees it, from a cache that is filled where it has to be.
 
-    The features are kept once, the accumulated color once for each first frame and realisation of the noise: a shot
-    that starts later has shorter histories, so that a network also learns how a shot begins. Features are kept in half
-    precision where nothing is lost by it, accumulated color in single.
+    The features are kept once, the radiance once for each first frame and realisation of the noise: a shot that starts
+    later has shorter histories, so that a network also learns how a shot begins. Features are kept in half precision
+    where nothing is lost by it, radiance in single. Pixels of the radiance and of the reference that are none (NaN,
+    infinite, negative, or absurdly large) get the mean of their neighbours. Motion is the sequence's own, or else
+    computed of positions and cameras; infinite, that is unknown, in the first frame then.
 
     What was made of other files (by name, size or time of change), of other settings or by another version of the
     code is made again. A run that finds somebody else filling the same place waits.
 
     Args:
-        sequence: frames with references, albedo, normal and depth, see :func:`check_trainable`.
+        sequence: frames with references.
         folder: of the cache; made if it does not exist.
-        alpha_min: see :func:`mcdenoise.ops.accumulate`.
+        front: what is done to the frames.
+        features: names of the buffers that are kept besides, of :func:`features_of`.
         firsts: indices of the first frames, ascending.
         realisations: use so many; all by default.
         keep_fireflies: every n-th realisation keeps its fireflies as if they were caustics; 0 for none.
@@ -196,15 +195,14 @@ def open_cached(
         InputError: a buffer or a reference is missing or damaged, or the cache cannot be written; nothing half made is
             left.
     """
-    check_trainable(sequence)
     found = sequence.realisations if realisations is None else min(realisations, sequence.realisations)
-    plan = _Plan(sequence, alpha_min, tuple(firsts), found, keep_fireflies)
+    kept = tuple(sorted({*features, "reference"}))
+    plan = _Plan(sequence, front, kept, tuple(firsts), found, keep_fireflies)
     # Not how many realisations were found: what was made of fewer is stale, and goes.
-    identity = json.dumps(
-        [str(sequence.root.resolve()), sequence.numbers, alpha_min, firsts, realisations, keep_fireflies]
-    )
+    settings = [sequence.numbers, front.settings, kept, firsts, realisations, keep_fireflies]
+    identity = json.dumps([str(sequence.root.resolve()), *settings])
     place = folder / f"{sequence.name[:100]}-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
-    finished = place / _key(plan)[:32]
+    finished = place / _key(sequence.root, [_FORMAT, *settings, found])[:32]
     cached = _load(finished, plan)
     if cached is not None:
         return cached
@@ -225,25 +223,32 @@ def open_cached(
     return cached
 
 
-def _key(plan: _Plan) -> str:
+def _key(root: Path, settings: list[Any]) -> str:
     """Checksum of everything the arrays depend on."""
-    digest = hashlib.sha256(json.dumps(plan.settings).encode() + _code())
-    root = plan.sequence.root
+    digest = hashlib.sha256(json.dumps(settings).encode() + _code())
     for path in sorted(path for place in _PLACES for path in root.glob(place)):
         # What begins with a dot is being written by a renderer, and gone in a moment.
         if path.suffix not in _SUFFIXES or path.name.startswith("."):
             continue
-        status = path.stat()
-        digest.update(f"{path.relative_to(root)}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
+        # A link to nothing is no file of the sequence.
+        with suppress(FileNotFoundError):
+            status = path.stat()
+            digest.update(os.fsencode(path.relative_to(root)))
+            digest.update(f"\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
     return digest.hexdigest()
 
 
 @functools.cache
 def _code() -> bytes:
-    """Checksum of the code that decodes and accumulates: a mended reader must not find what its predecessor read."""
-    modules = (buffers, history, bmfr, camera_matrices, exr, demodulation, fireflies, temporal)
-    sources = [Path(__file__), *(Path(str(module.__file__)) for module in modules)]
-    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).digest()
+    """Checksum of the whole package: a mended reader or operator must not find what its predecessor made.
+
+    Not of those files only that decode and accumulate: nobody would keep a list of them true.
+    """
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        content = source.read_bytes()
+        digest.update(f"{source.relative_to(package).as_posix()}\0{len(content)}\0".encode() + content)
+    return digest.digest()
 
 
 @contextmanager
@@ -272,8 +277,9 @@ def _fill(finished: Path, plan: _Plan) -> None:
 def _build(folder: Path, plan: _Plan) -> None:
     """Decode the frames one after the other; only features in the making are held in memory."""
     sequence = plan.sequence
-    histories = {start: plan.history(start[1]) for start in plan.starts}
-    features: dict[str, list[Array]] = {name: [] for name in _FEATURES}
+    steps = {start: plan.begin(start[1]) for start in plan.starts}
+    features: dict[str, list[Array]] = {name: [] for name in plan.features}
+    camera: Tensor | None = None
     digest = hashlib.sha256()
     with ExitStack() as stack:
         files = {
@@ -285,12 +291,14 @@ def _build(folder: Path, plan: _Plan) -> None:
                 frame = _read(sequence, number, realisation, digest)
                 for first in plan.firsts:
                     if first <= i:
-                        past = histories[first, realisation].update(frame)
-                        noisy = torch.cat([getattr(past, name) for name in _NOISY], 1)
+                        seen = dict(steps[first, realisation](frame).items())
+                        noisy = torch.cat([seen[name] for name in plan.noisy], 1)
                         files[first, realisation].write(noisy.numpy().tobytes())
                 if realisation == 0:
+                    found = _with_motion(frame, camera) if "motion" in features else frame
                     for name, values in features.items():
-                        values.append(_smallest(getattr(frame, name).numpy()))
+                        values.append(_smallest(dict(found.items())[name].numpy()))
+                    camera = frame.view_projection
     for name in list(features):
         # One frame that half precision cannot hold makes all of them single.
         np.save(folder / f"{name}.npy", np.concatenate(features.pop(name)), allow_pickle=False)
@@ -300,13 +308,21 @@ def _build(folder: Path, plan: _Plan) -> None:
 def _read(sequence: Sequence, number: int, realisation: int, digest: Any) -> Frame:
     """Decode a frame, add what is noisy and what is learnt from to the checksum, and validate."""
     frame = sequence.frame(number, reference=realisation == 0, realisation=realisation)
-    for image in (frame.color, frame.reference):
-        if image is not None:
-            digest.update(image.numpy().tobytes())
+    radiance = {"color": frame.color} | ({} if frame.reference is None else {"reference": frame.reference})
+    for image in radiance.values():
+        digest.update(image.numpy().tobytes())
+    # What validation does to colour alone; a reference is rendered by the same program.
+    mended = {name: replace_invalid(image)[0] for name, image in radiance.items()}
     try:
-        return frame.validate()[0]
+        return frame.replace(**mended).validate()[0].with_depth()
     except InputError as error:
         raise InputError(f"{sequence.root}, frame {number}: {error}") from error
+
+
+def _with_motion(frame: Frame, camera: Tensor | None) -> Frame:
+    """The frame with its motion, if need be that of its positions seen from the camera before."""
+    motion = motion_to_previous(frame, camera)
+    return frame.replace(motion=torch.full_like(frame.color[:, :2], torch.inf) if motion is None else motion)
 
 
 @contextmanager
@@ -338,27 +354,31 @@ def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
     sequence = plan.sequence
     try:
         about = json.loads((folder / "about.json").read_text())
-        features = {
-            name: _map(folder / f"{name}.npy", (len(sequence), channels, *sequence.size))
-            for name, channels in _FEATURES.items()
-        }
-        shots = [
-            Shot(
-                tuple(
-                    _map(folder / _color_name((first, k)), plan.color_shape(first)) for k in range(plan.realisations)
-                ),
-                {name: feature[first:] for name, feature in features.items()},
-            )
-            for first in plan.firsts
-        ]
+        features = {name: _map(folder / f"{name}.npy") for name in plan.features}
+        for name, feature in features.items():
+            _check(name, feature, (len(sequence), *feature.shape[1:-2], *_size(name, sequence)))
+        shots = []
+        for first in plan.firsts:
+            colors = [_map(folder / _color_name((first, k))) for k in range(plan.realisations)]
+            for color in colors:
+                _check(f"color of {first}", color, plan.color_shape(first))
+            later = {name: feature[first:] for name, feature in features.items()}
+            shots.append(Shot(tuple(colors), later, plan.front.demodulates))
         return CachedSequence(shots, str(about["sha256"]))
     except (OSError, EOFError, ValueError, KeyError, TypeError):
         return None
 
 
-def _map(path: Path, shape: tuple[int, ...]) -> Array:
+def _size(name: str, sequence: Sequence) -> tuple[int, int]:
+    return (4, 4) if name == "view_projection" else sequence.size
+
+
+def _map(path: Path) -> Array:
     # A plain view of the map: memmap's own slices cost more than what they read.
     array: Array = np.load(path, mmap_mode="r", allow_pickle=False).view(np.ndarray)
-    if array.shape != shape or array.dtype not in (np.float16, np.float32):
-        raise ValueError(f"{path}: expected {shape}, found {array.shape} {array.dtype}")
     return array
+
+
+def _check(name: str, array: Array, shape: tuple[int, ...]) -> None:
+    if array.shape != shape or array.dtype not in (np.float16, np.float32):
+        raise ValueError(f"{name}: expected {shape}, found {array.shape} {array.dtype}")

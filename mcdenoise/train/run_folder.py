@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -153,19 +152,3 @@ def about_weights(
         "commits": json.dumps(provenance),
         "licence": "Apache-2.0",
     }
-
-
-def source_commit() -> str:
-    """The commit of the source tree, with ``-dirty`` where files differ from it; ``"unknown"`` outside a checkout."""
-    source = Path(__file__)
-    try:
-        # An installed package may lie inside somebody else's checkout.
-        _git(source.parent, "ls-files", "--error-unmatch", source.name)
-        return _git(source.parent, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-
-
-def _git(folder: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(folder), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

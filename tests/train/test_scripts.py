@@ -6,6 +6,7 @@ import importlib.util
 import json
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,10 @@ import torch
 from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.data.camera_path import Camera
 from mcdenoise.errors import InputError
-from mcdenoise.models import create_model, describe_weights, load_weights, save_weights
+from mcdenoise.models import Chain, create_model, describe_weights, load_weights, parts_of, save_weights
+from mcdenoise.nn.unet import UNet
 
-SCRIPTS = Path(__file__).parents[1] / "training"
+SCRIPTS = Path(__file__).parents[2] / "training"
 
 
 def script(name: str) -> ModuleType:
@@ -31,12 +33,11 @@ def script(name: str) -> ModuleType:
 @pytest.mark.parametrize("place", [".", "inputs"])
 def test_cleaned_references(small_sequence: Path, tmp_path: Path, place: str) -> None:
     pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
-    from mcdenoise.peers import Oidn
-
     description = small_sequence / "inputs" / "camera.json"
     about = json.loads(description.read_text())
     description.write_text(json.dumps({**about, "reference_spp": {"0": 64}, "reference_noise": {"0": 0.1}}))
-    copied = script("clean_references").clean(small_sequence / place, tmp_path / "out", Oidn(threads=1))
+    oidn = create_model("oidn", quality="high", auxiliary="clean", source="raw", threads=1)
+    copied = script("clean_references").clean(small_sequence / place, tmp_path / "out", oidn)
     assert copied == tmp_path / "out" / "plane"
     source, cleaned = open_sequence(small_sequence), open_sequence(copied)
     assert cleaned.reference_numbers == source.reference_numbers
@@ -82,21 +83,34 @@ def test_more_noise_needs_the_cameras(small_sequence: Path, tmp_path: Path) -> N
 
 def test_wider_inputs_change_no_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
-    model = create_model("cascaded", width=8)
+    model = create_model("cascaded_v2", width=8)
     for parameter in model.parameters():
         parameter.data = parameter.data.half().float()
     # As if the U-Net of the first network were not given the last two channels of the features.
-    first = model.first.unet.encoder[0][0]
+    chain = next(parts_of(model, Chain))
+    first = next(parts_of(chain.initial, UNet)).encoder[0][0]
     first.weight.data[:, -2:] = 0
     wide = model.state_dict()
-    monkeypatch.setattr(
-        model, "state_dict", lambda: {**wide, "first.unet.encoder.0.0.weight": first.weight.data[:, :-2]}
-    )
+    (key,) = (key for key, value in model.named_parameters() if value is first.weight)
+    monkeypatch.setattr(model, "state_dict", lambda: {**wide, key: first.weight.data[:, :-2]})
     old, new = tmp_path / "old.safetensors", tmp_path / "new.safetensors"
-    old.write_bytes(save_weights(model, "cascaded", {"width": 8}, {"steps": "7"}))
+    old.write_bytes(save_weights(model, "cascaded_v2", {"width": 8}, {"steps": "7"}))
     new.write_bytes(script("widen_inputs").widened(old))
     loaded = load_weights(new)
     assert all(torch.equal(value, wide[key]) for key, value in loaded.state_dict().items())
+
+
+def test_the_weights_of_a_run_that_has_not_ended(small_sequence: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
+    pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
+    from mcdenoise.train import TrainConfig, train
+
+    settings = {"width": 4, "crop": 16, "frames": 2, "batch": 1, "steps": 2, "ema": 0.5, "validation_frames": 0}
+    weights = train(TrainConfig(**settings), [small_sequence], tmp_path / "run", checkpoint_every=1)
+    out = tmp_path / "early.safetensors"
+    monkeypatch.setattr("sys.argv", ["weights_of_checkpoint.py", str(tmp_path / "run"), "-o", str(out)])
+    script("weights_of_checkpoint").main()
+    assert describe_weights(out) == describe_weights(weights)
 
 
 def test_a_zoomed_shot_shows_a_part_of_the_image() -> None:
@@ -118,20 +132,20 @@ def test_a_zoomed_shot_shows_a_part_of_the_image() -> None:
 
 def test_weights_are_averaged(tmp_path: Path) -> None:
     files = [tmp_path / "first.safetensors", tmp_path / "second.safetensors"]
-    models = [create_model("cascaded_tiny", width=4) for _ in files]
+    models = [create_model("cascaded_v2_tiny", width=4) for _ in files]
     for number, (file, model) in enumerate(zip(files, models, strict=True)):
         for parameter in model.parameters():
             torch.nn.init.constant_(parameter, 1 + 2 * number)
-        file.write_bytes(save_weights(model, "cascaded_tiny", {"width": 4}, {"steps": str(number)}))
+        file.write_bytes(save_weights(model, "cascaded_v2_tiny", {"width": 4}, {"steps": str(number)}))
     out = tmp_path / "mean.safetensors"
     script("average_weights").average(files, out)
-    assert {float(value.unique()) for value in load_weights(out, "cascaded_tiny").state_dict().values()} == {2.0}
+    assert {float(value.unique()) for value in load_weights(out, "cascaded_v2_tiny").state_dict().values()} == {2.0}
     about = describe_weights(out)
     assert about["steps"] == "1"
     assert json.loads(about["mean_of"]) == [describe_weights(file)["sha256"] for file in files]
     with pytest.raises(InputError, match="expected at least two files of weights, found 1"):
         script("average_weights").average(files[:1], out)
     other = tmp_path / "other.safetensors"
-    other.write_bytes(save_weights(create_model("cascaded", width=4), "cascaded", {"width": 4}, {}))
-    with pytest.raises(InputError, match="expected weights of model 'cascaded_tiny', found those of 'cascaded'"):
+    other.write_bytes(save_weights(create_model("cascaded_v2", width=4), "cascaded_v2", {"width": 4}, {}))
+    with pytest.raises(InputError, match="expected weights of model 'cascaded_v2_tiny', found those of 'cascaded_v2'"):
         script("average_weights").average([other, *files], out)

@@ -1,0 +1,118 @@
+"""What comes first in a model and has no weights: it is computed once, into the cache, and not in every step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor, nn
+
+from mcdenoise.frame import Frame
+from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Skipping, State, Wrapper
+from mcdenoise.models.accumulated import CAUSTICS
+from mcdenoise.ops import remodulate
+
+
+@dataclass(frozen=True)
+class Front:
+    """Wrappers without weights, up to the one that accumulates; none where a model does not begin with them.
+
+    Args:
+        wrappers: outermost first, each with the settings of its constructor.
+    """
+
+    wrappers: tuple[tuple[type[Wrapper], dict[str, Any]], ...] = ()
+
+    @property
+    def accumulates(self) -> bool:
+        """Whether frames come out with a history: with ``current`` and ``length``."""
+        return bool(self.wrappers)
+
+    @property
+    def demodulates(self) -> bool:
+        """Whether frames come out without albedo in their radiance."""
+        return any(kind is Demodulated for kind, _ in self.wrappers)
+
+    @property
+    def settings(self) -> list[Any]:
+        """Everything that the frames depend on, as JSON knows it."""
+        return [[kind.__name__, settings] for kind, settings in self.wrappers]
+
+    def begin(self, *, keep_fireflies: bool = False) -> Callable[[Frame], Frame]:
+        """What makes of each frame of one shot what the rest of the model sees.
+
+        Args:
+            keep_fireflies: whatever the shot looks like, take its fireflies for caustics.
+        """
+        seen = _Seen()
+        model: Model = seen
+        for kind, settings in reversed(self.wrappers):
+            caustics = {"firefly_limit": CAUSTICS} if keep_fireflies and kind is Accumulated else {}
+            model = kind(model, **{**settings, **caustics})
+        state: State = None
+
+        def step(frame: Frame) -> Frame:
+            nonlocal state
+            _, state = model(frame, state)
+            return seen.frame
+
+        return step
+
+
+class _Seen(nn.Module):
+    """Remembers the frame that it is given."""
+
+    needs = Needs(trainable=False)
+    frame: Frame
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        self.frame = frame
+        return Output(frame.color), None
+
+
+class Remodulated(Wrapper):
+    """A method on frames whose radiance has no albedo in it, which it multiplies into all images of the result."""
+
+    @property
+    def needs(self) -> Needs:
+        """As those inside, and the albedo."""
+        needs = self.inner.needs
+        return Needs(needs.buffers | {"albedo"}, needs.uses, needs.trainable, needs.reach, needs.stride)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        output, state = self.inner(frame, state)
+        if (albedo := frame.albedo) is None:
+            return output, state
+        stages = {name: _with(albedo, image) for name, image in output.stages.items()}
+        return Output(_with(albedo, output.image), stages), state
+
+
+def _with(albedo: Tensor, image: Tensor) -> Tensor:
+    # A network that ends with a convolution hands out its precision.
+    return remodulate(image.to(albedo.dtype), albedo)
+
+
+def split(model: Model) -> tuple[Front, Model]:
+    """A model in two: what is computed into the cache, and the rest, which is trained on what is there.
+
+    What only skips work is no part of either: nothing is skipped in training.
+    """
+    wrappers: list[tuple[type[Wrapper], dict[str, Any]]] = []
+    found, rest = 0, model
+    # Not those that are derived from them, which may do anything.
+    while isinstance(model, Wrapper) and type(model) in (Demodulated, Accumulated):
+        wrappers.append((type(model), _settings(model)))
+        model = model.inner
+        if wrappers[-1][0] is Accumulated:
+            found, rest = len(wrappers), model
+    front = Front(tuple(wrappers[:found]))
+    while type(rest) is Skipping:
+        rest = rest.inner
+    return front, Remodulated(rest) if front.demodulates else rest
+
+
+def _settings(wrapper: Wrapper) -> dict[str, Any]:
+    """What the constructor of a wrapper was given: it keeps everything under its own name."""
+    return {name: value for name, value in vars(wrapper).items() if not name.startswith("_") and name != "training"}
