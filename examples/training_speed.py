@@ -1,7 +1,7 @@
 """Time training steps with the fast forms of the operators and with the plain ones, on the same clips, taking turns.
 
     python examples/training_speed.py
-    python examples/training_speed.py SEQUENCE... --model cascaded_small --rounds 10 --json times.json
+    python examples/training_speed.py SEQUENCE... --model cascaded_v2_small --rounds 10 --json times.json
 
 A step is that of `mcdenoise train`: its clips are drawn, the network runs forward and backward, the optimiser and the
 averaged weights follow. Without a sequence the clips are noise. Every round makes one step in each way and precision,
@@ -23,19 +23,22 @@ from typing import get_args
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from mcdenoise.benchmark.machine import describe_machine, fix_threads
-from mcdenoise.data.cache import PARTS, Shot
-from mcdenoise.data.clips import ClipSampler
 from mcdenoise.data.files import write_text
+from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
-from mcdenoise.models import create_model
+from mcdenoise.models import DEFAULT, create_model
 from mcdenoise.ops._backend import preferred
 from mcdenoise.train import TrainConfig
-from mcdenoise.train.config import Precision, check_config
+from mcdenoise.train.cache import NOISY, Shot
+from mcdenoise.train.clips import ClipSampler
+from mcdenoise.train.config import check_config
 from mcdenoise.train.data import DataFolders
 from mcdenoise.train.devices import open_fabric
+from mcdenoise.train.front import split
 from mcdenoise.train.loop import Trainer
 
 WARM_UP = 2
@@ -44,27 +47,30 @@ WARM_UP = 2
 def noise(config: TrainConfig) -> ClipSampler:
     """Clips of a shot without a picture: every buffer is noise in its range."""
     generator = np.random.default_rng(config.seed)
-    size = (config.frames, sum(PARTS.values()), config.crop, config.crop)
-    color, current, length, albedo, normal, depth, reference = np.split(
-        generator.random(size, np.float32), np.cumsum(list(PARTS.values()))[:-1], 1
-    )
-    noisy = np.concatenate([color, current, np.ceil(8 * length).clip(1)], 1)
-    features = {"albedo": albedo, "normal": 2 * normal - 1, "depth": 10 * depth, "reference": reference}
-    return ClipSampler([Shot((noisy,), features)], config.frames, config.crop)
+
+    def uniform(channels: int) -> NDArray[np.float32]:
+        return generator.random((config.frames, channels, config.crop, config.crop), np.float32)
+
+    noisy = np.concatenate([uniform(NOISY["color"] + NOISY["current"]), np.ceil(8 * uniform(1)).clip(1)], 1)
+    features = {"albedo": uniform(3), "normal": 2 * uniform(3) - 1, "depth": 10 * uniform(1), "reference": uniform(3)}
+    return ClipSampler([Shot((noisy,), features, demodulated=True)], config.frames, config.crop)
 
 
 def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:
     """Clips of sequences, decoded into a folder that goes with this process."""
     if not sequences:
         return noise(config)
+    front, rest = split(create_model(config.model))
     with tempfile.TemporaryDirectory() as cache:
-        return DataFolders.open(config, sequences, []).load(Path(cache)).sampler
+        return DataFolders.open(config, front, rest.needs, sequences, []).load(Path(cache)).sampler
 
 
 def steps(config: TrainConfig, sampler: ClipSampler, plain: bool) -> Callable[[int], None]:
     """Makes the step of a number; all start from the same weights."""
     torch.manual_seed(config.seed)
-    trainer = Trainer(config, create_model(config.model).train(), open_fabric("cpu", config.precision, config.batch))
+    fabric = open_fabric("cpu", config.precision, config.batch)
+    losses = {"image": 1.0, "initial": 1.0}
+    trainer = Trainer(config, create_model(config.model).train(), fabric, losses, has_state=False)
 
     def step(number: int) -> None:
         with preferred("torch") if plain else nullcontext():
@@ -76,7 +82,7 @@ def steps(config: TrainConfig, sampler: ClipSampler, plain: bool) -> Callable[[i
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("sequences", nargs="*", type=Path, metavar="SEQUENCE", help="folders with references")
-    parser.add_argument("--model", default="cascaded")
+    parser.add_argument("--model", default=DEFAULT)
     parser.add_argument("--batch", type=int, default=2)
     parser.add_argument("--frames", type=int, default=4)
     parser.add_argument("--crop", type=int, default=128)
@@ -100,6 +106,7 @@ def main() -> None:
             precision=precision,
             gradient_norm=1.0,
             ema=0.998,
+            draw_resolutions=False,
             validation_frames=0,
         )
         check_config(config, 1)

@@ -282,7 +282,7 @@ def test_versions_of_a_scene_are_held_out_together() -> None:
     assert done.stdout.splitlines() == [
         "['classroom', 'living-room', 'san-miguel']",
         "['classroom', 'living-room', 'san-miguel', 'sponza', 'sponza-moving-light']",
-        "grouped/kernel/without-sponza",
+        "grouped/cascade-K-width-64/without-sponza",
     ]
 
 
@@ -292,11 +292,12 @@ def test_paper_tables_of_what_is_there(dataset: Path, tmp_path: Path) -> None:
     train = ("paper_tables/train_folds.py", dataset, "-o", tmp_path / "runs", *small)
     written = run(*train, *scenes[:4], "--variants", "P+K", "P+K without TL").split()
     folds = [Path(line).relative_to(tmp_path / "runs" / "grouped").parts[:2] for line in written]
-    runs = ("cascaded", "cascaded-without-temporal-loss")
+    runs = ("cascade-P+K", "cascade-P+K-without-temporal-loss")
     assert folds == [(name, fold) for name in runs for fold in ("without-hall", "without-yard")]
-    config = json.loads((tmp_path / "runs/grouped/cascaded-without-temporal-loss/without-yard/config.json").read_text())
+    grouped = tmp_path / "runs" / "grouped"
+    config = json.loads((grouped / "cascade-P+K-without-temporal-loss" / "without-yard" / "config.json").read_text())
     assert config["temporal_weight"] == 0
-    data = json.loads((tmp_path / "runs/grouped/cascaded/without-hall/data.json").read_text())
+    data = json.loads((grouped / "cascade-P+K" / "without-hall" / "data.json").read_text())
     assert [entry["name"] for entry in data["sequences"]] == ["yard"]
 
     tables = ("paper_tables/tables.py", dataset, "--runs", tmp_path / "runs", "--markdown")
@@ -313,8 +314,8 @@ def test_paper_tables_of_what_is_there(dataset: Path, tmp_path: Path) -> None:
     assert "not in the zoo: Fan et al. 2021" in first
     # Data range 2 and a box window flatter.
     assert named["P+K", "meng2020"][0].split()[-1] > named["P+K", "strict"][0].split()[-1]
-    assert "not trained: no grouped/kernel/without-hall/kernel.safetensors; run train_folds.py" in third
-    assert "| P+K without BWA | 544,424 |" in fourth
+    assert "not trained: no grouped/cascade-K-width-64/without-hall/cascaded.safetensors; run train_folds.py" in third
+    assert "| P+K without BWA | 538,304 |" in fourth
 
 
 # What is left out
@@ -354,13 +355,13 @@ def test_start_up_times_whole_processes(tmp_path: Path) -> None:
 def test_training_speed_times_both_forms_in_both_precisions(small_sequence: Path, tmp_path: Path) -> None:
     pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
     file = tmp_path / "times.json"
-    small = ("--model", "cascaded_tiny", "--batch", "1", "--frames", "2", "--crop", "16", "--threads", "1")
+    small = ("--model", "cascaded_v2_tiny", "--batch", "1", "--frames", "2", "--crop", "16", "--threads", "1")
     for sequences in ((), (small_sequence,)):
         lines = run("training_speed.py", *sequences, *small, "--rounds", "2", "--json", file).splitlines()
-        assert lines[0] == "cascaded_tiny, 1 clips of 2 frames of 16x16, 2 rounds"
+        assert lines[0] == "cascaded_v2_tiny, 1 clips of 2 frames of 16x16, 2 rounds"
         assert ", 1 threads, mcdenoise " in lines[1]
         assert [line[:20].split() for line in lines[3:]] == [
-            [precision, form] for precision in ("32-true", "bf16-mixed") for form in ("fast", "plain")
+            [precision, form] for precision in ("float32", "bfloat16") for form in ("fast", "plain")
         ]
         assert lines[4].endswith(" 1.00")
         times = json.loads(file.read_text())["milliseconds"]

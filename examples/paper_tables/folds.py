@@ -10,33 +10,38 @@ Split = Literal["grouped", "paper"]
 SCENES = ("classroom", "living-room", "san-miguel", "sponza", "sponza-glossy", "sponza-moving-light")
 
 
+MODEL = "cascaded"
+
+
 @dataclass(frozen=True)
 class Variant:
-    """A network of the paper's tables and how it is trained.
+    """A network of the paper's tables and how it is trained: all with the accumulation of ``cascaded``.
 
     Args:
-        model: its name in the zoo.
+        settings: of the constructor of ``cascaded``.
         temporal_loss: whether it is trained with the temporal loss.
     """
 
-    model: str
+    settings: str
     temporal_loss: bool = True
 
     @property
     def folder(self) -> str:
         """Where its runs are."""
-        return self.model if self.temporal_loss else f"{self.model}-without-temporal-loss"
+        name = self.settings.replace("=", "-").replace(",", "-")
+        return name if self.temporal_loss else f"{name}-without-temporal-loss"
 
 
-# By the names of the paper's Tables 3 and 4: BWA is the bilateral weight adjustment, TL the temporal loss.
+# By the names of the paper's Tables 3 and 4: BWA is the bilateral weight adjustment, TL the temporal loss. One network
+# alone is wider, and so about as large as two.
 VARIANTS = {
-    "K": Variant("kernel"),
-    "P": Variant("pixel"),
-    "K+P": Variant("kernel_pixel"),
-    "K+K": Variant("kernel_kernel"),
-    "P+K": Variant("cascaded"),
-    "P+K without BWA": Variant("cascaded_plain"),
-    "P+K without TL": Variant("cascaded", temporal_loss=False),
+    "K": Variant("cascade=K,width=64"),
+    "P": Variant("cascade=P,width=64"),
+    "K+P": Variant("cascade=K+P"),
+    "K+K": Variant("cascade=K+K"),
+    "P+K": Variant("cascade=P+K"),
+    "P+K without BWA": Variant("cascade=P+K,bilateral=false"),
+    "P+K without TL": Variant("cascade=P+K", temporal_loss=False),
 }
 
 

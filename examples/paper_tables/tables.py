@@ -7,7 +7,8 @@ DATASET is a folder with a sequence in the BMFR layout for each scene, RUNS what
 and SSIM of each method on each scene, Table 2 milliseconds at 1280x720, Table 3 the order of the networks (K, P, K+P,
 K+K, P+K), Table 4 bilateral weights (BWA) and temporal loss (TL) on and off. PSNR and SSIM are given by two protocols:
 "strict" (sRGB curve, data range 1) and "meng2020", by which the published figures on this dataset seem to have been
-made. Each network is tested on scenes it has not been trained on.
+made. Each network is tested on scenes it has not been trained on, and on frames accumulated as those it was trained on;
+"accumulated" is that input of all of them. OIDN gets the noisy frames, and is told that features are clean.
 """
 
 import argparse
@@ -20,17 +21,17 @@ from statistics import mean, median, quantiles
 from typing import get_args
 
 import torch
-from folds import SCENES, VARIANTS, Split, run_folder
+from folds import MODEL, SCENES, VARIANTS, Split, run_folder
 from torch import Tensor
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
-from mcdenoise.denoiser import Images
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import check_references
 from mcdenoise.metrics import PROTOCOLS
-from mcdenoise.models import create_model
-from mcdenoise.peers import Oidn
+from mcdenoise.models import Model, Output, create_model, parts_of
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.train.config import parse_settings
 
 PROTOCOL_NAMES = ("strict", "meng2020")
 # What the paper compares with and this package has not.
@@ -87,31 +88,23 @@ class Measured:
 
     def _measure(self, method: str, scene: str) -> dict[str, Errors | str]:
         try:
-            denoiser, pick = self._method(method, scene)
-            return dict(self._score(scene, denoiser, pick))
+            return dict(self._score(scene, self._denoiser(method, scene), method))
         except InputError as error:
             return dict.fromkeys((method, f"{method}, initial"), str(error))
 
-    def _method(self, method: str, scene: str) -> tuple[Denoiser, Callable[[Frame, Images], dict[str, Tensor]]]:
-        if method in VARIANTS:
-            variant = VARIANTS[method]
-            run = run_folder(self.options.runs, self.options.split, variant, scene, self.options.scenes)
-            weights = run / f"{variant.model}.safetensors"
-            if not weights.exists():
-                raise InputError(f"not trained: no {weights.relative_to(self.options.runs)}; run train_folds.py")
-            denoiser = Denoiser(variant.model, weights=weights, alpha_min=0.2)
-            return denoiser, lambda frame, images: {method: images.denoised, f"{method}, initial": images.initial}
-        accumulating = Denoiser("cascaded_tiny", alpha_min=0.2)
+    def _denoiser(self, method: str, scene: str) -> Denoiser:
         if method == "OIDN":
-            oidn = Oidn()
-            return accumulating, lambda frame, images: {
-                method: oidn.denoise(images.noisy, frame.albedo, frame.normal, quality="high", clean_aux=True)
-            }
-        return accumulating, lambda frame, images: {method: getattr(images, method)}
+            return Denoiser("oidn", quality="high", auxiliary="clean", source="raw")
+        if method not in VARIANTS:
+            # Nothing but what all networks are given.
+            return Denoiser(create_model(MODEL, width=4))
+        run = run_folder(self.options.runs, self.options.split, VARIANTS[method], scene, self.options.scenes)
+        weights = run / f"{MODEL}.safetensors"
+        if not weights.exists():
+            raise InputError(f"not trained: no {weights.relative_to(self.options.runs)}; run train_folds.py")
+        return Denoiser(MODEL, weights=weights)
 
-    def _score(
-        self, scene: str, denoiser: Denoiser, pick: Callable[[Frame, Images], dict[str, Tensor]]
-    ) -> Iterable[tuple[str, Errors]]:
+    def _score(self, scene: str, denoiser: Denoiser, method: str) -> Iterable[tuple[str, Errors]]:
         folder = self.options.dataset / scene
         if not folder.is_dir():
             raise InputError(f"no such scene in DATASET: {scene}")
@@ -119,8 +112,8 @@ class Measured:
         check_references(sequence)
         values: dict[str, dict[str, list[float]]] = {}
         for number in sequence.numbers:
-            frame, _ = sequence.frame(number).with_depth().validate()
-            images = pick(frame, denoiser.images(frame))
+            frame = sequence.frame(number)
+            images = pick(denoiser.output(frame), method)
             if frame.reference is None:
                 continue
             for name, image in images.items():
@@ -129,6 +122,13 @@ class Measured:
                         value = PROTOCOLS[protocol].metrics[metric].function(image, frame.reference)
                         values.setdefault(name, {}).setdefault(f"{protocol} {metric}", []).append(float(value))
         return ((name, {key: mean(own) for key, own in found.items()}) for name, found in values.items())
+
+
+def pick(output: Output, method: str) -> dict[str, Tensor]:
+    """The images that count, by name: the result, or what a network was given; and that of the first network."""
+    stages = output.stages
+    images = {method: stages[method] if method in ("noisy", "accumulated") else output.image}
+    return images | ({f"{method}, initial": stages["initial"]} if "initial" in stages and method in VARIANTS else {})
 
 
 def cell(errors: Errors | str, notes: Footnotes) -> list[str]:
@@ -156,24 +156,26 @@ def table_2(measured: Measured, notes: Footnotes) -> list[list[str]]:
     """The networks alone, on noise: the time does not depend on what is seen, nor on the weights."""
     rounds, size = measured.options.rounds, (720, 1280)
     torch.manual_seed(0)
-    inputs = [torch.rand(1, channels, *size) for channels in (3, 3, 3, 1)]
-    models = {name: create_model(VARIANTS[name].model) for name in ("K", "P", "K+P", "K+K", "P+K")}
-    calls: dict[str, Callable[[], object]] = {}
-    for name, model in models.items():
-        model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        calls[name] = lambda model=model: model(*inputs)
+    channels = {"color": 3, "albedo": 3, "normal": 3, "depth": 1}
+    frame = Frame(**{name: torch.rand(1, count, *size) for name, count in channels.items()})
+    models: dict[str, Model] = {}
+    for name in ("K", "P", "K+P", "K+K", "P+K"):
+        model = create_model(MODEL, **parse_settings("settings", VARIANTS[name].settings))
+        models[name] = next(parts_of(model, Accumulated)).inner
+        models[name].to(memory_format=torch.channels_last)
+    absent = dict(ABSENT)
     try:
-        oidn = Oidn(threads=torch.get_num_threads())
-        calls["OIDN"] = lambda: oidn.denoise(*inputs[:3], quality="high", clean_aux=True)
+        models["OIDN"] = create_model(
+            "oidn", quality="high", auxiliary="clean", source="raw", threads=torch.get_num_threads()
+        )
     except InputError as error:
-        absent = {**ABSENT, "OIDN": str(error)}
-    else:
-        absent = ABSENT
+        absent["OIDN"] = str(error)
+    calls: dict[str, Callable[[], object]] = {name: lambda model=model: model(frame) for name, model in models.items()}
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds + 1):
         for name, call in calls.items():
             start = time.perf_counter()
-            with torch.inference_mode():
+            with torch.no_grad():
                 call()
             times[name].append((time.perf_counter() - start) * 1e3)
     rows = [["method", "milliseconds at 1280x720", "quartiles"]]
@@ -186,7 +188,8 @@ def table_2(measured: Measured, notes: Footnotes) -> list[list[str]]:
 def ablation(measured: Measured, notes: Footnotes, names: Iterable[str]) -> list[list[str]]:
     rows = [["network", "parameters", *(f"{name} PSNR / SSIM" for name in PROTOCOL_NAMES)]]
     for name in names:
-        parameters = sum(own.numel() for own in create_model(VARIANTS[name].model).parameters())
+        model = create_model(MODEL, **parse_settings("settings", VARIANTS[name].settings))
+        parameters = sum(own.numel() for own in model.parameters())
         rows.append([name, f"{parameters:,}", *cell(measured.average(name), notes)])
     return rows
 
