@@ -17,10 +17,11 @@ from pathlib import Path
 from mcdenoise.data import open_sequence, write_exr
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
-from mcdenoise.peers import Oidn
+from mcdenoise.frame import Frame
+from mcdenoise.models import Model, create_model
 
 
-def clean(source: Path, out: Path, oidn: Oidn) -> Path:
+def clean(source: Path, out: Path, oidn: Model) -> Path:
     """Copy a sequence to ``out``, its references denoised at high quality; returns the folder of the copy."""
     sequence = open_sequence(source)
     inputs = source / "inputs" if (source / "inputs").is_dir() else source
@@ -30,7 +31,7 @@ def clean(source: Path, out: Path, oidn: Oidn) -> Path:
         frame, _ = sequence.frame(number).validate()
         if frame.reference is None:
             continue
-        image = oidn.denoise(frame.reference, frame.albedo, frame.normal, quality="high", clean_aux=True)
+        image = oidn(Frame(color=frame.reference, albedo=frame.albedo, normal=frame.normal))[0].image
         # The filter may undershoot; radiance may not.
         pixels = image[0].clamp(0, 65504).permute(1, 2, 0).numpy()
         write_exr(copied / f"reference{number}.exr", pixels, ["R", "G", "B"], half=True)
@@ -48,7 +49,7 @@ def main() -> None:
     parser.add_argument("sequences", type=Path, nargs="+", metavar="SEQUENCE", help="folder with references")
     parser.add_argument("-o", "--out", type=Path, required=True, help="folder for the copies")
     options = parser.parse_args()
-    oidn = Oidn()
+    oidn = create_model("oidn", quality="high", auxiliary="clean", source="raw")
     for source in options.sequences:
         print(clean(source, options.out, oidn))
 

@@ -11,7 +11,8 @@ import torch
 
 from mcdenoise.data.files import atomic_path
 from mcdenoise.models import create_model, save_weights
-from mcdenoise.run_folder import about_weights
+from mcdenoise.train import TrainConfig
+from mcdenoise.train.run_folder import about_weights
 
 
 def main() -> None:
@@ -25,7 +26,7 @@ def main() -> None:
     checkpoint = torch.load(options.run / "checkpoint.pt", weights_only=True, map_location="cpu")
     network, *_, last = checkpoint["parts"]
     averages = {key.removeprefix("module."): value for key, value in last.items() if key.startswith("module.")}
-    settings = {"width": config["width"]} if config["width"] else {}
+    settings = TrainConfig(**config).model_settings
     model = create_model(config["model"], **settings)
     model.load_state_dict(averages if config["ema"] else network)
     about = about_weights(config, data, checkpoint["step"], checkpoint["provenance"])

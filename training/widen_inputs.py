@@ -13,6 +13,7 @@ from safetensors import safe_open
 
 from mcdenoise.data.files import atomic_path
 from mcdenoise.models import create_model, describe_weights, save_weights
+from mcdenoise.models._weights import _named
 
 
 def widened(path: Path) -> bytes:
@@ -21,12 +22,13 @@ def widened(path: Path) -> bytes:
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118 - a handle is no dict
     model = create_model(about["architecture"], **about["settings"])
-    for key, own in model.state_dict().items():
+    for key, own in _named(model).items():
         tensor = tensors[key]
         if own.dim() == 4 and own.shape[1] > tensor.shape[1]:
             missing = tensor.new_zeros(len(tensor), own.shape[1] - tensor.shape[1], *tensor.shape[2:])
-            tensors[key] = torch.cat([tensor, missing], 1)
-    model.load_state_dict(tensors)
+            tensor = torch.cat([tensor, missing], 1)
+        with torch.no_grad():
+            own.copy_(tensor)
     texts = {key: value for key, value in about.items() if key not in ("architecture", "settings", "sha256")}
     return save_weights(model, about["architecture"], about["settings"], texts)
 
