@@ -23,7 +23,6 @@ MODULES = {
 SIGNAL = {"errors", "frame", "ops"}
 LIBRARY = SIGNAL | {
     "metrics",
-    "losses",
     "nn",
     "models",
     "data",
@@ -32,15 +31,15 @@ LIBRARY = SIGNAL | {
     "render",
     "denoiser",
 }
-REPORTS = {"benchmark", "evaluate", "folder", "methods", "ops_overview", "report", "run_folder"}
+REPORTS = {"benchmark", "evaluate", "folder", "methods", "ops_overview", "report"}
 TOOLS = REPORTS | {"budget", "demo", "export", "gradcheck", "stability", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),
+    "commit": set(),
     "ops": set(),
     "frame": {"errors", "ops"},
     "metrics": SIGNAL,
-    "losses": SIGNAL | {"metrics"},
     "nn": SIGNAL,
     "models": SIGNAL | {"nn"},
     # Leaves: what is read and rendered knows the frame, and no method.
@@ -51,13 +50,12 @@ ALLOWED: dict[str, set[str]] = {
     "denoiser": SIGNAL | {"models"},
     "methods": SIGNAL | {"models", "denoiser"},
     "folder": LIBRARY,
-    "run_folder": SIGNAL | {"data"},
     "ops_overview": {"ops"},
     "evaluate": LIBRARY | {"folder"},
     "results": SIGNAL | {"data", "denoiser"},
     "report": LIBRARY | {"evaluate", "results"},
-    "benchmark": LIBRARY | {"evaluate", "methods", "ops_overview", "results", "run_folder"},
-    **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"results"}),
+    "benchmark": LIBRARY | {"commit", "evaluate", "methods", "ops_overview", "results"},
+    **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"commit", "results"}),
     "cli": LIBRARY | TOOLS | {"heap"},
     "__main__": {"cli"},
     # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.

@@ -12,9 +12,9 @@ from typing import Any, TypeAlias
 import OpenImageIO as oiio
 import torch
 
+from mcdenoise.commit import source_commit
 from mcdenoise.errors import InputError
 from mcdenoise.results import Machine
-from mcdenoise.commit import source_commit
 
 _PACKAGES = ("torch", "kornia", "numpy", "openimageio", "pyoidn", "flip-evaluator")
 _CGROUP = Path("/sys/fs/cgroup")

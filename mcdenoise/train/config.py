@@ -8,10 +8,10 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT
 
-Precision = Literal["float32", "bfloat16"]
 Schedule = Literal["constant", "cosine"]
 
 _WARM_UP = 200

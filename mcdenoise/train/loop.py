@@ -118,7 +118,7 @@ def train(
     identity = {"credits": credits, "initial_weights": start["sha256"], **data.description}
     first_clip = data.sampler.draw([config.seed])
     network.eval()
-    output, state = _tried(config.model, rest, first_clip)
+    output, state = _tried(config.model, rest, first_clip, fabric)
     losses = stage_weights(config.loss_weights, output)
     network.train()
     # Only now, so that input that cannot be trained on leaves no trace of a run.
@@ -150,12 +150,13 @@ def _trainable(config: TrainConfig, model: Model) -> Any:
     return model.train()
 
 
-def _tried(name: str, model: Model, clip: Clip) -> tuple[Output, State]:
-    """What a model gives for a frame: what cannot be trained is to be known before the run begins."""
-    frame = clip.frame(0)
+def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> tuple[Output, State]:
+    """What a model gives for the first frames of a clip: what fails is to be known before the run begins."""
+    state: State = None
     try:
-        with torch.no_grad():
-            output, state = model(frame)
+        with torch.no_grad(), fabric.autocast():
+            for frame in map(clip.frame, range(min(2, len(clip)))):
+                output, state = model(frame, state)
             images = {"image": output.image, **output.stages}
     except InputError:
         raise

@@ -31,7 +31,7 @@ class Recurrent(nn.Module):
             hidden, _ = reproject(state.to(image.dtype), frame.motion)
         update, reset = self.gates(torch.cat([image, hidden], 1)).sigmoid().chunk(2, 1)
         candidate = self.candidate(torch.cat([image, reset * hidden], 1)).tanh()
-        hidden = torch.lerp(hidden, candidate, update)
+        hidden = hidden + update * (candidate - hidden)
         return Output(torch.expm1(image + self.head(hidden)).clamp_min(0), {"input": frame.color}), hidden
 
 
@@ -91,3 +91,15 @@ def broken() -> nn.Module:
 def without_weights() -> Model:
     """Gives the frame back."""
     return FromBuffers(lambda color: color)
+
+
+def forgetful() -> nn.Module:
+    """Fails at the second frame."""
+
+    class Forgetful(Recurrent):
+        def forward(self, frame: Frame, state: Tensor | None = None) -> tuple[Output, Tensor]:
+            if state is not None:
+                raise RuntimeError("the state is gone")
+            return super().forward(frame, state)
+
+    return Forgetful()
