@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -14,6 +15,7 @@ from mcdenoise.models import Needs, Output, State
 
 # Central differences of smooth functions in float64: rounding is 1e-16 / 1e-6 of the value, truncation 1e-12.
 STEP, TOLERANCE = 1e-6, 1e-6
+COMPILED = ("mcdenoise.ops._fast", "mcdenoise.ops._numba", "mcdenoise.ops._triton", "torch")
 
 
 def shot(size: tuple[int, int], frames: int = 3) -> list[dict[str, Tensor]]:
@@ -48,6 +50,9 @@ def decisions(kept: list[Tensor], *, replay: bool) -> Iterator[None]:
 
     def detach(self: Tensor) -> Tensor:
         found = original(self)
+        # A compiled form computes with the memory of its arguments, and has derivatives of its own.
+        if sys._getframe(1).f_globals["__name__"].startswith(COMPILED):
+            return found
         if not replay:
             kept.append(found.clone())
             return found
