@@ -58,7 +58,8 @@ class Denoiser:
             so small that all keeps below it: what is there when the denoiser is made, the images of a frame and those
             of the history. Frames that you keep, beside the one that is denoised, are your own.
         differentiable: keep the graph, through the state too, so that ``backward`` reaches every earlier frame of the
-            shot; decisions, such as which pixels have a history, are held fixed. The images are the same.
+            shot. Decisions are held fixed: which pixels have a history, how much of one is given up, the exposure. The
+            images are the same. Frames of float64 are computed in float64 where the weights are, too.
         settings: for the model's constructor, such as ``alpha_min=0.2``; see the model's own page.
 
     Raises:
@@ -134,6 +135,7 @@ class Denoiser:
             InputError: frames of this size cannot be denoised within ``max_memory``; the message says with what.
         """
         self._state: State = None
+        self._shape: tuple[int, ...] = ()
         self._count, self._frames, self._buffers = 0, frames, buffers
         # Of one frame there is nothing ahead.
         self.has_room_ahead = size is not None and frames != 1
@@ -157,8 +159,8 @@ class Denoiser:
                 same buffers.
 
         Returns:
-            ``(B, 3, H, W)`` float32 scene-linear radiance on the denoiser's device, a tensor of its own; ``report``
-            says what was done.
+            ``(B, 3, H, W)`` float32 (or float64, see ``differentiable``) scene-linear radiance on the denoiser's device,
+            a tensor of its own; ``report`` says what was done.
 
         Raises:
             InputError: a buffer that the model needs is missing, another holds NaN, an illegal infinity or a value far
@@ -177,23 +179,48 @@ class Denoiser:
         with listening(report), nullcontext() if self.differentiable else torch.no_grad():
             with timed("validate", self.device):
                 given, hints = frame, Hints(last=self._is_last(), stages=stages, keep_all=self.keep_all)
-                frame, report.replaced_pixels, _ = frame.to(self.device).to(torch.float32).inspect()
+                dtype = self._dtype(frame)
+                frame, report.replaced_pixels, _ = frame.to(self.device).to(dtype).inspect()
                 frame = frame.with_depth().replace(hints=hints)
                 report.missing = self._missing(frame)
                 report.tiles = self._divide(frame)
             noisy = frame.color
             with bfloat16:
-                output, state = self.model(frame, self._state)
+                output, state = self._called(frame)
             with timed("validate", self.device):
                 self._check(output, frame, state)
                 # A renderer may write its next frame into the same buffers, and a user change an image in place.
                 state = state if self.frames_stay else _owned(state, [given, noisy])
                 if stages:
                     output = output._replace(stages={"noisy": noisy, **output.stages})
-                result: Output = _owned(Output(output.image.float(), output.stages), [given, noisy, state])
+                result: Output = _owned(Output(output.image.to(dtype), output.stages), [given, noisy, state])
         # Only now: a frame that was refused leaves no trace.
-        self._state, self._count = state, self._count + 1
+        self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1
         return result
+
+    def _dtype(self, frame: Frame) -> torch.dtype:
+        exact = self.differentiable and frame.color.dtype == torch.float64
+        weights = self.model.parameters() if isinstance(self.model, nn.Module) else ()
+        return torch.float64 if exact and all(each.dtype == torch.float64 for each in weights) else torch.float32
+
+    def _called(self, frame: Frame) -> tuple[Any, State]:
+        """What the model returns, which may be anything."""
+        shape = tuple(frame.color.shape)
+        try:
+            found = self.model(frame, self._state)
+        except InputError:
+            raise
+        except Exception as error:
+            if self._state is None or self._shape == shape:
+                raise
+            raise InputError(
+                f"model: the state is of frames of {self._shape}, found one of {shape}, with which the model fails; "
+                f"reset the denoiser: {' '.join(str(error).split())}"
+            ) from error
+        # An Output is a pair, too.
+        if isinstance(found, Output) or not (isinstance(found, tuple) and len(found) == 2):
+            raise InputError(f"model: expected a pair (Output, state), found {type(found).__name__}")
+        return found
 
     def _is_last(self) -> bool:
         """Whether no frame that follows can have a history."""
@@ -243,6 +270,8 @@ class Denoiser:
         if not isinstance(image, Tensor) or image.shape != frame.color.shape:
             found = type(output).__name__ if not isinstance(image, Tensor) else f"an image of {tuple(image.shape)}"
             raise InputError(f"model: expected an Output with an image of {tuple(frame.color.shape)}, found {found}")
+        if not image.is_floating_point():
+            raise InputError(f"model: expected a floating-point image, found {image.dtype}")
         if image.device != frame.color.device:
             raise InputError(f"model: expected an image on {frame.color.device}, found one on {image.device}")
         # A sum is the fastest way to see either, and only what is far beyond all radiance overflows it.
@@ -254,6 +283,8 @@ class Denoiser:
         for leaf in pytree.tree_leaves(state):
             if leaf is not None and not isinstance(leaf, Tensor):
                 raise InputError(f"model: expected a state of tensors, found {type(leaf).__name__} in it")
+            if leaf is not None and leaf.device != frame.color.device:
+                raise InputError(f"model: expected a state on {frame.color.device}, found {leaf.device} in it")
         if self._state is not None and not _alike(self._state, state):
             raise InputError("model: expected a state of the same structure as for the frame before, found another")
 

@@ -400,7 +400,7 @@ def _check_buffer(name: str, value: object) -> None:
 def _check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]]:
     """The values, clamped, and their extremes."""
     spec = _MATRIX if name == _MATRIX_NAME else BUFFERS.get(name, _ANYTHING)
-    low, high = (float(extreme) for extreme in torch.aminmax(value))
+    low, high = (float(extreme) for extreme in torch.aminmax(value.detach()))
     # A NaN comes through the extremes and fails the comparison; only then is it worth to look at every value again.
     if not -_UNBOUNDED < low <= high < _UNBOUNDED:
         _refuse_illegal(name, spec, value)

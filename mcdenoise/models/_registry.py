@@ -115,7 +115,15 @@ def build_model(name: str, **settings: Any) -> Model:
     except TypeError as error:
         known = ", ".join(inspect.signature(entry.construct).parameters) or "no settings"
         raise InputError(f"model '{name}': {error}; it takes {known}") from error
-    return as_model(entry.construct(**{**entry.settings, **settings}))
+    if ":" not in name:
+        return as_model(entry.construct(**{**entry.settings, **settings}))
+    try:
+        return as_model(entry.construct(**settings))
+    except InputError as error:
+        raise InputError(f"model '{name}': {str(error).removeprefix('model: ')}") from error
+    except Exception as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"model '{name}': the factory fails: {type(error).__name__}: {reason}") from error
 
 
 def describe_model(name: str) -> str:

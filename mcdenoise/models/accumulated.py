@@ -320,4 +320,8 @@ def _takes_light(color: Tensor) -> Tensor:
         # Not a number where there is no light to lose.
         fractions.append((1 - after / before).flatten(1))
     lost = torch.cat(fractions, 1)
-    return ((~lost.isnan()).sum(1) >= _LEAST_BLOCKS) & (lost.nanmedian(1).values > _LOST)
+    # The lower median of those that are numbers, as nanmedian, which graphs in ONNX do not have.
+    known = (~lost.isnan()).sum(1, keepdim=True)
+    ascending = torch.where(lost.isnan(), torch.inf, lost).sort(1).values
+    median = ascending.gather(1, (known - 1).clamp_min(0) // 2)
+    return ((known >= _LEAST_BLOCKS) & (median > _LOST))[:, 0]

@@ -1,0 +1,210 @@
+"""A model of one's own: by the place of its factory, with a state, and what is wrong with it in one line."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils import _pytree as pytree
+
+from mcdenoise import Denoiser, Frame, InputError, create_model
+from mcdenoise.models import Needs, Output, State
+
+SIZE = (24, 32)
+
+
+def frame(size: tuple[int, int] = SIZE, **buffers: Tensor) -> Frame:
+    return Frame(color=torch.rand(1, 3, *size), **buffers)
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    path = tmp_path / "mine.py"
+    path.write_text(
+        '''
+"""Somebody's own."""
+import torch
+from torch import nn
+
+number = 3
+
+
+class Blur(nn.Module):
+    def __init__(self, channels: int = 4):
+        super().__init__()
+        self.layers = nn.Sequential(nn.Conv2d(6, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, 3, 3, padding=1))
+
+    def forward(self, color, albedo):
+        return color + self.layers(torch.cat([color, albedo], 1))
+
+
+def network(channels: int = 4):
+    """Two convolutions."""
+    return Blur(channels)
+
+
+def nothing():
+    return 5
+
+
+def fails():
+    raise RuntimeError("no luck\\ntoday")
+'''
+    )
+    return path
+
+
+def own(path: Path, name: str) -> str:
+    return f"{path}:{name}"
+
+
+def test_a_factory_of_ones_own_is_a_model(mine: Path) -> None:
+    denoiser = Denoiser(own(mine, "network"), channels=8)
+    assert sum(parameter.numel() for parameter in denoiser.model.parameters()) == 6 * 8 * 9 + 8 + 8 * 3 * 9 + 3
+    assert denoiser(frame(albedo=torch.rand(1, 3, *SIZE))).shape == (1, 3, *SIZE)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("absent", r"expected a factory 'absent' in .*mine\.py, found .*network"),
+        ("number", "expected a factory that can be called, found int"),
+        ("nothing", "expected a model with `needs` .*found int"),
+        ("fails", "RuntimeError: no luck today"),
+    ],
+)
+def test_what_is_no_factory_of_a_model_is_refused_in_one_line(mine: Path, name: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        create_model(own(mine, name))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_factory_has_to_be_somewhere(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected a Python file with a factory of a model, found no such file"):
+        create_model(f"{tmp_path}/absent.py:network")
+    broken = tmp_path / "broken.py"
+    broken.write_text("import nothing_of_this_name")
+    with pytest.raises(InputError, match=r"broken\.py cannot be imported: ModuleNotFoundError"):
+        create_model(f"{broken}:network")
+    with pytest.raises(InputError, match="package.of.nobody cannot be imported"):
+        create_model("package.of.nobody:network")
+
+
+def test_settings_are_those_of_the_factory(mine: Path) -> None:
+    with pytest.raises(InputError, match=re.escape("it takes channels")):
+        create_model(own(mine, "network"), width=3)
+
+
+def test_a_buffer_that_the_frames_have_not(mine: Path) -> None:
+    with pytest.raises(InputError, match=r"buffer 'albedo': the model needs it, found only color; render it"):
+        Denoiser(own(mine, "network"))(frame())
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda color: color[..., :-1], r"expected an Output with an image of \(1, 3, 24, 32\), found an image of"),
+        (lambda color: color[:, :1], r"found an image of \(1, 1, 24, 32\)"),
+        (lambda color: color * torch.nan, "NaN or infinite"),
+        (lambda color: color / 0, "NaN or infinite"),
+        (lambda color: [color], r"expected a model .* <lambda> returned list"),
+        (lambda color: color.long(), r"expected a floating-point image, found torch\.int64"),
+        (lambda color: color.to("meta"), "expected an image on cpu, found one on meta"),
+    ],
+)
+def test_what_is_no_image_is_refused_in_one_line(function: Any, message: str) -> None:
+    denoiser = Denoiser(function)
+    with pytest.raises(InputError, match=message) as caught:
+        denoiser(frame())
+    assert "\n" not in str(caught.value)
+
+
+class Memory(NamedTuple):
+    mean: Tensor
+    count: Tensor
+
+
+class Mean(nn.Module):
+    """The mean of all frames, where it does not misbehave in the second."""
+
+    needs = Needs()
+
+    def __init__(self, misbehave: str = "") -> None:
+        super().__init__()
+        self.misbehave = misbehave
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        count = torch.ones(1, 1, 1, 1) if state is None else state.count + 1
+        mean = frame.color if state is None else state.mean + (frame.color - state.mean) / count
+        wrong = {"structure": (mean, count), "kind": Memory(mean, 3), "device": Memory(mean.to("meta"), count)}
+        after = wrong.get(self.misbehave, Memory(mean, count)) if state is not None else Memory(mean, count)
+        return Output(mean), after
+
+
+def test_a_state_is_carried_from_frame_to_frame() -> None:
+    denoiser, frames = Denoiser(Mean()), [frame() for _ in range(3)]
+    images = [denoiser(each) for each in frames]
+    torch.testing.assert_close(images[-1], torch.stack([each.color for each in frames]).mean(0))
+
+
+@pytest.mark.parametrize(
+    ("misbehave", "message"),
+    [
+        ("structure", "expected a state of the same structure as for the frame before, found another"),
+        ("kind", "expected a state of tensors, found int in it"),
+        ("device", "expected a state on cpu, found meta in it"),
+    ],
+)
+def test_what_is_no_state_is_refused_and_leaves_no_trace(misbehave: str, message: str) -> None:
+    model = Mean(misbehave)
+    denoiser, frames = Denoiser(model), [frame() for _ in range(2)]
+    denoiser(frames[0])
+    with pytest.raises(InputError, match=message):
+        denoiser(frames[1])
+    # The state is still that of the first frame.
+    model.misbehave = ""
+    torch.testing.assert_close(denoiser(frames[1]), (frames[0].color + frames[1].color) / 2)
+
+
+def test_a_state_of_another_size_is_refused_in_one_line_where_the_model_minds() -> None:
+    denoiser = Denoiser(Mean())
+    denoiser(frame())
+    with pytest.raises(InputError, match=r"the state is of frames of \(1, 3, 24, 32\), found one of \(1, 3, 20, 32\), .*reset the denoiser") as caught:
+        denoiser(frame((20, 32)))
+    assert "\n" not in str(caught.value)
+    denoiser.reset()
+    assert denoiser(frame((20, 32))).shape == (1, 3, 20, 32)
+
+
+def test_a_module_that_returns_an_output_alone_lacks_a_state() -> None:
+    class Alone(Mean):
+        def forward(self, frame: Frame, state: State = None) -> Output:  # type: ignore[override]
+            return Output(frame.color)
+
+    with pytest.raises(InputError, match=r"expected a pair \(Output, state\), found Output"):
+        Denoiser(Alone())(frame())
+
+
+def test_zeros_stand_for_no_history() -> None:
+    """For the whole of a model, so that a graph whose state is an input can begin with them."""
+    model = create_model("cascaded_v2_micro", pretrained=True)
+    color, position = torch.rand(1, 3, *SIZE), torch.rand(1, 3, *SIZE) + 1
+    camera = torch.eye(4).roll(-1, 1)[None] + 0.01 * torch.eye(4)
+    surface = {"normal": nn.functional.normalize(position), "depth": position[:, 2:]}
+    for buffers in (
+        {"motion": torch.full((1, 2, *SIZE), 0.5)},
+        {"motion": torch.zeros(1, 2, *SIZE), "depth": position[:, 2:]},
+        {"motion": torch.zeros(1, 2, *SIZE), "albedo": torch.rand(1, 3, *SIZE), **surface},
+        {"position": position, "view_projection": camera, **surface},
+    ):
+        first = Frame(color=color, **buffers)
+        with torch.no_grad():
+            output, state = model(first)
+            again, after = model(first, pytree.tree_map_only(Tensor, torch.zeros_like, state))
+        assert torch.equal(output.image, again.image)
+        for a, b in zip(pytree.tree_leaves(state), pytree.tree_leaves(after), strict=True):
+            assert a is b is None or torch.equal(a, b)
