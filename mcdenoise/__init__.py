@@ -3,9 +3,9 @@
 from importlib.metadata import version
 
 from mcdenoise import ops
-from mcdenoise.frame import Frame
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, list_models
 
 __version__ = version("mcdenoise")

@@ -83,9 +83,7 @@ class Step(nn.Module):
         named = zip(self._names, leaves, strict=True)
         return {name: torch.zeros_like(leaf, device=color.device) for name, leaf in named if name is not None}
 
-    def forward(
-        self, buffers: dict[str, Tensor], state: dict[str, Tensor]
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def forward(self, buffers: dict[str, Tensor], state: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """A step.
 
         Args:
@@ -163,7 +161,7 @@ def export_model(
     path: Path,
     *,
     buffers: Collection[str] | None = None,
-    format: Format | None = None,  # noqa: A002 - the option's name
+    format: Format | None = None,
     name: str = "",
 ) -> Exported:
     """Write a method as one graph: a step with the state as inputs and outputs, for frames of any size.
@@ -310,7 +308,7 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _format_of(path: Path, format: Format | None) -> Format:  # noqa: A002
+def _format_of(path: Path, format: Format | None) -> Format:
     known = ", ".join(SUFFIXES.values())
     found = next((kind for kind, suffix in SUFFIXES.items() if path.suffix == suffix), None)
     if format is None and found is None:

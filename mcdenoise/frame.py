@@ -57,7 +57,9 @@ BUFFERS: dict[str, BufferSpec] = {
     "previous_position": BufferSpec(
         3, -_UNBOUNDED, _UNBOUNDED, "where the surface point seen now was in the previous frame, world space"
     ),
-    "diffuse": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance that the camera sees by diffuse reflection, with albedo"),
+    "diffuse": BufferSpec(
+        3, 0.0, LARGEST_RADIANCE, "noisy radiance that the camera sees by diffuse reflection, with albedo"
+    ),
     "specular": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance that the camera sees by specular reflection"),
     "specular_albedo": BufferSpec(3, 0.0, 1.0, "specular reflectance, linear RGB", slack=1.0),
     "roughness": BufferSpec(1, 0.0, 1.0, "perceptual roughness: 0 is a mirror"),

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from mcdenoise.denoise import denoise_sequence
 from torch import nn
 
 from mcdenoise import Denoiser, create_model
 from mcdenoise.cli import main
 from mcdenoise.data import open_sequence
-from mcdenoise.denoise import denoise_sequence
 
 
 def small_model() -> nn.Module:

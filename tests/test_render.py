@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from mcdenoise.history import History
 
-from mcdenoise.frame import Frame
 from mcdenoise.cli import main
 from mcdenoise.data.exr import read_exr
 from mcdenoise.data.sequences import open_sequence
 from mcdenoise.demo_scene import demo_cameras, demo_scene
 from mcdenoise.errors import InputError
-from mcdenoise.history import History
+from mcdenoise.frame import Frame
 from mcdenoise.metrics import smape_linear
 from mcdenoise.render import Camera, load_shot, render_sequence, view_projection
 from mcdenoise.render import frames as render_frames

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from mcdenoise.denoise import denoise_sequence
 
 from mcdenoise import Denoiser, Frame, InputError, create_model
 from mcdenoise.data import open_sequence
 from mcdenoise.data.bmfr import write_bmfr_frame
-from mcdenoise.denoise import denoise_sequence
 from mcdenoise.models import save_weights
 
 

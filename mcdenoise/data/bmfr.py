@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.data.camera_matrices import Array, CameraMatrices, read_camera_matrices
 from mcdenoise.data.exr import LARGEST_HALF, Metadata, MetadataValue, read_exr, read_exr_header, write_exr
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
+from mcdenoise.frame import BUFFERS, Frame
 
 # Buffer to file name, in the order of writing: color comes last, so that a frame that has its color is complete.
 _STEMS = {

@@ -11,10 +11,10 @@ from typing import Protocol
 
 from torch import Tensor
 
-from mcdenoise.frame import Frame
 from mcdenoise.data.bmfr import find_frames, open_bmfr
 from mcdenoise.data.exr import Metadata
 from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
 
 _LARGEST_FRAME_COUNT = 1_000_000
 _KNOWN_LAYOUTS = "bmfr: color0.exr, color1.exr, ... in it or in its 'inputs'"

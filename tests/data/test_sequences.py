@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from mcdenoise.frame import Frame
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.bmfr import realisation_folder, write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, read_camera_matrices, write_camera_matrices
 from mcdenoise.data.sequences import parse_frames, with_unique_names
 from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
 
 SHARED_DATA = Path(__file__).parents[3] / "shared" / "data" / "train"
 RGB = ["R", "G", "B"]

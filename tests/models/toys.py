@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from mcdenoise import ops
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.models import (
@@ -23,7 +24,6 @@ from mcdenoise.models import (
     find_model,
     listening,
 )
-from mcdenoise import ops
 from mcdenoise.ops._backend import Backend
 
 

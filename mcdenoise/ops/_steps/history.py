@@ -22,8 +22,8 @@ from mcdenoise.ops._constants import (
 from mcdenoise.ops._history import COLOR, MEAN, RECENT, RECENT_MEAN, SQUARE, Blended
 from mcdenoise.ops._op import op, plain
 from mcdenoise.ops._rows import by_rows
-from mcdenoise.ops._window import corner
 from mcdenoise.ops._surface import Rule, Surface
+from mcdenoise.ops._window import corner
 from mcdenoise.ops.demodulation import demodulate
 from mcdenoise.ops.fireflies import KERNEL_SIZE, LIMIT, clamp_fireflies
 from mcdenoise.ops.lag import KERNEL_SIZE as LAG_KERNEL_SIZE
