@@ -159,13 +159,13 @@ class Denoiser:
                 same buffers.
 
         Returns:
-            ``(B, 3, H, W)`` float32 (or float64, see ``differentiable``) scene-linear radiance on the denoiser's device,
-            a tensor of its own; ``report`` says what was done.
+            ``(B, 3, H, W)`` float32 (or float64, see ``differentiable``) scene-linear radiance on the denoiser's
+            device, a tensor of its own; ``report`` says what was done.
 
         Raises:
             InputError: a buffer that the model needs is missing, another holds NaN, an illegal infinity or a value far
-                out of range; the result is no finite image; or there is too little memory, see :meth:`reset`. After this
-                error, as after any other, the history is that of the frame before.
+                out of range; the result is no finite image; or there is too little memory, see :meth:`reset`. After
+                this error, as after any other, the history is that of the frame before.
         """
         return self._step(frame, stages=False).image
 

@@ -58,9 +58,9 @@ BUFFERS: dict[str, BufferSpec] = {
         3, -_UNBOUNDED, _UNBOUNDED, "where the surface point seen now was in the previous frame, world space"
     ),
     "diffuse": BufferSpec(
-        3, 0.0, LARGEST_RADIANCE, "noisy radiance that the camera sees by diffuse reflection, with albedo"
+        3, 0.0, LARGEST_RADIANCE, "noisy radiance by diffuse reflection, with albedo"
     ),
-    "specular": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance that the camera sees by specular reflection"),
+    "specular": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance by specular reflection"),
     "specular_albedo": BufferSpec(3, 0.0, 1.0, "specular reflectance, linear RGB", slack=1.0),
     "roughness": BufferSpec(1, 0.0, 1.0, "perceptual roughness: 0 is a mirror"),
     "hit_distance": BufferSpec(
@@ -408,7 +408,8 @@ def _check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]
         _refuse_illegal(name, spec, value)
     if (spec.high == _UNBOUNDED and spec.low == -_UNBOUNDED) or (low >= spec.low and high <= spec.high):
         return value, (low, high)
-    if low < spec.low - _ROUNDING or high > spec.high + spec.slack:
+    # The largest radiance itself is rounded.
+    if low < spec.low - _ROUNDING or high > spec.high + max(spec.slack, 1e-6 * spec.high):
         raise InputError(
             f"buffer '{name}': expected values in [{spec.low:g}, {spec.high:g}] ({spec.meaning}), "
             f"found [{low:.4g}, {high:.4g}]"
