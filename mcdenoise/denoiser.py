@@ -178,7 +178,10 @@ class Denoiser:
         bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
         with listening(report), nullcontext() if self.differentiable else torch.no_grad():
             with timed("validate", self.device):
-                given, hints = frame, Hints(last=self._is_last(), stages=stages, keep_all=self.keep_all)
+                given, hints = (
+                    frame,
+                    Hints(last=self._is_last(), alone=self._frames == 1, stages=stages, keep_all=self.keep_all),
+                )
                 dtype = self._dtype(frame)
                 frame, report.replaced_pixels, _ = frame.to(self.device).to(dtype).inspect()
                 frame = frame.with_depth().replace(hints=hints)

@@ -57,9 +57,7 @@ BUFFERS: dict[str, BufferSpec] = {
     "previous_position": BufferSpec(
         3, -_UNBOUNDED, _UNBOUNDED, "where the surface point seen now was in the previous frame, world space"
     ),
-    "diffuse": BufferSpec(
-        3, 0.0, LARGEST_RADIANCE, "noisy radiance by diffuse reflection, with albedo"
-    ),
+    "diffuse": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance by diffuse reflection, with albedo"),
     "specular": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance by specular reflection"),
     "specular_albedo": BufferSpec(3, 0.0, 1.0, "specular reflectance, linear RGB", slack=1.0),
     "roughness": BufferSpec(1, 0.0, 1.0, "perceptual roughness: 0 is a mirror"),
@@ -89,12 +87,14 @@ class Hints(NamedTuple):
     Args:
         still: nothing moves in the image since the frame before.
         last: no frame follows, so that nothing needs to be remembered.
+        alone: no frame goes before either.
         stages: the images on the way to the result are asked for, too.
         keep_all: nothing is to be skipped, whether the scene needs it or not.
     """
 
     still: bool = False
     last: bool = False
+    alone: bool = False
     stages: bool = True
     keep_all: bool = False
 

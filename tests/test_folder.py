@@ -319,3 +319,35 @@ def test_a_stage_that_some_frames_do_without_has_a_median(small_sequence: Path, 
     report = denoise_sequence(open_sequence(small_sequence), tmp_path / "out", Denoiser(small_model()), "small")
     del report.frames[1].milliseconds["remodulate"], report.frames[2].milliseconds["remodulate"]
     assert report.milliseconds["remodulate"] == 0
+
+
+# What is skipped
+
+
+def test_the_command_line_prints_and_writes_the_plan(
+    small_sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plans = {}
+    for name, options in (("short", ["--tolerance", "0.01"]), ("whole", ["--keep-all"])):
+        out = tmp_path / name
+        command = ["denoise", str(small_sequence), "-o", str(out), "--model", "cascaded_v2_tiny", "--frames", "2"]
+        with pytest.raises(SystemExit) as stop:
+            main([*command, *options])
+        assert stop.value.code == 0
+        plans[name] = json.loads((out / "denoise.json").read_text())
+        printed = capsys.readouterr().out
+        if name == "short":
+            assert "  remember: skipped (" in printed
+        assert "  demodulate: kept (albedo)\n" in printed
+    assert (plans["short"]["tolerance"], plans["short"]["keep_all"], plans["whole"]["keep_all"]) == (0.01, False, True)
+    kept = {name: {row["stage"]: row["kept"] for row in plan["plan"]} for name, plan in plans.items()}
+    assert (kept["short"]["remember"], kept["whole"]["remember"]) == (False, True)
+    images = [(tmp_path / name / "denoised2.exr").read_bytes() for name in plans]
+    assert images[0] == images[1]
+
+
+def test_a_sequence_and_its_frames_one_by_one_are_the_same(small_sequence: Path, tmp_path: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    report = denoise_sequence(sequence, tmp_path / "out", Denoiser(small_model()), "small")
+    assert [row["stage"] for row in report.plan][:2] == ["read", "demodulate"]
+    assert {row["stage"]: row["skipped"] for row in report.plan}["remember"] == pytest.approx(1 / 4)

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from mcdenoise.history import History
 
 from mcdenoise.cli import main
 from mcdenoise.data.exr import read_exr
@@ -25,6 +24,7 @@ from mcdenoise.demo_scene import demo_cameras, demo_scene
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.metrics import smape_linear
+from mcdenoise.models import Journal, create_model, listening
 from mcdenoise.render import Camera, load_shot, render_sequence, view_projection
 from mcdenoise.render import frames as render_frames
 from mcdenoise.render.processes import render_in_processes
@@ -661,15 +661,17 @@ def test_history_follows_what_moves(moving: Path) -> None:
     sequence = open_sequence(moving)
     assert "previous_position" in sequence.buffers
     kept = {}
+    accumulated = create_model("accumulated")
     for known in (True, False):
-        history = History()
+        state, journal = None, Journal()
         for number in sequence.numbers:
             frame, _ = sequence.frame(number).validate()
             assert frame.previous_position is not None
             moved = (frame.previous_position != frame.position).any(1, keepdim=True)
-            past = history.update(frame if known else frame.replace(previous_position=None))
-        assert past.reset == ""
-        kept[known] = (past.length[moved] > 1).float().mean().item()
+            with listening(journal):
+                _, state = accumulated(frame if known else frame.replace(previous_position=None), state)
+        assert journal.reset == ""
+        kept[known] = (state[0].length[moved] > 1).float().mean().item()
     assert kept[True] > 0.9
     assert kept[False] < kept[True] - 0.3
 

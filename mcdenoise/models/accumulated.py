@@ -223,8 +223,9 @@ class Accumulated(Wrapper):
     def _report(self, found: Journal, frame: Frame, reset: str, *, still: bool, can_move: bool, keeps: bool) -> None:
         found.reset = reset
         source = "motion" if frame.motion is not None else "positions and cameras"
-        alone = "" if can_move else "no motion, and no positions with cameras: single frames"
-        note("accumulate", alone or source, float(not can_move))
+        lost = "" if can_move else "no motion, and no positions with cameras: single frames"
+        alone = "one frame" if frame.hints.alone and not frame.hints.keep_all else lost
+        note("accumulate", alone or source, float(alone != ""))
         why = alone or ("nothing moves in the image" if still and not frame.hints.keep_all else "")
         note("reproject", why or source, float(why != ""))
         note("remember", "for the next frame" if keeps else alone or "no frame reads it", float(not keeps))
