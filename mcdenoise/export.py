@@ -48,11 +48,11 @@ class Step(nn.Module):
     def __init__(self, model: Model, buffers: Collection[str]) -> None:
         super().__init__()
         self.model = model
-        self.buffers = tuple(name for name in [*BUFFERS, "view_projection"] if name in buffers)
-        self.buffers += tuple(sorted(set(buffers) - set(self.buffers)))
-        if absent := sorted(model.needs.buffers - set(self.buffers)):
-            raise InputError(f"buffer '{absent[0]}': the model needs it, found only {', '.join(self.buffers)}")
-        self.axes = _axes(self._example, self.buffers)
+        self.given = tuple(name for name in [*BUFFERS, "view_projection"] if name in buffers)
+        self.given += tuple(sorted(set(buffers) - set(self.given)))
+        if absent := sorted(model.needs.buffers - set(self.given)):
+            raise InputError(f"buffer '{absent[0]}': the model needs it, found only {', '.join(self.given)}")
+        self.axes = _axes(self._example, self.given)
         # The structure is that of a state after the first frame, which a graph keeps from then on.
         small, large = self._state_of(_SIZE, _BATCH), self._state_of(_OTHER_SIZE, _OTHER_BATCH)
         paths, self._spec = pytree.tree_flatten_with_path(small)
@@ -68,7 +68,7 @@ class Step(nn.Module):
         return self.model(self._frame(self._example(size, batch)))[1]
 
     def _example(self, size: tuple[int, int], batch: int) -> dict[str, Tensor]:
-        return {name: _example(name, size, batch) for name in self.buffers}
+        return {name: _example(name, size, batch) for name in self.given}
 
     def example(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Buffers of a frame, and the state of no frame."""
@@ -188,7 +188,7 @@ def export_model(
         _check_packages("onnx", "onnxscript")
     step = Step(model, default_buffers(model) if buffers is None else buffers)
     program = traced(step)
-    inputs = (*step.buffers, *(f"state.{each}" for each in step.state))
+    inputs = (*step.given, *(f"state.{each}" for each in step.state))
     outputs = ("image", *(f"next_state.{each}" for each in step.state))
     about = {"model": name or type(model).__name__, "mcdenoise": version("mcdenoise"), "torch": torch.__version__}
     write = _write_onnx if kind == "onnx" else _write_torch
@@ -269,10 +269,17 @@ def _write_onnx(
     outputs: tuple[str, ...],
     about: dict[str, str],
 ) -> None:
-    with _quiet():
-        written = torch.onnx.export(
-            program, dynamo=True, input_names=list(inputs), output_names=list(outputs), optimize=True, verbose=False
-        )
+    try:
+        with _quiet():
+            written = torch.onnx.export(
+                program, dynamo=True, input_names=list(inputs), output_names=list(outputs), optimize=True, verbose=False
+            )
+    except Exception as error:
+        first: BaseException = error
+        while first.__cause__ is not None:
+            first = first.__cause__
+        reason = " ".join(str(first).split())[:300]
+        raise InputError(f"model: expected a graph that ONNX has operators for, found: {reason}") from error
     if written is None:
         raise InputError("model: expected a graph that ONNX has operators for, found another")
     written.model.metadata_props.update(about)

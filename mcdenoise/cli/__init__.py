@@ -29,6 +29,7 @@ COMMANDS = {
     "report": "Write the page and the plots of a finished benchmark.",
     "gradcheck": "Check first and second derivatives of the operators in float64.",
     "stability": "Check operators, models and the denoiser on stiff and extreme inputs, in every precision.",
+    "export": "Write a model as an ONNX or torch.export graph.",
     "models": "List the models with their size and cost.",
     "ops": "List the operators with their error against the equations written out.",
 }

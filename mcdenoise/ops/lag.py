@@ -73,8 +73,9 @@ def history_lag(
     dtype = accumulator_dtype(history.dtype)
     # Squares keep within range of numbers up to 1. Divided before they are summed, which could overflow.
     largest = torch.maximum(history.detach().abs(), recent.detach().abs()).to(dtype).amax((1, 2, 3), keepdim=True)
-    # A power of two, which rounds nothing.
-    largest = torch.where(largest > 0, largest / (2 * torch.frexp(largest).mantissa), 1)
+    # Of a power of two, which rounds nothing, but for graphs: in ONNX they have no such number.
+    power = largest if torch.compiler.is_exporting() else largest / (2 * torch.frexp(largest).mantissa)
+    largest = torch.where(largest > 0, power, 1)
     long, short = ((image.to(dtype) / largest).mean(1, keepdim=True) for image in (history, recent))
     # Not the difference of the means, which cancels.
     mean, difference = _box(short, kernel_size), _box(short - long, kernel_size)

@@ -338,4 +338,4 @@ def _relative_test(
     else:
         distance = (torch.where(tap_hit, tap.depth, 0) - depth).abs()
         near = distance <= (DEPTH_LIMIT if position_limit is None else position_limit) * depth
-    return kept & torch.where(hit, tap_hit & near, ~tap_hit)
+    return kept & ((hit & tap_hit & near) | ~(hit | tap_hit))

@@ -258,7 +258,8 @@ def _shortened(
 ) -> Tensor:
     """Color and length if the history of mirrors and glass that move is no longer than that."""
     # A reduction over the channels takes a hundred times as long.
-    moves = torch.hypot(motion[:, :1], motion[:, 1:]) > STILL
+    # No hypot, which graphs in ONNX do not have.
+    moves = motion[:, :1].square() + motion[:, 1:].square() > STILL**2
     specular = albedo.amax(1, keepdim=True) < NO_ALBEDO
     too_long = moves & specular & (length > longest)
     weight = _weight_of_history(length.clamp_max(longest), alpha_min)

@@ -1,0 +1,68 @@
+"""`mcdenoise export`."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import tyro
+
+from mcdenoise.cli._options import Json, Out
+from mcdenoise.cli._output import write_json
+from mcdenoise.data import open_sequence
+from mcdenoise.errors import InputError
+from mcdenoise.export import Format, default_buffers, differences, export_model
+from mcdenoise.models import create_model
+
+
+def export(
+    model: tyro.conf.Positional[str],
+    out: Out,
+    weights: Path | None = None,
+    buffers: str | None = None,
+    format: Format | None = None,  # noqa: A002 - the option's name
+    check: Path | None = None,
+    frames: int = 5,
+    json: Json = None,
+) -> None:
+    """Export a model as one graph: a step with its state as inputs and outputs, for frames of any size.
+
+    The inputs are the buffers by name and the tensors of the state as state.NAME, zeros before the first frame; the
+    outputs are image and next_state.NAME. Takes some minutes.
+
+    Args:
+        model: name of a model, see `mcdenoise models`, or your own: path/to/file.py:factory or package.module:factory.
+        out: file to write, .onnx or .pt2.
+        weights: safetensors file of your own weights for that model.
+        buffers: names of the buffers that frames will have, such as color,albedo,normal,depth,motion; by default those
+            of --check, or else all that the model is better with.
+        format: onnx, or torch for torch.export.load; by default that of the file's ending.
+        check: folder of a sequence: run the ONNX graph by onnxruntime over its frames, and print the difference to torch.
+        frames: how many of them.
+        json: write the names of inputs and outputs, and the differences, to this file too.
+    """
+    made = create_model(model, pretrained=weights is None, weights=weights)
+    sequence = None if check is None else open_sequence(check)
+    if sequence is not None and (format == "torch" or out.suffix == ".pt2"):
+        raise InputError("--check: expected an ONNX file, which onnxruntime runs, found another format")
+    if frames < 1:
+        raise InputError(f"--frames: expected at least 1, found {frames}")
+    if buffers is not None:
+        chosen = frozenset(name.strip() for name in buffers.split(","))
+    elif sequence is not None:
+        wanted = made.needs.buffers | made.needs.uses
+        chosen = (sequence.buffers & wanted) | made.needs.buffers
+    else:
+        chosen = default_buffers(made)
+    start = time.perf_counter()
+    exported = export_model(made, out, buffers=chosen, format=format, name=model)
+    print(f"{exported.nodes} operators, in {time.perf_counter() - start:.0f} seconds")
+    print(f"inputs: {', '.join(exported.inputs)}")
+    print(f"outputs: {', '.join(exported.outputs)}")
+    found = {}
+    if sequence is not None:
+        for number, difference in differences(exported, made, sequence, frames):
+            found[number] = difference
+            print(f"frame {number}: largest difference to torch {difference:.1e}, relative")
+    write_json(json, {"model": model, "inputs": exported.inputs, "outputs": exported.outputs, "differences": found})
+    print(f"wrote {out}")

@@ -1,0 +1,262 @@
+"""A model as one graph: compiled, exported for images of any size, and run by onnxruntime."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from mcdenoise import Denoiser, Frame, InputError, create_model
+from mcdenoise.export import Exported, Step, default_buffers, export_model, traced
+from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, State
+
+# Of sums in another order, through some thirty layers: the suite's bound for whole models, see tests/golden.
+RTOL, ATOL = 1e-4, 1e-5
+
+MINE = '''
+"""Somebody's own network, with what it wears."""
+import torch
+from torch import nn
+
+from mcdenoise.models import Accumulated, Demodulated
+
+
+class Network(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.layers = nn.Sequential(nn.Conv2d(7, 4, 3, padding=1), nn.ReLU(), nn.Conv2d(4, 3, 3, padding=1))
+
+    def forward(self, color, normal, length):
+        return torch.relu(color + self.layers(torch.cat([color, normal, 1 / length], 1)))
+
+
+def network():
+    torch.manual_seed(0)
+    return Demodulated(Accumulated(Network()))
+'''
+
+
+def frames(size: tuple[int, int], count: int = 3, batch: int = 1) -> list[dict[str, Tensor]]:
+    """A shot whose image moves by a part of a pixel."""
+    generator = torch.Generator().manual_seed(size[0])
+    found = []
+    for _ in range(count):
+        values = {
+            "color": torch.rand(batch, 3, *size, generator=generator) * 2,
+            "albedo": torch.rand(batch, 3, *size, generator=generator),
+            "normal": torch.nn.functional.normalize(torch.ones(batch, 3, *size), dim=1),
+            "depth": torch.full((batch, 1, *size), 3.0),
+            "motion": torch.full((batch, 2, *size), 0.6),
+        }
+        values["depth"][..., : size[0] // 4, :] = torch.inf
+        found.append(values)
+    return found
+
+
+class Moments(NamedTuple):
+    mean: Tensor
+    half: Tensor
+
+
+class Recurrent(nn.Module):
+    """Means over time, at full and half the resolution; zeros are no history."""
+
+    needs = Needs()
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        half = torch.nn.functional.avg_pool2d(frame.color, 2, ceil_mode=True, count_include_pad=False)
+        state = Moments(torch.zeros_like(frame.color), torch.zeros_like(half)) if state is None else state
+        mean = 0.5 * state.mean + frame.color
+        half = 0.5 * state.half + half
+        return Output(mean + half.mean((2, 3), keepdim=True)), {"moments": Moments(mean, half)}["moments"]
+
+
+def eager(model: Model, shot: list[dict[str, Tensor]]) -> list[Tensor]:
+    state, images = None, []
+    with torch.no_grad():
+        for buffers in shot:
+            output, state = model(Frame(**buffers), state)
+            images.append(output.image)
+    return images
+
+
+def programmed(step: Step, program: torch.export.ExportedProgram, shot: list[dict[str, Tensor]]) -> list[Tensor]:
+    # Guards say in which layouts of memory a graph was traced, and nothing of its result.
+    run, state, images = program.module(check_guards=False), step.no_history(shot[0]), []
+    for buffers in shot:
+        image, state = run({name: buffers[name] for name in step.given}, state)
+        images.append(image)
+    return images
+
+
+def with_onnxruntime(exported: Exported, step: Step, shot: list[dict[str, Tensor]]) -> list[Tensor]:
+    onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
+    session = onnxruntime.InferenceSession(str(exported.path), providers=["CPUExecutionProvider"])
+    state, images = {f"state.{name}": value.numpy() for name, value in step.no_history(shot[0]).items()}, []
+    for buffers in shot:
+        feeds = {name: buffer.numpy() for name, buffer in buffers.items()} | state
+        image, *after = session.run(
+            list(exported.outputs), {each.name: feeds[each.name] for each in session.get_inputs()}
+        )
+        state = {
+            name.replace("next_state", "state"): value
+            for name, value in zip(exported.outputs[1:], after, strict=True)
+        }
+        images.append(torch.from_numpy(image))
+    return images
+
+
+def assert_alike(found: list[Tensor], expected: list[Tensor]) -> None:
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=RTOL, atol=ATOL)
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> str:
+    path = tmp_path / "mine.py"
+    path.write_text(MINE)
+    return f"{path}:network"
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
+def test_a_model_of_ones_own_is_exported_with_all_that_it_wears(mine: str, tmp_path: Path) -> None:
+    model = create_model(mine)
+    exported = export_model(model, tmp_path / "mine.onnx", name="mine")
+    assert exported.inputs == (
+        *("color", "albedo", "normal", "depth", "motion"),
+        *("state.color", "state.length", "state.surface.normal", "state.surface.depth"),
+        *("state.surface.label", "state.limit"),
+    )
+    assert exported.outputs[:2] == ("image", "next_state.color")
+    step = Step(model, default_buffers(model))
+    for size, batch in (((40, 64), 1), ((33, 47), 1), ((32, 32), 3)):
+        shot = frames(size, batch=batch)
+        assert_alike(with_onnxruntime(exported, step, shot), eager(model, shot))
+
+
+def test_a_state_of_several_resolutions_and_images_of_any_size(tmp_path: Path) -> None:
+    step = Step(Recurrent(), {"color"})
+    assert step.state == ("mean", "half")
+    program = traced(step)
+    for size in ((40, 64), (33, 47), (8, 5)):
+        shot = [{"color": buffers["color"]} for buffers in frames(size)]
+        assert_alike(programmed(step, program, shot), eager(step.model, shot))
+    # The file is an archive without pickled code, which torch loads by itself.
+    export_model(step.model, tmp_path / "recurrent.pt2", buffers={"color"}, name="mine")
+    extra = {"model": ""}
+    loaded = torch.export.load(tmp_path / "recurrent.pt2", extra_files=extra)
+    assert extra["model"] in ("mine", b"mine")
+    assert_alike(programmed(step, loaded, shot), eager(step.model, shot))
+    assert zipfile.is_zipfile(tmp_path / "recurrent.pt2")
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+@pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
+def test_a_compiled_step_is_the_step(backend: str, mine: str) -> None:
+    if backend == "inductor":
+        pytest.importorskip("torch._inductor")
+        from torch._inductor import cpp_builder
+
+        try:
+            cpp_builder.get_cpp_compiler()
+        except Exception as error:
+            pytest.skip(f"no C++ compiler: {error}")
+    model = create_model(mine)
+    torch._dynamo.reset()
+    compiled = torch.compile(model, fullgraph=True, backend=backend)
+    shot = frames((24, 32))
+    assert_alike(eager(compiled, shot), eager(model, shot))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("name", ["cascaded_v2_micro", "cascaded_v2_tiny", "cascaded_v2_small", "cascaded_v2"])
+def test_a_compiled_step_of_the_zoo_is_the_step(name: str) -> None:
+    model = create_model(name, pretrained=True)
+    torch._dynamo.reset()
+    compiled = torch.compile(model, fullgraph=True, backend="aot_eager", dynamic=False)
+    shot = frames((40, 56))
+    assert_alike(eager(compiled, shot), eager(model, shot))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
+@pytest.mark.parametrize("name", ["cascaded_v2_micro", "cascaded_v2_tiny", "cascaded_v2_small", "cascaded_v2"])
+def test_every_model_of_the_zoo_is_exported_for_images_of_any_size(name: str, tmp_path: Path) -> None:
+    model = create_model(name, pretrained=True)
+    exported = export_model(model, tmp_path / f"{name}.onnx", name=name)
+    step = Step(model, default_buffers(model))
+    for size, batch in (((64, 96), 1), ((45, 70), 2)):
+        shot = frames(size, batch=batch)
+        assert_alike(with_onnxruntime(exported, step, shot), eager(model, shot))
+
+
+class Impatient(nn.Module):
+    """Decides by the values of its input."""
+
+    needs = Needs()
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        return Output(frame.color if bool(frame.color.mean() > 1) else frame.color + 1), None
+
+
+class Proud(nn.Module):
+    """Its first frame is not what zeros give."""
+
+    needs = Needs()
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        mean = frame.color if state is None else (frame.color + state) / 2
+        return Output(mean), mean
+
+
+class Fixed(nn.Module):
+    """Knows images of one size."""
+
+    needs = Needs()
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        return Output(frame.color + torch.ones(61, 1) if frame.size[0] == 61 else frame.color), None
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (Impatient(), "expected one that torch.export can trace"),
+        (Proud(), "zeros must stand for no history"),
+        (Fixed(), "expected one that torch.export can trace for images of any size"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_is_no_graph_is_refused_in_one_line_and_nothing_is_written(
+    model: Model, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        export_model(model, tmp_path / "model.pt2")
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_requests_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"expected a file that ends with one of \.onnx, \.pt2"):
+        export_model(Recurrent(), tmp_path / "model.bin")
+    with pytest.raises(InputError, match=r"expected a name that ends with \.onnx, found \.pt2"):
+        export_model(Recurrent(), tmp_path / "model.pt2", format="onnx")
+    with pytest.raises(InputError, match="buffer 'color': the model needs it"):
+        export_model(Recurrent(), tmp_path / "model.pt2", buffers={"albedo"})
+
+
+def test_the_default_buffers_are_a_motion_rather_than_cameras() -> None:
+    model = Demodulated(Accumulated(nn.Identity()))  # takes `input`, a buffer of `Frame.extra`
+    assert default_buffers(model) == {"input", "albedo", "normal", "depth", "motion"}
+
+
+def test_a_graph_says_what_a_denoiser_says(mine: str) -> None:
+    model = create_model(mine)
+    shot, denoiser = frames((24, 32)), Denoiser(model, keep_all=True)
+    assert_alike([denoiser(Frame(**buffers)) for buffers in shot], eager(model, shot))
