@@ -10,13 +10,13 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame, Hints
-from mcdenoise.models import DEFAULT, Journal, Model, Output, State, Tiled, create_model, listening, parts_of, timed
+from mcdenoise.models import DEFAULT, Journal, Model, Output, State, create_model, listening, timed
 from mcdenoise.models._adapter import as_model
-from mcdenoise.models._memory import GB, Frames, Memory, Network, Tiling, check_side, describe
+from mcdenoise.models._contract import absent_buffers, checked_step, owned
+from mcdenoise.models._memory import Division, Frames
 
 Precision = Literal["float32", "bfloat16"]
 PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
@@ -105,16 +105,8 @@ class Denoiser:
         self.report = FrameReport()
         # Set by who never writes into a frame again that was handed over: then nothing of it is copied.
         self.frames_stay = False
-        self._tiled = [tiled for tiled in parts_of(self.model, Tiled) if tiled.halo is not None]
-        if tile is not None:
-            check_side(tile)
-            if max_memory is not None:
-                raise InputError("tile, max_memory: expected one of them, found both; max_memory chooses the tiles")
-        if not self._tiled and (tile, max_memory) != (None, None):
-            raise InputError("tile, max_memory: expected a model that computes tiles of an image, found one without")
-        self.tile = tile
-        self._memory = Memory(None if max_memory is None else max_memory * GB, self.device)
-        self._tilings: dict[Frames, Tiling] = {}
+        bfloat16 = precision == "bfloat16"
+        self._tiles = Division(self.model, tile, max_memory, self.device, bfloat16=bfloat16)
         self.reset()
 
     def reset(
@@ -139,11 +131,10 @@ class Denoiser:
         self._count, self._frames, self._buffers = 0, frames, buffers
         # Of one frame there is nothing ahead.
         self.has_room_ahead = size is not None and frames != 1
-        if buffers is not None and size is not None and self._tiled:
+        if buffers is not None and size is not None:
             streaming = self.has_history(buffers)
             shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else MOTION), streaming)
-            self._tiling(shot)
-            self.has_room_ahead = self.has_room_ahead and self._memory.has_room_ahead(shot, self._network())
+            self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
 
     def has_history(self, buffers: Collection[str]) -> bool:
         """Whether a frame with these buffers may have a history, or be one: else what tells motion is of no use."""
@@ -178,25 +169,21 @@ class Denoiser:
         bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
         with listening(report), nullcontext() if self.differentiable else torch.no_grad():
             with timed("validate", self.device):
-                given, hints = (
-                    frame,
-                    Hints(last=self._is_last(), alone=self._frames == 1, stages=stages, keep_all=self.keep_all),
-                )
-                dtype = self._dtype(frame)
+                given, dtype = frame, self._dtype(frame)
+                hints = Hints(last=self._is_last(), alone=self._frames == 1, stages=stages, keep_all=self.keep_all)
                 frame, report.replaced_pixels, _ = frame.to(self.device).to(dtype).inspect()
                 frame = frame.with_depth().replace(hints=hints)
-                report.missing = self._missing(frame)
-                report.tiles = self._divide(frame)
+                report.missing = absent_buffers(self.model, frame)
+                report.tiles = self._tiles.divide(self._shot(frame))
             noisy = frame.color
             with bfloat16:
-                output, state = self._called(frame)
+                output, state = checked_step(self.model, frame, self._state, self._shape)
             with timed("validate", self.device):
-                self._check(output, frame, state)
                 # A renderer may write its next frame into the same buffers, and a user change an image in place.
-                state = state if self.frames_stay else _owned(state, [given, noisy])
+                state = state if self.frames_stay else owned(state, [given, noisy])
                 if stages:
                     output = output._replace(stages={"noisy": noisy, **output.stages})
-                result: Output = _owned(Output(output.image.to(dtype), output.stages), [given, noisy, state])
+                result: Output = owned(Output(output.image.to(dtype), output.stages), [given, noisy, state])
         # Only now: a frame that was refused leaves no trace.
         self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1
         return result
@@ -206,111 +193,15 @@ class Denoiser:
         weights = self.model.parameters() if isinstance(self.model, nn.Module) else ()
         return torch.float64 if exact and all(each.dtype == torch.float64 for each in weights) else torch.float32
 
-    def _called(self, frame: Frame) -> tuple[Any, State]:
-        """What the model returns, which may be anything."""
-        shape = tuple(frame.color.shape)
-        try:
-            found = self.model(frame, self._state)
-        except InputError:
-            raise
-        except Exception as error:
-            if self._state is None or self._shape == shape:
-                raise
-            raise InputError(
-                f"model: the state is of frames of {self._shape}, found one of {shape}, with which the model fails; "
-                f"reset the denoiser: {' '.join(str(error).split())}"
-            ) from error
-        # An Output is a pair, too.
-        if isinstance(found, Output) or not (isinstance(found, tuple) and len(found) == 2):
-            raise InputError(f"model: expected a pair (Output, state), found {type(found).__name__}")
-        return found
+    def _shot(self, frame: Frame) -> Frames:
+        streaming = self.has_history(frame.buffers)
+        return Frames(frame.size, frame.buffers, streaming, self.has_room_ahead, frame.color.shape[0])
 
     def _is_last(self) -> bool:
         """Whether no frame that follows can have a history."""
         if self._frames is not None and self._count + 1 >= self._frames:
             return True
         return self._buffers is not None and not self.has_history(self._buffers)
-
-    def _missing(self, frame: Frame) -> list[str]:
-        """Buffers that the model is better with, sorted; refuses a frame without one that it needs."""
-        needs = self.model.needs
-        if absent := needs.missing(frame):
-            raise InputError(
-                f"buffer '{absent[0]}': the model needs it, found only {', '.join(sorted(frame.buffers))}; render it, "
-                "or take another model, see `mcdenoise models`"
-            )
-        missing = needs.uses - frame.buffers - {"previous_position", "position", "view_projection"}
-        return sorted(missing - ({"motion"} if {"position", "view_projection"} <= frame.buffers else frozenset()))
-
-    def _divide(self, frame: Frame) -> str:
-        """Choose the tiles; says which, and why."""
-        if not self._tiled:
-            return "whole frames: the model computes no tiles"
-        streaming = self.has_history(frame.buffers)
-        batch = frame.color.shape[0]
-        tiling = self._tiling(Frames(frame.size, frame.buffers, streaming, self.has_room_ahead, batch))
-        for tiled in self._tiled:
-            tiled.side = tiling.side
-        return tiling.reason
-
-    def _network(self) -> Network:
-        halo = max(tiled.halo or 0 for tiled in self._tiled)
-        return Network(halo, max(each.bytes_per_pixel(bfloat16=self.precision == "bfloat16") for each in self._tiled))
-
-    def _tiling(self, frames: Frames) -> Tiling:
-        """The tiles of these frames."""
-        if frames not in self._tilings:
-            if self.tile is not None:
-                tiling = Tiling(self.tile, f"{describe(frames.size, self.tile)}: as asked for")
-            else:
-                tiling = self._memory.choose(frames, self._network())
-            self._tilings[frames] = tiling
-        return self._tilings[frames]
-
-    def _check(self, output: Any, frame: Frame, state: State) -> None:
-        """Refuse what is no image of this frame, or no state."""
-        image = output.image if isinstance(output, Output) else None
-        if not isinstance(image, Tensor) or image.shape != frame.color.shape:
-            found = type(output).__name__ if not isinstance(image, Tensor) else f"an image of {tuple(image.shape)}"
-            raise InputError(f"model: expected an Output with an image of {tuple(frame.color.shape)}, found {found}")
-        if not image.is_floating_point():
-            raise InputError(f"model: expected a floating-point image, found {image.dtype}")
-        if image.device != frame.color.device:
-            raise InputError(f"model: expected an image on {frame.color.device}, found one on {image.device}")
-        # A sum is the fastest way to see either, and only what is far beyond all radiance overflows it.
-        if not image.detach().sum().isfinite() and (broken := int((~image.isfinite()).any(1).sum())):
-            raise InputError(
-                f"model: expected finite radiance, found {broken} NaN or infinite pixels; the frame is not kept: check "
-                "the buffers for values far out of range and the network for weights that are"
-            )
-        for leaf in pytree.tree_leaves(state):
-            if leaf is not None and not isinstance(leaf, Tensor):
-                raise InputError(f"model: expected a state of tensors, found {type(leaf).__name__} in it")
-            if leaf is not None and leaf.device != frame.color.device:
-                raise InputError(f"model: expected a state on {frame.color.device}, found {leaf.device} in it")
-        if self._state is not None and not _alike(self._state, state):
-            raise InputError("model: expected a state of the same structure as for the frame before, found another")
-
-
-def _alike(a: State, b: State) -> bool:
-    """Whether two states have the same structure; what is not there is like anything."""
-    if a is None or b is None:
-        return True
-    children, spec = pytree.tree_flatten(a, is_leaf=lambda x: x is not a)
-    others, other = pytree.tree_flatten(b, is_leaf=lambda x: x is not b)
-    if isinstance(a, Tensor) or isinstance(b, Tensor):
-        return isinstance(a, Tensor) and isinstance(b, Tensor) and a.ndim == b.ndim
-    return spec == other and all(_alike(*pair) for pair in zip(children, others, strict=True))
-
-
-def _owned(tree: Any, others: Any) -> Any:
-    """A tree with copies of those tensors that share memory with others."""
-    taken = {leaf.untyped_storage().data_ptr() for leaf in pytree.tree_leaves(others) if isinstance(leaf, Tensor)}
-
-    def own(tensor: Tensor) -> Tensor:
-        return tensor.clone() if tensor.untyped_storage().data_ptr() in taken else tensor
-
-    return pytree.tree_map_only(Tensor, own, tree)
 
 
 def _device(device: torch.device | str) -> torch.device:

@@ -229,7 +229,7 @@ def test_reading_ahead_does_not_change_an_image(
     sequence = open_sequence(small_sequence)
     for name, ahead in (("ahead", True), ("alone", False)):
         denoiser = Denoiser(small_model())
-        monkeypatch.setattr(type(denoiser._memory), "has_room_ahead", lambda *_, room=ahead: room)
+        monkeypatch.setattr(type(denoiser._tiles), "has_room_ahead", lambda *_, room=ahead: room)
         denoise_sequence(sequence, tmp_path / name, denoiser, "small", half=False)
         assert denoiser.has_room_ahead is ahead
     for number in sequence.numbers:

@@ -11,7 +11,9 @@ import torch
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS
-from mcdenoise.models.tiled import Region
+from mcdenoise.models._interface import Model
+from mcdenoise.models._wrapper import parts_of
+from mcdenoise.models.tiled import Region, Tiled
 
 GB = 1e9
 LEAST_SIDE = 64
@@ -44,6 +46,72 @@ class Tiling(NamedTuple):
 
     side: int | None
     reason: str
+
+
+class Division:
+    """How a model's images are divided into tiles.
+
+    Args:
+        model: any method; where it wears no :class:`mcdenoise.models.Tiled`, whole images are computed.
+        side: of the tiles in pixels, a multiple of 32 from 64 on; by default as memory allows.
+        max_memory: in GB, see :class:`mcdenoise.denoiser.Denoiser`.
+        device: where the model runs.
+        bfloat16: whether its convolutions are in bfloat16.
+
+    Raises:
+        InputError: side or memory are no such number, both are given, or the model computes no tiles.
+    """
+
+    def __init__(
+        self, model: Model, side: int | None, max_memory: float | None, device: torch.device, *, bfloat16: bool
+    ) -> None:
+        self._tiled = [tiled for tiled in parts_of(model, Tiled) if tiled.halo is not None]
+        if side is not None:
+            check_side(side)
+            if max_memory is not None:
+                raise InputError("tile, max_memory: expected one of them, found both; max_memory chooses the tiles")
+        if not self._tiled and (side, max_memory) != (None, None):
+            raise InputError("tile, max_memory: expected a model that computes tiles of an image, found one without")
+        self._side, self._bfloat16 = side, bfloat16
+        self._memory = Memory(None if max_memory is None else max_memory * GB, device)
+        self._tilings: dict[Frames, Tiling] = {}
+
+    def divide(self, frames: Frames) -> str:
+        """Choose the tiles of the next frame; says which, and why.
+
+        Raises:
+            InputError: not even the smallest tiles fit.
+        """
+        if not self._tiled:
+            return "whole frames: the model computes no tiles"
+        tiling = self._tiling(frames)
+        for tiled in self._tiled:
+            tiled.side = tiling.side
+        return tiling.reason
+
+    def has_room_ahead(self, frames: Frames) -> bool:
+        """Whether the next frame can be read, and the last one be written, while one is denoised.
+
+        Raises:
+            InputError: not even the smallest tiles fit.
+        """
+        if not self._tiled:
+            return True
+        self._tiling(frames)
+        return self._memory.has_room_ahead(frames, self._network())
+
+    def _tiling(self, frames: Frames) -> Tiling:
+        if frames not in self._tilings:
+            if self._side is not None:
+                tiling = Tiling(self._side, f"{describe(frames.size, self._side)}: as asked for")
+            else:
+                tiling = self._memory.choose(frames, self._network())
+            self._tilings[frames] = tiling
+        return self._tilings[frames]
+
+    def _network(self) -> Network:
+        halo = max(tiled.halo or 0 for tiled in self._tiled)
+        return Network(halo, max(tiled.bytes_per_pixel(bfloat16=self._bfloat16) for tiled in self._tiled))
 
 
 class Memory:

@@ -68,6 +68,12 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
     found = description["architecture"]
     if name is not None and found != name and ":" not in name:
         raise InputError(f"{path}: expected weights of model '{name}', found those of '{found}'")
+    # The code alone never decides what a file means.
+    if lacking := sorted(set(find_model(name or found).architecture) - set(description["settings"])):
+        raise InputError(
+            f"{path}: header 'settings': expected every setting of model '{found}', found no {', '.join(lacking)}; save "
+            "the weights again"
+        )
     settings = {**description["settings"], **settings}
     try:
         model = build_model(name or found, **settings)

@@ -1,0 +1,109 @@
+"""What a host asks of a method that may be anybody's: a pair of an image of the frame and a state of tensors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Output, State
+
+
+def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...]) -> tuple[Output, State]:
+    """Call a method, and refuse what is no image of the frame, or no state.
+
+    Args:
+        model: any method.
+        frame: valid.
+        state: of the frame before.
+        shape: of that frame's color.
+
+    Raises:
+        InputError: the result breaks the contract of :class:`mcdenoise.models.Model`, is not finite, or the method
+            fails with a state that is of frames of another size.
+    """
+    try:
+        found: Any = model(frame, state)
+    except InputError:
+        raise
+    except Exception as error:
+        if state is None or shape == tuple(frame.color.shape):
+            raise
+        raise InputError(
+            f"model: the state is of frames of {shape}, found one of {tuple(frame.color.shape)}, with which the model "
+            f"fails; reset the denoiser: {' '.join(str(error).split())}"
+        ) from error
+    # An Output is a pair, too.
+    if isinstance(found, Output) or not (isinstance(found, tuple) and len(found) == 2):
+        raise InputError(f"model: expected a pair (Output, state), found {type(found).__name__}")
+    output, after = found
+    _check_image(output, frame)
+    _check_state(state, after, frame)
+    return output, after
+
+
+def absent_buffers(model: Model, frame: Frame) -> list[str]:
+    """Buffers that a method is better with and the frame has not, sorted.
+
+    Raises:
+        InputError: the frame lacks one that the method needs.
+    """
+    needs = model.needs
+    if absent := needs.missing(frame):
+        raise InputError(
+            f"buffer '{absent[0]}': the model needs it, found only {', '.join(sorted(frame.buffers))}; render it, "
+            "or take another model, see `mcdenoise models`"
+        )
+    missing = needs.uses - frame.buffers - {"previous_position", "position", "view_projection"}
+    return sorted(missing - ({"motion"} if {"position", "view_projection"} <= frame.buffers else frozenset()))
+
+
+def owned(tree: Any, others: Any) -> Any:
+    """A tree with copies of those tensors that share memory with others."""
+    taken = {leaf.untyped_storage().data_ptr() for leaf in pytree.tree_leaves(others) if isinstance(leaf, Tensor)}
+
+    def own(tensor: Tensor) -> Tensor:
+        return tensor.clone() if tensor.untyped_storage().data_ptr() in taken else tensor
+
+    return pytree.tree_map_only(Tensor, own, tree)
+
+
+def _check_image(output: Any, frame: Frame) -> None:
+    image = output.image if isinstance(output, Output) else None
+    if not isinstance(image, Tensor) or image.shape != frame.color.shape:
+        found = type(output).__name__ if not isinstance(image, Tensor) else f"an image of {tuple(image.shape)}"
+        raise InputError(f"model: expected an Output with an image of {tuple(frame.color.shape)}, found {found}")
+    if not image.is_floating_point():
+        raise InputError(f"model: expected a floating-point image, found {image.dtype}")
+    if image.device != frame.color.device:
+        raise InputError(f"model: expected an image on {frame.color.device}, found one on {image.device}")
+    # A sum is the fastest way to see either, and only what is far beyond all radiance overflows it.
+    if not image.detach().sum().isfinite() and (broken := int((~image.isfinite()).any(1).sum())):
+        raise InputError(
+            f"model: expected finite radiance, found {broken} NaN or infinite pixels; the frame is not kept: check "
+            "the buffers for values far out of range and the network for weights that are"
+        )
+
+
+def _check_state(before: State, state: State, frame: Frame) -> None:
+    for leaf in pytree.tree_leaves(state):
+        if leaf is not None and not isinstance(leaf, Tensor):
+            raise InputError(f"model: expected a state of tensors, found {type(leaf).__name__} in it")
+        if leaf is not None and leaf.device != frame.color.device:
+            raise InputError(f"model: expected a state on {frame.color.device}, found {leaf.device} in it")
+    if before is not None and not _alike(before, state):
+        raise InputError("model: expected a state of the same structure as for the frame before, found another")
+
+
+def _alike(a: State, b: State) -> bool:
+    """Whether two states have the same structure; what is not there is like anything."""
+    if a is None or b is None:
+        return True
+    children, spec = pytree.tree_flatten(a, is_leaf=lambda x: x is not a)
+    others, other = pytree.tree_flatten(b, is_leaf=lambda x: x is not b)
+    if isinstance(a, Tensor) or isinstance(b, Tensor):
+        return isinstance(a, Tensor) and isinstance(b, Tensor) and a.ndim == b.ndim
+    return spec == other and all(_alike(*pair) for pair in zip(children, others, strict=True))
