@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise import Denoiser, Frame, create_model
-from mcdenoise.models import Needs, Output, State
 
 # Central differences of smooth functions in float64: rounding is 1e-16 / 1e-6 of the value, truncation 1e-12.
 STEP, TOLERANCE = 1e-6, 1e-6

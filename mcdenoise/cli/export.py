@@ -20,7 +20,7 @@ def export(
     out: Out,
     weights: Path | None = None,
     buffers: str | None = None,
-    format: Format | None = None,  # noqa: A002 - the option's name
+    format: Format | None = None,
     check: Path | None = None,
     frames: int = 5,
     json: Json = None,

@@ -173,7 +173,10 @@ def test_what_is_no_state_is_refused_and_leaves_no_trace(misbehave: str, message
 def test_a_state_of_another_size_is_refused_in_one_line_where_the_model_minds() -> None:
     denoiser = Denoiser(Mean())
     denoiser(frame())
-    with pytest.raises(InputError, match=r"the state is of frames of \(1, 3, 24, 32\), found one of \(1, 3, 20, 32\), .*reset the denoiser") as caught:
+    with pytest.raises(
+        InputError,
+        match=r"the state is of frames of \(1, 3, 24, 32\), found one of \(1, 3, 20, 32\), .*reset the denoiser",
+    ) as caught:
         denoiser(frame((20, 32)))
     assert "\n" not in str(caught.value)
     denoiser.reset()
