@@ -100,8 +100,13 @@ def _image(found: object) -> Tensor:
     return torch.from_numpy(np.array(found, dtype=np.float32)).permute(2, 0, 1)[None]
 
 
-def descend(box: Box, target: Tensor, loss: str, denoiser: Denoiser | None, steps: int, seed: int) -> list[float]:
-    """The largest error of the reflectance after each step."""
+WAYS = {"relative squared": ("noisy", "noisy, two images", "denoised"), "log, absolute": ("noisy", "denoised")}
+
+
+def descend(
+    box: Box, target: Tensor, loss: str, denoiser: Denoiser | None, steps: int, seed: int, two: bool = False
+) -> list[float]:
+    """The largest error of the reflectance after each step; with ``two``, of which each renders two images."""
     features = box.features()
     logits = torch.logit(torch.tensor(START)).requires_grad_()
     optimizer = torch.optim.Adam([logits], lr=0.1)
@@ -115,7 +120,12 @@ def descend(box: Box, target: Tensor, loss: str, denoiser: Denoiser | None, step
             denoiser.reset()
             image = denoiser(Frame(color=image.clamp_min(0), **features))
         optimizer.zero_grad()
-        LOSSES[loss](image, target).backward()
+        if two:
+            # The product of independent differences has no variance of the noise in its mean, nor has its gradient.
+            other = box(reflectance, seed * 100_003 + steps + step)
+            ((image - target) * (other - target) / (target.square() + 0.01)).mean().backward()
+        else:
+            LOSSES[loss](image, target).backward()
         optimizer.step()
         # As Adam's noise would otherwise never settle.
         optimizer.param_groups[0]["lr"] = 0.1 * (1 - step / steps)
@@ -124,7 +134,7 @@ def descend(box: Box, target: Tensor, loss: str, denoiser: Denoiser | None, step
 
 
 def compare(
-    variant: str, *, size: int = SIZE, steps: int = 100, seeds: int = 3, samples: int = 1024
+    variant: str, *, size: int = SIZE, steps: int = 120, seeds: int = 3, samples: int = 1024
 ) -> dict[tuple[str, str], list[list[float]]]:
     """Errors of the reflectance by loss and way (``noisy``, ``denoised``), for each noise seed, after each step."""
     box = Box(variant, size)
@@ -132,12 +142,12 @@ def compare(
     denoiser = Denoiser("cascaded_v2_micro", differentiable=True)
     found: dict[tuple[str, str], list[list[float]]] = {}
     for loss in LOSSES:
-        for way, used in (("noisy", None), ("denoised", denoiser)):
-            found[loss, way] = [descend(box, target, loss, used, steps, seed) for seed in range(1, 1 + seeds)]
+        for way in WAYS[loss]:
+            two, used = "two" in way, denoiser if way == "denoised" else None
+            count = steps // 2 if two else steps
+            found[loss, way] = [descend(box, target, loss, used, count, seed, two) for seed in range(1, 1 + seeds)]
             last = [errors[-1] for errors in found[loss, way]]
-            print(
-                f"{loss}, {way}: error {sum(last) / seeds:.3f} ({min(last):.3f} to {max(last):.3f}) after {steps} steps"
-            )
+            print(f"{loss}, {way}: error {sum(last) / seeds:.3f} ({min(last):.3f} to {max(last):.3f}), {steps} samples")
     return found
 
 
@@ -150,10 +160,11 @@ def plot(found: dict[tuple[str, str], list[list[float]]], path: Path) -> None:
 
     figure, panels = plt.subplots(1, len(LOSSES), figsize=(9, 3.6), sharey=True, layout="constrained")
     for panel, loss in zip(panels, LOSSES, strict=True):
-        for color, way in (("tab:orange", "noisy"), ("tab:blue", "denoised")):
-            for index, errors in enumerate(found[loss, way]):
-                panel.semilogy(errors, color=color, alpha=0.7, label=way if index == 0 else None)
-        panel.set(title=f"loss: {loss}", xlabel="samples a pixel = steps")
+        for color, way in zip(("tab:orange", "tab:green", "tab:blue"), WAYS["relative squared"], strict=True):
+            for index, errors in enumerate(found.get((loss, way), [])):
+                samples = [step * (2 if "two" in way else 1) for step in range(len(errors))]
+                panel.semilogy(samples, errors, color=color, alpha=0.7, label=way if index == 0 else None)
+        panel.set(title=f"loss: {loss}", xlabel="samples a pixel")
         panel.legend()
     panels[0].set_ylabel("largest error of the reflectance")
     figure.savefig(path, dpi=110)
@@ -165,7 +176,7 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, default=Path("inverse_rendering.png"))
     parser.add_argument("--variant", help="of Mitsuba; by default llvm_ad_rgb where that runs, else scalar_rgb")
     parser.add_argument("--size", type=int, default=SIZE)
-    parser.add_argument("--steps", type=int, default=100)
+    parser.add_argument("--steps", type=int, default=120)
     parser.add_argument("--seeds", type=int, default=3, help="of the noise")
     options = parser.parse_args()
     variant = options.variant or first_working(("llvm_ad_rgb",)) or "scalar_rgb"

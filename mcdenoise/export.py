@@ -189,6 +189,9 @@ def export_model(
             written. Nothing is written then.
     """
     kind = _format_of(path, format)
+    # Before minutes are spent.
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: cannot be written: expected its folder to exist, found none")
     if kind == "onnx":
         _check_packages("onnx", "onnxscript")
     step = Step(model, default_buffers(model) if buffers is None else buffers)
