@@ -65,7 +65,7 @@ class Step(nn.Module):
 
     @torch.no_grad()
     def _state_of(self, size: tuple[int, int], batch: int) -> State:
-        return self.model(self._frame(self._example(size, batch)))[1]
+        return self.model(self.frame(self._example(size, batch)))[1]
 
     def _example(self, size: tuple[int, int], batch: int) -> dict[str, Tensor]:
         return {name: _example(name, size, batch) for name in self.given}
@@ -94,14 +94,19 @@ class Step(nn.Module):
             The image, and the state for the next frame.
         """
         before = pytree.tree_unflatten([None if name is None else state[name] for name in self._names], self._spec)
-        output, after = self.model(self._frame(buffers), before if self.state else None)
+        output, after = self.model(self.frame(buffers), before if self.state else None)
         leaves = pytree.tree_leaves(after)
         if len(leaves) != len(self._names):
             raise InputError("model: expected a state of the same structure as for the frame before, found another")
         return output.image, {name: leaf for name, leaf in zip(self._names, leaves, strict=True) if name is not None}
 
-    def _frame(self, buffers: Mapping[str, Tensor]) -> Frame:
-        known = {name: buffer for name, buffer in buffers.items() if name in BUFFERS or name == "view_projection"}
+    def frame(self, buffers: Mapping[str, Tensor]) -> Frame:
+        """The frame that buffers by name are."""
+        known: dict[str, Any] = {
+            name: buffer
+            for name, buffer in buffers.items()
+            if name in BUFFERS or name in ("view_projection", "samples")
+        }
         extra = {name: buffer for name, buffer in buffers.items() if name not in known}
         return Frame(**known, extra=extra, hints=Hints(stages=False))
 
@@ -184,6 +189,9 @@ def export_model(
             written. Nothing is written then.
     """
     kind = _format_of(path, format)
+    # Before minutes are spent.
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: cannot be written: expected its folder to exist, found none")
     if kind == "onnx":
         _check_packages("onnx", "onnxscript")
     step = Step(model, default_buffers(model) if buffers is None else buffers)
@@ -230,8 +238,7 @@ def differences(exported: Exported, model: Model, sequence: Sequence, frames: in
     for number in sequence.numbers[:frames]:
         frame = sequence.frame(number, reference=False).to(torch.float32).validate()[0].with_depth()
         given = {name: buffer for name, buffer in frame.items() if name in names}
-        frame = Frame(**given)
-        expected = denoiser(frame)
+        expected = denoiser(step.frame(given))
         state = state or {f"state.{key}": value.numpy() for key, value in step.no_history(given).items()}
         feeds = {name: buffer.numpy() for name, buffer in given.items()} | state
         # What makes no difference to the result, the graph does not take.
@@ -254,7 +261,7 @@ def _check_no_history(
     # Guards are of layouts in memory and the like, and none of the result.
     with torch.no_grad():
         found = program.module(check_guards=False)(buffers, state)[0]
-        expected = step.model(step._frame(buffers))[0].image
+        expected = step.model(step.frame(buffers))[0].image
     if not _difference(found, expected) <= _NO_HISTORY_TOLERANCE:
         raise InputError(
             "model: expected the graph's first image, with a state of zeros, to be that of no state, found them "

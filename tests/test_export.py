@@ -103,8 +103,7 @@ def with_onnxruntime(exported: Exported, step: Step, shot: list[dict[str, Tensor
             list(exported.outputs), {each.name: feeds[each.name] for each in session.get_inputs()}
         )
         state = {
-            name.replace("next_state", "state"): value
-            for name, value in zip(exported.outputs[1:], after, strict=True)
+            name.replace("next_state", "state"): value for name, value in zip(exported.outputs[1:], after, strict=True)
         }
         images.append(torch.from_numpy(image))
     return images
@@ -260,3 +259,32 @@ def test_a_graph_says_what_a_denoiser_says(mine: str) -> None:
     model = create_model(mine)
     shot, denoiser = frames((24, 32)), Denoiser(model, keep_all=True)
     assert_alike([denoiser(Frame(**buffers)) for buffers in shot], eager(model, shot))
+
+
+def test_the_command_writes_the_graph_and_says_its_names(
+    mine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mcdenoise.cli import main
+
+    own = tmp_path / "plain.py"
+    own.write_text("def blur(color):\n    return color * 0.5\n\n\ndef factory():\n    return blur\n")
+    with pytest.raises(SystemExit) as stop:
+        main(["export", f"{own}:factory", "-o", str(tmp_path / "half.pt2"), "--json", str(tmp_path / "half.json")])
+    assert stop.value.code == 0
+    printed = capsys.readouterr().out
+    assert "inputs: color\noutputs: image\n" in printed
+    assert printed.endswith(f"wrote {tmp_path / 'half.pt2'}\n")
+    program = torch.export.load(tmp_path / "half.pt2").module(check_guards=False)
+    color = torch.rand(1, 3, 9, 7)
+    assert torch.equal(program({"color": color}, {})[0], color * 0.5)
+    for arguments, message in (
+        (["export", f"{own}:absent", "-o", "x.onnx"], "expected a factory 'absent'"),
+        (["export", f"{own}:factory", "-o", str(tmp_path / "absent" / "x.pt2")], "cannot be written"),
+        (["export", f"{own}:factory", "-o", "x.pt2", "--check", str(tmp_path)], "expected"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1

@@ -20,7 +20,7 @@ def export(
     out: Out,
     weights: Path | None = None,
     buffers: str | None = None,
-    format: Format | None = None,  # noqa: A002 - the option's name
+    format: Format | None = None,
     check: Path | None = None,
     frames: int = 5,
     json: Json = None,
@@ -37,7 +37,7 @@ def export(
         buffers: names of the buffers that frames will have, such as color,albedo,normal,depth,motion; by default those
             of --check, or else all that the model is better with.
         format: onnx, or torch for torch.export.load; by default that of the file's ending.
-        check: folder of a sequence: run the ONNX graph by onnxruntime over its frames, and print the difference to torch.
+        check: folder of a sequence: run the ONNX graph by onnxruntime over its frames, and print the differences.
         frames: how many of them.
         json: write the names of inputs and outputs, and the differences, to this file too.
     """

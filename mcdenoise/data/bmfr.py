@@ -88,7 +88,7 @@ class BmfrFolder:
         sources: dict[str, Mapping[int, Path]] = dict(self.files)
         if realisation:
             sources["color"] = self.more_colors[realisation - 1]
-        buffers = {
+        buffers: dict[str, Any] = {
             name: self._read(name, files[number])
             for name, files in sources.items()
             if number in files and (reference or name != "reference")

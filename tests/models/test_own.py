@@ -36,7 +36,8 @@ number = 3
 class Blur(nn.Module):
     def __init__(self, channels: int = 4):
         super().__init__()
-        self.layers = nn.Sequential(nn.Conv2d(6, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, 3, 3, padding=1))
+        first, second = nn.Conv2d(6, channels, 3, padding=1), nn.Conv2d(channels, 3, 3, padding=1)
+        self.layers = nn.Sequential(first, nn.ReLU(), second)
 
     def forward(self, color, albedo):
         return color + self.layers(torch.cat([color, albedo], 1))
@@ -90,7 +91,7 @@ def test_a_factory_has_to_be_somewhere(tmp_path: Path) -> None:
     broken.write_text("import nothing_of_this_name")
     with pytest.raises(InputError, match=r"broken\.py cannot be imported: ModuleNotFoundError"):
         create_model(f"{broken}:network")
-    with pytest.raises(InputError, match="package.of.nobody cannot be imported"):
+    with pytest.raises(InputError, match=r"package\.of\.nobody cannot be imported"):
         create_model("package.of.nobody:network")
 
 
