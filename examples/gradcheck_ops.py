@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
-from mcdenoise.gradcheck import check
+from mcdenoise.check.gradients import check
 from mcdenoise.ops import cross_bilateral_weights, demodulate, kernel_conv, remodulate
 
 PARTS = ["demodulate", "cross_bilateral_weights", "kernel_conv", "remodulate"]

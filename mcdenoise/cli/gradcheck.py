@@ -7,9 +7,9 @@ from dataclasses import asdict
 import tyro
 from rich.table import Table
 
+from mcdenoise.check.gradients import check_case, select
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import progress_bar, show, write_json
-from mcdenoise.gradcheck import check_case, select
 
 
 def gradcheck(ops: tyro.conf.Positional[list[str]] = [], json: Json = None) -> int:  # noqa: B006 - tyro reads it

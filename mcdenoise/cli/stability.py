@@ -5,10 +5,10 @@ from __future__ import annotations
 import tyro
 from rich.table import Table
 
+from mcdenoise.check.stability import FRAMES, Check, LongRun, Summary, as_json, parse_dtypes, stages, summarize
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import progress_bar, show, write_json
 from mcdenoise.errors import InputError
-from mcdenoise.stability import FRAMES, Check, LongRun, Summary, as_json, parse_dtypes, stages, summarize
 
 
 def stability(

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
+from mcdenoise.check.step_cases import STEPS
 from mcdenoise.errors import InputError
-from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
-from mcdenoise.ops._step_cases import STEPS
 
 # Only to make a failure repeatable: any upstream gradient must do.
 SEED = 0

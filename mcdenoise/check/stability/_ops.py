@@ -9,7 +9,7 @@ by at most ``n u`` of their magnitude ``s``, and rounds the result:
 The sum is the (absolute, componentwise) condition number: how far the exact result moves when inputs do. It is not
 taken from derivatives but measured in float64, by moving every input up and down by ``16 u``, so that a kink or a jump
 as near as rounding can reach is in it. ``s_j`` is ``|x_j|``, at least the smallest normal number (below it there are
-fewer digits), and more where an op computes with larger numbers, see :class:`mcdenoise.ops._case.Rounding`.
+fewer digits), and more where an op computes with larger numbers, see :class:`mcdenoise.check.case.Rounding`.
 
 ``n`` is a count of roundings. A sum of ``m`` terms has ``m - 1``, and a result that depends on ``m`` inputs is made of
 sums of at most so many; what is multiplied, divided and exponentiated on the way adds no more than 8. So ``n = m + 8``.
@@ -28,15 +28,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from mcdenoise.check.case import Case, Inputs, Op, Rounding, map_tensors
+from mcdenoise.check.cases import OPS
+from mcdenoise.check.stability._check import DTYPES, Check, name_of
+from mcdenoise.check.step_cases import STEPS
 from mcdenoise.errors import InputError
 from mcdenoise.ops import Surface, use
 from mcdenoise.ops._backend import Backend
-from mcdenoise.ops._case import Case, Inputs, Op, Rounding, map_tensors
-from mcdenoise.ops._cases import OPS
 from mcdenoise.ops._op import backends_of
-from mcdenoise.ops._step_cases import STEPS
 from mcdenoise.ops._window import accumulator_dtype
-from mcdenoise.stability._check import DTYPES, Check, name_of
 
 _DEPTH = 8
 _PROBE = 16

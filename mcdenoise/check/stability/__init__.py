@@ -10,15 +10,15 @@ from typing import Any
 
 import torch
 
+from mcdenoise.check.stability import _denoiser, _long_runs, _models, _ops
+from mcdenoise.check.stability._check import DTYPES, Check, Summary, parse_dtypes, summarize
+from mcdenoise.check.stability._denoiser import check_denoiser
+from mcdenoise.check.stability._long_runs import FRAMES, LongRun, long_runs
+from mcdenoise.check.stability._models import check_model
+from mcdenoise.check.stability._ops import check_case, check_op
 from mcdenoise.errors import InputError
 from mcdenoise.methods import parse_method
 from mcdenoise.models import list_models
-from mcdenoise.stability import _denoiser, _long_runs, _models, _ops
-from mcdenoise.stability._check import DTYPES, Check, Summary, parse_dtypes, summarize
-from mcdenoise.stability._denoiser import check_denoiser
-from mcdenoise.stability._long_runs import FRAMES, LongRun, long_runs
-from mcdenoise.stability._models import check_model
-from mcdenoise.stability._ops import check_case, check_op
 
 __all__ = [
     "DTYPES",
