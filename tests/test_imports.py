@@ -36,12 +36,13 @@ TOOLS = REPORTS | {"budget", "demo", "export", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),
+    "own": {"errors"},
     "commit": set(),
     "ops": set(),
     "frame": {"errors", "ops"},
     "metrics": SIGNAL,
     "nn": SIGNAL,
-    "models": SIGNAL | {"nn"},
+    "models": SIGNAL | {"nn", "own"},
     # Leaves: what is read and rendered knows the frame, and no method.
     "data": SIGNAL,
     "demo_scene": SIGNAL | {"data"},
@@ -50,7 +51,7 @@ ALLOWED: dict[str, set[str]] = {
     "denoiser": SIGNAL | {"models"},
     "methods": SIGNAL | {"models", "denoiser"},
     "folder": LIBRARY,
-    "check": LIBRARY | {"methods"},
+    "check": LIBRARY | {"methods", "own"},
     "evaluate": LIBRARY | {"folder"},
     "results": SIGNAL | {"data", "denoiser"},
     "report": LIBRARY | {"evaluate", "results"},
