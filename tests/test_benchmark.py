@@ -36,6 +36,7 @@ from mcdenoise.benchmark.operators import backends
 from mcdenoise.benchmark.run import kept_frames
 from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import fit_line, measure_sizes, synthetic_frame
+from mcdenoise.check.cases import OPS, Op
 from mcdenoise.cli import main
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.camera_matrices import read_camera_matrices, write_camera_matrices
@@ -54,7 +55,6 @@ from mcdenoise.models import (
     save_weights,
 )
 from mcdenoise.ops import downsample, upsample
-from mcdenoise.ops._cases import OPS, Op
 from mcdenoise.results import Cell, Cost, Machine, Method, OpResults, Results, Skipped, Spread
 
 METRICS = {"SMAPE", "relMSE", "PSNR", "SSIM", "tSMAPE", "tRMSE"}

@@ -100,7 +100,8 @@ def test_denoise_sequence_writes_every_frame(small_sequence: Path, weights: Path
 
 def test_gradcheck_passes() -> None:
     lines = run("gradcheck_ops.py", "demodulate", "kernel_conv").splitlines()
-    assert lines[0].startswith("passed  my_filter in color, albedo, normal, logits, scale, distance_scale")
+    arguments = "color, albedo, normal, logits, scale, distance_scale"
+    assert lines[0].startswith(f"passed  my_filter, example case, in {arguments}")
     assert {line.split()[1].rstrip(",") for line in lines[1:]} == {"demodulate", "kernel_conv"}
     assert all(line.startswith("passed") for line in lines)
 

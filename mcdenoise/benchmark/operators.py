@@ -14,13 +14,13 @@ from torch import Tensor
 from mcdenoise.benchmark.machine import Stopwatch, check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.methods import one_line
 from mcdenoise.benchmark.tables import write_ops_csv
+from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
+from mcdenoise.check.overview import DTYPES, relative_error
 from mcdenoise.data.files import new_folder
 from mcdenoise.errors import InputError
 from mcdenoise.ops import use
 from mcdenoise.ops._backend import Backend
-from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.ops._op import backends_of
-from mcdenoise.ops_overview import DTYPES, relative_error
 from mcdenoise.results import OpCost, OpResults, Spread
 
 # Far larger than any cache, so that the copy shows the memory's speed.

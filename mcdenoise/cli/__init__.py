@@ -27,7 +27,7 @@ COMMANDS = {
     "evaluate": "Compare a folder of denoised images with references.",
     "benchmark": "Measure error against run time of models and other denoisers.",
     "report": "Write the page and the plots of a finished benchmark.",
-    "gradcheck": "Check first and second derivatives of the operators in float64.",
+    "gradcheck": "Check first and second derivatives of the operators, or of a function of your own.",
     "stability": "Check operators, models and the denoiser on stiff and extreme inputs, in every precision.",
     "export": "Write a model as an ONNX or torch.export graph.",
     "models": "List the models with their size and cost.",

@@ -7,16 +7,21 @@ from dataclasses import asdict
 import tyro
 from rich.table import Table
 
+from mcdenoise.check.gradients import check_case, select
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import progress_bar, show, write_json
-from mcdenoise.gradcheck import check_case, select
 
 
 def gradcheck(ops: tyro.conf.Positional[list[str]] = [], json: Json = None) -> int:  # noqa: B006 - tyro reads it
-    """Check first and second derivatives of the operators against finite differences, in float64, slow mode.
+    """Check first and second derivatives of operators against finite differences, in float64, slow mode.
+
+    A function of your own takes floating-point tensors. What it is tried on is a small tuple of tensors, or several by
+    name, that its file gives as `function.example_inputs`, or as `inputs()` for all functions in it; without either,
+    images of 6 by 5 pixels for all arguments.
 
     Args:
-        ops: names of operators; all by default.
+        ops: names of operators, or functions of your own, path/to/file.py:function or package.module:function; all
+            operators by default.
         json: write the results to this file too.
     """
     table = Table("op", "case", "inputs", "result", "seconds")

@@ -6,9 +6,9 @@ from dataclasses import asdict
 
 from rich.table import Table
 
+from mcdenoise.check.overview import overview
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import show, write_json
-from mcdenoise.ops_overview import overview
 
 
 def ops(json: Json = None) -> None:

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
 import inspect
 import pkgutil
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Any
 
 from mcdenoise.errors import InputError
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._interface import Model
+from mcdenoise.own import in_one_line, load_own
 
 GROUP = "mcdenoise.models"
 
@@ -96,7 +94,7 @@ def find_model(name: str) -> Entry:
     if name in _installed():
         return _of_factory(name, _loaded_entry_point(name))
     if ":" in name:
-        return _of_factory(name, _own(name))
+        return _of_factory(name, load_own(name, "model", "factory")[0])
     raise InputError(
         f"model '{name}': expected one of {', '.join(list_models())}, or path/to/file.py:factory, or "
         "package.module:factory; see `mcdenoise models`"
@@ -122,8 +120,7 @@ def build_model(name: str, **settings: Any) -> Model:
     except InputError as error:
         raise InputError(f"model '{name}': {str(error).removeprefix('model: ')}") from error
     except Exception as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"model '{name}': the factory fails: {type(error).__name__}: {reason}") from error
+        raise InputError(f"model '{name}': the factory fails: {in_one_line(error)}") from error
 
 
 def describe_model(name: str) -> str:
@@ -157,34 +154,3 @@ def _loaded_entry_point(name: str) -> Any:
         return _installed()[name].load()
     except (ImportError, AttributeError) as error:
         raise InputError(f"model '{name}': its package offers it and cannot load it: {error}") from error
-
-
-def _own(name: str) -> Any:
-    """What ``path/to/file.py:factory`` or ``package.module:factory`` names."""
-    place, _, attribute = name.rpartition(":")
-    try:
-        module = _module_of_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
-    except InputError:
-        raise
-    except Exception as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"model '{name}': {place} cannot be imported: {type(error).__name__}: {reason}") from error
-    if not hasattr(module, attribute):
-        offered = ", ".join(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
-        raise InputError(f"model '{name}': expected a factory '{attribute}' in {place}, found {offered or 'none'}")
-    return getattr(module, attribute)
-
-
-def _module_of_file(path: Path) -> Any:
-    if not path.is_file():
-        raise InputError(f"{path}: expected a Python file with a factory of a model, found no such file")
-    # Its own name, so that a file beside it that is called alike is another module.
-    module_name = f"mcdenoise_own_{path.stem}_{abs(hash(path.resolve()))}"
-    spec = importlib.util.spec_from_file_location(module_name, path)
-    if spec is None or spec.loader is None:
-        raise InputError(f"{path}: expected a Python file, found something else")
-    module = importlib.util.module_from_spec(spec)
-    # Dataclasses and the like look their module up.
-    sys.modules[module_name] = module
-    spec.loader.exec_module(module)
-    return module

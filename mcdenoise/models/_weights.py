@@ -71,8 +71,8 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
     # The code alone never decides what a file means.
     if lacking := sorted(set(find_model(name or found).architecture) - set(description["settings"])):
         raise InputError(
-            f"{path}: header 'settings': expected every setting of model '{found}', found no {', '.join(lacking)}; save "
-            "the weights again"
+            f"{path}: header 'settings': expected every setting of model '{found}', found no {', '.join(lacking)}; "
+            "save the weights again"
         )
     settings = {**description["settings"], **settings}
     try:

@@ -30,7 +30,7 @@ STRIDE = 3
 # A convolution rounds weights, activations and results, each a relative change of its products such as the one whose
 # response is stored: of the sum of three, the root mean square is at most three times as large. Of a few random changes
 # the largest response of a pixel is not the largest of all, but that is hardly four times it (as in
-# mcdenoise.stability).
+# mcdenoise.check.stability).
 ALLOWED = {"largest": 3 * 4, "rms": 3}
 
 

@@ -23,8 +23,8 @@ from torch import Tensor
 from triton.runtime import interpreter
 
 from mcdenoise import ops
+from mcdenoise.check.cases import Case, Op, map_tensors
 from mcdenoise.ops import _backend
-from mcdenoise.ops._cases import Case, Op, map_tensors
 from mcdenoise.ops._triton import _filter as _triton_filter
 
 every_op = pytest.mark.parametrize("op", FAST, ids=lambda op: op.name)

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.ops import use
 from mcdenoise.ops._backend import Backend
-from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
 
 FAST = [op for op in OPS if op.name in ("kernel_conv", "kernel_splat", "cross_bilateral_filter")]
 # Of the largest number in the case. Half precision is rounded once, after a sum in float32; a derivative in float32

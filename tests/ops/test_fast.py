@@ -29,8 +29,8 @@ from plain_form import (
 from torch import Tensor
 
 from mcdenoise import ops
+from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.ops import _backend
-from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.ops._numba import _filter, _runtime
 
 every_op = pytest.mark.parametrize("op", FAST, ids=lambda op: op.name)

@@ -1,4 +1,4 @@
-"""What holds for every op, on every case of the table in ``mcdenoise/ops/_cases.py``."""
+"""What holds for every op, on every case of the table in ``mcdenoise/check/cases.py``."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from mcdenoise import gradcheck, ops
+from mcdenoise import ops
+from mcdenoise.check import gradients
+from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
+from mcdenoise.check.overview import DTYPES, overview, relative_error
 from mcdenoise.errors import InputError
-from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
-from mcdenoise.ops_overview import DTYPES, overview, relative_error
 
 # Of the largest absolute value of a result. Half precision is rounded once, after a sum in float32, or a few times by
 # the ops that have no sum; float32 is rounded at every tap, and an exponent near 50 is known to 50 eps.
@@ -110,7 +111,7 @@ def test_gradients_in_half_precision(op: Op, dtype: torch.dtype) -> None:
 
 @every_op
 def test_gradcheck(op: Op) -> None:
-    results = gradcheck.check([op.name])
+    results = gradients.check([op.name])
     assert [result.case for result in results] == [case.name for case in op.cases if case.differentiable]
     assert not [f"{result.case}: {result.message}" for result in results if not result.passed]
 
@@ -120,15 +121,15 @@ def test_gradcheck_reports_a_wrong_derivative() -> None:
         return image * image.detach()
 
     case = Case("square", "ordinary", lambda g: {"image": torch.rand(1, 1, 2, 2, generator=g).double()}, ("image",))
-    result = gradcheck.check_case(Op(detached, detached, (case,)), case)
+    result = gradients.check_case(Op(detached, detached, (case,)), case)
     assert (result.op, result.case, result.passed) == ("detached", "square", False)
     assert "Jacobian mismatch" in result.message
     assert "\n" not in result.message
 
 
 def test_gradcheck_of_an_unknown_op() -> None:
-    with pytest.raises(InputError, match=r"expected one of kernel_conv, .*accumulate, found sharpen"):
-        gradcheck.check(["kernel_conv", "sharpen"])
+    with pytest.raises(InputError, match=r"expected one of kernel_conv, .*accumulate, .*:function, found sharpen"):
+        gradients.check(["kernel_conv", "sharpen"])
 
 
 def transposed(tensor: Tensor) -> Tensor:

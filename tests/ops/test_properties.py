@@ -1,6 +1,6 @@
 """What holds for the ops on any input: shapes, dtypes and values are drawn by hypothesis, which shrinks what fails.
 
-A failure that turns up here becomes a case of the table in ``mcdenoise/ops/_extreme_cases.py``.
+A failure that turns up here becomes a case of the table in ``mcdenoise/check/extreme.py``.
 """
 
 from __future__ import annotations

@@ -9,12 +9,12 @@ import torch
 from plain_form import by
 from torch import Tensor
 
-from mcdenoise import gradcheck
-from mcdenoise.ops._case import Case, Op
+from mcdenoise.check import gradients
+from mcdenoise.check.case import Case, Op
+from mcdenoise.check.stability._ops import check_op, select
+from mcdenoise.check.step_cases import STEPS
 from mcdenoise.ops._op import backends_of
-from mcdenoise.ops._step_cases import STEPS
 from mcdenoise.ops._steps import history, network
-from mcdenoise.stability._ops import check_op, select
 
 every_step = pytest.mark.parametrize("step", STEPS, ids=lambda step: step.name)
 every_case = pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_is_its_formula(step: Op, case: Case, backend: str) -> None:
 
 @every_step
 def test_gradcheck(step: Op) -> None:
-    results = gradcheck.check([step.name])
+    results = gradients.check([step.name])
     assert not [f"{result.case}: {result.message}" for result in results if not result.passed]
 
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from mcdenoise import ops
+from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.ops import _backend
-from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
 
 # Of torch's own making, when its rules for forward mode are loaded.
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")

@@ -13,15 +13,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from mcdenoise import stability
+from mcdenoise.check import stability
+from mcdenoise.check.cases import OPS, Op
+from mcdenoise.check.stability import Check, check_case, check_denoiser, check_model, check_op, long_runs, summarize
+from mcdenoise.check.stability import _ops as op_checks
 from mcdenoise.cli import main
 from mcdenoise.errors import InputError
 from mcdenoise.models import list_models, pretrained_models
 from mcdenoise.ops import _op, kernel_conv
-from mcdenoise.ops._cases import OPS, Op
 from mcdenoise.ops._op import op, plain
-from mcdenoise.stability import Check, check_case, check_denoiser, check_model, check_op, long_runs, summarize
-from mcdenoise.stability import _ops as op_checks
 
 BY_NAME = {op.name: op for op in OPS}
 

@@ -1,4 +1,4 @@
-"""The fused steps and the inputs to try each of them on: what :mod:`mcdenoise.ops._cases` is for the public ops.
+"""The fused steps and the inputs to try each of them on: what :mod:`mcdenoise.check.cases` is for the public ops.
 
 The reference of a step is its formula, written out in float64 of torch's primitives or of other references.
 """
@@ -14,9 +14,9 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor
 
-from mcdenoise.ops import _reference
-from mcdenoise.ops._case import Case, Inputs, Op, Rounding, normal, uniform
-from mcdenoise.ops._extreme_cases import history_rounding
+from mcdenoise.check import reference
+from mcdenoise.check.case import Case, Inputs, Op, Rounding, normal, uniform
+from mcdenoise.check.extreme import history_rounding
 from mcdenoise.ops._steps import history, network
 
 Size = tuple[int, int, int]
@@ -161,7 +161,7 @@ def _depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
 def _gated_fusion(fine: Tensor, coarse: Tensor, weight: Tensor, bias: Tensor, *, logarithms: bool = False) -> Tensor:
     fine, coarse, weight, bias = fine.double(), coarse.double(), weight.double(), bias.double()
     size = (fine.shape[-2], fine.shape[-1])
-    wide, low = _reference.upsample(coarse, size), _reference.upsample(_reference.downsample(fine), size)
+    wide, low = reference.upsample(coarse, size), reference.upsample(reference.downsample(fine), size)
     detail = torch.log(1 + fine) if logarithms else fine
     alpha = torch.sigmoid(F.conv2d(torch.cat([detail, wide], 1), weight, bias, padding=1))
     return detail + alpha * (wide - (torch.log(1 + low) if logarithms else low))
@@ -169,8 +169,8 @@ def _gated_fusion(fine: Tensor, coarse: Tensor, weight: Tensor, bias: Tensor, *,
 
 def _low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor) -> Tensor:
     fine, coarse, top = fine.double(), coarse.double(), top.double()
-    means = _reference.downsample(_reference.downsample(_reference.downsample(fine)))
-    wanted = _reference.downsample(_reference.downsample(coarse))
+    means = reference.downsample(reference.downsample(reference.downsample(fine)))
+    wanted = reference.downsample(reference.downsample(coarse))
     wide, found = (F.interpolate(each, scale_factor=8.0, mode="bilinear") + 1e-3 for each in (wanted, means))
     rows, columns = slice(fine.shape[-2]), slice(fine.shape[-1])
     return torch.minimum(fine * wide[..., rows, columns] / found[..., rows, columns], torch.exp(top) - 1)
@@ -182,7 +182,7 @@ def _softplus(x: Tensor, *, units: tuple[float, ...]) -> Tensor:
 
 
 def _incoming(color: Tensor, albedo: Tensor) -> Tensor:
-    clamped = _reference.clamp_fireflies(_reference.demodulate(color, albedo))
+    clamped = reference.clamp_fireflies(reference.demodulate(color, albedo))
     mean = clamped.mean(1, keepdim=True)
     return torch.cat([clamped, mean**0.25, mean**0.5], 1)
 
@@ -208,7 +208,7 @@ def _lights(root: Tensor) -> Tensor:
 def _blend(
     entering: Tensor, previous: Tensor, previous_length: Tensor, motion: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    color, length = _reference.accumulate(entering, previous, previous_length, motion)
+    color, length = reference.accumulate(entering, previous, previous_length, motion)
     return color, length, (length > 1).double().mean((1, 2, 3))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._cases import OPS, Case, Op
+from mcdenoise.check.cases import OPS, Case, Op
 
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 

@@ -18,12 +18,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Generator, Tensor
 
-from mcdenoise.ops import _extreme_cases as extreme
-from mcdenoise.ops import _reference
-from mcdenoise.ops._case import Case, Inputs, Kind, Op, map_tensors
-from mcdenoise.ops._case import normal as _normal
-from mcdenoise.ops._case import radiance as _radiance
-from mcdenoise.ops._case import uniform as _uniform
+from mcdenoise.check import extreme, reference
+from mcdenoise.check.case import Case, Inputs, Kind, Op, map_tensors
+from mcdenoise.check.case import normal as _normal
+from mcdenoise.check.case import radiance as _radiance
+from mcdenoise.check.case import uniform as _uniform
 from mcdenoise.ops.atrous import Atrous, atrous
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
 from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
@@ -638,7 +637,7 @@ _IMAGE, _HISTORY = ("image",), ("color", "previous")
 OPS: tuple[Op, ...] = (
     Op(
         kernel_conv,
-        _reference.kernel_conv,
+        reference.kernel_conv,
         _filter_cases() + extreme.filters(),
         KernelConv,
         images=_IMAGE,
@@ -646,7 +645,7 @@ OPS: tuple[Op, ...] = (
     ),
     Op(
         kernel_splat,
-        _reference.kernel_splat,
+        reference.kernel_splat,
         _filter_cases() + extreme.filters(),
         KernelSplat,
         images=_IMAGE,
@@ -654,7 +653,7 @@ OPS: tuple[Op, ...] = (
     ),
     Op(
         cross_bilateral_weights,
-        _reference.cross_bilateral_weights,
+        reference.cross_bilateral_weights,
         _bilateral_cases() + extreme.bilateral(),
         CrossBilateralWeights,
         weights=_softmax,
@@ -662,7 +661,7 @@ OPS: tuple[Op, ...] = (
     ),
     Op(
         cross_bilateral_filter,
-        _reference.cross_bilateral_filter,
+        reference.cross_bilateral_filter,
         _bilateral_filter_cases() + extreme.bilateral_filters(),
         CrossBilateralFilter,
         images=_IMAGE,
@@ -670,82 +669,82 @@ OPS: tuple[Op, ...] = (
     ),
     Op(
         downsample,
-        _reference.downsample,
+        reference.downsample,
         _image_cases(lambda height, width: (height, width), with_size=False) + extreme.images(halved=False),
         images=_IMAGE,
     ),
     Op(
         upsample,
-        _reference.upsample,
+        reference.upsample,
         _image_cases(_half, with_size=True) + extreme.images(halved=True),
         images=_IMAGE,
     ),
     Op(
         laplacian_fusion,
-        _reference.laplacian_fusion,
+        reference.laplacian_fusion,
         _fusion_cases() + extreme.fusions(),
         LaplacianFusion,
         images=("fine", "coarse"),
     ),
     Op(
         demodulate,
-        _reference.demodulate,
+        reference.demodulate,
         _demodulation_cases("color") + extreme.demodulations("color"),
         Demodulate,
         images=("color",),
     ),
     Op(
         remodulate,
-        _reference.remodulate,
+        reference.remodulate,
         _demodulation_cases("image") + extreme.demodulations("image"),
         Remodulate,
         images=_IMAGE,
     ),
     Op(
         clamp_fireflies,
-        _reference.clamp_fireflies,
+        reference.clamp_fireflies,
         _firefly_cases() + extreme.fireflies(),
         ClampFireflies,
         images=_IMAGE,
         rounding=extreme.firefly_rounding,
     ),
-    Op(history_lag, _reference.history_lag, _lag_cases() + extreme.lags(), HistoryLag),
+    Op(history_lag, reference.history_lag, _lag_cases() + extreme.lags(), HistoryLag),
     Op(
         atrous,
-        _reference.atrous,
+        reference.atrous,
         _atrous_cases() + extreme.transforms(),
         Atrous,
         rounding=extreme.transform_rounding,
     ),
     Op(
         luminance_moments,
-        _reference.luminance_moments,
+        reference.luminance_moments,
         _luminance_cases() + extreme.luminances(),
         least_dtype=torch.float32,
     ),
     Op(
         moments_variance,
-        _reference.moments_variance,
+        reference.moments_variance,
         _moments_cases() + extreme.moments(),
         MomentsVariance,
     ),
     Op(
         motion_from_position,
-        _reference.motion_from_position,
+        reference.motion_from_position,
         _motion_cases() + extreme.motions(),
         least_dtype=torch.float32,
         rounding=extreme.motion_rounding,
     ),
     Op(
         reproject,
-        _reference.reproject,
+        reference.reproject,
         _history_cases(accumulating=False) + extreme.histories(accumulating=False),
         images=("previous",),
         rounding=extreme.history_rounding,
     ),
     Op(
         accumulate,
-        _reference.accumulate,
+        reference.accumulate,
         _history_cases(accumulating=True) + extreme.histories(accumulating=True),
         Accumulate,
         images=_HISTORY,

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from mcdenoise.check.stability._check import DTYPES, name_of
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Journal, Output, State, listening
 from mcdenoise.ops import accumulate
 from mcdenoise.ops.lag import THRESHOLD
-from mcdenoise.stability._check import DTYPES, name_of
 
 FRAMES, MOVING_FRAMES = 10_000, 1_000
 ALPHA_MIN = 0.1

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from mcdenoise.ops._case import Case, Inputs, Rounding, map_tensors, normal, radiance, uniform
+from mcdenoise.check.case import Case, Inputs, Rounding, map_tensors, normal, radiance, uniform
 from mcdenoise.ops._window import Border, inside, offsets, pad, shifted, unpad
 from mcdenoise.ops.bilateral import cross_bilateral_weights
 from mcdenoise.ops.fireflies import clamp_fireflies

@@ -9,13 +9,17 @@ by at most ``n u`` of their magnitude ``s``, and rounds the result:
 The sum is the (absolute, componentwise) condition number: how far the exact result moves when inputs do. It is not
 taken from derivatives but measured in float64, by moving every input up and down by ``16 u``, so that a kink or a jump
 as near as rounding can reach is in it. ``s_j`` is ``|x_j|``, at least the smallest normal number (below it there are
-fewer digits), and more where an op computes with larger numbers, see :class:`mcdenoise.ops._case.Rounding`.
+fewer digits), and more where an op computes with larger numbers, see :class:`mcdenoise.check.case.Rounding`.
 
 ``n`` is a count of roundings. A sum of ``m`` terms has ``m - 1``, and a result that depends on ``m`` inputs is made of
 sums of at most so many; what is multiplied, divided and exponentiated on the way adds no more than 8. So ``n = m + 8``.
 
 The same holds for gradients, as functions of inputs and upstream gradient; half precision is rounded between the steps
 of an op, since that is what it hands to autograd, so that ``u`` is the dtype's own there.
+
+A function of one's own is compared with itself in float64. Nothing is known of what it computes in between, so that
+``u`` is the dtype's own in its results, too, and its images are tried one by one. Its gradients in float64, with which
+those in other dtypes are compared, are first compared with difference quotients.
 """
 
 from __future__ import annotations
@@ -24,19 +28,22 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from mcdenoise.errors import InputError
+from mcdenoise.check import gradients
+from mcdenoise.check.case import Case, Inputs, Op, Rounding, map_tensors
+from mcdenoise.check.cases import OPS
+from mcdenoise.check.own import find_ops, op_of
+from mcdenoise.check.stability._check import DTYPES, Check, name_of
+from mcdenoise.check.step_cases import STEPS
 from mcdenoise.ops import Surface, use
 from mcdenoise.ops._backend import Backend
-from mcdenoise.ops._case import Case, Inputs, Op, Rounding, map_tensors
-from mcdenoise.ops._cases import OPS
 from mcdenoise.ops._op import backends_of
-from mcdenoise.ops._step_cases import STEPS
 from mcdenoise.ops._window import accumulator_dtype
-from mcdenoise.stability._check import DTYPES, Check, name_of
+from mcdenoise.own import in_one_line
 
 _DEPTH = 8
 _PROBE = 16
@@ -68,6 +75,11 @@ class _Trial:
         return found
 
     @property
+    def inner(self) -> torch.dtype:
+        """The dtype in which the op computes."""
+        return self.dtype if self.op.own else accumulator_dtype(self.dtype)
+
+    @property
     def numbers(self) -> Inputs:
         """The arguments that are rounded."""
         return {name: value for name, value in self.inputs.items() if not isinstance(value, Surface)}
@@ -76,8 +88,8 @@ class _Trial:
         """The op with other tensors in place of :attr:`leaves`, possibly several batches of them."""
         remaining = iter(leaves)
         given = map_tensors(lambda _: next(remaining), self.numbers)
-        copies = leaves[0].shape[0] // max(self.leaves[0].shape[0], 1)
         surfaces = {name: value for name, value in self.inputs.items() if name not in given}
+        copies = leaves[0].shape[0] // max(self.leaves[0].shape[0], 1) if surfaces else 1
         repeated = map_tensors(lambda tensor: tensor.to(leaves[0].dtype).repeat(copies, 1, 1, 1), surfaces)
         # The float64 twin always runs on the first backend, the plain one.
         backend = self.backend if leaves[0].dtype == self.dtype else backends(self.op)[0]
@@ -109,18 +121,14 @@ class _Exact:
 
 
 def select(names: Sequence[str] | None = None) -> list[Op]:
-    """Ops by name; all for ``None``.
+    """Ops by name, or functions of one's own, ``path/to/file.py:function``; all ops for ``None``.
 
     Raises:
-        InputError: there is no op of such a name.
+        InputError: there is no such op or function, or nothing that it runs on.
     """
     # What is not of a batch cannot be tried many times at once.
     every = OPS + tuple(step for step in STEPS if "weight" not in step.cases[0].inputs())
-    known = {op.name: op for op in every}
-    unknown = [name for name in names or () if name not in known]
-    if unknown:
-        raise InputError(f"op: expected one of {', '.join(known)}, found {', '.join(unknown)}")
-    return list(every) if names is None else [known[name] for name in names]
+    return list(every) if names is None else find_ops(names, every)
 
 
 def backends(op: Op) -> tuple[Backend | None, ...]:
@@ -136,6 +144,8 @@ def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
         op: an op of the table.
         dtypes: the dtypes to try it in.
     """
+    if op.own:
+        yield from (_check_derivative(op, case) for case in op.cases if case.differentiable)
     for dtype in dtypes:
         if not op.half and accumulator_dtype(dtype) != dtype:
             continue
@@ -145,6 +155,30 @@ def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
         for pair in ADJOINTS:
             if op.name == pair[0]:
                 yield from _check_adjoint(op, next(other for other in OPS if other.name == pair[1]), dtype)
+
+
+def check_stability(
+    function: Callable[..., Any], *inputs: Tensor, dtypes: Sequence[torch.dtype] = DTYPES
+) -> list[Check]:
+    """Compare a function of one's own, and its gradients, with itself in float64, against bounds from analysis.
+
+    ``mcdenoise stability path/to/file.py:function`` does the same.
+
+    Args:
+        function: of floating-point tensors, which returns one or several.
+        inputs: small tensors to try it on; without them, its example inputs, see :mod:`mcdenoise.check.own`.
+        dtypes: the dtypes to try it in.
+
+    Raises:
+        InputError: it is no such function, or there is nothing that it runs on.
+
+    Example:
+        >>> import torch
+        >>> from mcdenoise.check import check_stability
+        >>> all(check.passed for check in check_stability(torch.sin, torch.rand(1, 3, 2, 2)))
+        True
+    """
+    return list(check_op(op_of(function, inputs), dtypes))
 
 
 def check_case(op: Op, case: Case, dtype: torch.dtype, backend: Backend | None = None) -> list[Check]:
@@ -162,19 +196,24 @@ def check_case(op: Op, case: Case, dtype: torch.dtype, backend: Backend | None =
     trial = _Trial(op, case, dtype, backend, case.inputs(dtype))
     try:
         results = trial.run(trial.leaves)
-    except ValueError as error:
-        # A backend that cannot run on this machine says so.
+    except Exception as error:
+        # A backend that cannot run on this machine says so, and a function of one's own may fail in one dtype alone.
+        if not (op.own or isinstance(error, ValueError)):
+            raise
         passed = bool(backend) and "can run here" in str(error)
-        return [Check(op.name, case.name, name_of(dtype), backend or "", "runs", 0, 0, 0, passed, str(error))]
+        message = in_one_line(error) if op.own else str(error)
+        return [Check(op.name, case.name, name_of(dtype), backend or "", "runs", 0, 0, 0, passed, message)]
     exact = _exact_results(trial, results)
     checks = [_compare(trial, "forward", results, exact)]
     upstream = [_upstream(result) for result in results]
     leaves = [*trial.leaves, *upstream]
     try:
         gradients = trial.gradients(leaves)
-    except ValueError as error:
+    except Exception as error:
+        if op.own:
+            return [*checks, _found(trial, "gradient", 0, 0, 0, in_one_line(error))]
         # A backend that has no derivatives says so too.
-        if not backend or "can run here" not in str(error):
+        if not isinstance(error, ValueError) or not backend or "can run here" not in str(error):
             raise
     else:
         checks.append(_compare(trial, "gradient", gradients, _exact_gradients(trial, leaves, exact)))
@@ -190,11 +229,11 @@ def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
     inputs = map_tensors(Tensor.double, trial.inputs)
     references = trial.op.reference(**inputs, **trial.case.settings)
     references = [references] if isinstance(references, Tensor) else list(references)
-    dtype = accumulator_dtype(trial.dtype)
+    dtype = trial.inner
     rounding = trial.op.rounding(inputs, trial.case.settings)
     leaves = [leaf.double() for leaf in trial.leaves]
     magnitudes = _magnitudes(trial, leaves, rounding, dtype)
-    conditions = _conditions(trial.run, leaves, magnitudes, dtype)
+    conditions = _conditions(trial.run, leaves, magnitudes, dtype, at_once=not trial.op.own)
     return [
         _bounded(reference, condition + rounding.result, fan_in, dtype, result.dtype)
         for reference, result, (condition, fan_in) in zip(references, results, conditions, strict=True)
@@ -207,7 +246,7 @@ def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact])
     exact = [leaf.double() for leaf in leaves]
     magnitudes = _magnitudes(trial, exact[: len(trial.leaves)], rounding, trial.dtype)
     magnitudes += [leaf.abs() + torch.finfo(trial.dtype).tiny for leaf in exact[len(trial.leaves) :]]
-    conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype)
+    conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype, at_once=not trial.op.own)
     largest = max((leaf.abs().max().item() for leaf in exact[len(trial.leaves) :] if leaf.numel()), default=0.0)
     cancelling = _by_leaf(trial, [torch.zeros_like(leaf) for leaf in exact[: len(trial.leaves)]], rounding.gradients)
     # Where a result is infinite by right, so may its derivative be, or be nothing at all; elsewhere nothing excuses it.
@@ -235,14 +274,16 @@ def _by_leaf(trial: _Trial, defaults: list[Tensor], given: Inputs) -> list[Tenso
 
 
 def _conditions(
-    function: Function, leaves: list[Tensor], magnitudes: list[Tensor], dtype: torch.dtype
+    function: Function, leaves: list[Tensor], magnitudes: list[Tensor], dtype: torch.dtype, *, at_once: bool
 ) -> list[tuple[Tensor, Tensor]]:
     """Of each result ``sum_j s_j |dy / dx_j|``, measured, and the number of inputs that it depends on.
 
-    All ops treat the images of a batch alike and alone, so that many changed inputs are tried in one call.
+    All ops treat the images of a batch alike and alone, so that many changed inputs are tried in one call,
+    ``at_once``.
     """
     step = _PROBE * torch.finfo(dtype).eps / 2
     base = function(leaves)
+    changing = function if at_once else _one_by_one(function, leaves)
     # Infinity is not rounded, and what is never negative is not moved below zero.
     steps = [torch.where(size.isfinite(), step * size, 0).flatten().tolist() for size in magnitudes]
     down = [((leaf != 0) | (leaf < 0).any()).flatten().tolist() for leaf in leaves]
@@ -256,7 +297,7 @@ def _conditions(
             flat = copies[i].reshape(2 * len(chosen), -1)
             flat[2 * k, j] += steps[i][j]
             flat[2 * k + 1, j] -= steps[i][j] * down[i][j]
-        for result, total, fan, changed in zip(base, totals, fans, function(copies), strict=True):
+        for result, total, fan, changed in zip(base, totals, fans, changing(copies), strict=True):
             both = changed.reshape(len(chosen), 2, *result.shape)
             change = (both - result).abs()
             same = (both == result) | (both.isnan() & result.isnan()) | (change <= _NOISE * result.abs())
@@ -264,6 +305,17 @@ def _conditions(
             total += larger.sum(0) / step
             fan += (larger > 0).sum(0)
     return list(zip(totals, fans, strict=True))
+
+
+def _one_by_one(function: Function, leaves: list[Tensor]) -> Function:
+    """The function of many copies of its inputs, called for each."""
+
+    def run(copies: Sequence[Tensor]) -> list[Tensor]:
+        count = copies[0].numel() // leaves[0].numel()
+        stacked = [copy.reshape(count, *leaf.shape) for copy, leaf in zip(copies, leaves, strict=True)]
+        return [torch.stack(each) for each in zip(*map(function, zip(*stacked, strict=True)), strict=True)]
+
+    return run
 
 
 def _bounded(value: Tensor, condition: Tensor, fan_in: Tensor, inner: torch.dtype, outer: torch.dtype) -> _Exact:
@@ -306,6 +358,12 @@ def _compare(trial: _Trial, what: str, results: list[Tensor], exact: list[_Exact
         if share.max() > 1 and not message:
             message = f"found {found.reshape(-1)[i].item():.9g}, expected {truth.value.reshape(-1)[i].item():.9g}"
     return _found(trial, what, *worst, condition, message)
+
+
+def _check_derivative(op: Op, case: Case) -> Check:
+    """First derivatives in float64, which are the reference of those in other dtypes."""
+    result = gradients.check_case(op, case, order=1)
+    return Check(op.name, case.name, "float64", "", "derivative", 0, 0, 0, result.passed, result.message)
 
 
 def _check_weights(trial: _Trial, weights: Tensor) -> Check:

@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from mcdenoise.check.stability._check import DTYPES, Check, name_of
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.models import Accumulated, Skipping, parts_of
-from mcdenoise.stability._check import DTYPES, Check, name_of
 
 EXPOSURES = (1e-4, 1e-2, 1e2, 1e4)
 _DRAWS = 3

@@ -8,13 +8,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from mcdenoise.check.stability._check import DTYPES, Check, name_of
+from mcdenoise.check.stability._models import ALLOWED, EXPOSURES, relative_change
 from mcdenoise.denoiser import Denoiser, Precision
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, replace_invalid
 from mcdenoise.methods import parse_method
 from mcdenoise.models import DEFAULT
-from mcdenoise.stability._check import DTYPES, Check, name_of
-from mcdenoise.stability._models import ALLOWED, EXPOSURES, relative_change
 
 FRAMES = 3
 _SIZE = (17, 23)

@@ -10,15 +10,15 @@ from typing import Any
 
 import torch
 
+from mcdenoise.check.stability import _denoiser, _long_runs, _models, _ops
+from mcdenoise.check.stability._check import DTYPES, Check, Summary, parse_dtypes, summarize
+from mcdenoise.check.stability._denoiser import check_denoiser
+from mcdenoise.check.stability._long_runs import FRAMES, LongRun, long_runs
+from mcdenoise.check.stability._models import check_model
+from mcdenoise.check.stability._ops import check_case, check_op, check_stability
 from mcdenoise.errors import InputError
 from mcdenoise.methods import parse_method
 from mcdenoise.models import list_models
-from mcdenoise.stability import _denoiser, _long_runs, _models, _ops
-from mcdenoise.stability._check import DTYPES, Check, Summary, parse_dtypes, summarize
-from mcdenoise.stability._denoiser import check_denoiser
-from mcdenoise.stability._long_runs import FRAMES, LongRun, long_runs
-from mcdenoise.stability._models import check_model
-from mcdenoise.stability._ops import check_case, check_op
 
 __all__ = [
     "DTYPES",
@@ -32,6 +32,7 @@ __all__ = [
     "check_denoiser",
     "check_model",
     "check_op",
+    "check_stability",
     "long_runs",
     "parse_dtypes",
     "stages",
@@ -61,7 +62,8 @@ def stages(
     """What there is to check: ops, then models, then the denoiser, then long runs.
 
     Args:
-        ops: names of ops; ``None`` means all, or none where models are named.
+        ops: names of ops, or functions of one's own, ``path/to/file.py:function``; ``None`` means all ops, or none
+            where models are named.
         models: spellings of models, see :func:`mcdenoise.methods.parse_method`, each within a denoiser, and what learns
             also by itself; ``None`` means the whole zoo but what needs a package that is not installed or has no
             shipped weights, or none where ops are named.

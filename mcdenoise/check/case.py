@@ -1,4 +1,4 @@
-"""What a case of an op is, and what the table of ops says of each; the table itself is :mod:`mcdenoise.ops._cases`."""
+"""What a case of an op is, and what the table of ops says of each; the table itself is :mod:`mcdenoise.check.cases`."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Op:
 
     Args:
         function: the public function.
-        reference: the same as its equation, in float64; see :mod:`mcdenoise.ops._reference`.
+        reference: the same as its equation, in float64; see :mod:`mcdenoise.check.reference`.
         cases: at least four, among them ordinary ones.
         module: the Module twin, if there is one.
         least_dtype: results are at least as precise as this; other results have the dtype of the inputs.
@@ -86,6 +86,9 @@ class Op:
         weights: whether, with these settings, the result is non-negative weights that sum to one over the channels.
         rounding: see :class:`Rounding`; of inputs and settings.
         half: whether it promises anything of inputs in half precision.
+        own: whether it is somebody's own function, see :mod:`mcdenoise.check.own`. Its only equation is itself in
+            float64, so that its derivatives are proven wherever it is checked; it may treat the images of a batch
+            together; and half precision is rounded between its steps.
     """
 
     function: Callable[..., Any]
@@ -97,6 +100,7 @@ class Op:
     weights: Callable[[dict[str, Any]], bool] = lambda settings: False
     rounding: Callable[[Inputs, dict[str, Any]], Rounding] = _no_more
     half: bool = True
+    own: bool = False
 
     @property
     def name(self) -> str:
@@ -118,10 +122,12 @@ def map_tensors(function: Callable[[Tensor], Tensor], inputs: Inputs) -> Inputs:
 
 
 def uniform(g: Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
+    """Uniformly distributed numbers in ``[low, high)``, float64."""
     return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
 
 
 def normal(g: Generator, *shape: int) -> Tensor:
+    """Normally distributed numbers of variance one, float64."""
     return torch.randn(*shape, generator=g, dtype=torch.float64)
 
 

@@ -3,10 +3,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mcdenoise.gradcheck import check_case, select
-from mcdenoise.ops._case import uniform
-from mcdenoise.ops._cases import OPS, Case, Op
-from mcdenoise.ops._step_cases import STEPS
+from mcdenoise.check.case import uniform
+from mcdenoise.check.cases import OPS, Case, Op
+from mcdenoise.check.gradients import check_case, select
+from mcdenoise.check.step_cases import STEPS
 
 
 class _Wrong(torch.autograd.Function):

@@ -1,4 +1,4 @@
-"""Prove the derivatives of every op against difference quotients."""
+"""Prove the derivatives of every op, or of a function of one's own, against difference quotients."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mcdenoise.errors import InputError
-from mcdenoise.ops._cases import OPS, Case, Inputs, Op, map_tensors
-from mcdenoise.ops._step_cases import STEPS
+from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
+from mcdenoise.check.own import find_ops, op_of
+from mcdenoise.check.step_cases import STEPS
 
 # Only to make a failure repeatable: any upstream gradient must do.
 SEED = 0
@@ -39,40 +39,65 @@ class GradcheckResult:
     message: str
 
 
+def gradcheck(function: Callable[..., Any], *inputs: Tensor, order: int = 2) -> list[GradcheckResult]:
+    """Compare the derivatives of a function of one's own with difference quotients, in float64 and number by number.
+
+    ``mcdenoise gradcheck path/to/file.py:function`` does the same.
+
+    Args:
+        function: of floating-point tensors, which returns one or several.
+        inputs: small tensors to try it on, of any floating-point dtype; those alone that require gradients are moved,
+            if any does. Without them, its example inputs, see :mod:`mcdenoise.check.own`.
+        order: 1 for first derivatives, 2 for second ones too.
+
+    Returns:
+        One result for each case.
+
+    Raises:
+        InputError: it is no such function, or there is nothing that it runs on.
+
+    Example:
+        >>> import torch
+        >>> from mcdenoise.check import gradcheck
+        >>> [result.passed for result in gradcheck(torch.sin, torch.rand(1, 3, 2, 2))]
+        [True]
+    """
+    op = op_of(function, inputs)
+    return [check_case(op, case, order) for case in op.cases if case.differentiable]
+
+
 def check(names: Sequence[str] | None = None) -> list[GradcheckResult]:
     """Compare first and second derivatives with difference quotients, in float64 and number by number.
 
     Args:
-        names: ops to check; ``None`` means all.
+        names: ops to check, or functions of one's own, ``path/to/file.py:function`` or ``package.module:function``;
+            ``None`` means all ops.
 
     Returns:
         One result for each case of each op that has a differentiable input.
 
     Raises:
-        InputError: there is no op of such a name.
+        InputError: there is no such op or function, or nothing that it runs on.
     """
     return [check_case(op, case) for op, case in select(names)]
 
 
 def select(names: Sequence[str] | None = None) -> list[tuple[Op, Case]]:
     """The cases that :func:`check` goes through, each with its op; ``InputError`` as there."""
-    known = {op.name: op for op in OPS + STEPS}
-    unknown = [name for name in names or () if name not in known]
-    if unknown:
-        raise InputError(f"op: expected one of {', '.join(known)}, found {', '.join(unknown)}")
-    ops = OPS + STEPS if names is None else [known[name] for name in names]
+    ops = OPS + STEPS if names is None else find_ops(names, OPS + STEPS)
     return [(op, case) for op in ops for case in op.cases if case.differentiable]
 
 
-def check_case(op: Op, case: Case) -> GradcheckResult:
-    """:func:`check` of one case."""
+def check_case(op: Op, case: Case, order: int = 2) -> GradcheckResult:
+    """:func:`check` of one case; of ``order`` 1, of first derivatives alone."""
     start, passed, message = time.perf_counter(), True, ""
     function, arguments = _of_differentiable(op, case)
     try:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(SEED)
             torch.autograd.gradcheck(function, arguments, fast_mode=False)
-            torch.autograd.gradgradcheck(function, arguments, fast_mode=False)
+            if order > 1:
+                torch.autograd.gradgradcheck(function, arguments, fast_mode=False)
     except Exception as error:  # whatever an op raises belongs in the report of that op, and the others go on
         passed = False
         message = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)

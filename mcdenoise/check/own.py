@@ -1,0 +1,214 @@
+"""Somebody's own function as an op: where it is, and the example inputs that it is tried on.
+
+It takes floating-point tensors, one after the other, and returns one or several. Its example inputs are
+
+- ``function.example_inputs``, or else
+- ``inputs`` in the same file, for all functions there that have no ``example_inputs``.
+
+Either is a function without arguments or a value; what it gives is a tuple of tensors, or several by name, each of
+which is a case: ``{"ordinary": (image, albedo), "black": (0 * image, albedo)}``. It draws random numbers with a fixed
+seed. If some of the tensors require gradients, derivatives are checked in these alone, otherwise in all. Every number
+is moved by itself, so that the tensors have to be small, and away from points where there is no derivative.
+
+A function without example inputs is tried on small images of positive radiance, one for each argument that has no
+default: derivatives on ordinary ones, stability also on dark, bright and black ones and on a firefly.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+from mcdenoise.check.case import Case, Inputs, Kind, Op, uniform
+from mcdenoise.errors import InputError
+from mcdenoise.own import in_one_line, load_own
+
+ATTRIBUTE, BESIDE = "example_inputs", "inputs"
+# The matrix of derivatives of that many results in that many inputs takes 128 MiB.
+LARGEST = 4096
+_SEED = 0
+# Small, because each number is moved by itself, and with unlike sides, one odd and one even.
+IMAGE = (1, 3, 5, 6)
+
+
+def find_ops(names: Sequence[str], table: Sequence[Op]) -> list[Op]:
+    """Ops by name.
+
+    Args:
+        names: of ops of the table, or ``path/to/file.py:function``, ``package.module:function``.
+        table: ops that are known.
+
+    Raises:
+        InputError: there is no such op or function, or nothing that it runs on.
+    """
+    known = {op.name: op for op in table}
+    unknown = [name for name in names if name not in known and ":" not in name]
+    if unknown:
+        raise InputError(
+            f"op: expected one of {', '.join(known)}, or path/to/file.py:function, or package.module:function, "
+            f"found {', '.join(unknown)}"
+        )
+    return [known[name] if name in known else _load(name) for name in names]
+
+
+def op_of(function: Callable[..., Any], inputs: Sequence[Tensor] = ()) -> Op:
+    """A function as an op.
+
+    Args:
+        function: of floating-point tensors, which returns one or several.
+        inputs: what to try it on; its example inputs by default, see the head of this page.
+
+    Raises:
+        InputError: it is no such function, it fails on its example inputs, or it has none and fails on images.
+    """
+    name = getattr(function, "__name__", type(function).__name__)
+    return _op(
+        name, function, inputs or _examples(name, function, sys.modules.get(getattr(function, "__module__", "")))
+    )
+
+
+def _load(name: str) -> Op:
+    function, module = load_own(name, "function", "function")
+    return _op(name, function, _examples(name, function, module))
+
+
+def _examples(name: str, function: Any, module: Any) -> Any:
+    """What the file has for example inputs; ``None`` where it has none."""
+    found = getattr(function, ATTRIBUTE, None)
+    if found is None:
+        found = getattr(module, BESIDE, None)
+    if not callable(found):
+        return found
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(_SEED)
+            return found()
+    except Exception as error:
+        raise InputError(f"function '{name}': its example inputs fail: {in_one_line(error)}") from error
+
+
+def _op(name: str, function: Any, examples: Any) -> Op:
+    if not callable(function):
+        raise InputError(f"function '{name}': expected a function of tensors, found {type(function).__name__}")
+    called = _by_name(name, function)
+    if examples is None:
+        return Op(called, called, _image_cases(name, function), own=True)
+    given = examples if isinstance(examples, Mapping) else {"example": examples}
+    if not given:
+        raise InputError(f"function '{name}': expected example inputs by name, found none")
+    for case, tensors in given.items():
+        where = f"function '{name}', {case}"
+        _check_tensors(where, tensors)
+        _check_results(where, function, tensors)
+    return Op(called, called, tuple(_case(str(case), function, tensors) for case, tensors in given.items()), own=True)
+
+
+def _image_cases(name: str, function: Any) -> tuple[Case, ...]:
+    """Images for a function that says nothing of what it takes."""
+    required = [each for each in _parameters(function) if each.default is each.empty]
+    names = tuple(each.name for each in required)
+    g = Generator().manual_seed(_SEED)
+    images = [uniform(g, *IMAGE, low=0.1, high=1.1) for _ in names]
+    try:
+        if not images:
+            raise InputError("it names no argument without a default")
+        _check_results(f"function '{name}'", function, images)
+    except InputError as error:
+        reason = str(error).removeprefix(f"function '{name}': ")
+        raise InputError(
+            f"function '{name}': it has no example inputs, and cannot be tried on images of {IMAGE}: {reason}; give it "
+            f"an attribute {ATTRIBUTE}, or its file a function {BESIDE}(), that returns a tuple of tensors"
+        ) from error
+    spark = torch.ones(IMAGE, dtype=torch.float64)
+    spark[:, :, 2, 3] = 1e4
+    kinds: dict[str, tuple[Kind, Tensor | float]] = {
+        "ordinary image": ("ordinary", 1.0),
+        "dark": ("stiff", 1e-3),
+        "bright": ("stiff", 1e3),
+        "firefly": ("stiff", spark),
+        "black": ("extreme", 0.0),
+    }
+    return tuple(
+        Case(
+            case,
+            kind,
+            partial(_draw, {each: image * factor for each, image in zip(names, images, strict=True)}),
+            # Beside the others the step of a difference quotient is too large or too small.
+            names if kind == "ordinary" else (),
+        )
+        for case, (kind, factor) in kinds.items()
+    )
+
+
+def _check_tensors(where: str, tensors: Any) -> None:
+    if not isinstance(tensors, tuple | list) or not tensors:
+        raise InputError(
+            f"{where}: expected a tuple of tensors as example inputs, or several by name, found "
+            f"{'none' if isinstance(tensors, tuple | list) else type(tensors).__name__}"
+        )
+    for i, tensor in enumerate(tensors, start=1):
+        if not isinstance(tensor, Tensor) or not tensor.is_floating_point() or not tensor.numel():
+            found = f"{tensor.dtype} of {tuple(tensor.shape)}" if isinstance(tensor, Tensor) else type(tensor).__name__
+            raise InputError(f"{where}: expected a floating-point tensor as example input {i}, found {found}")
+    numbers = sum(tensor.numel() for tensor in tensors)
+    if numbers > LARGEST:
+        raise InputError(
+            f"{where}: expected at most {LARGEST} numbers in the example inputs, found {numbers}; every one is moved "
+            "by itself, so give it smaller tensors"
+        )
+
+
+def _check_results(where: str, function: Any, tensors: Sequence[Tensor]) -> None:
+    try:
+        with torch.no_grad():
+            results = function(*(tensor.detach().double().clone() for tensor in tensors))
+    except Exception as error:
+        raise InputError(f"{where}: it fails in float64: {in_one_line(error)}") from error
+    parts = results if isinstance(results, tuple | list) else (results,)
+    wrong = [part for part in parts if not isinstance(part, Tensor) or not part.is_floating_point()]
+    if wrong or not parts:
+        kinds = ", ".join(str(part.dtype) if isinstance(part, Tensor) else type(part).__name__ for part in wrong)
+        raise InputError(f"{where}: expected one or several floating-point tensors of it, found {kinds or 'none'}")
+
+
+def _by_name(name: str, function: Any) -> Callable[..., Any]:
+    """The function with arguments by name, in their order."""
+
+    def called(**given: Tensor) -> Tensor | tuple[Tensor, ...]:
+        results = function(*given.values())
+        return results if isinstance(results, Tensor) else tuple(results)
+
+    called.__name__ = name
+    return called
+
+
+def _case(name: str, function: Any, tensors: Sequence[Tensor]) -> Case:
+    names = _arguments(function, len(tensors))
+    chosen = tuple(each for each, tensor in zip(names, tensors, strict=True) if tensor.requires_grad)
+    drawn = {each: tensor.detach().double() for each, tensor in zip(names, tensors, strict=True)}
+    return Case(name, "ordinary", partial(_draw, drawn), chosen or names)
+
+
+def _draw(drawn: Mapping[str, Tensor], g: Generator) -> Inputs:
+    return {name: tensor.clone() for name, tensor in drawn.items()}
+
+
+def _arguments(function: Any, count: int) -> tuple[str, ...]:
+    """Names of the first arguments; numbers for those that have none."""
+    names = [each.name for each in _parameters(function)]
+    return tuple(names[i] if i < len(names) else f"input {i + 1}" for i in range(count))
+
+
+def _parameters(function: Any) -> list[inspect.Parameter]:
+    """Of a function, those that may be given without a name."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # functions of torch written in C++ have no signature
+        return []
+    return [each for each in parameters if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)]

@@ -1,0 +1,62 @@
+"""Somebody's own: what ``path/to/file.py:attribute`` or ``package.module:attribute`` names."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from mcdenoise.errors import InputError
+
+
+def load_own(name: str, kind: str, thing: str) -> tuple[Any, ModuleType]:
+    """Import what somebody wrote outside the package.
+
+    A file is run anew at each call, as a module of its own.
+
+    Args:
+        name: ``path/to/file.py:attribute`` or ``package.module:attribute``.
+        kind: what it is for, such as ``"model"``; for messages.
+        thing: what the attribute is, such as ``"factory"``; for messages.
+
+    Returns:
+        The attribute, and the module that it is in.
+
+    Raises:
+        InputError: there is no such file or module, it cannot be imported, or it has no such attribute.
+    """
+    place, _, attribute = name.rpartition(":")
+    try:
+        module = _module_of_file(Path(place), kind, thing) if place.endswith(".py") else importlib.import_module(place)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{kind} '{name}': {place} cannot be imported: {in_one_line(error)}") from error
+    if not hasattr(module, attribute):
+        offered = ", ".join(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
+        raise InputError(f"{kind} '{name}': expected a {thing} '{attribute}' in {place}, found {offered or 'none'}")
+    return getattr(module, attribute), module
+
+
+def in_one_line(error: Exception) -> str:
+    """Kind and message of an error that somebody's own code raised."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _module_of_file(path: Path, kind: str, thing: str) -> ModuleType:
+    if not path.is_file():
+        wanted = f"a {thing}" if thing == kind else f"a {thing} of a {kind}"
+        raise InputError(f"{path}: expected a Python file with {wanted}, found no such file")
+    # Its own name, so that a file beside it that is called alike is another module.
+    module_name = f"mcdenoise_own_{path.stem}_{abs(hash(path.resolve()))}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"{path}: expected a Python file, found something else")
+    module = importlib.util.module_from_spec(spec)
+    # Dataclasses and the like look their module up.
+    sys.modules[module_name] = module
+    spec.loader.exec_module(module)
+    return module
