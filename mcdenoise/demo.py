@@ -15,15 +15,15 @@ from torch import Tensor
 from mcdenoise.benchmark import BASELINES, Score, Settings, choose_methods, run_benchmark, scores_of
 from mcdenoise.data import open_sequence
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
-from mcdenoise.demo_scene import demo_cameras, demo_scene
 from mcdenoise.folder import SequenceReport, denoise_sequence, make_folder
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.metrics import displayed
 from mcdenoise.models import DEFAULT, Output
-from mcdenoise.render import render_sequence
 from mcdenoise.report import check_packages, write_report
 from mcdenoise.results import FILE
+from mcdenoise.scenes.demo import demo_cameras, demo_scene
+from mcdenoise.scenes.render import render_sequence
 
 FRAMES = 16
 SIZE = (320, 180)

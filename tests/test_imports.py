@@ -26,9 +26,7 @@ LIBRARY = SIGNAL | {
     "nn",
     "models",
     "data",
-    "demo_scene",
-    "random_scene",
-    "render",
+    "scenes",
     "denoiser",
 }
 REPORTS = {"benchmark", "check", "evaluate", "folder", "methods", "report"}
@@ -45,9 +43,7 @@ ALLOWED: dict[str, set[str]] = {
     "models": SIGNAL | {"nn", "own"},
     # Leaves: what is read and rendered knows the frame, and no method.
     "data": SIGNAL,
-    "demo_scene": SIGNAL | {"data"},
-    "random_scene": SIGNAL | {"data"},
-    "render": SIGNAL | {"data"},
+    "scenes": SIGNAL | {"data"},
     "denoiser": SIGNAL | {"models"},
     "methods": SIGNAL | {"models", "denoiser"},
     "folder": LIBRARY,

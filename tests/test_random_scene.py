@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from mcdenoise.data.camera_path import Camera, check_moves, pixel_rays
-from mcdenoise.random_scene import RandomScene, cameras, random_scene
-from mcdenoise.random_scene.materials import diffuse
-from mcdenoise.random_scene.stage import Stage, bounds, box
-from mcdenoise.render.tracer import Tracer, scene_digest
+from mcdenoise.scenes.random import RandomScene, cameras, random_scene
+from mcdenoise.scenes.random.materials import diffuse
+from mcdenoise.scenes.random.stage import Stage, bounds, box
+from mcdenoise.scenes.render.tracer import Tracer, scene_digest
 
 SEEDS = range(150)
 FRAMES = 12
@@ -108,7 +108,7 @@ def test_a_zoomed_camera_sees_the_middle_of_the_image() -> None:
 
 def test_making_a_scene_needs_no_mitsuba() -> None:
     code = (
-        "import sys\nfrom mcdenoise.random_scene import random_scene\nrandom_scene(0)\n"
+        "import sys\nfrom mcdenoise.scenes.random import random_scene\nrandom_scene(0)\n"
         "print(*{'mitsuba', 'drjit'} & set(sys.modules))"
     )
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120)

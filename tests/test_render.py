@@ -20,15 +20,15 @@ import torch
 from mcdenoise.cli import main
 from mcdenoise.data.exr import read_exr
 from mcdenoise.data.sequences import open_sequence
-from mcdenoise.demo_scene import demo_cameras, demo_scene
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import Journal, create_model, listening
-from mcdenoise.render import Camera, load_shot, render_sequence, view_projection
-from mcdenoise.render import frames as render_frames
-from mcdenoise.render.processes import render_in_processes
-from mcdenoise.render.tracer import first_working
+from mcdenoise.scenes.demo import demo_cameras, demo_scene
+from mcdenoise.scenes.render import Camera, load_shot, render_sequence, view_projection
+from mcdenoise.scenes.render import frames as render_frames
+from mcdenoise.scenes.render.processes import render_in_processes
+from mcdenoise.scenes.render.tracer import first_working
 
 SHARED_SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 WIDTH, HEIGHT = 32, 18
@@ -738,7 +738,7 @@ def test_workers_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(
         "import time\n"
-        "from mcdenoise.render.processes import render_in_processes\n"
+        "from mcdenoise.scenes.render.processes import render_in_processes\n"
         "class Source:\n"
         "    def tracer(self):\n"
         "        print('tracing', flush=True)\n"

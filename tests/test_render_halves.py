@@ -10,7 +10,7 @@ import torch
 
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
-from mcdenoise.render.halves import ReferenceHalves
+from mcdenoise.scenes.render.halves import ReferenceHalves
 
 PIXELS = 4000
 

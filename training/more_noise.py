@@ -17,7 +17,7 @@ import numpy as np
 
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
-from mcdenoise.render import Camera, render_sequence
+from mcdenoise.scenes.render import Camera, render_sequence
 
 _FIRST_SEED = 100
 

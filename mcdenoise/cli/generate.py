@@ -12,8 +12,8 @@ from mcdenoise.cli._output import progress_bar
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.errors import InputError
-from mcdenoise.random_scene import random_scene
-from mcdenoise.render import render_sequence
+from mcdenoise.scenes.random import random_scene
+from mcdenoise.scenes.render import render_sequence
 
 _FOR_TRAINING = RenderOptions(realisations=3, reference_spp=64, size="160x160")
 

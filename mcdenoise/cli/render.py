@@ -12,7 +12,7 @@ from mcdenoise.cli._options import Out, parse_size
 from mcdenoise.cli._output import progress_bar
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.errors import InputError
-from mcdenoise.render import load_shot, render_sequence
+from mcdenoise.scenes.render import load_shot, render_sequence
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class RenderOptions:
     variant: str | None = None
 
     def arguments(self) -> dict[str, Any]:
-        """Those of :func:`mcdenoise.render.render_sequence`."""
+        """Those of :func:`mcdenoise.scenes.render.render_sequence`."""
         if self.reference_spp < 0:
             raise InputError(f"--reference-spp: expected at least 0, found {self.reference_spp}")
         frames = self.reference_frames

@@ -50,7 +50,7 @@ def test_cleaned_references(small_sequence: Path, tmp_path: Path, place: str) ->
 
 def test_more_noise_of_a_scene_that_moves(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    from mcdenoise.render import render_sequence
+    from mcdenoise.scenes.render import render_sequence
 
     scene = tmp_path / "scene.xml"
     scene.write_text(

@@ -8,9 +8,9 @@ import math
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.random_scene.materials import diffuse, random_metal, random_opaque
-from mcdenoise.random_scene.stage import Part, Stage, ball, box, drum, plate, rgb, rod, rotate, sheet
-from mcdenoise.random_scene.textures import Color
+from mcdenoise.scenes.random.materials import diffuse, random_metal, random_opaque
+from mcdenoise.scenes.random.stage import Part, Stage, ball, box, drum, plate, rgb, rod, rotate, sheet
+from mcdenoise.scenes.random.textures import Color
 
 Rng = np.random.Generator
 _SKY_ROWS = 128

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.random_scene.furniture import curtain, decorate, furniture, glass_block, ornament, picture_frame
-from mcdenoise.random_scene.lights import add_lamps, sky, softbox, studio, sun_direction
-from mcdenoise.random_scene.materials import (
+from mcdenoise.scenes.random.furniture import curtain, decorate, furniture, glass_block, ornament, picture_frame
+from mcdenoise.scenes.random.lights import add_lamps, sky, softbox, studio, sun_direction
+from mcdenoise.scenes.random.materials import (
     Bsdf,
     diffuse,
     pane,
@@ -19,8 +19,8 @@ from mcdenoise.random_scene.materials import (
     rough_metal,
     rough_plastic,
 )
-from mcdenoise.random_scene.stage import Stage, ball, box, place, rod, sheet
-from mcdenoise.random_scene.textures import texture, wall_color
+from mcdenoise.scenes.random.stage import Stage, ball, box, place, rod, sheet
+from mcdenoise.scenes.random.textures import texture, wall_color
 
 Rng = np.random.Generator
 # A room with more shapes than this gets no further furniture.

@@ -16,16 +16,16 @@ from multiprocessing.synchronize import Event
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError
-from mcdenoise.render.folder import ReferenceState
-from mcdenoise.render.frames import FrameJob, render_frame
-from mcdenoise.render.tracer import Scene, Tracer
+from mcdenoise.scenes.render.folder import ReferenceState
+from mcdenoise.scenes.render.frames import FrameJob, render_frame
+from mcdenoise.scenes.render.tracer import Scene, Tracer
 
 _SECONDS_BETWEEN_LOOKS = 0.2
 
 
 @dataclass(frozen=True)
 class TracerSource:
-    """What a process needs to trace rays: the arguments of :class:`mcdenoise.render.tracer.Tracer`."""
+    """What a process needs to trace rays: the arguments of :class:`mcdenoise.scenes.render.tracer.Tracer`."""
 
     scene: Scene
     variant: str
@@ -108,7 +108,7 @@ def render_in_processes(
     advance: Callable[[int], None],
     on_reference: Callable[[int, ReferenceState], None],
 ) -> None:
-    """Render frames as :func:`mcdenoise.render.frames.render_frame` does, several at a time.
+    """Render frames as :func:`mcdenoise.scenes.render.frames.render_frame` does, several at a time.
 
     Args:
         source: the scene.

@@ -52,7 +52,7 @@ class Tracer:
     """Traces given rays through a scene, one by one in the scalar variant, all at once in the others.
 
     Args:
-        scene: see :func:`mcdenoise.render.render_sequence`.
+        scene: see :func:`mcdenoise.scenes.render.render_sequence`.
         variant: one of ``VARIANTS``.
         max_depth: longest path, in segments.
         moves: see :class:`mcdenoise.data.camera_path.Shot`.

@@ -1,7 +1,7 @@
 """Mitsuba 3: a scene and a camera path in, a noisy sequence with features and references out, in the BMFR layout."""
 
 from mcdenoise.data.camera_path import Camera, Shot, load_shot, view_projection
-from mcdenoise.render.sequence import render_sequence
-from mcdenoise.render.tracer import VARIANTS, Scene
+from mcdenoise.scenes.render.sequence import render_sequence
+from mcdenoise.scenes.render.tracer import VARIANTS, Scene
 
 __all__ = ["VARIANTS", "Camera", "Scene", "Shot", "load_shot", "render_sequence", "view_projection"]

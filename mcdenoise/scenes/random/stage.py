@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.random_scene.materials import Bsdf, every_kind
-from mcdenoise.random_scene.textures import Color
+from mcdenoise.scenes.random.materials import Bsdf, every_kind
+from mcdenoise.scenes.random.textures import Color
 
 Vector: TypeAlias = Sequence[float] | Array
 

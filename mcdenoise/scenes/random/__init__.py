@@ -2,7 +2,7 @@
 
 They are made for variety of what a denoiser meets: light through windows, small and large lamps, sun, gloss, glass,
 fine and coarse textures, thin parts, and cameras and objects that move. The description is plain Python and numpy, in
-the form :func:`mcdenoise.render.render_sequence` takes; Mitsuba is not needed to build it.
+the form :func:`mcdenoise.scenes.render.render_sequence` takes; Mitsuba is not needed to build it.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.random_scene.cameras import shoot
-from mcdenoise.random_scene.rooms import build
-from mcdenoise.random_scene.stage import Stage, bounds, rotate
+from mcdenoise.scenes.random.cameras import shoot
+from mcdenoise.scenes.random.rooms import build
+from mcdenoise.scenes.random.stage import Stage, bounds, rotate
 
 __all__ = ["RandomScene", "random_scene"]
 
@@ -28,7 +28,7 @@ class RandomScene:
     """A scene with its camera path.
 
     Args:
-        scene: a Mitsuba dictionary in the form :func:`mcdenoise.render.render_sequence` takes; metres, y is up.
+        scene: a Mitsuba dictionary in the form :func:`mcdenoise.scenes.render.render_sequence` takes; metres, y is up.
         cameras: one per frame.
         moves: id of an object in ``scene`` to ``(T, 4, 4)`` transforms in world space, one per frame, applied to the
             object where the scene places it. Empty for most seeds.

@@ -2,8 +2,8 @@
 
 It has what a denoiser must cope with: textures, a glossy and a mirror-like surface, glass, soft shadows, a corner that
 only indirect light reaches, parallax and disocclusion. All light can be sampled directly, so that one path per pixel
-already shows something. The description is plain Python and numpy, in the form :func:`mcdenoise.render.render_sequence`
-takes; Mitsuba is not needed to build it.
+already shows something. The description is plain Python and numpy, in the form that
+:func:`mcdenoise.scenes.render.render_sequence` takes; Mitsuba is not needed to build it.
 """
 
 from __future__ import annotations

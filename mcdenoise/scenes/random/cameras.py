@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.random_scene.stage import Stage
+from mcdenoise.scenes.random.stage import Stage
 
 Rng = np.random.Generator
 # The last frame of a path; a longer shot goes back and forth on it.

@@ -14,10 +14,10 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, view_projection
 from mcdenoise.errors import InputError
-from mcdenoise.render.folder import SequenceFolder
-from mcdenoise.render.frames import FrameJob, render_frame
-from mcdenoise.render.processes import TracerSource, render_in_processes
-from mcdenoise.render.tracer import (
+from mcdenoise.scenes.render.folder import SequenceFolder
+from mcdenoise.scenes.render.frames import FrameJob, render_frame
+from mcdenoise.scenes.render.processes import TracerSource, render_in_processes
+from mcdenoise.scenes.render.tracer import (
     RR_DEPTH,
     STRATIFIED_PATHS,
     Scene,
@@ -67,7 +67,8 @@ def render_sequence(
             ``out/inputs/realisation{1,2,...}``.
         reference_spp: paths per pixel of the references; with ``noise_level`` the most.
         noise_level: a reference is finished early when its estimated SMAPE against the truth is this small; see
-            :class:`mcdenoise.render.halves.ReferenceHalves`. ``camera.json`` has what was reached, frame by frame.
+            :class:`mcdenoise.scenes.render.halves.ReferenceHalves`. ``camera.json`` has what was reached, frame by
+            frame.
         reference_frames: numbers of the frames that get a reference; all by default.
         moves: for each object of the scene that moves, by its id, ``(T, 4, 4)``: one world-space transform per camera,
             applied to the object where the scene places it. Frames of a scene with moves have a ``previous_position``.

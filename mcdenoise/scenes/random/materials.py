@@ -1,7 +1,7 @@
 """Materials of a random scene, drawn from a fixed set of kinds.
 
 A vectorised renderer compiles its program anew for another set of plugins; therefore a plain colour is a small bitmap
-too, every scene has every kind, and :mod:`mcdenoise.random_scene.stage` sees to it.
+too, every scene has every kind, and :mod:`mcdenoise.scenes.random.stage` sees to it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.random_scene.textures import Color, leaf_mask, random_color, texture
+from mcdenoise.scenes.random.textures import Color, leaf_mask, random_color, texture
 
 Bsdf = dict[str, Any]
 _METALS = ("Ag", "Al", "Au", "Cu", "Cr", "W")

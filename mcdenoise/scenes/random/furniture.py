@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mcdenoise.random_scene.materials import (
+from mcdenoise.scenes.random.materials import (
     diffuse,
     foliage,
     glass,
@@ -16,8 +16,8 @@ from mcdenoise.random_scene.materials import (
     random_metal,
     random_opaque,
 )
-from mcdenoise.random_scene.stage import Part, Stage, ball, box, drum, place, plate, rod, rotate, sheet
-from mcdenoise.random_scene.textures import picture, random_color
+from mcdenoise.scenes.random.stage import Part, Stage, ball, box, drum, place, plate, rod, rotate, sheet
+from mcdenoise.scenes.random.textures import picture, random_color
 
 Rng = np.random.Generator
 Ref = dict[str, str]

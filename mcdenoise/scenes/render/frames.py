@@ -12,9 +12,9 @@ import torch
 
 from mcdenoise.data.bmfr import realisation_folder, write_buffer
 from mcdenoise.data.camera_path import Array, Camera, PixelRays, pixel_rays
-from mcdenoise.render.folder import ReferenceState, read_reference, write_realisation, write_reference
-from mcdenoise.render.halves import ReferenceHalves
-from mcdenoise.render.tracer import STRATIFIED_PATHS, Tracer
+from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write_realisation, write_reference
+from mcdenoise.scenes.render.halves import ReferenceHalves
+from mcdenoise.scenes.render.tracer import STRATIFIED_PATHS, Tracer
 
 # Too few paths have not met the rare bright ones yet, and seem to have less noise than they do.
 _FEWEST_PATHS_IN_A_HALF = 16
@@ -24,7 +24,7 @@ _SECONDS_BETWEEN_SAVES = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class FrameJob:
-    """What all frames have in common, and what was there before; see :func:`mcdenoise.render.render_sequence`.
+    """What all frames have in common, and what was there before; see :func:`mcdenoise.scenes.render.render_sequence`.
 
     Args:
         folder: ``inputs`` of the sequence.
