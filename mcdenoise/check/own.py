@@ -156,6 +156,8 @@ def _check_tensors(where: str, tensors: Any) -> None:
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point() or not tensor.numel():
             found = f"{tensor.dtype} of {tuple(tensor.shape)}" if isinstance(tensor, Tensor) else type(tensor).__name__
             raise InputError(f"{where}: expected a floating-point tensor as example input {i}, found {found}")
+        if tensor.device.type != "cpu":
+            raise InputError(f"{where}: expected example input {i} on cpu, found it on {tensor.device}")
     numbers = sum(tensor.numel() for tensor in tensors)
     if numbers > LARGEST:
         raise InputError(

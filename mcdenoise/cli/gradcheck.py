@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Literal
 
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
 from mcdenoise.check.gradients import check_case, select
@@ -12,7 +14,11 @@ from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import progress_bar, show, write_json
 
 
-def gradcheck(ops: tyro.conf.Positional[list[str]] = [], json: Json = None) -> int:  # noqa: B006 - tyro reads it
+def gradcheck(
+    ops: tyro.conf.Positional[list[str]] = [],  # noqa: B006 - tyro reads it
+    order: Literal[1, 2] = 2,
+    json: Json = None,
+) -> int:
     """Check first and second derivatives of operators against finite differences, in float64, slow mode.
 
     A function of your own takes floating-point tensors. What it is tried on is a small tuple of tensors, or several by
@@ -22,14 +28,18 @@ def gradcheck(ops: tyro.conf.Positional[list[str]] = [], json: Json = None) -> i
     Args:
         ops: names of operators, or functions of your own, path/to/file.py:function or package.module:function; all
             operators by default.
+        order: 1 for first derivatives alone, such as of a function that can be differentiated once.
         json: write the results to this file too.
     """
     table = Table("op", "case", "inputs", "result", "seconds")
     with progress_bar() as progress:
-        results = [check_case(op, case) for op, case in progress.track(select(ops or None), description="gradcheck")]
+        chosen = progress.track(select(ops or None), description="gradcheck")
+        results = [check_case(op, case, order) for op, case in chosen]
     for result in results:
         outcome = "ok" if result.passed else f"FAILED {result.message}"
-        table.add_row(result.op, result.case, ", ".join(result.inputs), outcome, f"{result.seconds:.2f}")
+        row = (result.op, result.case, ", ".join(result.inputs), outcome, f"{result.seconds:.2f}")
+        # What others wrote is no markup.
+        table.add_row(*map(escape, row))
     show(table)
     write_json(json, [asdict(result) for result in results])
     failed = sum(not result.passed for result in results)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
 from mcdenoise.check.stability import FRAMES, Check, LongRun, Summary, as_json, parse_dtypes, stages, summarize
@@ -74,7 +75,9 @@ def _print_checks(checks: list[Check]) -> None:
         elif list(found) == ["runs"]:
             holds, result = "-", f"not run: {found['runs'].worst.message}"
         condition = max(summary.condition for summary in summaries)
-        table.add_row(*key, str(sum(s.checks for s in summaries)), f"{condition:.1g}", *errors, holds, result)
+        # What others wrote is no markup.
+        row = (*key, str(sum(s.checks for s in summaries)), f"{condition:.1g}", *errors, holds, result)
+        table.add_row(*map(escape, row))
     show(table)
 
 

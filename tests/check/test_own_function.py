@@ -69,11 +69,25 @@ scaled.example_inputs = (torch.rand(1, 1, 2, 2, requires_grad=True), torch.rand(
 
 def single(image):
     if image.dtype == torch.float16:
-        raise RuntimeError("no kernel\\nfor half")
+        raise RuntimeError("no kernel\\nfor [/half]")
     return 2 * image
 
 
 single.example_inputs = (torch.ones(3),)
+
+
+class Forgetful(Square):
+    @staticmethod
+    def backward(ctx, gradient):
+        (image,) = ctx.saved_tensors
+        return 2 * image.detach() * gradient
+
+
+def forgetful(image):
+    return Forgetful.apply(image)
+
+
+forgetful.example_inputs = (torch.rand(2, 2) + 1,)
 
 
 def counts(image):
@@ -197,11 +211,13 @@ def test_digits_that_cancel_fail_where_they_do(mine: Path, run: Run, tmp_path: P
 
 def test_a_function_that_fails_in_one_precision(mine: Path, run: Run, tmp_path: Path) -> None:
     path = tmp_path / "stability.json"
-    status, _, _ = run("stability", f"{mine}:single", "--json", path)
+    status, out, _ = run("stability", f"{mine}:single", "--json", path)
     assert status == 1
+    # A table may be folded between words.
+    assert "[/half]" in out
     (failed,) = [check for check in json.loads(path.read_text())["checks"] if not check["passed"]]
     assert (failed["dtype"], failed["what"]) == ("float16", "runs")
-    assert failed["message"] == "RuntimeError: no kernel for half"
+    assert failed["message"] == "RuntimeError: no kernel for [/half]"
 
 
 def test_derivatives_in_what_requires_gradients_alone(mine: Path, run: Run, tmp_path: Path) -> None:
@@ -318,7 +334,7 @@ def test_inputs_may_be_handed_over() -> None:
         gradcheck(cube, torch.arange(3))
 
 
-def test_first_derivatives_alone() -> None:
+def test_first_derivatives_alone(mine: Path, run: Run) -> None:
     class Once(torch.autograd.Function):
         @staticmethod
         def forward(ctx: object, image: Tensor) -> Tensor:
@@ -333,5 +349,10 @@ def test_first_derivatives_alone() -> None:
         result: Tensor = Once.apply(image)
         return result
 
+    with pytest.raises(InputError, match="expected example input 1 on cpu, found it on meta"):
+        gradcheck(once, torch.rand(2, 2, device="meta"))
     assert [gradcheck(once, torch.rand(2, 2), order=order)[0].passed for order in (1, 2)] == [True, False]
     assert all(check.passed for check in check_stability(once, torch.rand(2, 2)))
+    # A second derivative that is wrong where the first is right.
+    assert [run("gradcheck", f"{mine}:forgetful", "--order", order)[0] for order in (1, 2)] == [0, 1]
+    assert run("gradcheck", f"{mine}:forgetful", "--order", 3)[0] == 2
