@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +32,6 @@ from mcdenoise.benchmark import (
     run_benchmark,
 )
 from mcdenoise.benchmark.memory import peak_memory
-from mcdenoise.benchmark.operators import backends
 from mcdenoise.benchmark.run import kept_frames
 from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import fit_line, measure_sizes, synthetic_frame
@@ -54,7 +53,8 @@ from mcdenoise.models import (
     pretrained_models,
     save_weights,
 )
-from mcdenoise.ops import downsample, upsample
+from mcdenoise.ops import _op, downsample, upsample
+from mcdenoise.ops._op import backends_of, op, plain
 from mcdenoise.results import Cell, Cost, Machine, Method, OpResults, Results, Skipped, Spread
 
 METRICS = {"SMAPE", "relMSE", "PSNR", "SSIM", "tSMAPE", "tRMSE"}
@@ -726,24 +726,23 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
         assert float(row["over copy"]) == pytest.approx(float(row["ms"]) / cost["copy"])
 
 
-def with_backends(image: Tensor, *, backend: Literal["exact", "off", "absent"] | None = None) -> Tensor:
-    if backend == "absent":
-        raise NotImplementedError("no such\ncompiler")
-    return downsample(image) * (1.5 if backend == "off" else 1)
+@op("numba", "triton")
+def with_backends(image: Tensor) -> Tensor:
+    return plain(downsample)(image)
 
 
 def test_every_backend_has_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mcdenoise.benchmark.operators, "_COPY_BYTES", 2**20)
-    assert backends(upsample) == [None]
-    assert backends(with_backends) == ["exact", "off", "absent"]
-    (plain,) = (op for op in OPS if op.function is downsample)
-    results = benchmark_ops(size=(16, 12), rounds=1, ops=[replace(plain, function=with_backends)])
+    monkeypatch.setitem(_op._forms, ("numba", "with_backends"), lambda image: with_backends.plain(image) * 1.5)
+    assert backends_of(upsample) == ("torch",)
+    (known,) = (op for op in OPS if op.function is downsample)
+    results = benchmark_ops(size=(16, 12), rounds=1, ops=[replace(known, function=with_backends)])
     rows = {(cost.backend, cost.dtype): cost for cost in results.costs}
     assert len(rows) == 9
-    assert rows["exact", "float32"].error < 1e-6
-    assert rows["off", "float32"].error == pytest.approx(0.5)
-    assert rows["absent", "float32"].failure == "NotImplementedError: no such compiler"
-    assert rows["absent", "float32"].milliseconds is None
+    assert rows["torch", "float32"].error < 1e-6
+    assert rows["numba", "float32"].error == pytest.approx(0.5)
+    assert rows["triton", "float32"].failure.endswith("found 'triton', which runs on an NVIDIA GPU, not on cpu")
+    assert rows["triton", "float32"].milliseconds is None
 
 
 def test_the_command_for_ops(run: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.ops import NO_ALBEDO
-from mcdenoise.ops._window import corner
+from mcdenoise.ops._window import corner, up_to_multiple
 
 # Of the mean of two pixels; one sample of a path tracer differs from the next by ten times as much or more.
 _SMOOTH = 0.02
@@ -61,8 +61,7 @@ def noise_free(frame: Frame) -> Tensor | None:
         rough.narrow(dim, 0, here.shape[dim]).logical_or_((here > there_lowest) | (there > here_lowest))
     # Both in one sum: a difference counts for more than all witnesses.
     counted = plain.to(brightness.dtype).add_(rough, alpha=_MANY)
-    height, width = counted.shape[-2:]
-    sums = F.avg_pool2d(F.pad(counted, (0, -width % _CELL, 0, -height % _CELL)), _CELL)
+    sums = F.avg_pool2d(up_to_multiple(counted, _CELL), _CELL)
     witnesses = (F.avg_pool2d(sums, 3, 1, 1) * (9 * _CELL**2)).round()
     cells = (witnesses >= _LEAST_WITNESSES) & (witnesses < _MANY)
     if not torch.compiler.is_compiling() and not cells.any():

@@ -12,7 +12,7 @@ from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.models.tiled import TILE, Tiled
 from mcdenoise.ops import downsample
 from mcdenoise.ops._steps.network import BLOCK, low_frequencies_of
-from mcdenoise.ops._window import corner
+from mcdenoise.ops._window import corner, up_to_multiple
 
 # Of the buffers, what a mean of 2x2 pixels is a buffer of.
 _IMAGES = tuple(name for name in BUFFERS if name not in ("motion", "reference"))
@@ -70,7 +70,7 @@ def _halved(frame: Frame) -> Frame:
 def _halved_mask(mask: Tensor) -> Tensor:
     """Where nothing is needed at half the size: in tiles far from all pixels that are needed."""
     height, width = mask.shape[-2:]
-    needed = F.pad((~mask).float(), (0, -width % TILE, 0, -height % TILE))
+    needed = up_to_multiple((~mask).float(), TILE)
     tiles = F.max_pool2d(F.max_pool2d(needed, TILE), 3, 1, 1)
     coarse = F.max_pool2d(tiles, 2, ceil_mode=True).bool()
     wide = coarse.repeat_interleave(TILE, -2).repeat_interleave(TILE, -1)

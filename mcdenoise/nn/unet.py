@@ -101,7 +101,8 @@ class UNet(nn.Module):
             is coarser than the finest level has its width.
         """
         height, width = x.shape[-2:]
-        x = _padded(x, (height + -height % self.multiple, width + -width % self.multiple))
+        # Whole multiples, whose halves are simple expressions in a graph for images of any size, as a remainder is not.
+        x = _padded(x, [(side + self.multiple - 1) // self.multiple * self.multiple for side in (height, width)])
         skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):
             if level:

@@ -69,6 +69,12 @@ def shifted(padded: Tensor, radius: int, dy: int, dx: int, height: int, width: i
     return padded.narrow(-2, radius + dy, height).narrow(-1, radius + dx, width)
 
 
+def up_to_multiple(image: Tensor, side: int) -> Tensor:
+    """``(..., H, W)`` with zeros after it, up to whole multiples of ``side``."""
+    right, below = ((size + side - 1) // side * side - size for size in (image.shape[-1], image.shape[-2]))
+    return F.pad(image, (0, right, 0, below))
+
+
 def corner(image: Tensor, height: int, width: int) -> Tensor:
     """The first rows and columns of ``(..., H, W)``, as a view.
 

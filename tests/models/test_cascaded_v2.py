@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from toys import frame_of, small
 
+from mcdenoise import ops
 from mcdenoise.frame import Frame
 from mcdenoise.models import Chain, CoarseToFine, create_model, overview, parts_of
 from mcdenoise.models import cascaded_v2 as page
@@ -16,7 +17,6 @@ from mcdenoise.models.cascaded_v2 import KernelNetwork, PixelNetwork
 from mcdenoise.nn import auto_exposure
 from mcdenoise.nn.inputs import FEATURES
 from mcdenoise.ops import cross_bilateral_weights, kernel_conv
-from mcdenoise.ops._backend import preferred
 
 WIDTH = 8
 
@@ -81,10 +81,11 @@ def test_weights_and_filter_in_one_give_the_same_image(
     with torch.no_grad(), bfloat16:
         image = model(frame_of(97, 131))[0].image
 
-        def in_two_steps(image: Tensor, logits: Tensor, *arguments: Any, border: Any, backend: Any) -> Tensor:
-            weights = cross_bilateral_weights(logits.float(), *arguments, border=border)
-            filtered = kernel_conv(image, weights, border="zeros", backend="torch")
-            expected = in_one(image, logits, *arguments, border=border, backend=backend)
+        def in_two_steps(image: Tensor, logits: Tensor, *arguments: Any, border: Any) -> Tensor:
+            expected = in_one(image, logits, *arguments, border=border)
+            with ops.use("torch"):
+                weights = cross_bilateral_weights(logits.float(), *arguments, border=border)
+                filtered = kernel_conv(image, weights, border="zeros")
             torch.testing.assert_close(filtered, expected, rtol=1e-4, atol=1e-5)
             calls.append(filtered)
             # What the next network reads is rounded to 8 bits in bfloat16, now and then to the other side.
@@ -195,7 +196,7 @@ def test_large_images_have_the_derivatives_of_the_plain_form() -> None:
         assert isinstance(model, nn.Module)
         for head in networks(model)[0].heads:
             nn.init.normal_(head.weight, std=0.1)
-        with preferred(backend):
+        with ops.use(backend, strict=False):
             model(frame_of(96, 110))[0].image.mean().backward()
         gradients.append([parameter.grad for parameter in model.parameters()])
     for fast, plain in zip(*gradients, strict=True):
