@@ -176,7 +176,8 @@ class Denoiser:
                 report.missing = absent_buffers(self.model, frame)
                 report.tiles = self._tiles.divide(self._shot(frame))
             noisy = frame.color
-            with bfloat16:
+            # What a model does not time itself counts as its network.
+            with bfloat16, timed("network", self.device):
                 output, state = checked_step(self.model, frame, self._state, self._shape)
             with timed("validate", self.device):
                 # A renderer may write its next frame into the same buffers, and a user change an image in place.
