@@ -239,7 +239,7 @@ def test_a_method_that_fails_on_one_scene_leaves_the_rest_alone(small_sequence: 
             "unlucky": "RuntimeError: out of luck" if scene == "plane" else "",
             "not a number": NOT_FINITE,
             "fine": "",
-            "unmakeable": "ZeroDivisionError: division by zero",
+            "unmakeable": f"model '{__name__}:unmakeable': the factory fails: ZeroDivisionError: division by zero",
         }.items()
     }
     for cell in results.cells:

@@ -118,6 +118,8 @@ def build_model(name: str, **settings: Any) -> Model:
     try:
         return as_model(entry.construct(**settings))
     except InputError as error:
+        if not str(error).startswith("model: "):
+            raise
         raise InputError(f"model '{name}': {str(error).removeprefix('model: ')}") from error
     except Exception as error:
         raise InputError(f"model '{name}': the factory fails: {in_one_line(error)}") from error
