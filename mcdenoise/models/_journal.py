@@ -81,13 +81,13 @@ def timed(stage: str, device: torch.device) -> AbstractContextManager[None]:
 
 @contextmanager
 def _timed(found: Journal, stage: str, device: torch.device) -> Iterator[None]:
-    start, within = _clock(device), sum(found.milliseconds.values())
+    start, within = clock(device), sum(found.milliseconds.values())
     yield
-    taken = _clock(device) - start - (sum(found.milliseconds.values()) - within)
+    taken = clock(device) - start - (sum(found.milliseconds.values()) - within)
     found.milliseconds[stage] = found.milliseconds.get(stage, 0.0) + taken
 
 
-def _clock(device: torch.device) -> float:
+def clock(device: torch.device) -> float:
     """Milliseconds, after the device has finished."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
