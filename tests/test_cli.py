@@ -428,7 +428,8 @@ def test_models(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> Non
     entries = json.loads(path.read_text())
     assert sorted(entry["name"] for entry in entries) == list_models()
     for entry in entries:
-        assert re.search(rf"\b{entry['name']} .* {entry['parameters']:,} ", text)
+        parameters = f"{entry['parameters']:,}" if entry["parameters"] else "-"
+        assert re.search(rf"\b{entry['name']} .* {parameters} ", text)
 
 
 def test_ops(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:

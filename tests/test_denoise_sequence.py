@@ -123,7 +123,7 @@ def test_the_report_of_a_sequence(small_sequence: Path, tmp_path: Path) -> None:
         ("demodulate", True, 0, "albedo"),
         ("accumulate", True, 0, "positions and cameras"),
         ("reproject", True, 0, "positions and cameras"),
-        ("remember", True, 0.25, "no frame reads it"),
+        ("remember", True, 0.25, "last frame"),
         ("noise-free pixels", True, 0, "there are none"),
         ("converged tiles", True, 0, "there are none"),
         ("unchanged tiles", True, 0, "there are none"),

@@ -340,8 +340,8 @@ BAD: dict[str, tuple[Callable[[Frame, Any], Any], str]] = {
     "channels": (lambda frame, state: (Output(frame.color[:, :1]), None), "found an image of (1, 1, 9, 7)"),
     "no image": (lambda frame, state: (Output(None), None), "found Output"),
     "no output": (lambda frame, state: (frame.color, None), "found Tensor"),
-    "nan": (lambda frame, state: (Output(frame.color * torch.nan), None), "found NaN or infinite values"),
-    "infinite": (lambda frame, state: (Output(frame.color / 0), None), "found NaN or infinite values"),
+    "nan": (lambda frame, state: (Output(frame.color * torch.nan), None), "NaN or infinite pixels"),
+    "infinite": (lambda frame, state: (Output(frame.color / 0), None), "NaN or infinite pixels"),
     "state of text": (lambda frame, state: (Output(frame.color), "state"), "found str"),
     "state of numbers": (lambda frame, state: (Output(frame.color), {"count": 1}), "found int"),
 }

@@ -228,7 +228,7 @@ class Accumulated(Wrapper):
         note("accumulate", alone or source, float(alone != ""))
         why = alone or ("nothing moves in the image" if still and not frame.hints.keep_all else "")
         note("reproject", why or source, float(why != ""))
-        note("remember", "for the next frame" if keeps else alone or "no frame reads it", float(not keeps))
+        note("remember", "for the next frame" if keeps else alone or "last frame", float(not keeps))
 
 
 def surface_before(frame: Frame) -> Surface:
