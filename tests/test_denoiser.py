@@ -442,7 +442,7 @@ def test_the_report_of_a_frame(frames: list[Frame]) -> None:
     denoiser = Denoiser(Keep())
     denoiser(frames[0])
     assert denoiser.report.stages == {}
-    assert list(denoiser.report.milliseconds) == ["validate"]
+    assert list(denoiser.report.milliseconds) == ["validate", "model"]
 
 
 def test_history_is_of_use_to_more_than_one_frame_that_tells_motion() -> None:
