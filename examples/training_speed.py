@@ -25,13 +25,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mcdenoise import ops
 from mcdenoise.benchmark.machine import describe_machine, fix_threads
 from mcdenoise.data.files import write_text
 from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.models import DEFAULT, create_model
-from mcdenoise.ops._backend import preferred
 from mcdenoise.train import TrainConfig
 from mcdenoise.train.cache import NOISY, Shot
 from mcdenoise.train.clips import ClipSampler
@@ -73,7 +73,7 @@ def steps(config: TrainConfig, sampler: ClipSampler, plain: bool) -> Callable[[i
     trainer = Trainer(config, create_model(config.model).train(), fabric, losses, has_state=False)
 
     def step(number: int) -> None:
-        with preferred("torch") if plain else nullcontext():
+        with ops.use("torch", strict=False) if plain else nullcontext():
             trainer.step(number, sampler.draw(trainer.seeds(number)))
 
     return step
