@@ -43,6 +43,20 @@ class Wrapper(nn.Module):
         return self.inner(frame, state)
 
 
+def run(model: Model, handed: list[Frame], state: State) -> tuple[Output, State]:
+    """Call a model with a frame that nobody else holds, so that the model can free it: of a large one, that is much.
+
+    Args:
+        model: any.
+        handed: the frame; empty afterwards.
+        state: see :class:`mcdenoise.models.Model`.
+    """
+    # A module's own call keeps its arguments until it returns.
+    step = model.forward if isinstance(model, nn.Module) else model
+    found: tuple[Output, State] = step(handed.pop(), state)
+    return found
+
+
 def parts_of(model: Model, kind: type[_Wanted]) -> Iterator[_Wanted]:
     """The wrappers of a kind that a model wears, outermost first."""
     if isinstance(model, nn.Module):

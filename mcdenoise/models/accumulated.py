@@ -136,6 +136,7 @@ class Accumulated(Wrapper):
         history, inner = (None, None) if state is None else state
         with timed("accumulate", frame.color.device):
             accumulated, history, inner = self._accumulate(frame.with_depth(), history, inner)
+        del frame
         output, inner = self.inner(accumulated, inner)
         stages = {"accumulated": accumulated.color, **output.stages}
         after = None if history is None and inner is None else (history, inner)

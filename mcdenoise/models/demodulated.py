@@ -10,7 +10,7 @@ from torch import Tensor
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import note, timed
-from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.models._wrapper import Wrapper, run
 from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
 from mcdenoise.ops._rows import by_rows
 
@@ -46,10 +46,10 @@ class Demodulated(Wrapper):
         if albedo is None or reason:
             return self.inner(frame, state)
         with timed("accumulate", device):
-            frame = _without_albedo(frame)
+            handed = [_without_albedo(frame)]
         wanted = frame.hints.stages
-        output, state = self.inner(frame, state)
         del frame
+        output, state = run(self.inner, handed, state)
         with timed("remodulate", device):
             # A network that ends with a convolution hands out its precision.
             stages = {name: _with(albedo, image) for name, image in output.stages.items() if wanted}
