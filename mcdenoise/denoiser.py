@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import MOTION, Frame, Hints
+from mcdenoise.frame import MOTION, Frame, Hints, tells_motion
 from mcdenoise.models import DEFAULT, Journal, Model, Output, State, create_model, listening, timed
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
@@ -139,8 +139,7 @@ class Denoiser:
 
     def has_history(self, buffers: Collection[str]) -> bool:
         """Whether a frame with these buffers may have a history, or be one: else what tells motion is of no use."""
-        can_move = "motion" in buffers or {"position", "view_projection"} <= set(buffers)
-        return self.keep_all or (self._frames != 1 and can_move)
+        return self.keep_all or (self._frames != 1 and tells_motion(buffers))
 
     def __call__(self, frame: Frame) -> Tensor:
         """Denoise the next frame of the shot.

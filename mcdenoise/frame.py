@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
@@ -75,6 +75,12 @@ BUFFERS: dict[str, BufferSpec] = {
 
 # The buffers that say where a pixel was in the frame before, and nothing else: of no use without a history.
 MOTION = frozenset({"position", "motion", "previous_position"})
+
+
+def tells_motion(buffers: Collection[str]) -> bool:
+    """Whether buffers of these names say where a pixel was in the frame before: motion, or positions and cameras."""
+    return "motion" in buffers or {"position", "view_projection"} <= set(buffers)
+
 
 _MATRIX = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "world-to-clip matrix")
 _MATRIX_NAME = "view_projection"

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import MOTION, Frame
+from mcdenoise.frame import MOTION, Frame, tells_motion
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import Journal, journal, note, timed
 from mcdenoise.models._wrapper import Wrapper
@@ -145,7 +145,7 @@ class Accumulated(Wrapper):
     def _accumulate(self, frame: Frame, history: History | None, inner: State) -> tuple[Frame, History | None, State]:
         """The frame with its history, the history for the next one, and the state that the method inside may have."""
         compiling = torch.compiler.is_compiling()
-        can_move = frame.motion is not None or (frame.position is not None and frame.view_projection is not None)
+        can_move = tells_motion(frame.buffers)
         reset = "" if history is None else _misfit(history, frame)
         surfaces = (frame, frame if history is None else history.surface)
         if self.rule == "bmfr" and any(each.position is None or each.normal is None for each in surfaces):

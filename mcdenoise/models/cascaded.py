@@ -73,8 +73,8 @@ class _Network(nn.Module):
         """Auxiliary features f, normalised to the range from 0 to 1 (Sec. 4.2)."""
         albedo, normal, depth = features_of(frame)
         statistics = frame.statistics or self.statistics(frame)
-        largest, typical = statistics["depth_scale"].split(1, 1)
-        return albedo, normal * 0.5 + 0.5, normalized_depth(depth, largest, typical)
+        near, typical = statistics["depth_scale"].split(1, 1)
+        return albedo, normal * 0.5 + 0.5, normalized_depth(depth, near, typical)
 
     def fuse(self, images: list[Tensor]) -> Tensor:
         """The scales of an image, finest first, in one."""

@@ -50,8 +50,8 @@ class CoarseToFine(Wrapper):
         return Output(self._at(frame if frame.statistics else prepared(self.inner, frame), self.resolutions)), None
 
     def _at(self, frame: Frame, resolutions: int) -> Tensor:
-        every = frame.skip is None or frame.hints.keep_all or torch.compiler.is_compiling()
-        needed = resolutions > 1 and (every or frame.skip is None or not bool(frame.skip.mask.all()))
+        skip = None if frame.hints.keep_all or torch.compiler.is_compiling() else frame.skip
+        needed = resolutions > 1 and (skip is None or not bool(skip.mask.all()))
         coarse = self._at(_halved(frame), resolutions - 1) if needed else None
         fine = self.inner(frame)[0].image
         if coarse is None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._journal import note, timed
 from mcdenoise.models._wrapper import Wrapper, run
 from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
@@ -24,9 +24,6 @@ class Demodulated(Wrapper):
     Args:
         inner: any method; it sees the radiance, that of the frame alone and their variance without albedo.
     """
-
-    def __init__(self, inner: Model) -> None:
-        super().__init__(inner)
 
     @property
     def needs(self) -> Needs:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from mcdenoise.frame import Frame, Skip
-from mcdenoise.models._interface import Output, State
+from mcdenoise.models._interface import Output, State, prepared
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.nn.inputs import auto_exposure
 
@@ -30,7 +30,7 @@ class Exposed(Wrapper):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         if "exposure" not in frame.statistics:
-            frame = frame.replace(statistics={**frame.statistics, **self.statistics(frame)})
+            frame = prepared(self, frame)
         exposure = frame.statistics["exposure"]
         output, state = self.inner(_scaled(frame, exposure), state)
         stages = {name: image / exposure for name, image in output.stages.items() if frame.hints.stages}

@@ -17,8 +17,9 @@ from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
-from mcdenoise.models.joint_bilateral import guide_of, scale_of_depth
+from mcdenoise.models.joint_bilateral import guide_of
 from mcdenoise.models.tiled import Tiled
+from mcdenoise.nn.inputs import scale_of_depth
 
 DEPTH_SCALE = 10.0
 # Of a tile's pixel: its covariance matrix of seven guides, and what solving for it takes, measured.

@@ -18,7 +18,8 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.tiled import TILE, Tiled
-from mcdenoise.ops._steps.network import depth_scale, normalized_depth
+from mcdenoise.nn.inputs import scale_of_depth
+from mcdenoise.ops._steps.network import normalized_depth
 
 # Depths in [0, 1] differ by much less than albedos and normals do: without a scale of its own, depth hardly guides.
 DEPTH_SCALE = 10.0
@@ -87,19 +88,12 @@ class JointBilateral(nn.Module):
         return Output(image), None
 
 
-def scale_of_depth(frame: Frame) -> dict[str, Tensor]:
-    """``depth_scale`` of a whole image as of :func:`mcdenoise.nn.inputs.image_statistics`; nothing without a depth."""
-    if frame.depth is None or "depth_scale" in frame.statistics:
-        return {}
-    return {"depth_scale": torch.cat(depth_scale(frame.depth), 1)}
-
-
 def guide_of(frame: Frame, depth_weight: float) -> Tensor:
     """Albedo, normal and depth in ``[0, depth_weight]``, of those that a frame has; of none, its color."""
     guides = [image for image in (frame.albedo, frame.normal) if image is not None]
     if frame.depth is not None:
-        largest, typical = (frame.statistics | scale_of_depth(frame))["depth_scale"].split(1, 1)  # type: ignore[operator]
-        guides.append(depth_weight * normalized_depth(frame.depth, largest, typical))
+        near, typical = {**frame.statistics, **scale_of_depth(frame)}["depth_scale"].split(1, 1)
+        guides.append(depth_weight * normalized_depth(frame.depth, near, typical))
     return torch.cat(guides or [frame.color], 1)
 
 

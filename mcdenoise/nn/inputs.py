@@ -56,19 +56,30 @@ def features_of(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
     return albedo, normal, torch.ones_like(color[:, :1]) if frame.depth is None else frame.depth
 
 
+def scale_of_depth(frame: Frame) -> dict[str, Tensor]:
+    """``depth_scale`` of a whole image ``(B, 2, 1, 1)``: what :func:`mcdenoise.ops._steps.network.depth_scale` finds.
+
+    Returns:
+        Nothing where the frame has it already, or has no depth.
+    """
+    if frame.depth is None or "depth_scale" in frame.statistics:
+        return {}
+    return {"depth_scale": torch.cat(depth_scale(frame.depth), 1)}
+
+
 def image_statistics(frame: Frame) -> dict[str, Tensor]:
     """Exposure and depth scale of a whole image, if the frame does not have them already.
 
     Returns:
-        ``exposure`` ``(B, 1, 1, 1)``, see :func:`auto_exposure`; ``depth_scale`` ``(B, 2, 1, 1)``, the largest finite
-        depth, and the typical one as a fraction of it. A second network takes what the first one found.
+        ``exposure`` ``(B, 1, 1, 1)``, see :func:`auto_exposure`; ``depth_scale``, see :func:`scale_of_depth`, that of a
+        depth of 1 where there is none. A second network takes what the first one found.
     """
     found = {name: frame.statistics[name] for name in ("exposure", "depth_scale") if name in frame.statistics}
     if "exposure" not in found:
         found["exposure"] = auto_exposure(frame.color)
+    found |= scale_of_depth(frame)
     if "depth_scale" not in found:
-        depth = frame.color.new_ones(len(frame.color), 1, 1, 1) if frame.depth is None else frame.depth
-        found["depth_scale"] = torch.cat(depth_scale(depth), 1)
+        found["depth_scale"] = torch.cat(depth_scale(frame.color.new_ones(len(frame.color), 1, 1, 1)), 1)
     return found
 
 
@@ -85,13 +96,13 @@ def input_of(frame: Frame, image: Tensor, *, logarithms: bool = True) -> Tensor:
         the frame alone, and one over the history length.
     """
     current = frame.color if frame.current is None else frame.current
-    exposure, (largest, typical) = frame.statistics["exposure"], frame.statistics["depth_scale"].split(1, 1)
-    features = (*features_of(frame), current, frame.length, exposure, (largest, typical))
+    exposure, (near, typical) = frame.statistics["exposure"], frame.statistics["depth_scale"].split(1, 1)
+    features = (*features_of(frame), current, frame.length, exposure, (near, typical))
     return buffers_input(image, *features, logarithms=logarithms)
 
 
 def guides_of(frame: Frame) -> list[Tensor]:
     """Normal and depth in [0, 1], which guide bilateral weights."""
     _, normal, depth = features_of(frame)
-    largest, typical = frame.statistics["depth_scale"].split(1, 1)
-    return list(network_guides(normal, depth, (largest, typical)).split([3, 1], 1))
+    near, typical = frame.statistics["depth_scale"].split(1, 1)
+    return list(network_guides(normal, depth, (near, typical)).split([3, 1], 1))
