@@ -22,7 +22,7 @@ import torch
 from mcdenoise.benchmark import parse_sizes
 from mcdenoise.benchmark.machine import describe_machine
 from mcdenoise.benchmark.sizes import synthetic_frame
-from mcdenoise.data.bmfr import write_bmfr_frame
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT

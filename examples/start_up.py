@@ -23,7 +23,7 @@ from pathlib import Path
 
 from mcdenoise.benchmark.machine import describe_machine
 from mcdenoise.benchmark.sizes import synthetic_frame
-from mcdenoise.data.bmfr import write_bmfr_frame
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 

@@ -1,4 +1,4 @@
-"""From a folder of frames to a folder of clean ones, with a report of what was done and how long each stage took."""
+"""From the files of a shot to the same files, clean, with a report of what was done and how long each stage took."""
 
 from __future__ import annotations
 
@@ -14,14 +14,18 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.data import Sequence, write_exr
+from mcdenoise.data import Sequence
 from mcdenoise.data.files import write_text
 from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import Output, Skipping, Stage, parts_of, summarize
+
+# Most pixels of a frame, and how much two frames have to correlate to show the same place.
+_MOST, _ALIKE = 0.5, 0.9
 
 
 @dataclass
@@ -32,11 +36,15 @@ class SequenceReport:
         model: name of the model, with its settings, or path of its weights.
         reading: how the sequence stores its color.
         frames: what happened to each frame, by number; its run times include waiting for the disk.
+        files: what was written, by number.
+        alike: frames that look like the one before and find no history in it.
     """
 
     model: str
     reading: str
     frames: dict[int, FrameReport] = field(default_factory=dict)
+    files: dict[int, Path] = field(default_factory=dict)
+    alike: list[int] = field(default_factory=list)
 
     @property
     def milliseconds(self) -> dict[str, float]:
@@ -60,6 +68,17 @@ class SequenceReport:
         return summarize([[read, *report.stages.values()] for report in self.frames.values()])
 
     @property
+    def warnings(self) -> list[str]:
+        """What is probably wrong."""
+        # A shot has its cuts; what begins anew with every other frame has none.
+        if len(self.alike) * 4 <= len(self.frames):
+            return []
+        return [
+            f"history: in {len(self.alike)} of {len(self.frames)} frames most pixels find nothing in the frame before, "
+            "though the two look alike; check motion and cameras with `mcdenoise inspect`"
+        ]
+
+    @property
     def replaced_pixels(self) -> int:
         """Pixels of the noisy color, over all frames, that were NaN, infinite, negative or above 1e16."""
         return sum(report.replaced_pixels for report in self.frames.values())
@@ -71,12 +90,13 @@ def denoise_sequence(
     denoiser: Denoiser,
     model: str,
     *,
-    half: bool = True,
+    full_float: bool = False,
+    output_layer: str | None = None,
     references: bool = False,
     on_frame: Callable[[], None] = lambda: None,
     on_output: Callable[[Frame, Output], None] | None = None,
 ) -> SequenceReport:
-    """Denoise a sequence and write ``OUT/denoisedN.exr`` and ``OUT/denoise.json``.
+    """Denoise a sequence and write its files, clean (:meth:`mcdenoise.data.Sequence.write`), and ``OUT/denoise.json``.
 
     While a frame is denoised, the next one is read and the one before is written, unless memory is too short for that
     (``Denoiser(max_memory=...)``).
@@ -86,7 +106,8 @@ def denoise_sequence(
         out: folder to write to; made if it does not exist.
         denoiser: is reset first.
         model: what to call the model in the report.
-        half: write half floats, else 32-bit floats.
+        full_float: write the radiance as 32-bit floats, whatever it was before.
+        output_layer: name of a layer to be added; then nothing is replaced.
         references: read references too, for ``on_output``.
         on_frame: called after each denoised frame.
         on_output: called with each frame and its image with those on the way to it, which take memory of their own.
@@ -97,6 +118,7 @@ def denoise_sequence(
             names are written.
     """
     make_folder(out)
+    _check_apart(sequence, out)
     # A report stands for a complete result: an old one must not survive a run that fails half-way.
     (out / "denoise.json").unlink(missing_ok=True)
     stored = "with albedo" if sequence.color_has_albedo else "without albedo, which the reader multiplies back"
@@ -105,11 +127,12 @@ def denoise_sequence(
     def write(number: int, image: Tensor, done: FrameReport) -> None:
         start = time.perf_counter()
         pixels = image[0].permute(1, 2, 0).cpu().numpy()
-        write_exr(out / f"denoised{number}.exr", pixels, ["R", "G", "B"], half=half, metadata=sequence.metadata(number))
+        report.files[number] = sequence.write(out, number, pixels, output_layer=output_layer, full_float=full_float)
         done.beside["write"] = _since(start)
 
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
+        seen: Tensor | None = None
         for number, frame, times in _read_frames(sequence, denoiser, reference=references):
             if on_output is None:
                 image = _denoised(denoiser, sequence, number, denoiser, frame, times)
@@ -118,6 +141,9 @@ def denoise_sequence(
                 on_output(frame, output)
                 image = output.image
                 del output
+            seen, before = _thumbnail(frame), seen
+            if _finds_nothing(denoiser.report) and _alike(seen, before):
+                report.alike.append(number)
             del frame
             start = time.perf_counter()
             if writing is not None:
@@ -213,6 +239,22 @@ def _denoised(
     return result
 
 
+def _thumbnail(frame: Frame) -> Tensor:
+    """A small image of what a frame shows, with little noise."""
+    shown = torch.log1p(frame.color.nan_to_num(0, 0, 0).clamp(0, 1e3)) if frame.albedo is None else frame.albedo
+    return F.adaptive_avg_pool2d(shown, (min(16, frame.size[0]), min(16, frame.size[1])))
+
+
+def _finds_nothing(done: FrameReport) -> bool:
+    return done.history is not None and done.history < _MOST
+
+
+def _alike(one: Tensor, other: Tensor | None) -> bool:
+    if other is None or one.shape != other.shape:
+        return False
+    return float(torch.corrcoef(torch.stack([one.flatten(), other.flatten()]))[0, 1]) > _ALIKE
+
+
 def _since(start: float) -> float:
     return (time.perf_counter() - start) * 1e3
 
@@ -232,6 +274,15 @@ def make_folder(out: Path) -> None:
         raise InputError(f"{out}: expected a folder that can be written to, found: {error.strerror}") from error
 
 
+def _check_apart(sequence: Sequence, out: Path) -> None:
+    """Results have the names of what they were made of: they must not take its place."""
+    source = sequence.root if sequence.root.is_dir() else sequence.root.parent
+    if out.resolve() in (source.resolve(), (source / "inputs").resolve()):
+        raise InputError(
+            f"{out}: expected another folder than that of the input, found the same; choose one to write to"
+        )
+
+
 def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> dict[str, Any]:
     return {
         "model": report.model,
@@ -240,6 +291,8 @@ def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> 
         "precision": denoiser.precision,
         "threads": torch.get_num_threads(),
         "sequence": {"name": sequence.name, "layout": sequence.layout, "size": list(sequence.size)},
+        "read": [row._asdict() for row in sequence.table],
+        "warnings": [*sequence.warnings, *report.warnings],
         "keep_all": denoiser.keep_all,
         "tolerance": next((skipping.tolerance for skipping in parts_of(denoiser.model, Skipping)), None),
         "plan": report.plan,
@@ -249,9 +302,11 @@ def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> 
         "beside": report.beside,
         "frames": {
             str(number): {
+                "file": report.files[number].name,
                 "milliseconds": done.milliseconds,
                 "beside": done.beside,
                 "reset": done.reset,
+                "history": done.history,
                 "replaced_pixels": done.replaced_pixels,
                 "missing": done.missing,
             }

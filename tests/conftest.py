@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mcdenoise.data.bmfr import write_bmfr_frame
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.color_space import import_colour
 from mcdenoise.frame import Frame

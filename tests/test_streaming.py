@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from mcdenoise import Denoiser, Frame, InputError, create_model
 from mcdenoise.cli import main
 from mcdenoise.data import open_sequence, read_exr
-from mcdenoise.data.bmfr import write_bmfr_frame, write_buffer
+from mcdenoise.data.readers.bmfr import write_bmfr_frame, write_buffer
 
 # With shipped weights, and fast.
 MODEL = "cascaded_v2_micro"

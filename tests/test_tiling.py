@@ -14,7 +14,7 @@ import torch
 
 from mcdenoise import Denoiser, Frame, InputError, create_model
 from mcdenoise.data import open_sequence
-from mcdenoise.data.bmfr import write_bmfr_frame
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.folder import denoise_sequence
 from mcdenoise.models import Model, save_weights
 

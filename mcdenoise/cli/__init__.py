@@ -20,7 +20,8 @@ Command = Callable[..., int | None]
 # What each command does; it is the function of its name in the module of its name here.
 COMMANDS = {
     "demo": "Render a short animation at one sample a pixel, denoise it, and show the result.",
-    "denoise": "Denoise a folder of frames.",
+    "denoise": "Denoise the frames of a shot, as a renderer wrote them.",
+    "inspect": "Show what would be read of the frames of a shot, and why; denoises nothing.",
     "render": "Render a Mitsuba 3 scene along a camera path to a noisy sequence with references.",
     "generate": "Render random scenes to train on.",
     "train": "Train a model on sequences with references.",

@@ -11,6 +11,9 @@ from mcdenoise.errors import InputError
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Json = Path | None
+# Frames of a shot: folders, files, patterns.
+Inputs = tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT [INPUT ...]")]]
+Map = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="BUFFER=LAYER")]]
 
 # With very many threads torch does not fail but crashes.
 _MOST_THREADS = 1024

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,12 @@ def print_times(milliseconds: dict[str, float]) -> None:
 def stages(milliseconds: dict[str, float]) -> str:
     """The run time of each stage in words."""
     return ", ".join(f"{stage} {value:.1f}" for stage, value in milliseconds.items())
+
+
+def warn(warnings: Iterable[str]) -> None:
+    """Say on stderr what is probably wrong, a line each."""
+    for warning in warnings:
+        print(f"warning: {warning}", file=sys.stderr)
 
 
 def write_json(path: Path | None, content: Any) -> None:

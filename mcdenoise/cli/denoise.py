@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 
-from mcdenoise.cli._options import Json, Out, check_threads
-from mcdenoise.cli._output import print_times, progress_bar, stages, write_json
-from mcdenoise.data import open_sequence
+from mcdenoise.cli._options import Inputs, Json, Map, Out, check_threads
+from mcdenoise.cli._output import print_times, progress_bar, stages, warn, write_json
+from mcdenoise.cli.inspect import open_inputs, print_sequence
 from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
 from mcdenoise.folder import denoise_sequence
+from mcdenoise.frame import MOTION
 from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.methods import Spelling, parse_method
 from mcdenoise.models import DEFAULT, describe_weights
 
 
 def denoise(
-    sequence: tyro.conf.Positional[Path],
+    inputs: Inputs,
     out: Out,
     model: str | None = None,
     weights: Path | None = None,
@@ -29,6 +30,10 @@ def denoise(
     device: str = "cpu",
     threads: int | None = None,
     precision: Precision = "float32",
+    map: Map = (),
+    color_without_albedo: bool = False,
+    color_with_albedo: bool = False,
+    output_layer: str | None = None,
     alpha_min: float | None = None,
     anti_lag: bool = True,
     full_float: bool = False,
@@ -41,11 +46,13 @@ def denoise(
     results: Path | None = None,
     json: Json = None,
 ) -> None:
-    """Denoise a folder of frames: writes OUT/denoisedN.exr and OUT/denoise.json.
+    """Denoise the frames of a shot: writes the same files, clean, to OUT, and OUT/denoise.json.
 
     Args:
-        sequence: folder of a sequence in a known layout.
-        out: folder to write to.
+        inputs: a folder; files; or a pattern such as 'shot_####.exr', 'shot_%%04d.exr' or 'shot_*.exr'. Each may be an
+            EXR with layers, or one file a buffer; `mcdenoise inspect` shows what is taken from where.
+        out: folder to write to: files of the same names, with the radiance replaced and all else as it was
+            (of the BMFR layout: denoisedN.exr).
         model: a name, see `mcdenoise models`, with settings if need be, such as "oidn(quality=fast)"; a weights file;
             or a model of your own, path/to/file.py:factory or package.module:factory. By default cascaded_v2, or the
             model that the weights are of.
@@ -54,9 +61,13 @@ def denoise(
         device: cpu or cuda.
         threads: CPU threads; torch's choice by default.
         precision: of the network's convolutions; bfloat16 is faster on processors that have it.
+        map: layer of a buffer whose name does not tell, such as albedo=RGBA.diff; 'motion=' for none. Repeatable.
+        color_without_albedo: the noisy color was divided by the albedo, which is multiplied back.
+        color_with_albedo: it was not; by default its values tell, and if they do not, it was not.
+        output_layer: add the result as a layer of this name, and replace nothing.
         alpha_min: smallest weight of the current frame in the accumulation, in (0, 1]; the model's own by default.
         anti_lag: give up the history where the light has changed.
-        full_float: write 32-bit instead of half floats.
+        full_float: write the result as 32-bit floats, even where it was stored as half floats.
         keep_all: skip nothing, whether the sequence needs it or not.
         tolerance: noise, or change, relative to its mean, below which a tile of a still shot is not denoised again;
             0 skips only what makes no difference.
@@ -76,7 +87,7 @@ def denoise(
         torch.set_num_threads(threads)
     if alpha_min is not None and not 0 < alpha_min <= 1:
         raise InputError(f"--alpha-min: expected in (0, 1], found {alpha_min}")
-    opened = open_sequence(sequence, frames)
+    opened = open_inputs(inputs, frames, map, without_albedo=color_without_albedo, with_albedo=color_with_albedo)
     if budget_ms is not None or max_error is not None:
         if weights is not None or model is not None:
             raise InputError("--budget-ms, --max-error: expected no --model or --weights: they choose it")
@@ -104,8 +115,8 @@ def denoise(
     denoiser = spelling.denoiser(
         device=device, precision=precision, keep_all=keep_all, tile=tile, max_memory=max_memory, **settings
     )
-    height, width = opened.size
-    print(f"{opened.name}: {opened.layout} layout, {len(opened)} frames of {width}x{height}")
+    print_sequence(opened)
+    began = time.perf_counter()
     with progress_bar() as progress:
         task = progress.add_task("denoise", total=len(opened))
         report = denoise_sequence(
@@ -113,9 +124,11 @@ def denoise(
             out,
             denoiser,
             str(spelling.weights or spelling.name),
-            half=not full_float,
+            full_float=full_float,
+            output_layer=output_layer,
             on_frame=lambda: progress.advance(task),
         )
+    taken = time.perf_counter() - began
     for row in report.plan:
         print(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
     if report.replaced_pixels:
@@ -123,6 +136,13 @@ def denoise(
     print(f"  tiles: {report.tiles}")
     print_times(report.milliseconds)
     print(f"{'beside that' if denoiser.has_room_ahead else 'of the waiting'}: {stages(report.beside)}")
+    absent = {name for done in report.frames.values() for name in done.missing}
+    if missing := sorted(absent - (MOTION if len(opened) == 1 else frozenset())):
+        print(f"without {', '.join(missing)}, with which {report.model} is better")
+    warn(report.warnings)
+    files = list(report.files.values())
+    names = files[0].name if len(files) == 1 else f"{files[0].name} to {files[-1].name}"
+    print(f"{len(files)} {'frame' if len(files) == 1 else 'frames'} in {taken:.1f} s: {out / names}")
     write_json(json, {"model": report.model, "milliseconds": report.milliseconds, "beside": report.beside})
 
 

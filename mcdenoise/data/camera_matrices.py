@@ -17,6 +17,7 @@ from mcdenoise.errors import InputError
 
 Array: TypeAlias = NDArray[np.float64]
 
+MATRICES = "camera_matrices.h"
 _LARGEST_FILE = 50 * 2**20
 # A comment that is never closed swallows the rest, so that whatever it hides counts as missing.
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?(?:\*/|\Z)", re.DOTALL)

@@ -16,11 +16,12 @@ from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
 
 Image: TypeAlias = NDArray[np.float32]
+Mask: TypeAlias = NDArray[np.bool_]
 MetadataValue: TypeAlias = str | int | float | tuple[float, ...]
 Metadata: TypeAlias = dict[str, MetadataValue]
 
 LARGEST_HALF = 65504.0
-_LARGEST_PIXEL_COUNT = 2**28
+LARGEST_PIXEL_COUNT = 2**28
 # Converted and compressed at a time: enough for all cores, and little beside a large image.
 _ROWS = 256
 # Black pixels in a byte of file: zlib's limit is 1032, and PXR24 drops a quarter before; DWA leaves one number of 64.
@@ -75,7 +76,7 @@ def read_exr(path: Path) -> tuple[Image, list[str], Metadata]:
     file, header = _open(path)
     try:
         pixels = file.read_image(0, 0, 0, len(header.channels), oiio.FLOAT)
-        reason = _reason(file)
+        reason = pending_error(file)
     except MemoryError:
         pixels, reason = None, "not enough memory"
     finally:
@@ -130,7 +131,7 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
         raise _unreadable(path, "a folder" if os.path.isdir(path) else "no such file", "check the path")
     file = oiio.ImageInput.open(str(path))
     if file is None:
-        reason = _reason(oiio).replace(f"EXR Error ({path}): ", "")
+        reason = pending_error(oiio).replace(f"EXR Error ({path}): ", "")
         raise _unreadable(path, f"what cannot be opened ({reason})", "check that the file is an EXR and complete")
     spec = file.spec()
     found = ""
@@ -140,25 +141,26 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
         found = "a deep image"
     elif spec.nchannels < 1:
         found = "no channels"
-    elif min(spec.width, spec.height) < 1 or spec.width * spec.height > _LARGEST_PIXEL_COUNT:
+    elif min(spec.width, spec.height) < 1 or spec.width * spec.height > LARGEST_PIXEL_COUNT:
         found = f"{spec.width} x {spec.height} pixels"
-    elif _is_hollow(path, spec):
+    elif is_hollow(path, spec, spec.width * spec.height * int(spec.pixel_bytes(True))):
         # Told before memory is taken for them.
         found = f"{spec.width} x {spec.height} pixels of {spec.nchannels} channels, but not the data for them"
     if found:
         file.close()
         raise _unreadable(path, found, "render a flat EXR of at most 2^28 pixels")
-    return file, ExrHeader((spec.height, spec.width), list(spec.channelnames), _metadata(spec))
+    return file, ExrHeader((spec.height, spec.width), list(spec.channelnames), picture_metadata(spec))
 
 
-def _is_hollow(path: Path, spec: oiio.ImageSpec) -> bool:
-    """Whether a header promises more than its file can hold, however it is compressed."""
+def is_hollow(path: Path, spec: oiio.ImageSpec, promised: int) -> bool:
+    """Whether a header promises more bytes of pixels than its file can hold, however it is compressed."""
     dwa = str(spec.getattribute("compression")).startswith("dwa")
     ratio = _LARGEST_DWA_RATIO if dwa else _LARGEST_RATIO
-    return spec.width * spec.height * int(spec.pixel_bytes(True)) > ratio * os.path.getsize(path)
+    return promised > ratio * os.path.getsize(path)
 
 
-def _metadata(spec: oiio.ImageSpec) -> Metadata:
+def picture_metadata(spec: oiio.ImageSpec) -> Metadata:
+    """The attributes that describe the picture, not how the file stores it."""
     kept: Metadata = {}
     for attribute in spec.extra_attribs:
         value = attribute.value
@@ -180,9 +182,9 @@ def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], half: bool) ->
     """Write the file and return why that failed, or an empty text."""
     file = oiio.ImageOutput.create("openexr")
     if file is None:
-        return _reason(oiio)
+        return pending_error(oiio)
     if not file.open(str(path), spec):
-        return _reason(file)
+        return pending_error(file)
     written = True
     for top in range(0, spec.height, _ROWS):
         pixels = np.ascontiguousarray(image[top : top + _ROWS], dtype=np.float32)
@@ -190,20 +192,20 @@ def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], half: bool) ->
             # Rounding would turn a firefly into infinity, which spreads through every filter downstream; NaN stays NaN.
             pixels = np.clip(pixels, -LARGEST_HALF, LARGEST_HALF)
         written = written and file.write_scanlines(top, top + len(pixels), 0, pixels)
-    reason = _reason(file)
+    reason = pending_error(file)
     if not file.close() or not written:
         return reason or "writing failed"
     # OpenImageIO does not notice when the last few kilobytes no longer fit on the disk: see whether they are there.
     check = oiio.ImageInput.open(str(path))
     if check is None:
-        return f"incomplete: {_reason(oiio)}"
+        return f"incomplete: {pending_error(oiio)}"
     last = check.read_scanlines(0, 0, spec.height - 1, spec.height, 0, 0, spec.nchannels, oiio.FLOAT)
-    reason = _reason(check)
+    reason = pending_error(check)
     check.close()
     return "" if last is not None and not reason else f"incomplete: {reason}"
 
 
-def _reason(source: Any) -> str:
+def pending_error(source: Any) -> str:
     """The pending error of OpenImageIO in one line; a damaged header can put bytes into it that are no text."""
     try:
         lines = source.geterror().split("\n")

@@ -1,85 +1,48 @@
-"""Sequences: folders of frames in known layouts, opened and checked in one call."""
+"""Sequences: frames of a shot in whatever files a renderer wrote, opened and checked in one call."""
 
 from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping
+from collections.abc import Sequence as Sequential
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Protocol
 
 from torch import Tensor
 
-from mcdenoise.data.bmfr import find_frames, open_bmfr
-from mcdenoise.data.exr import Metadata
+from mcdenoise.data.exr import Image, Metadata
+from mcdenoise.data.readers.bmfr import BmfrFolder, find_frames, is_bmfr, open_bmfr
+from mcdenoise.data.readers.choice import parse_mapping
+from mcdenoise.data.readers.files import RenderedFiles
+from mcdenoise.data.readers.names import find_files, group_files
+from mcdenoise.data.readers.opening import open_files
+from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 
 _LARGEST_FRAME_COUNT = 1_000_000
-_KNOWN_LAYOUTS = "bmfr: color0.exr, color1.exr, ... in it or in its 'inputs'"
-
-
-class Layout(Protocol):
-    """What a layout has to know about the frames that were chosen from a folder."""
-
-    @property
-    def numbers(self) -> list[int]:
-        """Frames in use, ascending."""
-        ...
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width in pixels."""
-        ...
-
-    @property
-    def buffers(self) -> frozenset[str]:
-        """Names of the buffers that every frame has."""
-        ...
-
-    @property
-    def reference_numbers(self) -> list[int]:
-        """Frames in use that have a reference."""
-        ...
-
-    @property
-    def color_has_albedo(self) -> bool:
-        """Whether color is stored with the albedo in it."""
-        ...
-
-    @property
-    def realisations(self) -> int:
-        """How many noisy colors every frame in use has."""
-        ...
-
-    def frame(self, number: int, *, reference: bool = True, realisation: int = 0) -> Frame:
-        """Read one frame."""
-        ...
-
-    def reference(self, number: int) -> Tensor:
-        """Read the reference of one frame that has one."""
-        ...
-
-    def metadata(self, number: int) -> Metadata:
-        """Attributes of one frame's color file."""
-        ...
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """The frames of one folder.
+    """The frames of one shot.
 
     Args:
-        root: the folder as it was given.
-        name: the name of the scene's folder.
-        layout: the layout that was detected: ``"bmfr"``.
+        root: the folder, file or pattern as it was given.
+        name: the name of the scene's folder, or of its only file.
+        layout: the layout that was detected: ``"bmfr"``, ``"noisebase"``, ``"oidn"``, or ``"files"`` for whatever else
+            renderers write.
         numbers: frame numbers, ascending.
         size: height and width in pixels, the same for every buffer and frame.
         buffers: names of the buffers that every frame of the sequence has.
         reference_numbers: frames that have a reference; possibly only some.
         color_has_albedo: whether the files hold color with the albedo in it. Frames always do.
         realisations: how many noisy colors every frame has: of the same pixels, with independent noise. Mostly 1.
+        table: what each buffer was taken from.
+        warnings: what is probably wrong, a line each.
+        unused: files and layers that look like buffers and are not used.
     """
 
     root: Path
@@ -91,7 +54,10 @@ class Sequence:
     reference_numbers: list[int]
     color_has_albedo: bool
     realisations: int
-    _source: Layout = field(repr=False)
+    table: Sequential[Row] = field(repr=False)
+    warnings: Sequential[str]
+    unused: Sequential[str] = field(repr=False)
+    _source: BmfrFolder | RenderedFiles = field(repr=False)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -151,6 +117,42 @@ class Sequence:
         self._check(number)
         return self._source.metadata(number)
 
+    def write(
+        self,
+        out: Path,
+        number: int,
+        image: Image,
+        *,
+        alpha: Image | None = None,
+        lights: Mapping[str, Image] | None = None,
+        output_layer: str | None = None,
+        full_float: bool = False,
+    ) -> Path:
+        """Write the clean image of one frame: the file that held its radiance, under its own name, clean.
+
+        Whatever else is in the file stays as it was: layers, parts, attributes, windows, compression, types of numbers.
+        In the BMFR layout, where each file is a buffer, it is a file ``denoisedN`` beside the ``colorN`` that it is of.
+
+        Args:
+            out: folder to write to. It must exist.
+            number: one of ``numbers``.
+            image: ``(H, W, 3)`` radiance.
+            alpha: ``(H, W, 1)`` coverage; that of the file stays by default.
+            lights: ``(H, W, 3)`` radiance of layers of light, by the names in ``frame.layers``.
+            output_layer: name of a layer to be added; then nothing is replaced.
+            full_float: store what is written as 32-bit floats, whatever it was before.
+
+        Returns:
+            The file.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        self._check(number)
+        return self._source.write(
+            out, number, image, alpha=alpha, lights=lights, output_layer=output_layer, full_float=full_float
+        )
+
     def _check(self, number: int) -> None:
         if number not in self.numbers:
             raise InputError(
@@ -158,29 +160,69 @@ class Sequence:
             )
 
 
-def open_sequence(path: Path, frames: str | None = None) -> Sequence:
-    """Open a folder of frames; headers of all chosen files are checked, pixels are not read.
+def open_sequence(
+    path: Path | Sequential[Path],
+    frames: str | None = None,
+    *,
+    mapping: Sequential[str] = (),
+    color_has_albedo: bool | None = None,
+    lights: Sequential[str] = (),
+) -> Sequence:
+    """Open the frames of a shot: headers of all chosen files are checked, and the pixels of the first one looked at.
 
     Args:
-        path: the folder of a scene, or the folder ``inputs`` inside it.
+        path: a folder, or the one that has a folder ``inputs`` inside it; a file; a pattern such as ``shot_####.exr``;
+            or several of these.
         frames: which frames to use, such as ``"0-59,70"``; all of them by default.
+        mapping: layers by buffer where names do not tell, such as ``"albedo=RGBA.diff"``; ``"motion="`` for none.
+        color_has_albedo: whether radiance has the albedo in it; told by the files' values by default.
+        lights: names of layers of light that add up to the color, or ``("all",)``: a frame has them as ``layers``.
 
     Raises:
-        InputError: there is no such folder, its layout is unknown, a frame or buffer is missing, or files do not fit
-            together.
+        InputError: nothing is there, the files do not tell what they are, a frame or buffer is missing, or files do not
+            fit together.
     """
-    path = Path(path)
-    if not os.path.isdir(path):
-        found = "a file" if os.path.isfile(path) else "no such folder"
-        raise InputError(f"{path}: expected the folder of a sequence, found {found}; check the path")
+    given = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
+    if not given:
+        raise InputError("input: expected a folder, a file or a pattern, found nothing")
+    folder = _bmfr_folder(given)
+    found: list[str] = []
+
+    def chosen(present: list[int]) -> list[int]:
+        numbers = _choose(given[0], present, frames)
+        found.extend(_gaps(present) if frames is None else [])
+        return numbers
+
+    source: BmfrFolder | RenderedFiles
+    if folder is not None and not mapping and not lights:
+        files = find_frames(folder) or {"color": {}}
+        source, layout = open_bmfr(folder, files, chosen(sorted(files["color"])), color_has_albedo), "bmfr"
+    else:
+        where = str(given[0]) if len(given) == 1 else f"{given[0]} and {len(given) - 1} more"
+        paths = find_files([folder] if folder is not None else given)
+        if not paths:
+            raise InputError(f"{where}: expected images that a renderer wrote, found none; check the path")
+        groups, layout = group_files(paths)
+        source = open_files(
+            groups,
+            chosen,
+            where=where,
+            mapping=parse_mapping(mapping),
+            color_has_albedo=color_has_albedo,
+            lights=lights,
+        )
+    return _wrap(given[0], layout, source, found)
+
+
+def _bmfr_folder(given: Sequential[Path]) -> Path | None:
+    """The folder of frames in that layout, if that is what was given; or one ``inputs`` in it."""
+    (path, *more) = given
+    if more or not os.path.isdir(path):
+        return None
     for folder in (path, path / "inputs"):
-        files = find_frames(folder) if os.path.isdir(folder) else None
-        if files is not None:
-            numbers = _choose(folder, sorted(files["color"]), frames)
-            return _wrap(path, "bmfr", open_bmfr(folder, files, numbers))
-    raise InputError(
-        f"{path}: expected frames in a known layout ({_KNOWN_LAYOUTS}), found no color file; check the path"
-    )
+        if os.path.isdir(folder) and is_bmfr(folder):
+            return folder
+    return None
 
 
 def with_unique_names(sequences: list[Sequence]) -> list[Sequence]:
@@ -232,20 +274,24 @@ def _choose(folder: Path, present: list[int], frames: str | None) -> list[int]:
                 f"{folder}: expected frame {absent[0]}, found frames {_summary(present)}; choose among these"
             )
         return chosen
-    for before, after in pairwise(present):
-        if after != before + 1:
-            raise InputError(
-                f"{folder}: expected frame {before + 1} after frame {before}, found {after}; "
-                f"render the missing frames, or choose frames such as '{present[0]}-{before}'"
-            )
     return present
+
+
+def _gaps(present: list[int]) -> list[str]:
+    """What is missing between the frames that are there."""
+    missing = [(a + 1, b - 1) for a, b in pairwise(present) if b != a + 1]
+    if not missing:
+        return []
+    spans = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in missing[:8])
+    more = f" and {len(missing) - 8} more" if len(missing) > 8 else ""
+    return [f"frames: {spans}{more} missing; the history begins anew behind a gap, unless positions lead across it"]
 
 
 def _summary(numbers: list[int]) -> str:
     return f"{numbers[0]} to {numbers[-1]}"
 
 
-def _wrap(root: Path, layout: str, source: Layout) -> Sequence:
+def _wrap(root: Path, layout: str, source: BmfrFolder | RenderedFiles, gaps: list[str]) -> Sequence:
     name = root.resolve().name
     if name == "inputs":
         name = root.resolve().parent.name
@@ -259,5 +305,8 @@ def _wrap(root: Path, layout: str, source: Layout) -> Sequence:
         reference_numbers=source.reference_numbers,
         color_has_albedo=source.color_has_albedo,
         realisations=source.realisations,
+        table=source.table,
+        warnings=[*gaps, *source.warnings],
+        unused=source.unused,
         _source=source,
     )

@@ -41,12 +41,15 @@ class Journal:
         stages: what was skipped of them, and why, by name.
         reset: why the history was not used; empty where it was.
         tiles: the parts of the image that were computed, and why those.
+        history: the fraction of the pixels that found themselves in the frame before; ``None`` where nothing was looked
+            for.
     """
 
     milliseconds: dict[str, float] = field(default_factory=dict)
     stages: dict[str, Stage] = field(default_factory=dict)
     reset: str = ""
     tiles: str = ""
+    history: float | None = None
 
 
 _listening: list[Journal] = []

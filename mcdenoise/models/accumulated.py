@@ -164,6 +164,8 @@ class Accumulated(Wrapper):
             still = is_still(frame, history)
             color, length, kept = self._blend(frame, entering, seen, history, still)
             cut = kept.mean() < _CUT_FRACTION
+            if (found := journal()) is not None:
+                found.history = float(kept.mean())
             if compiling:
                 color = torch.where(cut, without_history(entering), color)
                 length = torch.where(cut, 1, length)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from mcdenoise.data import open_sequence, read_exr, write_exr
-from mcdenoise.data.bmfr import realisation_folder, write_bmfr_frame
+from mcdenoise.data.readers.bmfr import realisation_folder, write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, read_camera_matrices, write_camera_matrices
 from mcdenoise.data.sequences import parse_frames, with_unique_names
 from mcdenoise.errors import InputError
@@ -263,7 +263,6 @@ def _without_albedo(inputs: Path) -> None:
 
 
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
-    "gap": (lambda inputs: (inputs / "color2.exr").unlink(), "expected frame 2 after frame 1, found 3"),
     "buffer of one frame": (
         lambda inputs: (inputs / "shading_normal2.exr").unlink(),
         r"shading_normal2\.exr: expected buffer 'normal' for every frame",
@@ -323,10 +322,19 @@ def test_damaged_pixels_are_refused_when_the_frame_is_read(small_sequence: Path)
 def test_folder_that_is_no_sequence(tmp_path: Path) -> None:
     assert "no such folder" in refused(lambda: open_sequence(tmp_path / "missing"))
     (tmp_path / "notes.txt").write_text("color0.exr")
-    message = refused(lambda: open_sequence(tmp_path))
-    assert "bmfr" in message
-    assert "color0.exr" in message
-    assert "found a file" in refused(lambda: open_sequence(tmp_path / "notes.txt"))
+    assert "expected images that a renderer wrote, found none" in refused(lambda: open_sequence(tmp_path))
+    assert "found '.txt'" in refused(lambda: open_sequence(tmp_path / "notes.txt"))
+
+
+def test_a_gap_is_told_and_ends_what_motion_tells(small_sequence: Path) -> None:
+    for path in (small_sequence / "inputs").glob("*1.exr"):
+        path.unlink()
+    sequence = open_sequence(small_sequence)
+    assert sequence.numbers == [0, 2, 3]
+    assert sequence.warnings == [
+        "frames: 1 missing; the history begins anew behind a gap, unless positions lead across it"
+    ]
+    assert sequence.frame(2).motion is None
 
 
 HEADER = """

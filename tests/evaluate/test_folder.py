@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from mcdenoise.data import open_sequence, read_exr, write_exr
-from mcdenoise.data.bmfr import write_bmfr_frame
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS, evaluate_folder, find_images, measure, noise_floor
 from mcdenoise.metrics import PROTOCOLS, displayed, flicker_srgb, warped_rmse_srgb, warping_error_srgb

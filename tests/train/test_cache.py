@@ -19,7 +19,7 @@ import torch
 
 import mcdenoise
 from mcdenoise.data import open_sequence
-from mcdenoise.data.bmfr import write_buffer
+from mcdenoise.data.readers.bmfr import write_buffer
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from mcdenoise.data.bmfr import realisation_folder, write_buffer
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.exr import read_exr, read_exr_header
 from mcdenoise.data.files import write_text
+from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer
 from mcdenoise.errors import InputError
 
 _ADVICE = "choose another output folder, or delete this one"

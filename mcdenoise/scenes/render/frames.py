@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mcdenoise.data.bmfr import realisation_folder, write_buffer
 from mcdenoise.data.camera_path import Array, Camera, PixelRays, pixel_rays
+from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer
 from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write_realisation, write_reference
 from mcdenoise.scenes.render.halves import ReferenceHalves
 from mcdenoise.scenes.render.tracer import STRATIFIED_PATHS, Tracer

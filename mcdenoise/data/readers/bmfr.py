@@ -6,7 +6,8 @@ import json
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.data.camera_matrices import Array, CameraMatrices, read_camera_matrices
-from mcdenoise.data.exr import LARGEST_HALF, Metadata, MetadataValue, read_exr, read_exr_header, write_exr
+from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices, read_camera_matrices
+from mcdenoise.data.exr import LARGEST_HALF, Image, Metadata, MetadataValue, read_exr, read_exr_header, write_exr
 from mcdenoise.data.files import write_text
+from mcdenoise.data.images import FORMATS
+from mcdenoise.data.readers.cameras import convert, read_as
+from mcdenoise.data.readers.rewrite import write_like
+from mcdenoise.data.readers.values import Row, normal_is_encoded, nothing_hit, read_radiance
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
 
@@ -31,8 +36,9 @@ _STEMS = {
     "reference": "reference",
     "color": "color",
 }
+# What nobody else calls a buffer.
+_OWN_STEMS = {"shading_normal", "world_position"}
 _CHANNELS = {1: ["Y"], 2: ["X", "Y"], 3: ["R", "G", "B"]}
-_MATRICES = "camera_matrices.h"
 _DESCRIPTION = "camera.json"
 _FULL_FLOAT = {"position", "previous_position"}
 
@@ -52,6 +58,9 @@ class BmfrFolder:
         color_has_albedo: whether the color files hold radiance (``camera.json`` says so) or radiance divided by
             albedo (the published data, which has no ``camera.json``). Without albedo files it is always radiance.
         more_colors: for each realisation of the noise from 1 on, the color file of each frame number.
+        table: what each buffer was taken from.
+        warnings: what is probably wrong.
+        unused: files that look like buffers of the layout and are not.
     """
 
     path: Path
@@ -61,6 +70,11 @@ class BmfrFolder:
     cameras: CameraMatrices | None
     color_has_albedo: bool
     more_colors: Sequence[Mapping[int, Path]] = ()
+    encoded_normals: bool = False
+    camera_convention: str = ""
+    table: Sequence[Row] = ()
+    warnings: Sequence[str] = ()
+    unused: Sequence[str] = ()
 
     @property
     def realisations(self) -> int:
@@ -97,18 +111,45 @@ class BmfrFolder:
         if not self.color_has_albedo:
             buffers["color"] = buffers["color"] * buffers["albedo"]
         if self.cameras is not None:
-            matrix = self.cameras.view_projection(number, self.size)
+            matrix = convert(self.cameras.view_projection(number, self.size), self.camera_convention)
             if "position" in buffers:
                 matrix, distance = _view_depth(matrix, buffers["position"])
                 buffers.setdefault("depth", distance)
             buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
+        if self.encoded_normals and "normal" in buffers:
+            encoded = buffers["normal"]
+            buffers["normal"] = torch.where((encoded != 0).any(1, keepdim=True), 2 * encoded - 1, 0)
         if "depth" in buffers:
-            buffers["depth"] = _normalise_depth(buffers["depth"], buffers.get("albedo"), buffers.get("normal"))
+            buffers["depth"] = _with_infinite_background(buffers["depth"], buffers.get("albedo"), buffers.get("normal"))
         return Frame(**buffers)
 
     def reference(self, number: int) -> Tensor:
         """Read the reference of one frame that has one."""
         return self._read("reference", self.files["reference"][number])
+
+    def write(
+        self,
+        out: Path,
+        number: int,
+        image: Image,
+        *,
+        alpha: Image | None = None,
+        lights: Mapping[str, Image] | None = None,
+        output_layer: str | None = None,
+        full_float: bool = False,
+    ) -> Path:
+        """Write ``denoisedN.exr``; see :meth:`mcdenoise.data.Sequence.write`. There is neither alpha nor a layer."""
+        if output_layer is not None:
+            raise InputError(
+                f"{self.path}: expected files with layers to add '{output_layer}' to, found one file a buffer; "
+                "leave out --output-layer: the color files stay as they are"
+            )
+        source = self.files["color"][number]
+        target = out / f"denoised{source.name.removeprefix(_STEMS['color'])}"
+        names = read_exr_header(source).channels
+        replaced = {(0, name): image[..., i] for i, name in enumerate(names)}
+        write_like(source, target, replaced, added={}, full_float=full_float)
+        return target
 
     def _read(self, name: str, path: Path) -> Tensor:
         image, channels, _ = read_exr(path)
@@ -124,6 +165,28 @@ def find_frames(path: Path) -> dict[str, dict[int, Path]] | None:
     """
     found = _list_files(path, _STEMS)
     return found if found["color"] else None
+
+
+def is_bmfr(path: Path) -> bool:
+    """Whether the images of a folder are in this layout, by their names: at least they say nothing else.
+
+    Raises:
+        InputError: as :func:`find_frames`.
+    """
+    files = find_frames(path)
+    if files is None:
+        return False
+    first = next(iter(files["color"].values()))
+    with suppress(InputError):
+        if len(read_exr_header(first).channels) != BUFFERS["color"].channels:
+            return False
+    names = os.listdir(path)
+    if {_DESCRIPTION, MATRICES} & set(names):
+        return True
+    known = re.compile(rf"({'|'.join(_STEMS.values())})[0-9]+\.exr")
+    images = [name for name in names if Path(name).suffix.lower() in FORMATS and not name.startswith(".")]
+    stems = {found[1] for name in images if (found := known.fullmatch(name))}
+    return all(map(known.fullmatch, images)) and bool(stems & _OWN_STEMS or stems == {"color"})
 
 
 def realisation_folder(folder: Path, realisation: int) -> Path:
@@ -147,13 +210,17 @@ def _list_files(path: Path, stems: Mapping[str, str]) -> dict[str, dict[int, Pat
     return found
 
 
-def open_bmfr(path: Path, files: Mapping[str, Mapping[int, Path]], numbers: list[int]) -> BmfrFolder:
-    """Check the chosen frames of a folder, from file names and headers alone.
+def open_bmfr(
+    path: Path, files: Mapping[str, Mapping[int, Path]], numbers: list[int], color_has_albedo: bool | None = None
+) -> BmfrFolder:
+    """Check the chosen frames of a folder, from file names and headers, and what the first one's values say.
 
     Args:
         path: the folder.
         files: what :func:`find_frames` found there.
         numbers: the frames to use, ascending; each has a color file.
+        color_has_albedo: whether color is radiance with the albedo in it; what ``camera.json`` says, or else what the
+            values tell, by default.
 
     Raises:
         InputError: a file is missing or unreadable, or sizes or channels differ from what is expected.
@@ -171,15 +238,83 @@ def open_bmfr(path: Path, files: Mapping[str, Mapping[int, Path]], numbers: list
                     f"{missing}: expected buffer '{name}' for every frame, found it for some; "
                     f"render it, or leave out all {_STEMS[name]} files"
                 )
-    cameras = read_camera_matrices(path / _MATRICES) if (path / _MATRICES).exists() else None
+    cameras = read_camera_matrices(path / MATRICES) if (path / MATRICES).exists() else None
     if cameras is not None and len(cameras) <= numbers[-1]:
         raise InputError(
-            f"{path / _MATRICES}: expected a matrix for frame {numbers[-1]}, found {len(cameras)} (frames 0 to "
+            f"{path / MATRICES}: expected a matrix for frame {numbers[-1]}, found {len(cameras)} (frames 0 to "
             f"{len(cameras) - 1}); write all matrices, or choose fewer frames"
         )
-    has_albedo = _color_has_albedo(path, "albedo" in used)
     more_colors = _find_realisations(path, numbers, size)
-    return BmfrFolder(path, {name: files[name] for name in used}, numbers, size, cameras, has_albedo, more_colors)
+    own = {name: files[name] for name in used}
+    stated = _color_has_albedo(path, "albedo" in used) if color_has_albedo is None else color_has_albedo
+    folder = BmfrFolder(path, own, numbers, size, cameras, stated is not False, more_colors)
+    return _look(folder, stated)
+
+
+def _look(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
+    """What the values of the first frame say that nobody has stated."""
+    number = folder.numbers[0]
+    # What is stated is not looked for, and the pixels of most files are not read twice.
+    looked_at = {"position", "normal"} | ({"color", "albedo", "reference"} if stated is None else set())
+    images = {
+        name: folder._read(name, files[number])[0].permute(1, 2, 0).numpy()
+        for name, files in folder.files.items()
+        if name in looked_at and number in files
+    }
+    words = {name: "" for name in sorted(folder.files) if folder.files[name]}
+    warnings: list[str] = []
+    has_albedo = stated is not False
+    if "albedo" not in folder.files:
+        words["color"] = "radiance"
+    elif stated is not None:
+        words["color"] = f"{'with' if stated else 'without'} albedo, as stated"
+    else:
+        has_albedo, words["color"], warnings = read_radiance(
+            images["color"], np.clip(np.nan_to_num(images["albedo"]), 0, 1), images.get("reference"), None
+        )
+    encoded = "normal" in images and normal_is_encoded(images["normal"])
+    if encoded:
+        words["normal"] = "stored as n/2 + 1/2, decoded"
+    convention, cameras = "", folder.cameras
+    if cameras is not None and "position" in images:
+        position = images["position"].astype(np.float64)
+        seen = (position != 0).any(-1)
+        if "normal" in images:
+            seen &= (images["normal"] != 0).any(-1)
+        convention, error = read_as(cameras.view_projection(number, folder.size), position, seen)
+        words["view_projection"] = (
+            f"{convention or 'row vectors, y down'}: positions are seen {error:.2g} pixels from their own"
+        )
+        if convention == "unknown":
+            warnings.append(
+                f"{MATRICES}: its cameras see the positions {error:.0f} pixels from their own, whichever way they are "
+                "read, so no history is found; write the matrices of these frames"
+            )
+        elif convention:
+            warnings.append(f"{MATRICES}: read as {convention}, since only so it sees the positions at their pixels")
+    rows = [
+        Row(name, MATRICES if name == "view_projection" else f"{_STEMS[name]}#.exr", said)
+        for name, said in words.items()
+    ]
+    return replace(
+        folder,
+        color_has_albedo=has_albedo,
+        encoded_normals=encoded,
+        camera_convention=convention,
+        table=rows,
+        warnings=warnings,
+        unused=_unused(folder),
+    )
+
+
+def _unused(folder: BmfrFolder) -> list[str]:
+    """Images whose names say that they are buffers, and that the layout calls otherwise: `normal0.exr`."""
+    known = re.compile(rf"({'|'.join(_STEMS.values())})[0-9]+\.exr")
+    images = [name for name in sorted(os.listdir(folder.path)) if Path(name).suffix.lower() in FORMATS]
+    kinds = dict.fromkeys(
+        re.sub("[0-9]+", "#", name) for name in images if not known.fullmatch(name) and name[0] != "."
+    )
+    return list(kinds)
 
 
 def _find_realisations(path: Path, numbers: list[int], size: tuple[int, int]) -> list[dict[int, Path]]:
@@ -269,11 +404,12 @@ def _check_file(
         )
 
 
-def _color_has_albedo(path: Path, albedo_present: bool) -> bool:
+def _color_has_albedo(path: Path, albedo_present: bool) -> bool | None:
+    """What ``camera.json`` says of it; ``None`` without one: then its values tell the published data from others."""
     description = path / _DESCRIPTION
     if not description.exists():
         # Without albedo there is nothing to multiply back: somebody's plain radiance, not the published data.
-        return not albedo_present
+        return None if albedo_present else True
     try:
         content = json.loads(description.read_text(encoding="utf-8"))
         has_albedo = content.get("color_includes_albedo", True)
@@ -298,9 +434,9 @@ def _view_depth(matrix: Array, position: Tensor) -> tuple[Array, Tensor]:
     return matrix, w.float()[None, None]
 
 
-def _normalise_depth(depth: Tensor, albedo: Tensor | None, normal: Tensor | None) -> Tensor:
+def _with_infinite_background(depth: Tensor, albedo: Tensor | None, normal: Tensor | None) -> Tensor:
     """Infinity where nothing was hit: depth 0, a placeholder behind the camera, or neither albedo nor normal."""
-    nothing = depth <= 0
+    nothing = torch.from_numpy(nothing_hit(depth.numpy()))
     if albedo is not None and normal is not None:
         # Both: mirrors and glass have no albedo, but they have a normal.
         nothing |= ((albedo == 0) & (normal == 0)).all(dim=1, keepdim=True)

@@ -1,0 +1,78 @@
+"""`mcdenoise inspect`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Sequential
+from pathlib import Path
+
+from mcdenoise.cli._options import Inputs, Json, Map
+from mcdenoise.cli._output import print_rows, warn, write_json
+from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.errors import InputError
+
+
+def inspect(
+    inputs: Inputs,
+    frames: str | None = None,
+    map: Map = (),
+    color_without_albedo: bool = False,
+    color_with_albedo: bool = False,
+    json: Json = None,
+) -> None:
+    """Show what would be read of the frames of a shot, from where, and why; denoises nothing.
+
+    Args:
+        inputs: a folder; files; or a pattern, as for `mcdenoise denoise`.
+        frames: which frames, such as 0-59,70; all by default.
+        map: layer of a buffer whose name does not tell, such as albedo=RGBA.diff; 'motion=' for none. Repeatable.
+        color_without_albedo: the noisy color was divided by the albedo.
+        color_with_albedo: it was not.
+        json: write what is shown to this file too.
+    """
+    opened = open_inputs(inputs, frames, map, without_albedo=color_without_albedo, with_albedo=color_with_albedo)
+    print_sequence(opened)
+    write_json(
+        json,
+        {
+            "name": opened.name,
+            "layout": opened.layout,
+            "frames": opened.numbers,
+            "size": list(opened.size),
+            "buffers": sorted(opened.buffers),
+            "read": [row._asdict() for row in opened.table],
+            "unused": list(opened.unused),
+            "warnings": list(opened.warnings),
+        },
+    )
+
+
+def open_inputs(
+    inputs: Sequential[Path],
+    frames: str | None,
+    map: Sequential[str],
+    *,
+    without_albedo: bool,
+    with_albedo: bool,
+    lights: Sequential[str] = (),
+) -> Sequence:
+    """Open what the command line names.
+
+    Raises:
+        InputError: see :func:`mcdenoise.data.open_sequence`.
+    """
+    if with_albedo and without_albedo:
+        raise InputError("--color-with-albedo, --color-without-albedo: expected one of them, found both")
+    stated = with_albedo if with_albedo or without_albedo else None
+    return open_sequence(inputs, frames, mapping=map, color_has_albedo=stated, lights=lights)
+
+
+def print_sequence(sequence: Sequence) -> None:
+    """Print what was found, what each buffer is taken from, and what is probably wrong."""
+    height, width = sequence.size
+    numbers = sequence.numbers
+    frames = f"frame {numbers[0]}" if len(numbers) == 1 else f"{len(numbers)} frames, {numbers[0]} to {numbers[-1]},"
+    print(f"{sequence.name}: {sequence.layout} layout, {frames} of {width}x{height}")
+    print_rows([{"buffer": row.buffer, "taken from": row.source, "read as": row.reading} for row in sequence.table])
+    if sequence.unused:
+        print(f"not used: {', '.join(sequence.unused)}")
+    warn(sequence.warnings)

@@ -1,0 +1,216 @@
+"""Images of every kind that renderers write, through OpenImageIO: what is in a file, and some of its channels.
+
+An EXR of several parts, each with channels of its own, or one picture as `.hdr`, `.pfm`, `.tif` or `.png`. Pixels come
+as 32-bit floats; every failure is told in one line.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from mcdenoise.data.exr import LARGEST_PIXEL_COUNT, Image, Metadata, is_hollow, pending_error, picture_metadata
+from mcdenoise.errors import InputError
+
+# Those that are opened, by the names of OpenImageIO.
+FORMATS = {
+    ".exr": "openexr",
+    ".sxr": "openexr",
+    ".mxr": "openexr",
+    ".cxr": "openexr",
+    ".hdr": "hdr",
+    ".pfm": "pnm",
+    ".tif": "tiff",
+    ".tiff": "tiff",
+    ".png": "png",
+}
+_LARGEST_PARTS, _LARGEST_CHANNELS = 1024, 4096
+# Rows that are decoded at a time, with all channels, of which few are wanted: a chunk of DWAB has 256.
+_ROWS = 256
+_EXR = {suffix for suffix, name in FORMATS.items() if name == "openexr"}
+_INTEGERS = {"uint32", "int32"}
+
+
+@dataclass(frozen=True)
+class Part:
+    """One image of a file.
+
+    Args:
+        name: of the part, empty where the file gives none.
+        size: height and width of the data window in pixels.
+        origin: row and column of its first pixel in the display window.
+        channels: their names, R, G, B first.
+        integers: those that are stored as whole numbers, such as identities of objects.
+        display_referred: whether the samples are display values (sRGB), such as in an 8-bit PNG.
+    """
+
+    name: str
+    size: tuple[int, int]
+    origin: tuple[int, int]
+    channels: tuple[str, ...]
+    integers: frozenset[str]
+    display_referred: bool
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What a file says about its images before any pixel is read.
+
+    Args:
+        format: the container, as OpenImageIO calls it, such as ``openexr``.
+        parts: at least one.
+        metadata: attributes of the first part that describe the picture.
+    """
+
+    format: str
+    parts: tuple[Part, ...]
+    metadata: Metadata
+
+
+def read_image_header(path: Path) -> ImageHeader:
+    """Read the headers of all parts of a file.
+
+    Raises:
+        InputError: the file is missing, of another format, deep, damaged or of absurd size.
+    """
+    file, header = _open(path)
+    file.close()
+    return header
+
+
+def read_channels(path: Path, wanted: Mapping[int, Sequence[str]]) -> dict[int, Image]:
+    """Read some channels of a file.
+
+    Args:
+        path: the file.
+        wanted: names of channels, by the index of their part.
+
+    Returns:
+        For each part float32 ``(H, W, C)`` pixels of its data window, top row first, channels in the order of
+        ``wanted``.
+
+    Raises:
+        InputError: as :func:`read_image_header`; a part or channel is not there; pixels are damaged or missing.
+    """
+    file, header = _open(path)
+    try:
+        for part, names in wanted.items():
+            found = header.parts[part].channels if part < len(header.parts) else ()
+            if absent := [name for name in names if name not in found]:
+                raise InputError(
+                    f"{path}: expected channel '{absent[0]}', as the first file has it, found "
+                    f"{', '.join(found[:8]) or 'no such part'}; render all frames with the same layers"
+                )
+        return {part: _read(path, file, part, header.parts[part], names) for part, names in wanted.items()}
+    finally:
+        file.close()
+
+
+def _read(path: Path, file: oiio.ImageInput, index: int, part: Part, names: Sequence[str]) -> Image:
+    places = [part.channels.index(name) for name in names]
+    first, end = min(places), max(places) + 1
+    picked = [place - first for place in places]
+    height, width = part.size
+    try:
+        spec = file.spec(index)
+        if spec.tile_width or path.suffix.lower() not in _EXR:
+            pixels = file.read_image(index, 0, first, end, oiio.FLOAT)
+            rows = None if pixels is None else np.asarray(pixels).reshape(height, width, -1)[..., picked]
+        else:
+            rows = np.empty((height, width, len(names)), np.float32)
+            for top in range(0, height, _ROWS):
+                bottom = min(top + _ROWS, height)
+                pixels = file.read_scanlines(index, 0, spec.y + top, spec.y + bottom, 0, first, end, oiio.FLOAT)
+                if pixels is None:
+                    rows = None
+                    break
+                rows[top:bottom] = np.asarray(pixels).reshape(bottom - top, width, -1)[..., picked]
+        reason = pending_error(file)
+    except MemoryError:
+        rows, reason = None, "not enough memory"
+    # A file cut short has an intact header, and its missing rows would otherwise be black.
+    if rows is None or reason:
+        raise InputError(
+            f"{path}: expected whole images, found damaged or missing pixels ({reason}); render or copy the file again"
+        )
+    return np.ascontiguousarray(rows, dtype=np.float32)
+
+
+def _open(path: Path) -> tuple[oiio.ImageInput, ImageHeader]:
+    # os.path, because Path.is_file raises for a name that is too long or a folder that may not be entered.
+    if not os.path.isfile(path):
+        found = "a folder" if os.path.isdir(path) else "no such file"
+        raise InputError(f"{path}: expected an image, found {found}; check the path")
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: expected one of {', '.join(FORMATS)}, found '{path.suffix}'; convert the file")
+    name = FORMATS[path.suffix.lower()]
+    config = oiio.ImageSpec()
+    config.attribute("oiio:RawColor", 1)
+    file, reason = None, "damaged header"
+    with suppress(UnicodeDecodeError, MemoryError):
+        file = oiio.ImageInput.open(str(path), config)
+        reason = pending_error(oiio).replace(f"EXR Error ({path}): ", "")
+    if file is None:
+        raise InputError(
+            f"{path}: expected an image, found what cannot be opened ({reason}); check that the file is complete"
+        )
+    if file.format_name() != name:
+        found = file.format_name()
+        file.close()
+        raise _refused(path, f"a file of the format {found}, which its name does not say")
+    try:
+        return file, _header(path, file, name)
+    except BaseException:
+        file.close()
+        raise
+
+
+def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
+    parts: list[Part] = []
+    metadata: Metadata = {}
+    bytes_promised = 0
+    while len(parts) <= _LARGEST_PARTS:
+        try:
+            if not file.seek_subimage(len(parts), 0):
+                break
+            spec = file.spec()
+            kinds = [str(kind) for kind in spec.channelformats] or [str(spec.format)] * spec.nchannels
+            channels = tuple(spec.channelnames)
+            metadata = metadata or picture_metadata(spec)
+            part_name = str(spec.getattribute("oiio:subimagename") or spec.getattribute("name") or "")
+            space = str(spec.getattribute("oiio:ColorSpace") or "").lower()
+        except UnicodeDecodeError as error:
+            raise _refused(path, "names that are no text") from error
+        pixels = spec.width * spec.height
+        if spec.deep:
+            raise _refused(path, "a deep image")
+        if not 1 <= spec.nchannels <= _LARGEST_CHANNELS:
+            raise _refused(path, f"{spec.nchannels} channels")
+        if min(spec.width, spec.height) < 1 or pixels > LARGEST_PIXEL_COUNT or spec.depth > 1:
+            raise _refused(path, f"{spec.width} x {spec.height} pixels")
+        bytes_promised += pixels * int(spec.pixel_bytes(True))
+        # Told before memory is taken for them.
+        if is_hollow(path, spec, bytes_promised):
+            raise _refused(
+                path, f"{spec.width} x {spec.height} pixels of {spec.nchannels} channels, but not their data"
+            )
+        integers = frozenset(c for c, kind in zip(channels, kinds, strict=True) if kind in _INTEGERS)
+        display = name in ("png", "tiff") and kinds[0] in ("uint8", "uint16") and "lin" not in space
+        size, origin = (spec.height, spec.width), (spec.y, spec.x)
+        parts.append(Part(part_name, size, origin, channels, integers, display))
+        if name != "openexr":
+            break
+    pending_error(file)
+    if not parts:
+        raise _refused(path, "no image")
+    return ImageHeader(name, tuple(parts), metadata)
+
+
+def _refused(path: Path, found: str) -> InputError:
+    return InputError(f"{path}: expected an image, found {found}; render a flat image of at most 2^28 pixels")

@@ -1,0 +1,179 @@
+"""Which layer is which buffer: by its name, by what somebody says, or else by its values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mcdenoise.data.exr import Image
+from mcdenoise.data.readers.layers import NAMES, Layer, fits, named, recognise
+from mcdenoise.data.readers.values import is_direction
+from mcdenoise.errors import InputError
+from mcdenoise.frame import BUFFERS
+
+# Buffers that somebody may map a layer to; the rest is no image of a frame.
+MAPPABLE = sorted(set(BUFFERS) - {"current", "length"})
+
+
+@dataclass
+class Choice:
+    """The layers of a frame that are used.
+
+    Args:
+        layers: by buffer.
+        reasons: why, where it is not the name that says so.
+        written: the layers that the result replaces: mostly that of the color, and those that are equal to it.
+        unused: layers that look like buffers and are not used.
+    """
+
+    layers: dict[str, Layer] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+    written: list[Layer] = field(default_factory=list)
+    unused: list[Layer] = field(default_factory=list)
+
+
+def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read: Callable[[Layer], Image]) -> Choice:
+    """Choose the layer of each buffer.
+
+    Args:
+        where: what the layers are of, for messages.
+        layers: all of a frame.
+        mapping: names of layers by buffer, as somebody gave them; an empty one stands for none.
+        read: the pixels of a layer in the first frame, to look at where names do not tell.
+
+    Raises:
+        InputError: there is no color, or two layers that might be it; or what is asked for is not there.
+    """
+    choice = Choice()
+    candidates: dict[str, list[tuple[int, Layer]]] = {buffer: [] for buffer in NAMES}
+    strangers: list[Layer] = []
+    for layer in layers:
+        found = recognise(layer)
+        if found is not None and fits(found[0], layer):
+            candidates[found[0]].append((found[1], layer))
+        else:
+            strangers.append(layer)
+    for buffer, text in mapping.items():
+        if text:
+            choice.layers[buffer] = _mapped(where, layers, buffer, text)
+            choice.reasons[buffer] = "as asked for"
+    color = choice.layers.get("color") or _color(where, candidates["color"], strangers, mapping)
+    choice.layers["color"] = color
+    for buffer in NAMES:
+        if buffer not in choice.layers and buffer not in mapping:
+            best = _best(where, buffer, candidates[buffer], color)
+            if best is not None:
+                choice.layers[buffer] = best
+    own = [layer for layer in strangers if not color.family or layer.family == color.family]
+    _by_values(choice, own, mapping, read)
+    # What has been denoised already stands beside what has not: there the result belongs.
+    finished = [layer for rank, layer in candidates["color"] if layer.family == color.family and rank == 1]
+    choice.written = [color]
+    if (0, color) in candidates["color"] and len(finished) == 1:
+        choice.written = finished
+        choice.reasons["color"] = f"not denoised yet; '{finished[0]}' has been, and gets the result"
+    elif twins := _twins(color, own, read):
+        choice.written += twins
+        choice.reasons["color"] = f"the same as {', '.join(map(str, twins))}, which gets the result too"
+    used = {*choice.layers.values(), *choice.written}
+    choice.unused = [layer for own in candidates.values() for _, layer in own if layer not in used]
+    return choice
+
+
+def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
+    """Read ``--map`` options, such as ``albedo=RGBA.diff``; ``motion=`` stands for none.
+
+    Raises:
+        InputError: one is something else.
+    """
+    mapping: dict[str, str] = {}
+    for text in texts:
+        buffer, equals, layer = (part.strip() for part in text.partition("="))
+        if not equals or buffer not in MAPPABLE or buffer in mapping:
+            raise InputError(f"--map: expected BUFFER=LAYER with a buffer of {', '.join(MAPPABLE)}, found {text!r}")
+        if buffer == "color" and not layer:
+            raise InputError("--map: expected a layer for 'color', found none; no frame can do without")
+        mapping[buffer] = layer
+    return mapping
+
+
+def _mapped(where: str, layers: Sequence[Layer], buffer: str, text: str) -> Layer:
+    found = named(layers, text)
+    if len(found) != 1:
+        names = ", ".join(str(layer) for layer in (found or layers)[:24])
+        raise InputError(
+            f"{where}: expected one layer for --map {buffer}={text}, found {'several' if found else 'none'}; "
+            f"{'they are' if found else 'there are'} {names}"
+        )
+    if not fits(buffer, found[0]):
+        raise InputError(
+            f"{where}: expected {BUFFERS[buffer].channels} channels for --map {buffer}={text}, "
+            f"found {len(found[0].channels)}; choose another layer"
+        )
+    return found[0]
+
+
+def _color(
+    where: str, candidates: Sequence[tuple[int, Layer]], strangers: Sequence[Layer], mapping: Mapping[str, str]
+) -> Layer:
+    if not candidates:
+        # A single picture of unknown name is what is to be denoised.
+        pictures = [layer for layer in strangers if layer.is_color]
+        if len(pictures) == 1:
+            return pictures[0]
+        found = ", ".join(str(layer) for layer in [*pictures, *strangers][:12]) or "no layers of floats"
+        raise InputError(f"{where}: expected noisy radiance, found {found}; name it with --map color=LAYER")
+    least = min(rank for rank, _ in candidates)
+    best = [layer for rank, layer in candidates if rank == least]
+    if len(best) > 1:
+        raise InputError(
+            f"{where}: expected one layer of noisy radiance, found {', '.join(map(str, best[:8]))}; "
+            f"choose with --map color={best[0].name or best[0]}, or give only the files of one shot"
+        )
+    return best[0]
+
+
+def _best(where: str, buffer: str, candidates: Sequence[tuple[int, Layer]], color: Layer) -> Layer | None:
+    """The preferred layer of the same image as the color; a file of its own belongs to every image."""
+    own = [(rank, layer) for rank, layer in candidates if layer.family == color.family or layer.anonymous] or (
+        list(candidates) if color.anonymous or not color.family else []
+    )
+    if not own:
+        return None
+    least = min(rank for rank, _ in own)
+    best = [layer for rank, layer in own if rank == least]
+    if len(best) > 1:
+        raise InputError(
+            f"{where}: expected one layer for '{buffer}', found {', '.join(map(str, best[:8]))}; "
+            f"choose with --map {buffer}={best[0].name or best[0]}"
+        )
+    return best[0]
+
+
+def _twins(color: Layer, strangers: Sequence[Layer], read: Callable[[Layer], Image]) -> list[Layer]:
+    """Layers that hold the color once more: Mitsuba writes that of a nested integrator twice."""
+    others = [layer for layer in strangers if layer.is_color and (layer.group, layer.part) == (color.group, color.part)]
+    if not others:
+        return []
+    pixels = read(color)[..., :3]
+    return [layer for layer in others if np.array_equal(read(layer)[..., :3], pixels, equal_nan=True)]
+
+
+def _by_values(
+    choice: Choice, strangers: Sequence[Layer], mapping: Mapping[str, str], read: Callable[[Layer], Image]
+) -> None:
+    """Layers with names of somebody's own, such as those of Mitsuba: depths end in T, normals have unit length."""
+    vectors = [layer for layer in strangers if layer.components == ("x", "y", "z")]
+    depths = [layer for layer in strangers if layer.components == ("t",)]
+    directions = [layer for layer in vectors if is_direction(read(layer))] if vectors else []
+    points = [layer for layer in vectors if layer not in directions]
+    for buffer, found, why in (
+        ("depth", depths, "by its component T"),
+        ("normal", directions, "by its values: vectors of unit length"),
+        ("position", points, "by its values: coordinates"),
+    ):
+        if buffer not in choice.layers and buffer not in mapping and len(found) == 1:
+            choice.layers[buffer] = found[0]
+            choice.reasons[buffer] = why

@@ -1,0 +1,290 @@
+"""Frames as renderers write them: one EXR with many layers, or one file a buffer, with names of any kind."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mcdenoise.data.camera_matrices import Array, CameraMatrices
+from mcdenoise.data.exr import Image, Mask, Metadata
+from mcdenoise.data.images import Part, read_channels, read_image_header
+from mcdenoise.data.readers.cameras import convert, fit_camera
+from mcdenoise.data.readers.choice import Choice
+from mcdenoise.data.readers.layers import Layer
+from mcdenoise.data.readers.lights import Light
+from mcdenoise.data.readers.names import FileGroup, pattern_of
+from mcdenoise.data.readers.rewrite import write_like
+from mcdenoise.data.readers.transfer import decode
+from mcdenoise.data.readers.values import USUAL_MOTION, Convention, Row, nothing_hit
+from mcdenoise.errors import InputError
+from mcdenoise.frame import BUFFERS, Frame
+
+# What is light or a fraction of it: these samples of a PNG went through a transfer function, those of a normal did not.
+_LIGHT = {"color", "albedo", "reference", "diffuse", "specular", "specular_albedo", "emission"}
+# How much farther than everything else the sky is.
+_SKY = 1000.0
+# How far below 0 lossy compression leaves black.
+_LOSSY = 1e-3
+
+
+@dataclass
+class RenderedFiles:
+    """Frames of one shot; made by :func:`open_files`.
+
+    Args:
+        groups: the kinds of files.
+        parts: of the first file of each kind.
+        numbers: frames in use, ascending.
+        choice: which layer is which buffer.
+        lights: additive layers of radiance, which are denoised with the color, by name.
+        cameras: what a ``camera_matrices.h`` beside the files says.
+        color_has_albedo: whether radiance has the albedo in it.
+    """
+
+    groups: Sequence[FileGroup]
+    parts: Sequence[tuple[Part, ...]]
+    numbers: list[int]
+    choice: Choice
+    lights: Mapping[str, Light]
+    cameras: CameraMatrices | None = None
+    color_has_albedo: bool = True
+    encoded_normals: bool = False
+    motion: Convention = USUAL_MOTION
+    camera_convention: str = ""
+    has_camera: bool = False
+    drops_positions: bool = False
+    table: list[Row] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    realisations: int = 1
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self.part(self.choice.layers["color"]).size
+
+    @property
+    def buffers(self) -> frozenset[str]:
+        """Names of the buffers that every frame has."""
+        present = {
+            name
+            for name, layer in self.choice.layers.items()
+            if all(number in self.groups[layer.group].files for number in self.numbers)
+        }
+        if len(self.choice.layers["color"].channels) > 3:
+            present.add("alpha")
+        if "position" in present and (self.has_camera or self.cameras is not None):
+            present |= {"view_projection", "depth"}
+        elif self.cameras is not None:
+            present.add("view_projection")
+        if self.drops_positions:
+            present -= {"position", "view_projection"}
+        return frozenset(present)
+
+    @property
+    def unused(self) -> list[str]:
+        """Layers that look like buffers and are not used."""
+        return [self.named(layer) for layer in self.choice.unused]
+
+    @property
+    def reference_numbers(self) -> list[int]:
+        """Frames in use that have a reference."""
+        layer = self.choice.layers.get("reference")
+        return [] if layer is None else [n for n in self.numbers if n in self.groups[layer.group].files]
+
+    def metadata(self, number: int) -> Metadata:
+        """Attributes of one frame's color file."""
+        return read_image_header(self.file(self.choice.layers["color"], number)).metadata
+
+    def reference(self, number: int) -> Tensor:
+        """Read the reference of one frame that has one."""
+        return _tensor(self.read(number, {"reference": self.choice.layers["reference"]})["reference"][..., :3])
+
+    def frame(self, number: int, *, reference: bool = True, realisation: int = 0) -> Frame:
+        """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
+        wanted = {
+            name: layer
+            for name, layer in self.choice.layers.items()
+            if number in self.groups[layer.group].files and (reference or name != "reference")
+        }
+        for name, light in self.lights.items():
+            wanted |= {f"light {name} {i}": layer for i, layer in enumerate(light.layers)}
+        images = self.read(number, wanted)
+        lights = {}
+        for name, light in self.lights.items():
+            own = [images.pop(f"light {name} {i}")[..., :3] for i in range(len(light.layers))]
+            lights[name] = _tensor(light.radiance(own))
+        return self._as_frame(number, images, lights)
+
+    def write(
+        self,
+        out: Path,
+        number: int,
+        image: Image,
+        *,
+        alpha: Image | None = None,
+        lights: Mapping[str, Image] | None = None,
+        output_layer: str | None = None,
+        full_float: bool = False,
+    ) -> Path:
+        """Write the file of a frame as it was read, with the clean radiance in place of the noisy one.
+
+        Args:
+            out: folder to write to.
+            number: of the frame.
+            image: ``(H, W, 3)`` radiance.
+            alpha: ``(H, W, 1)``; that of the file by default.
+            lights: ``(H, W, 3)`` radiance of each of ``self.lights``.
+            output_layer: adds a layer of this name instead.
+            full_float: store what is replaced as 32-bit floats, whatever it was.
+
+        Returns:
+            The file.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        layer = self.choice.written[0]
+        source = self.file(layer, number)
+        replaced: dict[tuple[int, str], Image] = {}
+        added: dict[str, Image] = {}
+        if output_layer is not None:
+            names = [".".join((*layer.family, output_layer, letter)) for letter in "RGB"]
+            added = {name: image[..., i] for i, name in enumerate(names)}
+        else:
+            replaced = {
+                (each.part, name): image[..., i]
+                for each in self.choice.written
+                for i, name in enumerate(each.channels[:3])
+            }
+        mask = self.choice.layers.get("alpha") if len(layer.channels) < 4 else None
+        if alpha is not None and len(layer.channels) > 3:
+            replaced[layer.part, layer.channels[3]] = alpha[..., 0]
+        elif alpha is not None and mask is not None and mask.group == layer.group:
+            replaced[mask.part, mask.channels[0]] = alpha[..., 0]
+        for name, radiance in (lights or {}).items():
+            own = self.lights[name]
+            images = self.read(number, {str(i): each for i, each in enumerate(own.layers)})
+            pixels = own.stored(radiance, [images[str(i)][..., :3] for i in range(len(own.layers))])
+            replaced |= {(own.layers[0].part, c): pixels[..., i] for i, c in enumerate(own.layers[0].channels[:3])}
+        write_like(source, out / source.name, replaced, added=added, part=layer.part, full_float=full_float)
+        return out / source.name
+
+    def _as_frame(self, number: int, images: dict[str, Image], lights: Mapping[str, Tensor]) -> Frame:
+        color = images["color"]
+        if color.shape[2] > 3:
+            images.setdefault("alpha", np.clip(color[..., 3:4], 0, 1))
+        # Lossy compression leaves black a little below 0.
+        images["color"] = np.where((color < 0) & (color > -_LOSSY), 0, color)[..., :3]
+        seen = ~nothing_hit(images["depth"]) if "depth" in images else None
+        if "albedo" in images:
+            images["albedo"] = np.clip(np.nan_to_num(images["albedo"], nan=0, posinf=1, neginf=0), 0, 1)
+            if not self.color_has_albedo:
+                images["color"] = images["color"] * images["albedo"]
+        if "normal" in images:
+            normal = np.nan_to_num(images["normal"], nan=0, posinf=0, neginf=0)
+            if self.encoded_normals:
+                normal = np.where((normal != 0).any(-1, keepdims=True), 2 * normal - 1, 0)
+            images["normal"] = np.clip(normal, -1, 1)
+        if "motion" in images:
+            images["motion"] = motion = self.motion.apply(images["motion"])
+            if seen is not None and motion.any():
+                # Renderers that follow surfaces write 0 where there is none, although the camera moves.
+                images["motion"] = np.where(seen | (motion != 0), motion, np.float32(np.inf))
+        matrix = self.camera(number, images, seen)
+        if matrix is not None and "position" in images:
+            position = images["position"].astype(np.float64)
+            known = hit(images, seen)
+            w = np.where(known[..., None], position, 0) @ matrix[:3, 3] + matrix[3, 3]
+            images.setdefault("depth", np.where(known & (w > 0), w, 0)[..., None].astype(np.float32))
+            sky = _far_points(matrix, float(w[known].max(initial=1)), self.size)
+            images["position"] = np.where(known[..., None], position, sky).astype(np.float32)
+            seen = ~nothing_hit(images["depth"])
+        if self.drops_positions or matrix is None:
+            images.pop("position", None)
+        buffers: dict[str, Any] = {name: _tensor(image) for name, image in images.items() if name in BUFFERS}
+        if matrix is not None and not self.drops_positions:
+            buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
+        if seen is not None:
+            buffers["depth"] = _tensor(np.where(seen, images["depth"], np.inf))
+        frame = Frame(**buffers)
+        return frame.replace(layers=dict(lights)) if lights else frame
+
+    def camera(self, number: int, images: Mapping[str, Image], seen: Mask | None) -> Array | None:
+        """The world-to-clip matrix of a frame: the given one, or else that by which its positions are seen."""
+        if self.cameras is not None:
+            return convert(self.cameras.view_projection(number, self.size), self.camera_convention)
+        if not self.has_camera or "position" not in images:
+            return None
+        found = fit_camera(images["position"].astype(np.float64), hit(images, seen))
+        return None if found is None else found.matrix
+
+    def named(self, layer: Layer) -> str:
+        """A layer and its file, for people."""
+        return pattern_of(self.groups[layer.group]) + ("" if layer.anonymous else f" {layer}")
+
+    def part(self, layer: Layer) -> Part:
+        """The part that a layer is in, of the first file of its kind."""
+        return self.parts[layer.group][layer.part]
+
+    def file(self, layer: Layer, number: int) -> Path:
+        """The file that has a layer of a frame."""
+        return self.groups[layer.group].files[number]
+
+    def read(self, number: int, layers: Mapping[str, Layer]) -> dict[str, Image]:
+        """Layers of one frame, each file opened once."""
+        files: defaultdict[Path, dict[int, list[str]]] = defaultdict(lambda: defaultdict(list))
+        for layer in layers.values():
+            channels = files[self.file(layer, number)][layer.part]
+            channels += [channel for channel in layer.channels if channel not in channels]
+        images: dict[str, Image] = {}
+        for path, wanted in files.items():
+            found = read_channels(path, wanted)
+            for name, layer in layers.items():
+                if self.file(layer, number) == path:
+                    pixels = found[layer.part][..., [wanted[layer.part].index(c) for c in layer.channels]]
+                    images[name] = self._decoded(name, layer, pixels, path)
+        return images
+
+    def _decoded(self, name: str, layer: Layer, pixels: Image, path: Path) -> Image:
+        if pixels.shape[:2] != self.size:
+            (height, width), (found_height, found_width) = self.size, pixels.shape[:2]
+            raise InputError(
+                f"{path}: expected {width} x {height} pixels like the first color file, found "
+                f"{found_width} x {found_height}; render all buffers and frames at one size"
+            )
+        if self.part(layer).display_referred and name in _LIGHT:
+            pixels = np.concatenate([decode(pixels[..., :3]), pixels[..., 3:]], -1)
+        channels = BUFFERS[name].channels if name in BUFFERS else 3
+        if name in ("color", "motion"):
+            return pixels
+        if name == "variance" and pixels.shape[2] < 3:
+            return np.repeat(pixels[..., :1], 3, -1)
+        return pixels[..., :channels]
+
+
+def hit(images: Mapping[str, Image], seen: Mask | None) -> Mask:
+    """``(H, W)`` where something was hit: as the depth says or, without one, where there is a position."""
+    position = images["position"]
+    known: Mask = np.isfinite(position).all(-1) & ((position != 0).any(-1) if seen is None else seen[..., 0])
+    return known
+
+
+def _far_points(matrix: Array, depth: float, size: tuple[int, int]) -> Array:
+    """Points far behind all others that a camera sees at its pixels: where the sky is, so that it can be followed."""
+    height, width = size
+    rows, columns = np.mgrid[:height, :width]
+    screen = np.stack([(columns + 0.5) / width * 2 - 1, (rows + 0.5) / height * 2 - 1, np.ones(size)], -1)
+    columns_used = matrix[:, [0, 1, 3]]
+    result: Array = (_SKY * depth * screen - columns_used[3]) @ np.linalg.pinv(columns_used[:3])
+    return result
+
+
+def _tensor(image: Image) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None].contiguous()

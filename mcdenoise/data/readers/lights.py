@@ -1,0 +1,102 @@
+"""Layers of light that add up to the color, such as diffuse and glossy, direct and indirect."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mcdenoise.data.exr import Image
+from mcdenoise.data.readers.layers import Layer, named, recognise
+from mcdenoise.errors import InputError
+
+ALL = "all"
+# Blender divides light by the color of what it fell on: `DiffDir` times `DiffCol` is what adds up.
+_DIVIDED = {
+    f"{kind}{way}": f"{kind}{color}"
+    for kinds, ways, color in (
+        (("Diff", "Gloss", "Trans", "Subsurface"), ("Dir", "Ind"), "Col"),
+        (("Diffuse ", "Glossy ", "Transmission ", "Subsurface "), ("Direct", "Indirect"), "Color"),
+    )
+    for kind in kinds
+    for way in ways
+}
+# What adds up in Blender, Arnold, RenderMan, V-Ray and LuxCore, where all of it is asked for.
+_ADDED = {
+    *_DIVIDED,
+    *("Emit", "Env", "VolumeDir", "VolumeInd", "Emission", "Environment", "Volume Direct", "Volume Indirect"),
+    *("diffuse_direct", "diffuse_indirect", "specular_direct", "specular_indirect", "coat_direct", "coat_indirect"),
+    *("sheen_direct", "sheen_indirect", "transmission_direct", "transmission_indirect", "sss_direct", "sss_indirect"),
+    *("volume_direct", "volume_indirect", "emission", "background"),
+    *(
+        "directDiffuse",
+        "indirectDiffuse",
+        "directSpecular",
+        "indirectSpecular",
+        "subsurface",
+        "transmissive",
+        "emissive",
+    ),
+    *("DIRECT_DIFFUSE", "DIRECT_GLOSSY", "EMISSION", "INDIRECT_DIFFUSE", "INDIRECT_GLOSSY", "INDIRECT_SPECULAR"),
+}
+
+
+@dataclass(frozen=True)
+class Light:
+    """A layer of radiance.
+
+    Args:
+        layers: its own and, where it is stored divided by a color, that color.
+    """
+
+    layers: tuple[Layer, ...]
+
+    def radiance(self, images: Sequence[Image]) -> Image:
+        """What adds up to the color, of the pixels of its layers; invalid values are left to who checks the color."""
+        result: Image = images[0] if len(images) == 1 else images[0] * images[1]
+        return result
+
+    def stored(self, radiance: Image, images: Sequence[Image]) -> Image:
+        """The radiance as the layer keeps it, so that :meth:`radiance` of it is the same again.
+
+        Where it is divided by a color of 0 nothing can be kept, and what was there stays.
+        """
+        if len(images) == 1:
+            return radiance
+        result: Image = np.divide(radiance, images[1], out=images[0].astype(np.float32, copy=True), where=images[1] > 0)
+        return result
+
+
+def find_lights(where: str, layers: Sequence[Layer], color: Layer, names: Sequence[str]) -> Mapping[str, Light]:
+    """The layers of light that somebody asks for.
+
+    Args:
+        where: what the layers are of, for messages.
+        layers: all of a frame.
+        color: that of the radiance; of several view layers, its own is meant.
+        names: of layers, or ``all`` for those that are known to add up.
+
+    Raises:
+        InputError: there is no such layer, or it has no three channels.
+    """
+    own = [layer for layer in layers if layer.family == color.family or layer.anonymous]
+    if list(names) == [ALL]:
+        names = [layer.name for layer in own if layer.title in _ADDED and len(layer.channels) >= 3]
+        if not names:
+            raise InputError(
+                f"{where}: expected layers of light for --layers all, found none that are known; name them"
+            )
+    lights: dict[str, Light] = {}
+    for name in names:
+        found = named(own, name) or named(layers, name)
+        if len(found) != 1 or not found[0].is_color or found[0] == color:
+            pictures = ", ".join(str(layer) for layer in layers if layer.is_color and recognise(layer) is None)
+            raise InputError(
+                f"{where}: expected one layer of light for --layers {name}, found "
+                f"{', '.join(map(str, found)) or 'none'}; choose among {pictures or 'none: there are no other layers'}"
+            )
+        (layer,) = found
+        colors = [each for each in own if each.title == _DIVIDED.get(layer.title) and each.family == layer.family]
+        lights[layer.name] = Light((layer, *colors[:1]))
+    return lights

@@ -1,0 +1,181 @@
+"""File names: which digits of them count the frames, and which files are the same kind of buffer."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcdenoise.data.images import FORMATS
+from mcdenoise.errors import InputError
+
+# OIDN's training data: `name_0008spp.hdr.exr`, whose digits count samples.
+_OIDN = re.compile(r"(?P<name>.+?)_(?P<samples>[0-9]{1,9})spp\.(?P<buffer>hdr|ldr|alb|nrm|z)", re.IGNORECASE)
+_PLACEHOLDER = re.compile(r"#+|%0?[0-9]*d")
+_DIGITS = re.compile(r"([0-9]{1,18})")
+
+
+@dataclass(frozen=True)
+class FileGroup:
+    """Files of one kind, one for each frame.
+
+    Args:
+        label: what their names say besides the number, such as ``shot_albedo``.
+        files: by frame number.
+    """
+
+    label: str
+    files: Mapping[int, Path]
+
+
+def find_files(inputs: Sequence[Path]) -> list[Path]:
+    """Image files that somebody means by folders, files and patterns, sorted.
+
+    Args:
+        inputs: folders, of which all images are taken that are not hidden; files; and patterns, in whose last part
+            ``####``, ``%04d``, ``*``, ``?`` and ``[...]`` stand for what varies.
+
+    Raises:
+        InputError: nothing is there.
+    """
+    found: dict[Path, None] = {}
+    for given in inputs:
+        if os.path.isdir(given):
+            new = _listed(given)
+        elif os.path.lexists(given):
+            # Whatever it is: opening it says what is wrong with it.
+            new = [given]
+        else:
+            new = _matches(given)
+        found.update(dict.fromkeys(new))
+    return list(found)
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        names = sorted(os.listdir(folder))
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
+    return [folder / name for name in names if Path(name).suffix.lower() in FORMATS and not name.startswith(".")]
+
+
+def _matches(pattern: Path) -> list[Path]:
+    folder, name = pattern.parent, pattern.name
+    # Digits alone stand for a number: `shot_####.exr` is not `shot_0001_mask.exr`.
+    pieces = re.split(f"({_PLACEHOLDER.pattern})", name)
+    wild = any(mark in name for mark in "*?[")
+    expression = "".join(
+        rf"[0-9]{{{_least_digits(piece)},9}}" if i % 2 else (_translated(piece) if wild else re.escape(piece))
+        for i, piece in enumerate(pieces)
+    )
+    if len(pieces) == 1 and not wild:
+        raise InputError(
+            f"{pattern}: expected a folder, an image, or a pattern such as shot_####.exr, found no such file"
+        )
+    if not os.path.isdir(folder):
+        raise InputError(f"{pattern}: expected files, found no folder {folder}; check the path")
+    found = [path for path in _listed(folder) if re.fullmatch(expression, path.name)]
+    if not found:
+        raise InputError(f"{pattern}: expected files with such names, found none; check the pattern")
+    return found
+
+
+def _least_digits(placeholder: str) -> int:
+    if placeholder.startswith("#"):
+        return len(placeholder)
+    return int(placeholder.strip("%d") or 1) or 1
+
+
+def _translated(text: str) -> str:
+    """A glob as a regular expression, without what anchors it."""
+    return fnmatch.translate(text).removeprefix("(?s:")[: -len(r")\Z")]
+
+
+def group_files(paths: Sequence[Path]) -> tuple[list[FileGroup], str]:
+    """Sort files by kind.
+
+    Names are alike but for digits. The digits that vary among files which are alike otherwise count the frames; where
+    none do, the last ones.
+
+    Args:
+        paths: the files.
+
+    Returns:
+        The kinds, and the name of the layout.
+
+    Raises:
+        InputError: two numbers vary, or two files are the same frame of a kind.
+    """
+    oidn = [(path, match) for path in paths if (match := _OIDN.fullmatch(path.stem))]
+    if oidn and len(oidn) == len(paths):
+        return _oidn_groups(oidn), "oidn"
+    alike: defaultdict[tuple[Path, tuple[str, ...], str], list[tuple[Path, list[str]]]] = defaultdict(list)
+    for path in paths:
+        pieces = _DIGITS.split(path.stem)
+        alike[path.parent, tuple(pieces[::2]), path.suffix.lower()].append((path, pieces[1::2]))
+    groups: list[FileGroup] = []
+    for (_, texts, _), members in alike.items():
+        groups += _split_by_number(texts, members)
+    return _with_stills(groups), "files"
+
+
+def _split_by_number(texts: tuple[str, ...], members: list[tuple[Path, list[str]]]) -> list[FileGroup]:
+    count = len(texts) - 1
+    values = [{int(digits[place]) for _, digits in members} for place in range(count)]
+    varying = [place for place in range(count) if len(values[place]) > 1]
+    if not count:
+        return [FileGroup(texts[0], {0: path}) for path, _ in members]
+    if len(varying) > 1:
+        # The last one counts; each shot is a kind of its own, so that nobody mixes them.
+        shots: defaultdict[tuple[str, ...], list[tuple[Path, list[str]]]] = defaultdict(list)
+        for path, digits in members:
+            shots[tuple(digits[:-1])].append((path, digits))
+        return [group for own in shots.values() for group in _split_by_number(texts, own)]
+    place = varying[0] if varying else count - 1
+    files: dict[int, Path] = {}
+    for path, digits in members:
+        other = files.setdefault(int(digits[place]), path)
+        if other != path:
+            raise InputError(f"{path}: expected one file a frame, found {other.name} as well; remove one")
+    digits = members[0][1]
+    words = [text + (digits[i] if i < count and i != place else " ") for i, text in enumerate(texts)]
+    return [FileGroup("".join(words).strip(" ._-"), dict(sorted(files.items())))]
+
+
+def _with_stills(groups: list[FileGroup]) -> list[FileGroup]:
+    """Buffers of one still may be numbered in their own way: `albedo.exr` beside `render_0007.exr` belongs to it."""
+    if len(groups) > 1 and all(len(group.files) == 1 for group in groups):
+        numbers = {number for group in groups for number in group.files} - {0}
+        if len(numbers) == 1:
+            (number,) = numbers
+            return [FileGroup(group.label, {number: path}) for group in groups for path in group.files.values()]
+    return groups
+
+
+def _oidn_groups(found: Iterable[tuple[Path, re.Match[str]]]) -> list[FileGroup]:
+    """One kind a buffer; the image with the most samples a pixel is the reference, that with the fewest is denoised."""
+    shots: defaultdict[str, dict[str, dict[int, Path]]] = defaultdict(lambda: defaultdict(dict))
+    for path, match in found:
+        shots[match["name"]][match["buffer"].lower()][int(match["samples"])] = path
+    kinds: defaultdict[str, dict[int, Path]] = defaultdict(dict)
+    for number, (_, buffers) in enumerate(sorted(shots.items())):
+        for buffer, files in buffers.items():
+            least, most = min(files), max(files)
+            kinds[buffer][number] = files[least]
+            if most > least and buffer == "hdr":
+                kinds["reference"][number] = files[most]
+    return [FileGroup(label, files) for label, files in kinds.items()]
+
+
+def pattern_of(group: FileGroup) -> str:
+    """The names of a kind of files, with # for the digits of the frame."""
+    number, path = next(iter(group.files.items()))
+    digits = [found for found in _DIGITS.finditer(path.stem) if int(found[0]) == number]
+    if len(group.files) == 1 or not digits:
+        return path.name
+    start, end = digits[-1].span()
+    return f"{path.name[:start]}{'#' * (end - start)}{path.name[end:]}"

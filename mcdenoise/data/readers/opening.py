@@ -1,0 +1,300 @@
+"""Finding out what the files of a shot hold: by names and headers, and by the values of its first frames."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from mcdenoise.data.camera_matrices import MATRICES, CameraMatrices, read_camera_matrices
+from mcdenoise.data.exr import Image
+from mcdenoise.data.images import ImageHeader, Part, read_channels, read_image_header
+from mcdenoise.data.readers.cameras import fit_camera, miss, read_as
+from mcdenoise.data.readers.choice import choose
+from mcdenoise.data.readers.files import RenderedFiles, hit
+from mcdenoise.data.readers.layers import Layer, layers_of
+from mcdenoise.data.readers.lights import find_lights
+from mcdenoise.data.readers.names import FileGroup, pattern_of
+from mcdenoise.data.readers.values import (
+    USUAL_MOTION,
+    Convention,
+    Row,
+    match_motion,
+    normal_is_encoded,
+    nothing_hit,
+    read_radiance,
+)
+from mcdenoise.errors import InputError
+
+# How motion is stored where the name of its layer tells: Blender's points to the frame before, in pixels, y up.
+_MOTION = {"vector": Convention(1, -1, "previous - current, y up, pixels")}
+# The pairs of frames that are looked at to tell what motion says.
+_PAIRS = 3
+# Pixels by which points move where a camera moves.
+_MOVED = 0.3
+# How far from the origin a camera is that sees positions in its own space, in distances of what it sees.
+_ORIGIN = 1e-2
+
+
+def open_files(
+    groups: Sequence[FileGroup],
+    choose_numbers: Callable[[list[int]], list[int]],
+    *,
+    where: str,
+    mapping: Mapping[str, str],
+    color_has_albedo: bool | None = None,
+    lights: Sequence[str] = (),
+) -> RenderedFiles:
+    """Find out what the files of a shot hold: by names and headers, and by the values of its first frames.
+
+    Args:
+        groups: kinds of files.
+        choose_numbers: which of the frames to use.
+        where: what they are, for messages.
+        mapping: see :func:`mcdenoise.data.readers.choice.choose`.
+        color_has_albedo: whether radiance has the albedo in it; told by the data by default.
+        lights: names of additive layers of radiance that are denoised with the color.
+
+    Raises:
+        InputError: the files do not tell what they are, do not fit together, or cannot be read.
+    """
+    headers = [read_image_header(next(iter(group.files.values()))) for group in groups]
+    layers = [layer for i, header in enumerate(headers) for layer in layers_of(i, groups[i].label, header.parts)]
+
+    def read_first(layer: Layer) -> Image:
+        path = next(iter(groups[layer.group].files.values()))
+        return read_channels(path, {layer.part: layer.channels})[layer.part]
+
+    choice = choose(where, layers, mapping, read_first)
+    color = choice.layers["color"]
+    numbers = choose_numbers(sorted(groups[color.group].files))
+    shot = RenderedFiles(groups, [header.parts for header in headers], numbers, choice, {})
+    _check(shot)
+    found = find_lights(where, layers, color, lights)
+    shot = replace(shot, lights=found, cameras=_cameras(shot))
+    _look(shot, color_has_albedo)
+    return shot
+
+
+def _check(shot: RenderedFiles) -> None:
+    """Every frame has every buffer, of one size and place."""
+    color = shot.choice.layers["color"]
+    main = shot.part(color)
+    for name, layer in sorted(shot.choice.layers.items()):
+        files = shot.groups[layer.group].files
+        missing = [number for number in shot.numbers if number not in files]
+        if missing and name != "reference":
+            raise InputError(
+                f"{pattern_of(shot.groups[layer.group])}: expected buffer '{name}' for every frame, found none for "
+                f"frame {missing[0]}; render it, or leave the buffer out with --map {name}="
+            )
+        part = shot.part(layer)
+        if (part.size, part.origin) != (main.size, main.origin):
+            raise InputError(
+                f"{next(iter(files.values()))}: expected '{name}' in the pixels of the color "
+                f"({_window(main)}), found {_window(part)}; render all layers in one window, or leave this one "
+                f"out with --map {name}="
+            )
+    names = {layer: set(layer.channels) for layer in shot.choice.layers.values()}
+    for group, own in enumerate(shot.groups):
+        used = [layer for layer in names if layer.group == group]
+        for number in shot.numbers if used else []:
+            if number in own.files:
+                _check_header(own.files[number], read_image_header(own.files[number]), used, main)
+
+
+def _check_header(path: Path, header: ImageHeader, layers: Sequence[Layer], main: Part) -> None:
+    for layer in layers:
+        found = header.parts[layer.part].channels if layer.part < len(header.parts) else ()
+        if absent := [channel for channel in layer.channels if channel not in found]:
+            raise InputError(
+                f"{path}: expected channel '{absent[0]}', as the first file has it, found {', '.join(found[:8])}; "
+                "render all frames with the same layers"
+            )
+        part = header.parts[layer.part]
+        if (part.size, part.origin) != (main.size, main.origin):
+            raise InputError(
+                f"{path}: expected {_window(main)} like the first color file, found {_window(part)}; "
+                "render all buffers and frames at one size"
+            )
+
+
+def _window(part: Part) -> str:
+    (height, width), (top, left) = part.size, part.origin
+    return f"{width} x {height} pixels" + (f" at {left}, {top}" if (top, left) != (0, 0) else "")
+
+
+def _cameras(shot: RenderedFiles) -> CameraMatrices | None:
+    path = shot.file(shot.choice.layers["color"], shot.numbers[0]).parent / MATRICES
+    if not os.path.lexists(path):
+        return None
+    cameras = read_camera_matrices(path)
+    if len(cameras) <= shot.numbers[-1]:
+        raise InputError(
+            f"{path}: expected a matrix for frame {shot.numbers[-1]}, found {len(cameras)} (frames 0 to "
+            f"{len(cameras) - 1}); write all matrices, or choose fewer frames"
+        )
+    return cameras
+
+
+def _look(shot: RenderedFiles, color_has_albedo: bool | None) -> None:
+    """Read the first frame, and the next ones where there is motion, and decide what their values mean."""
+    number, chosen = shot.numbers[0], dict(shot.choice.layers)
+    images = shot.read(
+        number,
+        {n: each for n, each in shot.choice.layers.items() if n != "reference" or number in shot.reference_numbers},
+    )
+    readings = {name: [shot.choice.reasons[name]] if name in shot.choice.reasons else [] for name in images}
+    _look_at_color(shot, images, readings["color"], color_has_albedo)
+    if "albedo" in images:
+        above = float((np.nan_to_num(images["albedo"]) > 1).any(-1).mean())
+        readings["albedo"].append(f"{above:.1%} of the pixels above 1, clamped" if above else "0 to 1")
+    if "normal" in images:
+        shot.encoded_normals = normal_is_encoded(images["normal"])
+        readings["normal"].append("stored as n/2 + 1/2, decoded" if shot.encoded_normals else "signed")
+        length = np.linalg.norm(
+            np.nan_to_num(images["normal"]) * (2 if shot.encoded_normals else 1) - shot.encoded_normals, axis=-1
+        )
+        if not 0.5 < np.median(length[length > 0.05] if (length > 0.05).any() else [1.0]) < 1.5:
+            shot.warnings.append("'normal': most have no unit length; is it a normal? leave it out with --map normal=")
+    if "depth" in images:
+        far = nothing_hit(images["depth"])
+        what = (
+            "background: none"
+            if not far.any()
+            else f"background: {far.mean():.0%}, {_span(images['depth'][far])}, read as infinity"
+        )
+        readings["depth"].append(what)
+    if "position" in images:
+        _look_at_positions(shot, images, readings)
+    elif shot.cameras is not None:
+        readings["view_projection"] = ["no positions to check it with"]
+    if "motion" in images:
+        shot.motion, said = _motion(shot)
+        readings["motion"].append(said)
+    for name, words in readings.items():
+        layer = chosen.get(name)
+        source = shot.named(layer) if layer else MATRICES if shot.cameras else "the positions"
+        shot.table.append(Row(name, source, "; ".join(words)))
+
+
+def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list[str], stated: bool | None) -> None:
+    if shot.part(shot.choice.layers["color"]).display_referred:
+        words.append("display values, made linear")
+        shot.warnings.append(
+            "'color': 8 or 16 bits of display values: what was brighter than white is lost; render floats"
+        )
+    if "albedo" not in images:
+        words.append("radiance")
+        return
+    albedo = np.clip(np.nan_to_num(images["albedo"]), 0, 1)
+    reference = images["reference"][..., :3] if "reference" in images else None
+    shot.color_has_albedo, said, warning = read_radiance(images["color"][..., :3], albedo, reference, stated)
+    words.append(said)
+    shot.warnings += warning
+
+
+def _look_at_positions(shot: RenderedFiles, images: Mapping[str, Image], readings: dict[str, list[str]]) -> None:
+    position = images["position"].astype(np.float64)
+    known = hit(images, ~nothing_hit(images["depth"]) if "depth" in images else None)
+    words = readings.setdefault("view_projection", [])
+    if shot.cameras is not None:
+        stated = shot.cameras.view_projection(shot.numbers[0], shot.size)
+        shot.camera_convention, error = read_as(stated, position, known)
+        if shot.camera_convention != "unknown":
+            shot.has_camera = True
+            how = shot.camera_convention or "row vectors, y down"
+            words.append(f"{how}: positions are seen {error:.2g} pixels from their own")
+            if shot.camera_convention:
+                shot.warnings.append(f"{MATRICES}: read as {how}, since only so it sees the positions at their pixels")
+            return
+        shot.warnings.append(
+            f"{MATRICES}: does not see the positions at their pixels (they miss by {error:.0f}) whichever way it is "
+            "read; cameras are found from the positions instead"
+        )
+        shot.cameras = None
+    found = fit_camera(position, known)
+    if found is None:
+        words.append("the positions do not tell a camera")
+        readings["position"].append("not used without a camera")
+        readings.pop("view_projection")
+        shot.drops_positions = True
+    elif _is_in_camera_space(shot, images) and _is_in_camera_space(shot, _last(shot)):
+        # Where a point was in the frame before is not told.
+        shot.drops_positions, shot.has_camera = True, "depth" not in images
+        readings["position"].append("in the space of the camera: only its depth is used")
+        readings.pop("view_projection")
+    else:
+        shot.has_camera = True
+        words.append(f"found from the positions, which it sees {found.error:.2g} pixels from their own")
+
+
+def _last(shot: RenderedFiles) -> dict[str, Image]:
+    """Positions and depth of the last frame."""
+    return shot.read(
+        shot.numbers[-1], {n: each for n, each in shot.choice.layers.items() if n in ("position", "depth")}
+    )
+
+
+def _is_in_camera_space(shot: RenderedFiles, images: Mapping[str, Image]) -> bool:
+    """Whether the camera that sees the positions of a frame is their origin."""
+    known = hit(images, ~nothing_hit(images["depth"]) if "depth" in images else None)
+    found = fit_camera(images["position"].astype(np.float64), known)
+    distance = np.linalg.norm(images["position"][known], axis=-1)
+    return found is not None and bool(np.linalg.norm(found.eye) < _ORIGIN * np.median(distance))
+
+
+def _motion(shot: RenderedFiles) -> tuple[Convention, str]:
+    """The convention of the motion, by comparing neighbouring frames; motion that is none goes."""
+    layer = shot.choice.layers["motion"]
+    given = _MOTION.get(layer.title.lower(), USUAL_MOTION)
+    kept = {"albedo", "normal"} & set(shot.choice.layers) or {"color"}
+    pairs = []
+    moved = False
+    following = [(a, b) for a, b in pairwise(shot.numbers) if b == a + 1][:_PAIRS]
+    for before, now in following:
+        wanted = {
+            name: shot.choice.layers[name]
+            for name in kept | {"motion"} | ({"position", "depth"} & set(shot.choice.layers))
+        }
+        images, previous = (shot.read(number, wanted) for number in (now, before))
+        moved |= _camera_moved(shot, (before, previous), (now, images))
+        features, earlier = (
+            {name: np.clip(np.nan_to_num(each[name][..., :3]), -1, 1) for name in kept} for each in (images, previous)
+        )
+        pairs.append((features, earlier, images["motion"]))
+    if pairs and moved and not any(motion.any() for *_, motion in pairs):
+        shot.choice.unused.append(shot.choice.layers.pop("motion"))
+        shot.warnings.append(
+            "'motion': all zeros although the camera moves, as Blender writes it with motion blur; positions are used "
+            "instead"
+        )
+        return given, "all zeros: not used"
+    chosen, told = match_motion(pairs, given)
+    if chosen[:2] != given[:2]:
+        shot.warnings.append(f"'motion': read as {chosen.words}, since only so frames match the ones before them")
+    return chosen, f"{chosen.words}{', as neighbouring frames match' if told else ''}"
+
+
+def _camera_moved(
+    shot: RenderedFiles, before: tuple[int, Mapping[str, Image]], now: tuple[int, Mapping[str, Image]]
+) -> bool:
+    """Whether the camera of a frame sees the points of the next one elsewhere."""
+    if not shot.has_camera:
+        return False
+    seens = [~nothing_hit(images["depth"]) if "depth" in images else None for _, images in (before, now)]
+    matrix = shot.camera(*before, seens[0])
+    position = now[1]["position"].astype(np.float64)
+    return matrix is not None and miss(matrix, position, hit(now[1], seens[1])) > _MOVED
+
+
+def _span(values: Image) -> str:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return "not finite"
+    low, high = float(known.min()), float(known.max())
+    return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"

@@ -1,0 +1,286 @@
+"""What the values of a buffer say of themselves: encodings, placeholders, units and signs that no name tells.
+
+All arrays are ``(H, W, C)``; every decision comes with the words for the person who reads the table of what was read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from mcdenoise.data.camera_matrices import Array
+from mcdenoise.data.exr import LARGEST_HALF, Image, Mask
+
+# No scene is so deep, and what renderers write for nothing is deeper: 1e10 (Blender), 1e30, 3.4e38.
+_FARTHEST = 1e9
+_BLOCK = 8
+# Elasticities of 1 and of 0 are told apart here, since gloss and light between colored walls lower both (measured: 0.47
+# to 1.17 and -0.53 to 0.19), where the value is so many of its standard errors away, and these are no larger than that.
+_THRESHOLD, _SIGMAS, _LARGEST_ERROR = 1 / 3, 3.0, 0.15
+# By how much one reading has to be nearer to the reference than the other.
+_NEARER = 1.5
+_LARGEST_MOTION = 1e5
+# A pixel that moves by less says little of the sign; fewer pixels than this say nothing.
+_MOVES, _LEAST_MOVING = 0.5, 64
+# Another sign is taken where it matches so much better than the one that the format has.
+_BETTER = 0.85
+
+
+class Row(NamedTuple):
+    """What one buffer was taken from.
+
+    Args:
+        buffer: its name.
+        source: file and layer.
+        reading: how its values are read, and why.
+    """
+
+    buffer: str
+    source: str
+    reading: str
+
+
+class Albedo(NamedTuple):
+    """Whether radiance has the albedo in it.
+
+    Args:
+        included: ``None`` where the data does not tell.
+        elasticity: by how many percent the radiance grows with one percent of albedo: near 1 if it is in, 0 if not.
+        error: the standard error of that.
+    """
+
+    included: bool | None
+    elasticity: float
+    error: float
+
+
+def albedo_included(color: Image, albedo: Image) -> Albedo:
+    """Tell from a frame whether its radiance has been divided by its albedo.
+
+    Two regressions over blocks of pixels, neither of which noise can bend: of the ratios of two channels (a path's
+    noise is nearly the same in all three), and of the fourth root of the brightness over its mean (under which one path
+    in a thousand that finds a lamp weighs no more than ten others). The standard error is that of leaving out each
+    stripe of blocks in turn.
+    """
+    usable: Mask = np.all([(albedo > 0.02).all(-1), (color >= 0).all(-1), np.isfinite(color).all(-1)], axis=0)
+    sums = []
+    lit: Mask = np.logical_and(usable, (color > 0).all(-1))
+    for one, other in ((0, 1), (1, 2)):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sums.append(
+                _slopes(np.log(albedo[..., one] / albedo[..., other]), np.log(color[..., one] / color[..., other]), lit)
+            )
+    roots = [np.sqrt(np.sqrt(np.maximum(image.mean(-1), 0))) for image in (albedo, color)]
+    sums.append(_slopes(roots[0], roots[1], usable, relative=True))
+    stripes = np.stack(sums, 0)
+    # Each way of looking weighs as its own error allows.
+    found = [_jackknife(each) for each in stripes]
+    weights = np.array([1 / max(error, 1e-3) ** 2 if np.isfinite(error) else 0.0 for _, error in found])
+    if not weights.sum():
+        return Albedo(None, float("nan"), float("inf"))
+    slope = float(sum(w * value for w, (value, _) in zip(weights, found, strict=True) if w) / weights.sum())
+    error = float(weights.sum() ** -0.5)
+    told = abs(slope - _THRESHOLD) > _SIGMAS * error and error < _LARGEST_ERROR
+    return Albedo(slope > _THRESHOLD if told else None, slope, error)
+
+
+def albedo_included_as_in(reference: Image, color: Image, albedo: Image) -> bool | None:
+    """Whether radiance has the albedo in it as its reference has; ``None`` where neither reading is clearly nearer."""
+    with_it, without = (_distance(image, reference) for image in (color, color * albedo))
+    return with_it < without if max(with_it, without) > _NEARER * min(with_it, without) else None
+
+
+def _distance(image: Image, reference: Image) -> float:
+    """Mean relative difference of large blocks, in which noise is averaged."""
+    one, other = (
+        F.adaptive_avg_pool2d(torch.from_numpy(np.nan_to_num(each)).permute(2, 0, 1).contiguous(), (6, 8))
+        for each in (image, reference)
+    )
+    return float(((one - other).abs() / (one + other + 1e-6)).mean())
+
+
+def _slopes(x: Image, y: Image, usable: Mask, *, relative: bool = False) -> Array:
+    """``(N, 2)`` covariance and variance, summed over the blocks of each of N stripes."""
+    height, width = (size // _BLOCK * _BLOCK for size in x.shape)
+
+    def blocks(image: Image | Array) -> Array:
+        cut = np.where(usable, image, 0)[:height, :width].astype(np.float64)
+        return cut.reshape(height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK).swapaxes(1, 2).reshape(-1, _BLOCK**2)
+
+    inside, xs, ys = blocks(np.ones_like(x)), blocks(x), blocks(y)
+    count = np.maximum(inside.sum(1, keepdims=True), 1)
+    mean_x, mean_y = xs.sum(1, keepdims=True) / count, ys.sum(1, keepdims=True) / count
+    if relative:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xs, ys = np.nan_to_num(xs / mean_x), np.nan_to_num(ys / mean_y)
+        known = (mean_x[:, 0] > 0) & (mean_y[:, 0] > 0)
+        mean_x, mean_y = np.ones_like(mean_x), np.ones_like(mean_y)
+    else:
+        known = np.ones(len(x), bool)
+    within = (inside > 0) & known[:, None] & (count > _BLOCK**2 / 2)
+    dx, dy = np.where(within, xs - mean_x, 0), np.where(within, ys - mean_y, 0)
+    pairs = np.stack([(dx * dy).sum(1), (dx * dx).sum(1)], 1)
+    # What is uniform but for rounding and noise of the features tells nothing.
+    pairs[pairs[:, 1] < count[:, 0] * 1e-4] = 0
+    return np.stack([pairs[k::16].sum(0) for k in range(16)])
+
+
+def _jackknife(stripes: Array) -> tuple[float, float]:
+    total = stripes.sum(0)
+    told = np.count_nonzero(stripes[:, 1])
+    if told < 8 or not total[1] > 0:
+        return 0.0, float("inf")
+    left_out = (total[0] - stripes[:, 0]) / np.maximum(total[1] - stripes[:, 1], 1e-30)
+    n = len(stripes)
+    return float(total[0] / total[1]), float(np.sqrt((n - 1) / n * ((left_out - left_out.mean()) ** 2).sum()))
+
+
+def read_radiance(
+    color: Image, albedo: Image, reference: Image | None, stated: bool | None
+) -> tuple[bool, str, list[str]]:
+    """Whether radiance has the albedo in it: as stated, or as its values tell, or else it is ordinary radiance.
+
+    Returns:
+        The answer, the words for it, and what to warn of.
+    """
+    readings = {True: "radiance with albedo", False: "radiance without albedo, which is multiplied back"}
+    if stated is not None:
+        return stated, f"{readings[stated]}, as stated", []
+    included = None if reference is None else albedo_included_as_in(reference, color, albedo)
+    why = "only so it is as bright as its reference"
+    if included is None:
+        told = albedo_included(color, albedo)
+        included = told.included
+        why = f"1 % of albedo makes {told.elasticity:.2f} +- {told.error:.2f} % of light"
+        if included is None:
+            # What has no texture at all says nothing, and is what it is called; what says something else is doubtful.
+            doubtful = told.elasticity + _SIGMAS * told.error < 2 / 3
+            warning = (
+                "'color': taken as ordinary radiance; its values do not tell whether it was divided by the albedo. If "
+                "it was, say --color-without-albedo"
+            )
+            return True, f"{readings[True]}, taken as such: its values do not tell", [warning] if doubtful else []
+    warning = (
+        "'color': taken as divided by its albedo, which is multiplied back, since only so it fits; if it is ordinary "
+        "radiance, say --color-with-albedo"
+    )
+    return included, f"{readings[included]}: {why}", [] if included else [warning]
+
+
+def normal_is_encoded(normal: Image) -> bool:
+    """Whether a normal is stored as ``n / 2 + 1 / 2``: nothing is negative, and it has unit length when decoded."""
+    present = (normal != 0).any(-1) & np.isfinite(normal).all(-1)
+    if not present.any() or normal[present].min() < -0.05 or normal[present].max() > 1.05:
+        return False
+    seen = normal[present]
+    as_stored, decoded = np.linalg.norm(seen, axis=-1), np.linalg.norm(2 * seen - 1, axis=-1)
+    return bool(np.median(np.abs(decoded - 1)) < np.median(np.abs(as_stored - 1)))
+
+
+def is_direction(vectors: Image) -> bool:
+    """Whether most vectors have unit length or none at all."""
+    length = np.linalg.norm(np.nan_to_num(vectors), axis=-1)
+    present = length > 1e-3
+    return bool(present.any() and (np.abs(length[present] - 1) < 0.05).mean() > 0.9)
+
+
+def nothing_hit(depth: Image) -> Mask:
+    """Where a depth is what a renderer writes for nothing: 0 or less, 1e9 or more, half's largest, or no number."""
+    with np.errstate(invalid="ignore"):
+        nothing: Mask = ~((depth > 0) & (depth < _FARTHEST) & (depth != LARGEST_HALF))
+    return nothing
+
+
+class Convention(NamedTuple):
+    """How a motion buffer is stored: ``previous = current + (x * scale_x, y * scale_y)`` in pixels, y down.
+
+    Args:
+        scale_x: of the first channel.
+        scale_y: of the second.
+        words: for people.
+    """
+
+    scale_x: float
+    scale_y: float
+    words: str
+
+    def apply(self, motion: Image) -> Image:
+        """``(H, W, 2)`` in pixels, y down; infinite where a renderer writes something huge or no number."""
+        scaled: Image = motion[..., :2] * np.array([self.scale_x, self.scale_y], np.float32)
+        with np.errstate(invalid="ignore"):
+            known = (np.abs(scaled) < _LARGEST_MOTION).all(-1, keepdims=True)
+        return np.where(known, scaled, np.float32(np.inf))
+
+
+USUAL_MOTION = Convention(1, 1, "previous - current, y down, pixels")
+
+
+def conventions(size: tuple[int, int], motion: Image) -> list[Convention]:
+    """Those that a motion buffer may have: two signs each, in pixels; in parts of the image where that may be."""
+    height, width = size
+    finite = motion[..., :2][np.isfinite(motion[..., :2])]
+    scales = [(1.0, 1.0, "pixels")]
+    if not finite.size or np.abs(finite[np.abs(finite) < _LARGEST_MOTION]).max(initial=0) <= 2:
+        scales += [(width, height, "parts of the image"), (width / 2, height / 2, "parts of half the image")]
+    return [
+        Convention(
+            sx * x,
+            sy * y,
+            f"{'previous - current' if sx > 0 else 'current - previous'}, {'y down' if sx == sy else 'y up'}, {unit}",
+        )
+        for (x, y, unit), sx, sy in product(scales, (1, -1), (1, -1))
+    ]
+
+
+def match_motion(
+    pairs: Sequence[tuple[Mapping[str, Image], Mapping[str, Image], Image]], given: Convention
+) -> tuple[Convention, bool]:
+    """Which convention of motion leads to the pixels of the frame before that look alike.
+
+    Args:
+        pairs: features of a frame by name, those of the frame before, and the motion as stored.
+        given: the convention that the format is known for.
+
+    Returns:
+        The given one, unless another fits clearly better; and whether the frames tell anything at all.
+    """
+    if not pairs:
+        return given, False
+    candidates = conventions(pairs[0][2].shape[:2], np.concatenate([motion for *_, motion in pairs]))
+    known = next((each for each in candidates if each[:2] == given[:2]), None)
+    candidates = candidates if known else [given, *candidates]
+    given = known or given
+    moving = sum(int((np.abs(given.apply(m)).max(-1) > _MOVES).sum()) for *_, m in pairs)
+    units = {each.words.rpartition(", ")[2] for each in candidates}
+    if moving < _LEAST_MOVING and len(units) == 1:
+        return given, False
+    errors = {each: float(np.mean([_mismatch(*pair, each) for pair in pairs])) for each in candidates}
+    best = min(errors, key=lambda each: errors[each])
+    at_rest = Convention(0, 0, "")
+    if errors[best] > 0.98 * float(np.mean([_mismatch(*pair, at_rest) for pair in pairs])):
+        return given, False
+    return (best, True) if errors[best] < _BETTER * errors[given] else (given, True)
+
+
+def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Image, convention: Convention) -> float:
+    """Mean difference of features and of those to which a motion leads; pixels that it leads outside count as 1."""
+    moved = convention.apply(motion) if convention.scale_x else np.zeros_like(motion[..., :2])
+    height, width = moved.shape[:2]
+    rows, columns = np.mgrid[:height, :width]
+    x = (columns + moved[..., 0] + 0.5) / width * 2 - 1
+    y = (rows + moved[..., 1] + 0.5) / height * 2 - 1
+    known = np.isfinite(x) & np.isfinite(y)
+    grid = torch.from_numpy(np.stack([np.where(known, x, 0), np.where(known, y, 0)], -1)).float()[None]
+    inside = known & (np.abs(x) <= 1) & (np.abs(y) <= 1)
+    total = 0.0
+    for name, image in now.items():
+        source = torch.from_numpy(before[name]).permute(2, 0, 1)[None]
+        found = F.grid_sample(source, grid, align_corners=False, padding_mode="border")[0].permute(1, 2, 0).numpy()
+        error = np.minimum(np.abs(found - image).mean(-1), 1)
+        total += float(np.where(inside, error, 1)[known].mean()) if known.any() else 1.0
+    return total
