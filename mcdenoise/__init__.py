@@ -3,11 +3,11 @@
 from importlib.metadata import version
 
 from mcdenoise import ops
-from mcdenoise.denoiser import Denoiser
+from mcdenoise.denoiser import Denoiser, denoise
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, list_models
 
 __version__ = version("mcdenoise")
 
-__all__ = ["Denoiser", "Frame", "InputError", "create_model", "list_models", "ops"]
+__all__ = ["Denoiser", "Frame", "InputError", "create_model", "denoise", "list_models", "ops"]

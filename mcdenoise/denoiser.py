@@ -1,18 +1,21 @@
-"""Streaming denoising: a frame in, a clean image out."""
+"""Streaming denoising: a frame in, a clean image out; and a still, from arrays to an array."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
+from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import MOTION, Frame, Hints, tells_motion
+from mcdenoise.frame import MOTION, Frame, Hints, Layout, tells_motion
 from mcdenoise.models import DEFAULT, Journal, Model, Output, State, create_model, listening, timed
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
@@ -137,6 +140,10 @@ class Denoiser:
             shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else MOTION), streaming)
             self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
 
+    def detach(self) -> None:
+        """Cut the graph of the history, for truncated backpropagation: ``backward`` from later frames ends here."""
+        self._state = pytree.tree_map_only(Tensor, Tensor.detach, self._state)
+
     def has_history(self, buffers: Collection[str]) -> bool:
         """Whether a frame with these buffers may have a history, or be one: else what tells motion is of no use."""
         return self.keep_all or (self._frames != 1 and tells_motion(buffers))
@@ -206,6 +213,98 @@ class Denoiser:
         if self._frames is not None and self._count + 1 >= self._frames:
             return True
         return self._buffers is not None and not self.has_history(self._buffers)
+
+
+def denoise(
+    color: ArrayLike,
+    *,
+    layout: Layout = "HWC",
+    albedo: ArrayLike | None = None,
+    normal: ArrayLike | None = None,
+    depth: ArrayLike | None = None,
+    position: ArrayLike | None = None,
+    view_projection: ArrayLike | None = None,
+    diffuse: ArrayLike | None = None,
+    specular: ArrayLike | None = None,
+    specular_albedo: ArrayLike | None = None,
+    roughness: ArrayLike | None = None,
+    hit_distance: ArrayLike | None = None,
+    emission: ArrayLike | None = None,
+    variance: ArrayLike | None = None,
+    alpha: ArrayLike | None = None,
+    samples: ArrayLike | None = None,
+    extra: Mapping[str, ArrayLike] | None = None,
+    model: str | Model | nn.Module = DEFAULT,
+    device: torch.device | str = "cpu",
+    precision: Precision = "float32",
+    **settings: Any,
+) -> NDArray[np.float32]:
+    """Denoise a still: arrays in, an array out.
+
+    The model is made anew in each call, and nothing is kept: for the frames of a shot, which have a history, and for
+    many stills take a :class:`Denoiser` and :meth:`mcdenoise.Frame.from_numpy`.
+
+    Args:
+        color: ``(H, W, 3)`` in the layout ``"HWC"``, ``(3, H, W)`` in ``"CHW"``: scene-linear radiance of any float
+            dtype. Pixels that are NaN, infinite, negative or above 1e16 are replaced, see :class:`Denoiser`.
+        layout: of every array, the result's too. It is never guessed: an array of another layout is refused.
+        albedo: like ``color``, in [0, 1]; this and the following are what the renderer wrote besides, all optional; for
+            shapes see :meth:`mcdenoise.Frame.from_numpy`, for meanings :class:`mcdenoise.Frame`.
+        normal: like ``color``, in [-1, 1].
+        depth: ``(H, W)`` or with the axis of the channel.
+        position: like ``color``; with ``view_projection`` it stands for a depth.
+        view_projection: ``(4, 4)``.
+        diffuse: like ``color``.
+        specular: like ``color``.
+        specular_albedo: like ``color``.
+        roughness: like ``depth``.
+        hit_distance: like ``depth``.
+        emission: like ``color``.
+        variance: like ``color``.
+        alpha: like ``depth``; it is there for models that use it, and is not denoised.
+        samples: ``(S, H, W, C)`` or ``(S, C, H, W)``.
+        extra: further buffers by name.
+        model: as of :class:`Denoiser`.
+        device: where to run; the result comes back from it.
+        precision: as of :class:`Denoiser`.
+        settings: further arguments of :class:`Denoiser`, such as ``weights``, and settings of the model.
+
+    Returns:
+        The clean image, float32 whatever the dtype of ``color``, in its layout, contiguous, with memory of its own.
+
+    Raises:
+        InputError: an array has another layout, size or number of channels, holds no floats or illegal values, or the
+            model lacks a buffer or has no such setting; the message names it.
+
+    Example:
+        >>> noisy, albedo = np.random.rand(24, 32, 3), np.full((24, 32, 3), 0.5)
+        >>> clean = denoise(noisy, albedo=albedo, model="cascaded_v2_micro")
+        >>> clean.shape, clean.dtype
+        ((24, 32, 3), dtype('float32'))
+    """
+    frame = Frame.from_numpy(
+        color,
+        layout=layout,
+        albedo=albedo,
+        normal=normal,
+        depth=depth,
+        position=position,
+        view_projection=view_projection,
+        diffuse=diffuse,
+        specular=specular,
+        specular_albedo=specular_albedo,
+        roughness=roughness,
+        hit_distance=hit_distance,
+        emission=emission,
+        variance=variance,
+        alpha=alpha,
+        samples=samples,
+        extra=extra,
+    )
+    denoiser = Denoiser(model, device=device, precision=precision, **settings)
+    denoiser.reset(frames=1)
+    image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()
+    return np.ascontiguousarray(image if layout == "CHW" else image.transpose(1, 2, 0))
 
 
 def _device(device: torch.device | str) -> torch.device:

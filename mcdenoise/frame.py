@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
@@ -81,6 +83,10 @@ def tells_motion(buffers: Collection[str]) -> bool:
     """Whether buffers of these names say where a pixel was in the frame before: motion, or positions and cameras."""
     return "motion" in buffers or {"position", "view_projection"} <= set(buffers)
 
+
+# Which axis of an array holds the channels.
+Layout: TypeAlias = Literal["HWC", "CHW"]
+LAYOUTS: tuple[Layout, ...] = ("HWC", "CHW")
 
 _MATRIX = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "world-to-clip matrix")
 _MATRIX_NAME = "view_projection"
@@ -219,6 +225,105 @@ class Frame:
                 shape = (batch, *samples, channels, height, width)
             if tuple(value.shape) != shape:
                 raise InputError(f"buffer '{name}': expected shape {shape} like 'color', found {tuple(value.shape)}")
+
+    @classmethod
+    def from_numpy(
+        cls,
+        color: ArrayLike,
+        *,
+        layout: Layout = "HWC",
+        albedo: ArrayLike | None = None,
+        normal: ArrayLike | None = None,
+        depth: ArrayLike | None = None,
+        position: ArrayLike | None = None,
+        motion: ArrayLike | None = None,
+        previous_position: ArrayLike | None = None,
+        view_projection: ArrayLike | None = None,
+        diffuse: ArrayLike | None = None,
+        specular: ArrayLike | None = None,
+        specular_albedo: ArrayLike | None = None,
+        roughness: ArrayLike | None = None,
+        hit_distance: ArrayLike | None = None,
+        emission: ArrayLike | None = None,
+        variance: ArrayLike | None = None,
+        alpha: ArrayLike | None = None,
+        samples: ArrayLike | None = None,
+        reference: ArrayLike | None = None,
+        extra: Mapping[str, ArrayLike] | None = None,
+    ) -> Frame:
+        """A frame of one image, as a renderer's Python interface hands over its buffers: arrays without a batch.
+
+        Arrays are of any float dtype, which is kept (``longdouble`` becomes float64), of any strides and byte order. A
+        tensor shares the memory of its array wherever torch can: where that is writable, in native byte order and
+        without negative strides; otherwise it is a copy.
+
+        Args:
+            color: ``(H, W, 3)`` in the layout ``"HWC"``, ``(3, H, W)`` in ``"CHW"``.
+            layout: of every array. It is never guessed: an array of another layout is refused.
+            albedo: like ``color``; for the meaning of each buffer see :class:`Frame`.
+            normal: like ``color``.
+            depth: ``(H, W)``, as every buffer of one channel may be, or with the axis of the channel.
+            position: like ``color``.
+            motion: of two channels.
+            previous_position: like ``color``.
+            view_projection: ``(4, 4)``.
+            diffuse: like ``color``.
+            specular: like ``color``.
+            specular_albedo: like ``color``.
+            roughness: like ``depth``.
+            hit_distance: like ``depth``.
+            emission: like ``color``.
+            variance: like ``color``.
+            alpha: like ``depth``.
+            samples: ``(S, H, W, C)`` or ``(S, C, H, W)``.
+            reference: like ``color``.
+            extra: further buffers by name, each ``(H, W)`` or of any number of channels.
+
+        Raises:
+            InputError: an array has another layout, size or number of channels, or holds no floats; the message names
+                it, in the shapes of the layout.
+
+        Example:
+            >>> import numpy as np
+            >>> frame = Frame.from_numpy(np.ones((4, 6, 3), np.float32), depth=np.ones((4, 6), np.float32))
+            >>> frame.color.shape, frame.depth.shape
+            (torch.Size([1, 3, 4, 6]), torch.Size([1, 1, 4, 6]))
+            >>> Frame.from_numpy(np.ones((3, 4, 6)))
+            Traceback (most recent call last):
+            ...
+            mcdenoise.errors.InputError: buffer 'color': expected shape (H, W, 3), found (3, 4, 6); pass layout='CHW'
+        """
+        if layout not in LAYOUTS:
+            raise InputError(f"layout: expected one of {', '.join(LAYOUTS)}, found {layout!r}")
+        given: dict[str, ArrayLike | None] = {
+            "albedo": albedo,
+            "normal": normal,
+            "depth": depth,
+            "position": position,
+            "motion": motion,
+            "previous_position": previous_position,
+            "view_projection": view_projection,
+            "diffuse": diffuse,
+            "specular": specular,
+            "specular_albedo": specular_albedo,
+            "roughness": roughness,
+            "hit_distance": hit_distance,
+            "emission": emission,
+            "variance": variance,
+            "alpha": alpha,
+            "samples": samples,
+            "reference": reference,
+        }
+        image = _of_array("color", color, layout, None)
+        size = (image.shape[2], image.shape[3])
+        buffers: dict[str, Any] = {
+            name: _of_array(name, value, layout, size) for name, value in given.items() if value is not None
+        }
+        for name in extra or {}:
+            if name in _NAMES:
+                raise InputError(f"extra: expected names that Frame does not know, found '{name}'; pass {name}=...")
+        others = {name: _of_array(name, value, layout, size) for name, value in (extra or {}).items()}
+        return cls(color=image, **buffers, extra=others)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -396,6 +501,65 @@ def _mended(color: Tensor, usable: Tensor) -> Tensor:
     total = torch.nn.functional.avg_pool2d(zeroed.to(dtype) / 9, 3, stride=1, padding=1, divisor_override=1)
     count = torch.nn.functional.avg_pool2d(usable.to(dtype), 3, stride=1, padding=1, divisor_override=1)
     return torch.where(usable, color, (total * (9 / count.clamp_min(1))).to(color.dtype))
+
+
+def _of_array(name: str, value: ArrayLike, layout: Layout, size: tuple[int, int] | None) -> Tensor:
+    """A buffer of an array, with a batch of one; ``size`` is that of color, and not there for color itself."""
+    array = _floats(name, value)
+    if name == _MATRIX_NAME:
+        if array.shape != (4, 4):
+            raise InputError(f"buffer '{name}': expected shape (4, 4), found {array.shape}")
+        return torch.from_numpy(array)[None]
+    # A buffer that is not in the vocabulary has any number of channels, and so have samples.
+    wanted = BUFFERS[name].channels if name in BUFFERS else None
+    axis, axes = -1 if layout == "HWC" else -3, 4 if name == "samples" else 3
+    found = array.shape
+    if array.ndim == 2 and wanted in (1, None):
+        array = np.expand_dims(array, axis)
+    fits = array.ndim == axes and 0 not in array.shape and wanted in (None, array.shape[axis])
+    image = np.moveaxis(array, axis, -3) if fits else array
+    if not fits or image.shape[-2:] != (size or image.shape[-2:]):
+        height, width = size or ("H", "W")
+        expected = [height, width, wanted or "C"] if layout == "HWC" else [wanted or "C", height, width]
+        listed = ", ".join(str(each) for each in (["S", *expected] if name == "samples" else expected))
+        like = f"{' or ' + str(size) if wanted == 1 else ''} like 'color'" if size else ""
+        advice = "" if size else _advice(array, axis)
+        raise InputError(f"buffer '{name}': expected shape ({listed}){like}, found {found}{advice}")
+    return torch.from_numpy(image)[None]
+
+
+def _advice(color: NDArray[Any], axis: int) -> str:
+    """What to do with an array that is no color."""
+    if color.ndim == 4:
+        return "; pass one image, or tensors (B, C, H, W) to Frame itself"
+    if color.ndim == 3 and color.shape[axis] == 4:
+        return "; pass its first three channels, and the fourth as alpha"
+    if color.ndim == 3 and color.shape[-4 - axis] == 3:
+        return f"; pass layout='{'CHW' if axis == -1 else 'HWC'}'"
+    return ""
+
+
+def _floats(name: str, value: ArrayLike) -> NDArray[Any]:
+    """An array of floats that torch can share the memory of: a copy where it cannot."""
+    if isinstance(value, Tensor):
+        raise InputError(f"buffer '{name}': expected a numpy array, found a torch.Tensor; Frame itself takes tensors")
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"buffer '{name}': expected an array, found {type(value).__name__}: {error}") from error
+    if array.dtype.kind != "f":
+        advice = "convert it with astype(numpy.float32)"
+        if array.dtype in (np.uint8, np.uint16):
+            advice = f"undo the encoding of a display first, about (x / {np.iinfo(array.dtype).max}) ** 2.2"
+        raise InputError(
+            f"buffer '{name}': expected a float dtype, as images are scene-linear floats, found {array.dtype}; {advice}"
+        )
+    if array.dtype.itemsize > 8:
+        array = array.astype(np.float64)
+    if not array.dtype.isnative:
+        array = array.astype(array.dtype.newbyteorder("="))
+    shared = array.flags.writeable and all(each >= 0 and each % array.itemsize == 0 for each in array.strides)
+    return array if shared else array.copy()
 
 
 def _check_buffer(name: str, value: object) -> None:

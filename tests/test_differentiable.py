@@ -131,3 +131,20 @@ def test_derivative_in_the_normals_of_the_same_frame() -> None:
     assert isinstance(model, nn.Module)
     sizes = check(Denoiser(model.double(), differentiable=True), shot((24, 40), 1)[:1], ("color", "albedo", "normal"))
     assert all(size > 0 for size in sizes.values())
+
+
+def test_detach_ends_the_graph_and_changes_no_image() -> None:
+    frames = [{name: buffer.float() for name, buffer in each.items()} for each in shot((24, 32), frames=2)]
+    images = []
+    for cut in (False, True):
+        denoiser = Denoiser("cascaded_v2_micro", differentiable=True)
+        leaves = [each["color"].clone().requires_grad_() for each in frames]
+        for frame, color in zip(frames, leaves, strict=True):
+            image = denoiser(Frame(**{**frame, "color": color}))
+            if cut:
+                denoiser.detach()
+        images.append(image.detach())
+        image.sum().backward()
+        assert (leaves[0].grad is None) is cut
+        assert leaves[1].grad is not None
+    assert torch.equal(*images)

@@ -46,6 +46,8 @@ ALLOWED: dict[str, set[str]] = {
     "scenes": SIGNAL | {"data"},
     "denoiser": SIGNAL | {"models"},
     "methods": SIGNAL | {"models", "denoiser"},
+    # For scripts of a renderer: nothing of the package imports them.
+    "integrations": SIGNAL | {"models", "denoiser"},
     "folder": LIBRARY,
     "check": LIBRARY | {"methods", "own"},
     "evaluate": LIBRARY | {"folder"},

@@ -62,7 +62,8 @@ class Upsampling(nn.ConvTranspose2d):
     """A transposed convolution whose bias learns in a twentieth of the time."""
 
     def forward(self, x: Tensor, output_size: list[int] | None = None) -> Tensor:
-        if self.bias is None or not torch.is_grad_enabled():
+        # A bias that does not learn needs nothing, and torch's own has derivatives forward.
+        if self.bias is None or not (self.bias.requires_grad and torch.is_grad_enabled()):
             return super().forward(x, output_size)
         return _Biased.apply(F.conv_transpose2d(x, self.weight, self.bias.detach(), self.stride), self.bias)
 

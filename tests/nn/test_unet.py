@@ -146,3 +146,16 @@ def test_unet_sees_what_it_is_given_at_coarser_scales() -> None:
 def test_unet_needs_a_decoder_level_for_each_scale(levels: int, half: bool, lowest: int) -> None:
     with pytest.raises(ValueError, match=f"levels: expected at least {lowest}, found {levels}"):
         UNet(5, 4, levels, half=half)
+
+
+# Of torch's own making, when its rules for forward mode are loaded.
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+def test_a_network_that_does_not_learn_has_its_derivative_forward() -> None:
+    unet = UNet(3, 4).double().requires_grad_(False)
+    image, direction = (torch.randn(1, 3, 16, 24, dtype=torch.float64) for _ in range(2))
+    _, forward = torch.func.jvp(lambda x: unet(x)[0], (image,), (direction,))
+    leaf = image.clone().requires_grad_()
+    weights = torch.randn_like(forward)
+    (unet(leaf)[0] * weights).sum().backward()
+    assert leaf.grad is not None
+    torch.testing.assert_close((forward * weights).sum(), (leaf.grad * direction).sum())

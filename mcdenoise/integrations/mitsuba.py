@@ -1,0 +1,341 @@
+"""In the place of ``mi.OptixDenoiser``: the same arguments, with every method of the zoo, on any processor.
+
+Dr.Jit and Mitsuba are optional (``pip install 'mcdenoise[render]'``) and imported when a denoiser is made.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+from collections.abc import Mapping
+from typing import Any, overload
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.denoiser import Denoiser, Precision
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models import DEFAULT, Model
+
+_ROOT = "<root>"
+# Color, and alpha where there is one; a monochromatic variant renders luminance.
+_FORMATS = ("Y", "YA", "RGB", "RGBA")
+_CHANNELS = {"albedo": 3, "normals": 3, "flow": 2}
+
+
+class MitsubaDenoiser:
+    """Denoises what Mitsuba 3 renders, called as ``mi.OptixDenoiser`` (Mitsuba 3.9) is called.
+
+    A script changes in the line that makes the denoiser. What differs then: it runs in every variant and on every
+    processor, and gradients of a ``TensorXf`` go through it.
+
+    **Bitmaps** come back in the pixel format of what was noisy, as float32 and linear; a bitmap of another component
+    format, or encoded for a display, is converted first.
+
+    **Tensors** come back as tensors of the same shape. In a variant that differentiates (``llvm_ad_rgb``,
+    ``cuda_ad_rgb``), derivatives in ``noisy``, ``albedo``, ``normals`` and ``flow`` go through :func:`drjit.wrap`,
+    backward and forward, if one of them has gradients enabled; if none has, no graph is kept. Decisions are held fixed,
+    see ``differentiable`` of :class:`mcdenoise.Denoiser`. A history counts as a constant: gradients do not reach the
+    frames before. Parameters of a model given by name have no gradients; those of a module of yours get theirs.
+
+    **Temporal denoising**: this denoiser keeps its own history, which is more than the image before (the radiance that
+    was accumulated, its length, the surfaces that were seen), and so takes no image from ``previous_denoised``. That
+    argument only tells where a shot begins: with ``None``, or with the noisy image itself (which OptiX asks for in the
+    first frame), the history is forgotten; with anything else, such as the result of the call before, it goes on. The
+    frames of a shot are to be given in order, each once.
+
+    **Flow** is that of OptiX: pixels, x right and y down, from where a point was in the previous frame to where it is
+    now, ``previous = current - flow``. (NVIDIA's Falcor hands the negative of its motion vectors, which lead from the
+    current to the previous frame, to OptiX.) Zeros mean that nothing moves.
+
+    **Normals** may be in world space, as the ``aov`` integrator writes them, or in that of the sensor. ``to_sensor`` is
+    accepted and not needed: methods compare normals with each other and with those of the frame before, which in world
+    space stay what they are while the camera turns.
+
+    Values that an ``aov`` integrator is known to write are mended: albedo is clamped to [0, 1] (a rough conductor
+    reaches 93), normals to [-1, 1] (reconstruction filters overshoot). Pixels of the color that are NaN, infinite,
+    negative or above 1e16 are replaced, see ``denoiser.report``.
+
+    Args:
+        input_size: width and height of every image.
+        albedo: whether the renderer's albedo will be given, too. What is given without having been announced is not
+            looked at, as by OptiX.
+        normals: whether shading normals will be given; unlike OptiX, also without albedo.
+        temporal: whether calls are the frames of a shot, with flow; else each is a still.
+        denoise_alpha: whether alpha, the second or fourth channel, is denoised, too: as if it were the color of a white
+            surface, which takes as long again. Else it stays as it is.
+        model: as of :class:`mcdenoise.Denoiser`.
+        device: of torch. By default a GPU for the CUDA variants, where torch has one, else the CPU.
+        precision: as of :class:`mcdenoise.Denoiser`.
+        settings: its further arguments (``weights``, ``tile``, ``max_memory``), and settings of the model.
+
+    Attributes:
+        denoiser: the :class:`mcdenoise.Denoiser` as it was after the last call; its ``report`` says what was done.
+
+    Raises:
+        InputError: Mitsuba is missing, the size is none, or :class:`mcdenoise.Denoiser` refuses its arguments.
+
+    Example:
+        ::
+
+            import mitsuba as mi
+            from mcdenoise.integrations.mitsuba import MitsubaDenoiser
+
+            mi.set_variant("scalar_rgb")
+            aovs = {"type": "aov", "aovs": "albedo:albedo,normals:sh_normal", "image": {"type": "path"}}
+            scene = mi.load_dict(mi.cornell_box() | {"integrator": aovs})
+            mi.render(scene, spp=1)
+            film = scene.sensors()[0].film()
+            # denoiser = mi.OptixDenoiser(film.size(), albedo=True, normals=True)
+            denoiser = MitsubaDenoiser(film.size(), albedo=True, normals=True)
+            clean = denoiser(film.bitmap(), albedo_ch="albedo", normals_ch="normals")
+    """
+
+    def __init__(
+        self,
+        input_size: Any,
+        albedo: bool = False,
+        normals: bool = False,
+        temporal: bool = False,
+        denoise_alpha: bool = False,
+        *,
+        model: str | Model | nn.Module = DEFAULT,
+        device: torch.device | str | None = None,
+        precision: Precision = "float32",
+        **settings: Any,
+    ) -> None:
+        self._mi, self._dr = _import("mitsuba"), _import("drjit")
+        self._size = _size(input_size)
+        self._announced = {"albedo": albedo, "normals": normals, "flow": temporal}
+        self._temporal, self._denoise_alpha = temporal, denoise_alpha
+        if device is None:
+            cuda = str(self._mi.variant()).startswith("cuda") and torch.cuda.is_available()
+            device = "cuda" if cuda else "cpu"
+        self.denoiser = Denoiser(model, device=device, precision=precision, **settings)
+        if isinstance(model, str) and isinstance(self.denoiser.model, nn.Module):
+            self.denoiser.model.requires_grad_(False)
+
+    @overload
+    def __call__(
+        self,
+        noisy: Any,
+        albedo: Any = None,
+        normals: Any = None,
+        to_sensor: Any = None,
+        flow: Any = None,
+        previous_denoised: Any = None,
+    ) -> Any: ...
+
+    @overload
+    def __call__(
+        self,
+        noisy: Any,
+        albedo_ch: str = "",
+        normals_ch: str = "",
+        to_sensor: Any = None,
+        flow_ch: str = "",
+        previous_denoised_ch: str = "",
+        noisy_ch: str = _ROOT,
+    ) -> Any: ...
+
+    def __call__(self, noisy: Any, *arguments: Any, **named: Any) -> Any:
+        """Denoise a tensor or a bitmap.
+
+        For a ``mi.TensorXf`` the arguments are ``(noisy, albedo=None, normals=None, to_sensor=None, flow=None,
+        previous_denoised=None)``, all tensors ``(height, width, channels)``; for a ``mi.Bitmap`` they are ``(noisy,
+        albedo_ch="", normals_ch="", to_sensor=None, flow_ch="", previous_denoised_ch="", noisy_ch="<root>")``, names of
+        layers in it.
+
+        Args:
+            noisy: radiance, 3 or 4 channels, of a monochromatic variant 1 or 2: with alpha behind. A bitmap of several
+                layers holds the other buffers, too.
+            arguments: see above; the meaning of each is that of ``mi.OptixDenoiser``, as far as the class does not say
+                otherwise.
+            named: the same by name.
+
+        Returns:
+            Clean radiance: a tensor of the shape of ``noisy``, or a float32 bitmap with the pixel format of the noisy
+            layer. Alpha is kept.
+
+        Raises:
+            InputError: a buffer that was announced is not given, a layer is not there, a buffer has another size or
+                number of channels, or values that no denoiser can use.
+        """
+        if isinstance(noisy, self._mi.Bitmap):
+            return self._bitmap(noisy, *arguments, **named)
+        if self._dr.is_tensor_v(noisy):
+            return self._tensors(noisy, *arguments, **named)
+        raise InputError(f"noisy: expected a mitsuba.Bitmap or TensorXf, found {type(noisy).__name__}")
+
+    def _bitmap(
+        self,
+        noisy: Any,
+        albedo_ch: str = "",
+        normals_ch: str = "",
+        to_sensor: Any = None,
+        flow_ch: str = "",
+        previous_denoised_ch: str = "",
+        noisy_ch: str = _ROOT,
+    ) -> Any:
+        layers = {noisy_ch: noisy}
+        if noisy.pixel_format() == self._mi.Bitmap.PixelFormat.MultiChannel:
+            layers = dict(noisy.split())
+
+        def layer(argument: str, name: str) -> Any:
+            if name not in layers:
+                found = ", ".join(f"'{each}'" for each in layers)
+                raise InputError(
+                    f"{argument}: expected the name of a layer of the bitmap, found '{name}' among {found}"
+                )
+            return layers[name]
+
+        image = layer("noisy_ch", noisy_ch)
+        kind = image.pixel_format()
+        if kind.name not in _FORMATS:
+            raise InputError(
+                f"noisy: expected layer '{noisy_ch}' in a pixel format of {', '.join(_FORMATS)}, found {kind.name}; "
+                "convert it, or name another layer with noisy_ch"
+            )
+        names = {"albedo": albedo_ch, "normals": normals_ch, "flow": flow_ch}
+        buffers = {name: self._read(layer(f"{name}_ch", ch)) for name, ch in names.items() if ch}
+        previous = self._read(layer("previous_denoised_ch", previous_denoised_ch)) if previous_denoised_ch else None
+        color = self._read(image)
+        buffers = self._checked(color, buffers)
+        self._begin(color, previous)
+        clean = self._step(self.denoiser, color, buffers, differentiable=False)
+        pixels = np.ascontiguousarray(clean.cpu().numpy())
+        result = self._mi.Bitmap(pixels, kind)
+        result.set_premultiplied_alpha(image.premultiplied_alpha())
+        return result
+
+    def _tensors(
+        self,
+        noisy: Any,
+        albedo: Any = None,
+        normals: Any = None,
+        to_sensor: Any = None,
+        flow: Any = None,
+        previous_denoised: Any = None,
+    ) -> Any:
+        given = {"albedo": albedo, "normals": normals, "flow": flow, "previous_denoised": previous_denoised}
+        for name, each in given.items():
+            if each is not None and not self._dr.is_tensor_v(each):
+                raise InputError(f"{name}: expected a TensorXf like noisy, found {type(each).__name__}")
+        # As in Mitsuba, an empty tensor is one that is not given.
+        given = {name: each for name, each in given.items() if each is not None and len(each)}
+        last = given.pop("previous_denoised", None)
+        given = {name: each for name, each in given.items() if self._announced[name]}
+        color, previous = noisy.torch(), None if last is None else last.torch()
+        buffers = self._checked(color, {name: each.torch() for name, each in given.items()})
+        self._begin(color, previous)
+        if not any(self._dr.grad_enabled(each) for each in (noisy, *given.values())):
+            return type(noisy)(self._step(self.denoiser, color, buffers, differentiable=False))
+        return self._differentiable(noisy, given)
+
+    def _differentiable(self, noisy: Any, given: Mapping[str, Any]) -> Any:
+        """The step as an operation of Dr.Jit."""
+        # Dr.Jit may compute the function again for derivatives forward: each time from the history before the frame.
+        before, after = self.denoiser, []
+
+        def step(color: Tensor, buffers: dict[str, Tensor]) -> Tensor:
+            denoiser = copy.copy(before)
+            clean = self._step(denoiser, color, buffers, differentiable=True)
+            after.append(denoiser)
+            return clean
+
+        try:
+            clean = self._dr.wrap(source="drjit", target="torch")(step)(noisy, dict(given))
+        except RuntimeError as error:
+            if isinstance(error.__cause__, InputError):
+                raise error.__cause__ from None
+            raise
+        self.denoiser = after[0]
+        self.denoiser.detach()
+        return clean
+
+    def _begin(self, noisy: Tensor, previous: Tensor | None) -> None:
+        """Forget the history where a shot begins."""
+        if not self._temporal:
+            self.denoiser.reset(frames=1)
+        elif previous is None or torch.equal(previous.nan_to_num(), noisy.nan_to_num()):
+            self.denoiser.reset()
+
+    def _step(
+        self, denoiser: Denoiser, noisy: Tensor, buffers: Mapping[str, Tensor], *, differentiable: bool
+    ) -> Tensor:
+        """Denoise ``(H, W, C)`` images, and keep the history in this denoiser."""
+        colors = 3 if noisy.shape[2] > 2 else 1
+        color, alpha = _planes(noisy[..., :colors]).expand(-1, 3, -1, -1), _planes(noisy[..., colors:])
+        features: dict[str, Any] = {}
+        if "albedo" in buffers:
+            features["albedo"] = _planes(buffers["albedo"]).clamp(0, 1)
+        if "normals" in buffers:
+            features["normal"] = _planes(buffers["normals"]).clamp(-1, 1)
+        if "flow" in buffers:
+            features["motion"] = -_planes(buffers["flow"])
+        with_alpha = self._denoise_alpha and alpha.shape[1] > 0
+        if with_alpha:
+            # A second image of the batch: what is not covered by a surface is black, and the surface white.
+            color = torch.cat([color, alpha.expand(-1, 3, -1, -1)])
+            features = {
+                name: torch.cat([each, torch.ones_like(each) if name == "albedo" else each])
+                for name, each in features.items()
+            }
+        denoiser.differentiable = differentiable
+        image = denoiser(Frame(color, **features)).to(noisy.device)
+        if with_alpha:
+            alpha = image[1:].mean(1, keepdim=True).clamp(0, 1)
+        clean = image[:1] if colors == 3 else image[:1].mean(1, keepdim=True)
+        return torch.cat([clean, alpha], 1)[0].permute(1, 2, 0).contiguous()
+
+    def _checked(self, noisy: Tensor, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The buffers that were announced, all of the size that was."""
+        width, height = self._size
+        sized = f"for images of {width}x{height} (width x height)"
+        if noisy.ndim != 3 or noisy.shape[2] not in (1, 2, 3, 4) or noisy.shape[:2] != (height, width):
+            raise InputError(
+                f"noisy: expected shape ({height}, {width}, 3 or 4) {sized}, found {tuple(noisy.shape)}; make a "
+                "denoiser for each size, and give albedo and normals by themselves"
+            )
+        found = {}
+        for name, channels in _CHANNELS.items():
+            if not self._announced[name]:
+                continue
+            if name not in buffers:
+                argument = "temporal" if name == "flow" else name
+                advice = "; it may be zero" if name == "flow" else ""
+                raise InputError(f"{name}: expected, as the denoiser was made with {argument}=True, found none{advice}")
+            shape, expected = tuple(buffers[name].shape), (height, width, channels)
+            if shape != expected:
+                raise InputError(f"{name}: expected shape {expected} {sized}, found {shape}")
+            found[name] = buffers[name]
+        return found
+
+    def _read(self, bitmap: Any) -> Tensor:
+        """``(H, W, C)`` linear float32 pixels."""
+        # Mitsuba converts no channels that it has no name for; those of vectors are numbers as they are.
+        if bitmap.pixel_format() != self._mi.Bitmap.PixelFormat.MultiChannel:
+            bitmap = bitmap.convert(component_format=self._mi.Struct.Type.Float32, srgb_gamma=False)
+        pixels = torch.from_numpy(np.array(bitmap).astype(np.float32))
+        return pixels if pixels.ndim == 3 else pixels[..., None]
+
+
+def _planes(image: Tensor) -> Tensor:
+    return image.permute(2, 0, 1)[None]
+
+
+def _size(input_size: Any) -> tuple[int, int]:
+    # A vector of Dr.Jit has an axis for its lanes.
+    sizes = np.ravel(np.array(input_size)).tolist()
+    if len(sizes) != 2 or any(int(each) != each or each < 1 for each in sizes):
+        raise InputError(f"input_size: expected width and height in pixels, found {input_size}")
+    return int(sizes[0]), int(sizes[1])
+
+
+def _import(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(f"{name} is needed, which is not installed; pip install 'mcdenoise[render]'") from error

@@ -1,0 +1,254 @@
+"""Arrays in, an array out: what `Frame.from_numpy` and `denoise` take, in which layout, and what they refuse."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import mcdenoise
+from mcdenoise import Denoiser, Frame, InputError, denoise
+from mcdenoise.frame import BUFFERS, LAYOUTS, Layout
+
+HEIGHT, WIDTH = 5, 7
+MODEL = "cascaded_v2_micro"
+# What Accumulated adds to a frame: no renderer writes them.
+OWN = {"current", "length"}
+
+
+def image(channels: int, layout: Layout = "HWC", *, seed: int = 0, dtype: Any = np.float32) -> np.ndarray[Any, Any]:
+    """The same pixels in either layout."""
+    pixels = np.random.default_rng(seed).random((HEIGHT, WIDTH, channels)).astype(dtype)
+    return pixels if layout == "HWC" else np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
+
+
+def complaint(error: pytest.ExceptionInfo[InputError]) -> str:
+    """The message of an error, which must be one line."""
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_buffer_of_a_renderer_arrives_in_its_place(layout: Layout) -> None:
+    names = [name for name in BUFFERS if name not in OWN]
+    arrays = {name: image(BUFFERS[name].channels, layout, seed=seed) for seed, name in enumerate(names)}
+    matrix = np.arange(16.0).reshape(4, 4)
+    samples = np.stack([image(5, layout, seed=seed) for seed in (50, 51)])
+    extra = {"crypto": image(2, layout, seed=60), "mask": image(1, seed=61)[..., 0]}
+    frame = Frame.from_numpy(**arrays, layout=layout, view_projection=matrix, samples=samples, extra=extra)
+    assert frame.buffers == {*names, "view_projection", "samples", "crypto", "mask"}
+    for seed, name in enumerate(names):
+        tensor = frame.buffer(name)
+        assert tensor is not None
+        assert tensor.shape == (1, BUFFERS[name].channels, HEIGHT, WIDTH)
+        pixels = image(BUFFERS[name].channels, seed=seed)
+        assert torch.equal(tensor[0].permute(1, 2, 0), torch.from_numpy(pixels)), name
+    assert frame.view_projection is not None
+    assert torch.equal(frame.view_projection[0], torch.from_numpy(matrix))
+    assert frame.samples is not None
+    assert torch.equal(frame.samples[0, 1].permute(1, 2, 0), torch.from_numpy(image(5, seed=51)))
+    assert torch.equal(frame.extra["crypto"][0].permute(1, 2, 0), torch.from_numpy(image(2, seed=60)))
+    assert frame.extra["mask"].shape == (1, 1, HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_one_channel_needs_no_axis(layout: Layout) -> None:
+    depth = image(1, layout)
+    for value in (depth, depth.squeeze()):
+        frame = Frame.from_numpy(image(3, layout), depth=value, layout=layout)
+        assert frame.depth is not None
+        assert torch.equal(frame.depth[0, 0], torch.from_numpy(depth.squeeze()))
+
+
+def test_an_image_three_pixels_wide_is_of_the_layout_that_is_named() -> None:
+    cube = np.random.default_rng(0).random((3, 3, 3)).astype(np.float32)
+    first, second = (Frame.from_numpy(cube, layout=layout).color[0] for layout in LAYOUTS)
+    assert torch.equal(second, torch.from_numpy(cube))
+    assert torch.equal(first, torch.from_numpy(cube).permute(2, 0, 1))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "kept"),
+    [
+        (np.float16, torch.float16),
+        (np.float32, torch.float32),
+        (np.float64, torch.float64),
+        (np.longdouble, torch.float64),
+        (">f4", torch.float32),
+        ("<f8", torch.float64),
+    ],
+)
+def test_any_float_dtype(dtype: Any, kept: torch.dtype) -> None:
+    pixels = image(3, dtype=dtype)
+    frame = Frame.from_numpy(pixels)
+    assert frame.color.dtype == kept
+    assert np.array_equal(frame.color[0].permute(1, 2, 0).numpy(), pixels)
+
+
+def read_only(pixels: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    copied = pixels.copy()
+    copied.flags.writeable = False
+    return copied
+
+
+def unaligned(pixels: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """A field of records of 5 bytes."""
+    records = np.zeros(pixels.shape, dtype=[("flag", "u1"), ("value", "<f4")])
+    records["value"] = pixels
+    return records["value"]
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        read_only,
+        unaligned,
+        lambda pixels: pixels[::-1, ::-1].copy()[::-1, ::-1],
+        lambda pixels: np.asfortranarray(pixels),
+        lambda pixels: np.repeat(pixels, 2, axis=1)[:, ::2],
+        lambda pixels: np.concatenate([pixels, pixels], axis=2)[..., :3],
+    ],
+    ids=["read-only", "unaligned", "negative strides", "Fortran order", "every other", "of RGBRGB"],
+)
+def test_arrays_of_any_memory(view: Any) -> None:
+    pixels = image(3)
+    given = view(pixels)
+    frame = Frame.from_numpy(given, albedo=given)
+    assert torch.equal(frame.color[0].permute(1, 2, 0), torch.from_numpy(pixels))
+
+
+def test_memory_is_shared_where_that_is_possible() -> None:
+    pixels, fixed = image(3), read_only(image(3))
+    frame = Frame.from_numpy(pixels, albedo=fixed)
+    frame.color[0, 1, 2, 3] = 8
+    assert pixels[2, 3, 1] == 8
+    assert frame.albedo is not None
+    frame.albedo[0, 1, 2, 3] = 8
+    assert fixed[2, 3, 1] != 8
+
+
+@pytest.mark.parametrize(
+    ("color", "layout", "message"),
+    [
+        (image(3, "CHW"), "HWC", "expected shape (H, W, 3), found (3, 5, 7); pass layout='CHW'"),
+        (image(3, "HWC"), "CHW", "expected shape (3, H, W), found (5, 7, 3); pass layout='HWC'"),
+        (image(4), "HWC", "expected shape (H, W, 3), found (5, 7, 4); pass its first three channels"),
+        (image(4, "CHW"), "CHW", "expected shape (3, H, W), found (4, 5, 7); pass its first three channels"),
+        (image(1)[..., 0], "HWC", "expected shape (H, W, 3), found (5, 7)"),
+        (image(3)[None], "HWC", "expected shape (H, W, 3), found (1, 5, 7, 3); pass one image, or tensors"),
+        (image(3)[:0], "HWC", "expected shape (H, W, 3), found (0, 7, 3)"),
+        (np.uint8(image(3)), "HWC", "found uint8; undo the encoding of a display first, about (x / 255)"),
+        (np.uint16(image(3)), "HWC", "found uint16; undo the encoding of a display first, about (x / 65535)"),
+        (np.int32(image(3)), "HWC", "found int32; convert it with astype(numpy.float32)"),
+        (image(3) + 1j, "HWC", "found complex64"),
+        (torch.ones(5, 7, 3), "HWC", "expected a numpy array, found a torch.Tensor"),
+        ([[1.0], [1.0, 2.0]], "HWC", "expected an array, found list"),
+        ("image.exr", "HWC", "expected a float dtype"),
+    ],
+)  # fmt: skip
+def test_what_is_no_color_is_told_in_one_line(color: Any, layout: Layout, message: str) -> None:
+    for function in (Frame.from_numpy, denoise):
+        with pytest.raises(InputError) as caught:
+            function(color, layout=layout)
+        assert complaint(caught).startswith("buffer 'color': ")
+        assert message in complaint(caught)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("albedo", image(3)[1:], "expected shape (5, 7, 3) like 'color', found (4, 7, 3)"),
+        ("albedo", image(3, "CHW"), "expected shape (5, 7, 3) like 'color', found (3, 5, 7)"),
+        ("normal", image(4), "expected shape (5, 7, 3) like 'color', found (5, 7, 4)"),
+        ("normal", image(1)[..., 0], "expected shape (5, 7, 3) like 'color', found (5, 7)"),
+        ("depth", image(3), "expected shape (5, 7, 1) or (5, 7) like 'color', found (5, 7, 3)"),
+        ("depth", image(1)[:, 1:, 0], "expected shape (5, 7, 1) or (5, 7) like 'color', found (5, 6)"),
+        ("samples", image(3), "expected shape (S, 5, 7, C) like 'color', found (5, 7, 3)"),
+        ("view_projection", np.eye(3), "expected shape (4, 4), found (3, 3)"),
+        ("view_projection", np.eye(4)[None], "expected shape (4, 4), found (1, 4, 4)"),
+        ("depth", image(1).astype(bool), "expected a float dtype"),
+    ],
+)
+def test_what_is_no_buffer_of_the_color_is_told_in_one_line(name: str, value: Any, message: str) -> None:
+    for function in (Frame.from_numpy, denoise):
+        with pytest.raises(InputError) as caught:
+            function(image(3), **{name: value})
+        assert complaint(caught).startswith(f"buffer '{name}': ")
+        assert message in complaint(caught)
+
+
+def test_names_and_layouts_that_are_none() -> None:
+    with pytest.raises(InputError, match="layout: expected one of HWC, CHW, found 'NHWC'"):
+        Frame.from_numpy(image(3), layout="NHWC")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="normals"):
+        Frame.from_numpy(image(3), normals=image(3))  # type: ignore[call-arg]
+    with pytest.raises(InputError, match="normals"):
+        denoise(image(3), normals=image(3), model=MODEL)
+    with pytest.raises(
+        InputError, match=r"extra: expected names that Frame does not know, found 'albedo'; pass albedo="
+    ):
+        Frame.from_numpy(image(3), extra={"albedo": image(3)})
+    with pytest.raises(InputError, match=r"buffer 'crypto': expected shape \(5, 7, C\)"):
+        Frame.from_numpy(image(3), extra={"crypto": image(2)[1:]})
+
+
+# A still in one call
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_a_still_is_what_the_denoiser_makes_of_it(layout: Layout, dtype: Any) -> None:
+    color, albedo, normal = (image(3, layout, seed=seed, dtype=dtype) for seed in range(3))
+    depth = image(1, layout, seed=3, dtype=dtype)
+    before = color.copy()
+    clean = denoise(color, albedo=albedo, normal=normal, depth=depth, layout=layout, model=MODEL)
+    assert np.array_equal(color, before)
+    assert clean.shape == color.shape
+    assert clean.dtype == np.float32
+    assert clean.flags.c_contiguous
+    assert clean.flags.writeable
+    axes = (2, 0, 1) if layout == "HWC" else (0, 1, 2)
+    tensors = [torch.from_numpy(each.transpose(axes).copy())[None] for each in (color, albedo, normal, depth)]
+    denoiser = Denoiser(MODEL)
+    denoiser.reset(frames=1)
+    color_, albedo_, normal_, depth_ = tensors
+    expected = denoiser(Frame(color_, albedo=albedo_, normal=normal_, depth=depth_))[0].permute(
+        np.argsort(axes).tolist()
+    )
+    assert np.array_equal(clean, expected.numpy())
+
+
+def test_a_model_that_does_nothing_gives_back_the_same_pixels() -> None:
+    pixels = image(3, dtype=np.float64)[::-1]
+    assert np.array_equal(denoise(pixels, model="noisy"), pixels.astype(np.float32))
+
+
+def test_models_and_settings_are_those_of_the_denoiser() -> None:
+    color = image(3)
+    doubled = denoise(color, model=lambda color: 2 * color)
+    assert np.array_equal(doubled, 2 * color)
+    narrow, wide = (denoise(color, model="joint_bilateral", sigma_space=sigma) for sigma in (1, 3))
+    assert not np.array_equal(narrow, wide)
+    with pytest.raises(InputError, match="precision"):
+        denoise(color, model=MODEL, precision="float8")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="device"):
+        denoise(color, model=MODEL, device="nowhere")
+
+
+def test_values_that_would_spoil_the_result_are_refused() -> None:
+    albedo = image(3)
+    albedo[2, 3, 1] = np.nan
+    with pytest.raises(InputError) as caught:
+        denoise(image(3), albedo=albedo, model=MODEL)
+    assert "buffer 'albedo'" in complaint(caught)
+    assert "row 2, column 3" in complaint(caught)
+    broken = image(3)
+    broken[2, 3, 1] = np.inf
+    assert np.isfinite(denoise(broken, model=MODEL)).all()
+
+
+def test_the_package_has_it() -> None:
+    assert mcdenoise.denoise is denoise
