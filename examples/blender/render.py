@@ -10,7 +10,8 @@ The scene is built here: a lacquered checkered floor, a brick wall, rough steel,
 a sky, a matt object that moves and a camera that moves. Nothing is downloaded.
 
 This script stands alone. It imports Blender's Python module ``bpy``, which is under the GPL (``pip install
-bpy==4.5.15``, Python 3.11; no display is needed), and nothing else beyond the standard library.
+bpy==4.5.15`` or ``bpy==5.0.1``, Python 3.11; no display is needed), and nothing else beyond the standard library.
+Blender 4.5 writes all passes into one part of the file; Blender 5.0 writes a part for each, unless ``--interleave``.
 """
 
 import argparse
@@ -56,6 +57,7 @@ def main():
     )
     parser.add_argument("--view-layer", default="ViewLayer", help="name of the view layer")
     parser.add_argument("--stereo", action="store_true", help="two views in one file")
+    parser.add_argument("--interleave", action="store_true", help="Blender 5: one part for all passes, as before 5.0")
     parser.add_argument("--codec", default="ZIP", help="ZIP, ZIPS, PIZ, RLE, PXR24, DWAA, DWAB, NONE")
     parser.add_argument("--float", action="store_true", help="write 32 bits for every channel, not 16 for colors")
     parser.add_argument("--reference-samples", type=int, default=0, help="also write references, with so many samples")
@@ -85,6 +87,9 @@ def main():
     layer = scene.view_layers[0]
     layer.name = args.view_layer
     settings = scene.render.image_settings
+    if bpy.app.version >= (5, 0):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+        settings.use_exr_interleave = args.interleave
     settings.file_format = "OPEN_EXR_MULTILAYER"
     settings.exr_codec = args.codec
     settings.color_depth = "32" if args.float else "16"
@@ -253,7 +258,8 @@ def sky():
     world.use_nodes = True
     tree = world.node_tree
     node = tree.nodes.new("ShaderNodeTexSky")
-    node.sky_type = "NISHITA"
+    # Nishita's sky has gone by another name since Blender 5.0.
+    node.sky_type = "NISHITA" if bpy.app.version < (5, 0) else "SINGLE_SCATTERING"
     node.sun_elevation, node.sun_rotation = math.radians(28), math.radians(215)
     node.sun_size = math.radians(3)
     node.sun_intensity = 0.4
