@@ -3,8 +3,8 @@
     python mitsuba_frames.py -o mitsuba
 
 The scene holds a checkered floor, a wall, a rough golden ball, a glass ball and a lamp that is seen; above the wall
-there is nothing. The camera moves. ``as_tensor.exr`` is the first frame as ``mi.util.write_bitmap`` writes the array
-that ``mi.render`` returns: that array has no channel names.
+there is nothing. The camera moves. ``as_tensor.exr`` is the first frame at half the size as ``mi.util.write_bitmap``
+writes the array that ``mi.render`` returns: that array has no channel names.
 """
 
 import argparse
@@ -28,10 +28,10 @@ def main():
     width, height = (int(number) for number in args.size.split("x"))
     for frame in range(1, 4):
         scene = mi.load_dict(describe(mi, frame, width, height, args.samples))
-        image = mi.render(scene, seed=frame)
+        mi.render(scene, seed=frame)
         scene.sensors()[0].film().write(str(args.output / f"frame.{frame:04d}.exr"))
-        if frame == 1:
-            mi.util.write_bitmap(str(args.output / "as_tensor.exr"), image, write_async=False)
+    small = mi.load_dict(describe(mi, 1, width // 2, height // 2, args.samples))
+    mi.util.write_bitmap(str(args.output / "as_tensor.exr"), mi.render(small, seed=1), write_async=False)
 
 
 def describe(mi, frame, width, height, samples):
