@@ -1,0 +1,272 @@
+"""Render a small scene with Blender's Cycles into multilayer EXR files, the way an artist's scene writes them.
+
+    python render.py -o shots --size 320x180 --frames 8 --samples 1 --filter none --reference-samples 256
+
+The folder then holds ``shot_0001.exr``, ``shot_0002.exr``, ... with every pass that a denoiser can use (Combined,
+Denoising Albedo, Normal and Depth, Depth, Position, Normal, Vector, the parts of the light path) and
+``reference_0001.exr``, ... with Combined alone, of the same frames with many samples.
+
+The scene is built here: a lacquered checkered floor, a brick wall, rough steel, glass, a mirror, a lamp that is seen,
+a sky, a matt object that moves and a camera that moves. Nothing is downloaded.
+
+This script stands alone. It imports Blender's Python module ``bpy``, which is under the GPL (``pip install
+bpy==4.5.15`` or ``bpy==5.0.1``, Python 3.11; no display is needed), and nothing else beyond the standard library.
+Blender 4.5 writes all passes into one part of the file; Blender 5.0 writes a part for each, unless ``--interleave``.
+"""
+
+import argparse
+import math
+from pathlib import Path
+
+import bpy
+
+PARTS = [f"{kind}_{part}" for kind in ("diffuse", "glossy", "transmission") for part in ("direct", "indirect", "color")]
+PASSES = {
+    "data": ["z", "position", "normal", "vector"],
+    "light": ["emit", "environment", *PARTS],
+}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder to write into")
+    parser.add_argument("--name", default="shot", help="what the files are called before _0001.exr")
+    parser.add_argument("--size", default="320x180", help="WIDTHxHEIGHT in pixels")
+    parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--start", type=int, default=1, help="number of the first frame")
+    parser.add_argument("--samples", type=int, default=1, help="samples per pixel")
+    parser.add_argument(
+        "--filter",
+        choices=("default", "none"),
+        default="default",
+        help="pixel filter: Blackman-Harris of 1.5 pixels, or every sample at the centre of its pixel",
+    )
+    parser.add_argument("--depth-of-field", action="store_true")
+    parser.add_argument("--motion-blur", action="store_true", help="Blender then writes a Vector pass of zeros")
+    parser.add_argument("--transparent", action="store_true", help="the film is transparent where the sky is seen")
+    parser.add_argument(
+        "--denoise", action="store_true", help="denoise Combined in Blender; Noisy Image lies beside it"
+    )
+    parser.add_argument(
+        "--passes",
+        nargs="*",
+        choices=("denoising", "data", "light", "samples"),
+        default=("denoising", "data", "light"),
+        help="groups of passes beside Combined: Denoising Albedo, Normal and Depth; Depth, Position, Normal and "
+        "Vector; diffuse, glossy and transmission light with emission and environment; Debug Sample Count",
+    )
+    parser.add_argument("--view-layer", default="ViewLayer", help="name of the view layer")
+    parser.add_argument("--stereo", action="store_true", help="two views in one file")
+    parser.add_argument("--interleave", action="store_true", help="Blender 5: one part for all passes, as before 5.0")
+    parser.add_argument("--codec", default="ZIP", help="ZIP, ZIPS, PIZ, RLE, PXR24, DWAA, DWAB, NONE")
+    parser.add_argument("--float", action="store_true", help="write 32 bits for every channel, not 16 for colors")
+    parser.add_argument("--reference-samples", type=int, default=0, help="also write references, with so many samples")
+    parser.add_argument("--seed", type=int, default=0, help="noise seed; every frame draws noise of its own from it")
+    parser.add_argument("--threads", type=int, default=0, help="processor threads; 0 takes all")
+    args = parser.parse_args()
+
+    scene = build_scene(args.start, args.frames)
+    width, height = (int(number) for number in args.size.split("x"))
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = width, height, 100
+    if args.threads:
+        scene.render.threads_mode, scene.render.threads = "FIXED", args.threads
+    scene.render.film_transparent = args.transparent
+    scene.render.use_motion_blur = args.motion_blur
+    scene.camera.data.dof.use_dof = args.depth_of_field
+    if args.stereo:
+        scene.render.use_multiview = True
+        scene.render.views_format = "STEREO_3D"
+
+    cycles = scene.cycles
+    cycles.device = "CPU"
+    cycles.use_adaptive_sampling = False
+    # Cycles takes a box filter as one pixel wide whatever the width says, so the narrow one is the default kind.
+    cycles.pixel_filter_type = "BLACKMAN_HARRIS"
+    cycles.filter_width = 0.01 if args.filter == "none" else 1.5
+
+    layer = scene.view_layers[0]
+    layer.name = args.view_layer
+    settings = scene.render.image_settings
+    if bpy.app.version >= (5, 0):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+        settings.use_exr_interleave = args.interleave
+    settings.file_format = "OPEN_EXR_MULTILAYER"
+    settings.exr_codec = args.codec
+    settings.color_depth = "32" if args.float else "16"
+    if args.stereo:
+        settings.views_format = "MULTIVIEW"
+
+    args.output.mkdir(parents=True, exist_ok=True)
+    choose_passes(layer, args.passes)
+    cycles.use_denoising = args.denoise
+    if args.denoise:
+        cycles.denoiser = "OPENIMAGEDENOISE"
+    render(scene, args.output, args.name, args.samples, args.seed)
+    if args.reference_samples:
+        choose_passes(layer, ())
+        cycles.use_denoising = False
+        # A seed of its own: the reference must not share noise with the frame that it judges.
+        render(scene, args.output, "reference", args.reference_samples, args.seed + 1_000_000)
+
+
+def choose_passes(layer, groups):
+    """Switch on the passes of these groups and no others."""
+    for group, names in PASSES.items():
+        for name in names:
+            setattr(layer, f"use_pass_{name}", group in groups)
+    layer.cycles.denoising_store_passes = "denoising" in groups
+    layer.cycles.pass_debug_sample_count = "samples" in groups
+
+
+def render(scene, folder, name, samples, seed):
+    """Render every frame of the scene to ``folder/name_0001.exr`` and on."""
+    scene.cycles.samples = samples
+    for frame in range(scene.frame_start, scene.frame_end + 1):
+        scene.frame_set(frame)
+        scene.cycles.seed = seed + frame
+        scene.render.filepath = str((folder / f"{name}_{frame:04d}.exr").resolve())
+        bpy.ops.render.render(write_still=True)
+
+
+def build_scene(start, frames):
+    """The scene with its camera and its moving object animated over frames ``start`` and on."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    scene.frame_start, scene.frame_end = start, start + frames - 1
+    scene.world = sky()
+
+    plane("Floor", (0, 0, 0), (0, 0, 0), 12, checkered_lacquer())
+    plane("Wall", (0, 3.5, 1.4), (math.pi / 2, 0, 0), (9, 2.8), bricks())
+    plane("Mirror", (-2.6, 1.6, 1.0), (math.pi / 2, 0, math.radians(50)), (2.0, 1.8), metal("Mirror", 0.9, 0.0))
+    ball("Steel", (-0.9, 0.9, 0.7), 0.7, metal("Steel", 0.62, 0.35))
+    ball("Glass", (0.75, -0.4, 0.5), 0.5, glass())
+    ball("Lamp", (1.9, 1.9, 2.0), 0.3, lamp())
+    bpy.ops.mesh.primitive_monkey_add(size=1.2, location=(2.1, 0.4, 0.62), rotation=(0, 0, math.radians(-25)))
+    mover = finish("Mover", matt("Clay", (0.72, 0.22, 0.1)))
+    mover.modifiers.new("Smooth", "SUBSURF").render_levels = 2
+
+    camera_data = bpy.data.cameras.new("Camera")
+    camera = bpy.data.objects.new("Camera", camera_data)
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    target = bpy.data.objects.new("Target", None)
+    target.location = (0.1, 0.9, 0.95)
+    scene.collection.objects.link(target)
+    aim = camera.constraints.new("TRACK_TO")
+    aim.target, aim.track_axis, aim.up_axis = target, "TRACK_NEGATIVE_Z", "UP_Y"
+    camera_data.lens = 30
+    camera_data.dof.focus_distance = 5.0
+    camera_data.dof.aperture_fstop = 0.3
+
+    # For the Vector pass Cycles looks at the frames before and after, so the path begins one earlier and ends later.
+    for frame in range(start - 1, start + frames + 1):
+        step = frame - start
+        camera.location = (-0.6 + 0.16 * step, -5.2 + 0.05 * step, 1.7 + 0.05 * step)
+        camera.keyframe_insert("location", frame=frame)
+        mover.location = (2.1 - 0.12 * step, 0.4 + 0.05 * step, 0.62)
+        mover.keyframe_insert("location", frame=frame)
+    return scene
+
+
+def plane(name, location, rotation, size, material):
+    bpy.ops.mesh.primitive_plane_add(size=1, location=location, rotation=rotation)
+    width, height = size if isinstance(size, tuple) else (size, size)
+    bpy.context.object.scale = (width, height, 1)
+    return finish(name, material)
+
+
+def ball(name, location, radius, material):
+    bpy.ops.mesh.primitive_uv_sphere_add(radius=radius, location=location, segments=64, ring_count=32)
+    return finish(name, material)
+
+
+def finish(name, material):
+    """Name the object just made, smooth it and give it its material."""
+    thing = bpy.context.object
+    thing.name = name
+    thing.data.materials.append(material)
+    thing.data.polygons.foreach_set("use_smooth", [True] * len(thing.data.polygons))
+    return thing
+
+
+def surface(name, **inputs):
+    """A material of one Principled BSDF, and its nodes for what is added to it."""
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    shader = material.node_tree.nodes["Principled BSDF"]
+    for key, value in inputs.items():
+        shader.inputs[key.replace("_", " ")].default_value = value
+    return material, material.node_tree, shader
+
+
+def matt(name, color):
+    return surface(name, Base_Color=(*color, 1), Roughness=1.0)[0]
+
+
+def metal(name, color, roughness):
+    return surface(name, Base_Color=(color, color, color * 1.02, 1), Metallic=1.0, Roughness=roughness)[0]
+
+
+def glass():
+    return surface("Glass", Base_Color=(0.95, 1.0, 0.97, 1), Roughness=0.0, IOR=1.5, Transmission_Weight=1.0)[0]
+
+
+def lamp():
+    material, _, shader = surface("Lamp")
+    shader.inputs["Emission Color"].default_value = (1.0, 0.72, 0.4, 1)
+    shader.inputs["Emission Strength"].default_value = 25.0
+    return material
+
+
+def checkered_lacquer():
+    material, tree, shader = surface("Lacquer", Roughness=0.6, Coat_Weight=1.0, Coat_Roughness=0.03)
+    checks = texture(tree, "ShaderNodeTexChecker", Scale=14.0)
+    checks.inputs["Color1"].default_value = (0.55, 0.45, 0.32, 1)
+    checks.inputs["Color2"].default_value = (0.08, 0.1, 0.14, 1)
+    stains = texture(tree, "ShaderNodeTexNoise", Scale=30.0)
+    mix = tree.nodes.new("ShaderNodeMixRGB")
+    mix.blend_type, mix.inputs["Fac"].default_value = "MULTIPLY", 0.5
+    tree.links.new(checks.outputs["Color"], mix.inputs["Color1"])
+    tree.links.new(stains.outputs["Fac"], mix.inputs["Color2"])
+    tree.links.new(mix.outputs["Color"], shader.inputs["Base Color"])
+    return material
+
+
+def bricks():
+    material, tree, shader = surface("Bricks", Roughness=1.0)
+    wall = texture(tree, "ShaderNodeTexBrick", Scale=6.0)
+    wall.inputs["Color1"].default_value = (0.5, 0.2, 0.12, 1)
+    wall.inputs["Color2"].default_value = (0.35, 0.12, 0.08, 1)
+    wall.inputs["Mortar"].default_value = (0.75, 0.72, 0.66, 1)
+    tree.links.new(wall.outputs["Color"], shader.inputs["Base Color"])
+    return material
+
+
+def texture(tree, kind, **inputs):
+    """A texture node over the object's own coordinates (generated: 0..1)."""
+    node = tree.nodes.new(kind)
+    where = tree.nodes.new("ShaderNodeTexCoord")
+    tree.links.new(where.outputs["Generated"], node.inputs["Vector"])
+    for key, value in inputs.items():
+        node.inputs[key].default_value = value
+    return node
+
+
+def sky():
+    world = bpy.data.worlds.new("Sky")
+    world.use_nodes = True
+    tree = world.node_tree
+    node = tree.nodes.new("ShaderNodeTexSky")
+    # Nishita's sky has gone by another name since Blender 5.0.
+    node.sky_type = "NISHITA" if bpy.app.version < (5, 0) else "SINGLE_SCATTERING"
+    node.sun_elevation, node.sun_rotation = math.radians(28), math.radians(215)
+    node.sun_size = math.radians(3)
+    node.sun_intensity = 0.4
+    tree.links.new(node.outputs["Color"], tree.nodes["Background"].inputs["Color"])
+    tree.nodes["Background"].inputs["Strength"].default_value = 0.07
+    return world
+
+
+if __name__ == "__main__":
+    main()
