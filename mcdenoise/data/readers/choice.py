@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mcdenoise.data.exr import Image
+from mcdenoise.data.readers.cameras import fit_camera
 from mcdenoise.data.readers.layers import NAMES, Layer, fits, named, recognise
 from mcdenoise.data.readers.values import is_direction
 from mcdenoise.errors import InputError
@@ -168,12 +169,17 @@ def _by_values(
     vectors = [layer for layer in strangers if layer.components == ("x", "y", "z")]
     depths = [layer for layer in strangers if layer.components == ("t",)]
     directions = [layer for layer in vectors if is_direction(read(layer))] if vectors else []
-    points = [layer for layer in vectors if layer not in directions]
+    points = [layer for layer in vectors if layer not in directions and _tell_a_camera(read(layer))]
     for buffer, found, why in (
         ("depth", depths, "by its component T"),
         ("normal", directions, "by its values: vectors of unit length"),
-        ("position", points, "by its values: coordinates"),
+        ("position", points, "by its values: coordinates that a camera sees at their pixels"),
     ):
         if buffer not in choice.layers and buffer not in mapping and len(found) == 1:
             choice.layers[buffer] = found[0]
             choice.reasons[buffer] = why
+
+
+def _tell_a_camera(vectors: Image) -> bool:
+    position = vectors.astype(np.float64)
+    return fit_camera(position, (position != 0).any(-1)) is not None

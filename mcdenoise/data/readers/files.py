@@ -58,6 +58,7 @@ class RenderedFiles:
     encoded_normals: bool = False
     motion: Convention = USUAL_MOTION
     camera_convention: str = ""
+    positions_of_camera: bool = False
     has_camera: bool = False
     drops_positions: bool = False
     table: list[Row] = field(default_factory=list)
@@ -250,7 +251,21 @@ class RenderedFiles:
                 if self.file(layer, number) == path:
                     pixels = found[layer.part][..., [wanted[layer.part].index(c) for c in layer.channels]]
                     images[name] = self._decoded(name, layer, pixels, path)
+        if self.positions_of_camera and "position" in images:
+            images["position"] = self.in_world(number, images["position"])
         return images
+
+    def in_world(self, number: int, position: Image) -> Image:
+        """Positions in the space of a camera that the file's attribute ``worldToCamera`` is of; none where it is 0."""
+        to_camera = world_to_camera(self.metadata(number))
+        if to_camera is None:
+            raise InputError(
+                f"{self.file(self.choice.layers['color'], number)}: expected the attribute 'worldToCamera', as "
+                "the first file has it, found none; leave positions out with --map position="
+            )
+        homogeneous = np.concatenate([position, np.ones_like(position[..., :1])], -1)
+        world = (homogeneous @ np.linalg.inv(to_camera))[..., :3]
+        return np.where((position != 0).any(-1, keepdims=True), world, 0).astype(np.float32)
 
     def _decoded(self, name: str, layer: Layer, pixels: Image, path: Path) -> Image:
         if pixels.shape[:2] != self.size:
@@ -274,6 +289,17 @@ def hit(images: Mapping[str, Image], seen: Mask | None) -> Mask:
     position = images["position"]
     known: Mask = np.isfinite(position).all(-1) & ((position != 0).any(-1) if seen is None else seen[..., 0])
     return known
+
+
+def world_to_camera(metadata: Metadata) -> Array | None:
+    """The matrix for row vectors that a file has as an attribute, whichever way it is written there."""
+    for name, value in metadata.items():
+        if name.lower() == "worldtocamera" and isinstance(value, tuple) and len(value) == 16:
+            matrix = np.reshape(np.array(value, np.float64), (4, 4))
+            for each in (matrix, matrix.T):
+                if np.allclose(each[:, 3], (0, 0, 0, 1), atol=1e-4) and abs(np.linalg.det(each)) > 1e-12:
+                    return each
+    return None
 
 
 def _far_points(matrix: Array, depth: float, size: tuple[int, int]) -> Array:

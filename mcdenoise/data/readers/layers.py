@@ -32,7 +32,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "depth": ("depth z zdepth zfiltered linearz viewz dd", "denoisingdepth"),
     "position": ("position worldposition p pos posw worldpos pworld positionmulti",),
     "previous_position": ("previousposition prevpos prevposw",),
-    "motion": ("vector motion motionvector motionvectors mvec mv flow backward",),
+    "motion": ("vector motion motionvector motionvectors mvec mv flow backward", "velocity"),
     "variance": ("variance rgbavariance rgbvariance colorvariance beautyvariance",),
     "alpha": ("alpha a",),
     "roughness": ("roughness",),
@@ -53,7 +53,7 @@ _COLORS = ({"r", "g", "b"}, {"red", "green", "blue"})
 # These words speak of something about a buffer, and not of itself.
 _ABOUT = {"variance", "var", "mse", "noice", "error", "count"}
 # And what stands behind these is a buffer of another kind of light.
-_OTHERS = {"specular", "glossy", "transmission", "light", "shadow", "forward"}
+_OTHERS = {"specular", "glossy", "transmission", "light", "shadow", "forward", "relative"}
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+")
 
 
@@ -118,15 +118,18 @@ def layers_of(group: int, label: str, parts: Sequence[Part]) -> list[Layer]:
         if any(colors <= roots for colors in _COLORS):
             # Z beside R, G, B is a depth, and not a third coordinate.
             together &= {"r", "g", "b", "a", "red", "green", "blue", "alpha"}
-        elif not {"x", "y"} <= roots and not {"u", "v"} <= roots:
+        elif not {"x", "y"} <= roots and not {"u", "v"} <= roots and roots != {"r", "g"}:
             together = set()
         for channel in usable:
             prefix, dot, _ = channel.rpartition(".")
-            alone = not dot and channel.lower() not in together
-            channels.setdefault(channel if alone else prefix, []).append(channel)
+            if not dot and channel.lower() not in together:
+                # `Nsx, Nsy, Nsz` of pbrt are one layer, and `dzdx, dzdy` none.
+                stem, three = channel[:-1], [channel[:-1] + letter for letter in "xyz"]
+                prefix = stem if stem and channel in three and set(three) <= set(usable) else channel
+            channels.setdefault(prefix, []).append(channel)
         for prefix, own in channels.items():
             single = own == [prefix]
-            components = [("" if single else channel.rpartition(".")[2].lower()) for channel in own]
+            components = ["" if single else channel.removeprefix(prefix).removeprefix(".").lower() for channel in own]
             order = sorted(range(len(own)), key=lambda place: (_ORDER.get(components[place], 9), place))
             name = prefix
             if len(parts) > 1 and prefix and part.name.startswith(prefix):
@@ -183,7 +186,8 @@ def fits(buffer: str, layer: Layer) -> bool:
     """Whether a layer has the channels that a buffer needs; one channel may be stored as grey."""
     count = len(layer.channels)
     if BUFFERS[buffer].channels == 1:
-        return count == 1 or layer.is_color
+        # Or, as Falcor's depth, with its derivative.
+        return count <= 2 or layer.is_color
     if buffer == "motion":
         return count in (2, 3, 4)
     if buffer == "variance":

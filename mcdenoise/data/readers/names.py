@@ -74,7 +74,8 @@ def _matches(pattern: Path) -> list[Path]:
     )
     if len(pieces) == 1 and not wild:
         raise InputError(
-            f"{pattern}: expected a folder, an image, or a pattern such as shot_####.exr, found no such file"
+            f"{pattern}: expected a folder, an image, or a pattern such as shot_####.exr, found "
+            "no such folder or file; check the path"
         )
     if not os.path.isdir(folder):
         raise InputError(f"{pattern}: expected files, found no folder {folder}; check the path")

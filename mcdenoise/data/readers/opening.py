@@ -15,7 +15,7 @@ from mcdenoise.data.exr import Image
 from mcdenoise.data.images import ImageHeader, Part, read_channels, read_image_header
 from mcdenoise.data.readers.cameras import fit_camera, miss, read_as
 from mcdenoise.data.readers.choice import choose
-from mcdenoise.data.readers.files import RenderedFiles, hit
+from mcdenoise.data.readers.files import RenderedFiles, hit, world_to_camera
 from mcdenoise.data.readers.layers import Layer, layers_of
 from mcdenoise.data.readers.lights import find_lights
 from mcdenoise.data.readers.names import FileGroup, pattern_of
@@ -198,7 +198,7 @@ def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
     shot.warnings += warning
 
 
-def _look_at_positions(shot: RenderedFiles, images: Mapping[str, Image], readings: dict[str, list[str]]) -> None:
+def _look_at_positions(shot: RenderedFiles, images: dict[str, Image], readings: dict[str, list[str]]) -> None:
     position = images["position"].astype(np.float64)
     known = hit(images, ~nothing_hit(images["depth"]) if "depth" in images else None)
     words = readings.setdefault("view_projection", [])
@@ -223,7 +223,13 @@ def _look_at_positions(shot: RenderedFiles, images: Mapping[str, Image], reading
         readings["position"].append("not used without a camera")
         readings.pop("view_projection")
         shot.drops_positions = True
-    elif _is_in_camera_space(shot, images) and _is_in_camera_space(shot, _last(shot)):
+    elif not shot.positions_of_camera and _is_in_camera_space(shot, images) and _is_in_camera_space(shot, _last(shot)):
+        if world_to_camera(shot.metadata(shot.numbers[0])) is not None:
+            shot.positions_of_camera = True
+            images["position"] = shot.in_world(shot.numbers[0], images["position"])
+            readings["position"].append("in the space of the camera, brought to the world by 'worldToCamera'")
+            _look_at_positions(shot, images, readings)
+            return
         # Where a point was in the frame before is not told.
         shot.drops_positions, shot.has_camera = True, "depth" not in images
         readings["position"].append("in the space of the camera: only its depth is used")
@@ -268,13 +274,19 @@ def _motion(shot: RenderedFiles) -> tuple[Convention, str]:
         )
         pairs.append((features, earlier, images["motion"]))
     if pairs and moved and not any(motion.any() for *_, motion in pairs):
-        shot.choice.unused.append(shot.choice.layers.pop("motion"))
+        del shot.choice.layers["motion"]
         shot.warnings.append(
             "'motion': all zeros although the camera moves, as Blender writes it with motion blur; positions are used "
             "instead"
         )
         return given, "all zeros: not used"
     chosen, told = match_motion(pairs, given)
+    if chosen is None:
+        del shot.choice.layers["motion"]
+        shot.warnings.append(
+            "'motion': does not lead to what looks alike in the frame before, whichever way it is read; it is not used"
+        )
+        return given, "fits no neighbouring frame: not used"
     if chosen[:2] != given[:2]:
         shot.warnings.append(f"'motion': read as {chosen.words}, since only so frames match the ones before them")
     return chosen, f"{chosen.words}{', as neighbouring frames match' if told else ''}"

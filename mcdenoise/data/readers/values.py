@@ -29,6 +29,8 @@ _LARGEST_MOTION = 1e5
 _MOVES, _LEAST_MOVING = 0.5, 64
 # Another sign is taken where it matches so much better than the one that the format has.
 _BETTER = 0.85
+# And motion says something where it matches so much better than none.
+_TELLING = 0.98
 
 
 class Row(NamedTuple):
@@ -121,7 +123,7 @@ def _slopes(x: Image, y: Image, usable: Mask, *, relative: bool = False) -> Arra
         known = (mean_x[:, 0] > 0) & (mean_y[:, 0] > 0)
         mean_x, mean_y = np.ones_like(mean_x), np.ones_like(mean_y)
     else:
-        known = np.ones(len(x), bool)
+        known = np.ones(len(xs), bool)
     within = (inside > 0) & known[:, None] & (count > _BLOCK**2 / 2)
     dx, dy = np.where(within, xs - mean_x, 0), np.where(within, ys - mean_y, 0)
     pairs = np.stack([(dx * dy).sum(1), (dx * dx).sum(1)], 1)
@@ -239,7 +241,7 @@ def conventions(size: tuple[int, int], motion: Image) -> list[Convention]:
 
 def match_motion(
     pairs: Sequence[tuple[Mapping[str, Image], Mapping[str, Image], Image]], given: Convention
-) -> tuple[Convention, bool]:
+) -> tuple[Convention | None, bool]:
     """Which convention of motion leads to the pixels of the frame before that look alike.
 
     Args:
@@ -247,7 +249,8 @@ def match_motion(
         given: the convention that the format is known for.
 
     Returns:
-        The given one, unless another fits clearly better; and whether the frames tell anything at all.
+        The given one, unless another fits clearly better; ``None`` where none is better than no motion at all, although
+        much moves; and whether the frames tell anything.
     """
     if not pairs:
         return given, False
@@ -261,9 +264,10 @@ def match_motion(
         return given, False
     errors = {each: float(np.mean([_mismatch(*pair, each) for pair in pairs])) for each in candidates}
     best = min(errors, key=lambda each: errors[each])
-    at_rest = Convention(0, 0, "")
-    if errors[best] > 0.98 * float(np.mean([_mismatch(*pair, at_rest) for pair in pairs])):
-        return given, False
+    at_rest = float(np.mean([_mismatch(*pair, Convention(0, 0, "")) for pair in pairs]))
+    if errors[best] > _TELLING * at_rest:
+        contradicts = errors[best] > at_rest and moving > _LEAST_MOVING
+        return (None, True) if contradicts else (given, False)
     return (best, True) if errors[best] < _BETTER * errors[given] else (given, True)
 
 
