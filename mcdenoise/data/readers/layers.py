@@ -140,9 +140,13 @@ def layers_of(group: int, label: str, parts: Sequence[Part]) -> list[Layer]:
                 name = ".".join(filter(None, (part.name, prefix)))
             found.append(Layer(group, index, name, tuple(own[i] for i in order), tuple(components[i] for i in order)))
     # A file of one picture is what its own name says: `albedo_0001.exr`.
-    if len(parts) == 1 and len(found) == 1 and (not found[0].name or len(found[0].channels) == 1):
+    if len(parts) == 1 and len(found) == 1:
         (only,) = found
-        return [Layer(group, 0, label or only.name, only.channels, only.components, anonymous=True)]
+        picture = Layer(group, 0, label or only.name, only.channels, only.components, anonymous=True)
+        says = recognise(picture)
+        # `reference_0001.exr` is one, whatever its only layer is called.
+        if not only.name or len(only.channels) == 1 or (says is not None and says[1] <= _ROOT_RANK):
+            return [picture]
     return found
 
 
