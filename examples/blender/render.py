@@ -57,6 +57,8 @@ def main():
     )
     parser.add_argument("--view-layer", default="ViewLayer", help="name of the view layer")
     parser.add_argument("--stereo", action="store_true", help="two views in one file")
+    parser.add_argument("--second-layer", metavar="NAME", help="a second view layer, which does not see the wall")
+    parser.add_argument("--composite", action="store_true", help="Blender 4.5: also write what the compositor makes")
     parser.add_argument("--interleave", action="store_true", help="Blender 5: one part for all passes, as before 5.0")
     parser.add_argument("--codec", default="ZIP", help="ZIP, ZIPS, PIZ, RLE, PXR24, DWAA, DWAB, NONE")
     parser.add_argument("--float", action="store_true", help="write 32 bits for every channel, not 16 for colors")
@@ -86,6 +88,12 @@ def main():
 
     layer = scene.view_layers[0]
     layer.name = args.view_layer
+    layers = [layer]
+    if args.second_layer:
+        layers.append(scene.view_layers.new(args.second_layer))
+        hide_wall(scene, layers[1])
+    if args.composite:
+        composite(scene)
     settings = scene.render.image_settings
     if bpy.app.version >= (5, 0):
         settings.media_type = "MULTI_LAYER_IMAGE"
@@ -97,13 +105,15 @@ def main():
         settings.views_format = "MULTIVIEW"
 
     args.output.mkdir(parents=True, exist_ok=True)
-    choose_passes(layer, args.passes)
+    for layer in layers:
+        choose_passes(layer, args.passes)
     cycles.use_denoising = args.denoise
     if args.denoise:
         cycles.denoiser = "OPENIMAGEDENOISE"
     render(scene, args.output, args.name, args.samples, args.seed)
     if args.reference_samples:
-        choose_passes(layer, ())
+        for layer in layers:
+            choose_passes(layer, ())
         cycles.use_denoising = False
         # A seed of its own: the reference must not share noise with the frame that it judges.
         render(scene, args.output, "reference", args.reference_samples, args.seed + 1_000_000)
@@ -116,6 +126,30 @@ def choose_passes(layer, groups):
             setattr(layer, f"use_pass_{name}", group in groups)
     layer.cycles.denoising_store_passes = "denoising" in groups
     layer.cycles.pass_debug_sample_count = "samples" in groups
+
+
+def hide_wall(scene, layer):
+    """Keep the wall out of a view layer, by way of a collection of its own."""
+    collection = bpy.data.collections.new("Behind")
+    scene.collection.children.link(collection)
+    wall = bpy.data.objects["Wall"]
+    for owner in wall.users_collection:
+        owner.objects.unlink(wall)
+    collection.objects.link(wall)
+    layer.layer_collection.children[collection.name].exclude = True
+
+
+def composite(scene):
+    """Let the compositor pass the first view layer's image through, a little darker."""
+    scene.use_nodes = True
+    tree = scene.node_tree
+    tree.nodes.clear()
+    source = tree.nodes.new("CompositorNodeRLayers")
+    darker = tree.nodes.new("CompositorNodeExposure")
+    darker.inputs["Exposure"].default_value = -0.5
+    target = tree.nodes.new("CompositorNodeComposite")
+    tree.links.new(source.outputs["Image"], darker.inputs["Image"])
+    tree.links.new(darker.outputs["Image"], target.inputs["Image"])
 
 
 def render(scene, folder, name, samples, seed):

@@ -27,6 +27,8 @@ COMMANDS = {
         " --passes denoising data --seed 4",
         f"{CYCLES} -o blender_stereo --size 32x18 --frames 1 --samples 1 --filter none --stereo --passes denoising"
         " --seed 5",
+        f"{CYCLES} -o blender_layers --size 32x18 --frames 1 --samples 4 --second-layer 'No Wall' --composite"
+        " --passes denoising --seed 8",
     ],
     "blender5": [
         f"{CYCLES} -o blender5 --size 64x36 --frames 1 --samples 4 --denoise --seed 6",
