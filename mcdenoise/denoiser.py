@@ -151,8 +151,8 @@ class Denoiser:
 
         Args:
             frame: a renderer's outputs, any float dtype; pixels of ``color`` that are NaN, infinite, negative or above
-                1e16 are replaced and counted. Its layers are for :meth:`output`, and not looked at here. Nothing of it is kept, so that the next frame may be written into the
-                same buffers.
+                1e16 are replaced and counted. Its layers are for :meth:`output`, and not looked at here. Nothing of
+                it is kept, so that the next frame may be written into the same buffers.
 
         Returns:
             ``(B, 3, H, W)`` float32 (or float64, see ``differentiable``) scene-linear radiance on the denoiser's

@@ -26,7 +26,7 @@ REST = "(rest)"
 # with references of every layer these were the best (docs/layers.md).
 _FALLOFFS, _COARSE = (10.0, 10.0, 1000.0, 20.0), 0.75
 # Of a pixel: what half floats leave of a sum that they round. Less is no layer of its own.
-_ROUNDING = 2.0**-9
+_ROUNDING, _SMALLEST_HALF = 2.0**-9, 2.0**-24
 # Of all light: layers that are brighter than the color together by more than this are not its parts.
 _MOST_EXCESS = 0.02
 
@@ -77,7 +77,8 @@ def completed(frame: Frame, output: Output) -> Output:
 def split(image: Tensor, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """An image in parts of given proportions, which sum to it: each is ``image * part / sum of parts``.
 
-    Where all parts are black they have the proportion that they have in the whole of the image.
+    Where all parts are black they have the proportion that they have in the whole of the image; where all are black
+    everywhere they are equal.
 
     Args:
         image: ``(B, 3, H, W)``.
@@ -89,8 +90,12 @@ def split(image: Tensor, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
     all_light = _sum(means)
     some, any_light = total > 0, all_light > 0
     total, all_light = torch.where(some, total, 1), torch.where(any_light, all_light, 1)
-    everywhere = {name: torch.where(any_light, mean / all_light, 1 / len(parts)) for name, mean in means.items()}
-    return {name: image * torch.where(some, part / total, everywhere[name]) for name, part in positive.items()}
+    equal = len(parts) - (REST in parts)
+    shares = {
+        name: torch.where(any_light, mean / all_light, 0 if name == REST and equal else 1 / max(equal, 1))
+        for name, mean in means.items()
+    }
+    return {name: image * torch.where(some, part / total, shares[name]) for name, part in positive.items()}
 
 
 def fractions(frame: Frame, image: Tensor) -> Mapping[str, Tensor]:
@@ -128,8 +133,8 @@ def _smoothed(image: Tensor, guide: Tensor) -> Tensor:
 def closed(frame: Frame) -> Frame:
     """The frame with all of its color in layers: what is in none of them is one more, :data:`REST`.
 
-    Half floats round every layer by itself. Where layers are brighter together than the color, they are scaled down to
-    it; where they lack no more than rounding takes, they are scaled up.
+    Half floats round every layer by itself. Where layers are brighter together than the color they are scaled to it,
+    and everywhere if they lack no more than rounding takes.
 
     Raises:
         InputError: they are brighter by more than that: parts of something else.
@@ -144,10 +149,12 @@ def closed(frame: Frame) -> Frame:
             f"{float(excess):.0%} of their light; leave out what is not a part of it"
         )
     rest = frame.color - total
-    fits = (rest.abs() <= _ROUNDING * frame.color).all()
-    scale = torch.where((rest < 0) | fits, frame.color / torch.where(total > 0, total, 1), 1)
+    least = _ROUNDING * frame.color + (len(frame.layers) + 1) * _SMALLEST_HALF
+    # Of all pixels or none: what is dim in some is a layer all the same.
+    whole = (rest < 0) | ((rest <= least).all() & (total > 0))
+    scale = torch.where(whole, frame.color / torch.where(whole, total, 1), 1)
     layers = {name: layer * scale for name, layer in frame.layers.items()}
-    return frame.replace(layers=layers | {REST: torch.where(fits, 0, rest).clamp_min(0)})
+    return frame.replace(layers=layers | {REST: torch.where((rest <= least).all(), 0, rest.clamp_min(0))})
 
 
 def opened(output: Output) -> Output:

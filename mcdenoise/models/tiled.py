@@ -81,9 +81,9 @@ class Tiled(Wrapper):
         computed = sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1])
         note("network", f"on {computed:.0%} of the pixels", 1 - computed)
         image = results.pop("image") if results else _known(frame, "image")
-        alpha = results.pop(_ALPHA) if _ALPHA in results else None
+        covered = results.pop(_ALPHA) if _ALPHA in results else None
         layers = {name: results.pop(_LAYER + name) for name in frame.layers if _LAYER + name in results}
-        return Output(image, results, layers, alpha), None
+        return Output(image, results, layers, covered), None
 
     def _parts(self, frame: Frame) -> list[Region] | None:
         """The tiles to compute; ``None`` for the whole image at once."""

@@ -56,8 +56,8 @@ def atrous(
 
     Returns:
         ``(B, 3 + C, H, W)`` filtered light and ``(B, 1, H, W)`` variance of its luminance, each in its argument's
-        dtype. Half precision is computed in float32. A mean of the input, whatever the weights: the pixel itself has the
-        weight ``h`` at least.
+        dtype. Half precision is computed in float32. A mean of the input, whatever the weights: the pixel itself has
+        the weight ``h`` at least.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
