@@ -20,6 +20,7 @@ from mcdenoise.models import DEFAULT, Journal, Model, Output, State, create_mode
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
 from mcdenoise.models._journal import clock
+from mcdenoise.models._layers import REST, alpha_of, closed, completed, opened
 from mcdenoise.models._memory import Division, Frames
 
 Precision = Literal["float32", "bfloat16"]
@@ -64,6 +65,8 @@ class Denoiser:
         differentiable: keep the graph, through the state too, so that ``backward`` reaches every earlier frame of the
             shot. Decisions are held fixed: which pixels have a history, how much of one is given up, the exposure. The
             images are the same. Frames of float64 are computed in float64 where the weights are, too.
+        alpha: denoise the alpha of frames, too, with the kernels of the color; a method without kernels keeps it, and
+            the report says so.
         settings: for the model's constructor, such as ``alpha_min=0.2``; see the model's own page.
 
     Raises:
@@ -90,12 +93,13 @@ class Denoiser:
         tile: int | None = None,
         max_memory: float | None = None,
         differentiable: bool = False,
+        alpha: bool = False,
         **settings: Any,
     ) -> None:
         self.device = _device(device)
         if precision not in PRECISIONS:
             raise InputError(f"precision: expected one of {', '.join(PRECISIONS)}, found '{precision}'")
-        self.precision, self.keep_all, self.differentiable = precision, keep_all, differentiable
+        self.precision, self.keep_all, self.differentiable, self.alpha = precision, keep_all, differentiable, alpha
         if isinstance(model, str):
             model = create_model(model, pretrained=weights is None, weights=weights, **settings)
         elif settings or weights is not None:
@@ -132,6 +136,7 @@ class Denoiser:
         """
         self._state: State = None
         self._shape: tuple[int, ...] = ()
+        self._layers: tuple[str, ...] = ()
         self._count, self._frames, self._buffers = 0, frames, buffers
         # Of one frame there is nothing ahead.
         self.has_room_ahead = size is not None and frames != 1
@@ -153,8 +158,8 @@ class Denoiser:
 
         Args:
             frame: a renderer's outputs, any float dtype; pixels of ``color`` that are NaN, infinite, negative or above
-                1e16 are replaced and counted. Nothing of it is kept, so that the next frame may be written into the
-                same buffers.
+                1e16 are replaced and counted. Its layers are for :meth:`output`, and not looked at here. Nothing of
+                it is kept, so that the next frame may be written into the same buffers.
 
         Returns:
             ``(B, 3, H, W)`` float32 (or float64, see ``differentiable``) scene-linear radiance on the denoiser's
@@ -165,11 +170,26 @@ class Denoiser:
                 out of range; the result is no finite image; or there is too little memory, see :meth:`reset`. After
                 this error, as after any other, the history is that of the frame before.
         """
-        return self._step(frame, stages=False).image
+        return self._step(frame.replace(layers={}) if frame.layers else frame, stages=False).image
 
-    def output(self, frame: Frame) -> Output:
-        """As calling the denoiser, with the images on the way to the result: ``noisy`` first."""
-        return self._step(frame, stages=True)
+    def output(self, frame: Frame, *, stages: bool = True) -> Output:
+        """As calling the denoiser, with what comes with the image.
+
+        Args:
+            frame: as of a call. Of ``frame.layers`` any parts of the color may be there, the same in all frames of a
+                shot; a negative or infinite value in one makes its pixel invalid.
+            stages: whether to hand out the images on the way to the result: ``noisy`` first.
+
+        Returns:
+            The image, the stages, a denoised layer for each of the frame's, and the alpha if the denoiser was made to
+            denoise it. With those that add up to ``color``, the layers add up to the image. The report says how they
+            were denoised, as the stage ``layers``: with the kernels of the color, or, of a method that has none, by
+            splitting its image.
+
+        Raises:
+            InputError: as a call; or layers are no parts of the color, or others than those of the frame before.
+        """
+        return self._step(frame, stages=stages)
 
     def _step(self, frame: Frame, *, stages: bool) -> Output:
         self.report = report = FrameReport()
@@ -177,9 +197,16 @@ class Denoiser:
         with listening(report), nullcontext() if self.differentiable else torch.no_grad():
             with timed("validate", self.device):
                 given, dtype = frame, self._dtype(frame)
-                hints = Hints(last=self._is_last(), alone=self._frames == 1, stages=stages, keep_all=self.keep_all)
+                hints = Hints(
+                    last=self._is_last(),
+                    alone=self._frames == 1,
+                    stages=stages,
+                    keep_all=self.keep_all,
+                    alpha=self.alpha,
+                )
                 frame, report.replaced_pixels, _ = frame.to(self.device).to(dtype).inspect()
-                frame = frame.with_depth().replace(hints=hints)
+                frame = closed(frame.with_depth().replace(hints=hints))
+                self._check_layers(frame)
                 report.missing = absent_buffers(self.model, frame)
                 report.tiles = self._tiles.divide(self._shot(frame))
             noisy = frame.color
@@ -194,10 +221,24 @@ class Denoiser:
                 state = state if self.frames_stay else owned(state, [given, noisy])
                 if stages:
                     output = output._replace(stages={"noisy": noisy, **output.stages})
-                result: Output = owned(Output(output.image.to(dtype), output.stages), [given, noisy, state])
+                output = completed(frame, output._replace(image=output.image.to(dtype)))
+                result: Output = owned(opened(output), [given, noisy, state])
         # Only now: a frame that was refused leaves no trace.
         self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1
+        self._layers = self._carried(frame)
         return result
+
+    def _check_layers(self, frame: Frame) -> None:
+        if self._state is not None and self._layers != self._carried(frame):
+            before, now = (
+                ", ".join(name for name in names if name != REST) or "none"
+                for names in (self._layers, self._carried(frame))
+            )
+            raise InputError(f"layers: expected those of the frame before, {before}, found {now}; reset the denoiser")
+
+    def _carried(self, frame: Frame) -> tuple[str, ...]:
+        """Names of what has a history beside the color."""
+        return (*frame.layers, *(() if alpha_of(frame) is None else ("alpha",)))
 
     def _dtype(self, frame: Frame) -> torch.dtype:
         exact = self.differentiable and frame.color.dtype == torch.float64

@@ -20,6 +20,8 @@ _ROUNDING = 1e-2
 # Largest radiance that counts as such, in whatever unit. Divided by the smallest albedo (0.04), squared, and summed
 # over the 3 x 1024 numbers of the largest window of squares, it stays below the largest float32: (25e16)^2 3072 = 2e38.
 LARGEST_RADIANCE = 1e16
+# Of the pixels: a layer with more unusable ones is no radiance, and would take the color with it.
+_MOST_BROKEN = 0.1
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,7 @@ class Hints(NamedTuple):
         alone: no frame goes before either.
         stages: the images on the way to the result are asked for, too.
         keep_all: nothing is to be skipped, whether the scene needs it or not.
+        alpha: the alpha is to be denoised, too, with the kernels of the color; else it is not looked at.
     """
 
     still: bool = False
@@ -109,6 +112,7 @@ class Hints(NamedTuple):
     alone: bool = False
     stages: bool = True
     keep_all: bool = False
+    alpha: bool = False
 
 
 _NO_HINTS = Hints()
@@ -165,6 +169,9 @@ class Frame:
             :class:`mcdenoise.models.Accumulated`.
         length: ``(B, 1, H, W)`` history length of ``color`` in frames, at least 1; added likewise.
         extra: further ``(B, C, H, W)`` buffers by name.
+        layers: ``(B, 3, H, W)`` radiance that adds up to ``color``, such as diffuse and glossy light, by name: parts
+            that are to be denoised with it so that they still add up. A method is given all of ``color`` in layers;
+            :class:`mcdenoise.denoiser.Denoiser` adds what is missing.
         statistics: what is computed of the whole image before it is cut to tiles, ``(B, N, 1, 1)`` by name.
         skip: pixels whose result is known, see :class:`Skip`.
         hints: see :class:`Hints`.
@@ -203,6 +210,7 @@ class Frame:
     current: Tensor | None = None
     length: Tensor | None = None
     extra: Mapping[str, Tensor] = field(default_factory=dict)
+    layers: Mapping[str, Tensor] = field(default_factory=dict)
     statistics: Mapping[str, Tensor] = field(default_factory=dict)
     skip: Skip | None = None
     hints: Hints = _NO_HINTS
@@ -225,6 +233,8 @@ class Frame:
                 shape = (batch, *samples, channels, height, width)
             if tuple(value.shape) != shape:
                 raise InputError(f"buffer '{name}': expected shape {shape} like 'color', found {tuple(value.shape)}")
+        for name, value in self.layers.items():
+            _check_layer(name, value, self.color)
 
     @classmethod
     def from_numpy(
@@ -353,13 +363,14 @@ class Frame:
         return replace(self, **changes)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Frame:
-        """The same frame with a function applied to every buffer."""
+        """The same frame with a function applied to every buffer and layer."""
         changed: dict[str, Any] = {name: function(value) for name, value in self.items() if name in _NAMES}
         extra = {name: function(value) for name, value in self.extra.items()}
-        return replace(self, **changed, extra=extra)
+        layers = {name: function(value) for name, value in self.layers.items()}
+        return replace(self, **changed, extra=extra, layers=layers)
 
     def to(self, target: torch.device | torch.dtype | str) -> Frame:
-        """Every buffer moved to a device or converted to a dtype."""
+        """Every buffer and layer moved to a device or converted to a dtype."""
         return self.map(lambda value: value.to(target))
 
     def crop(self, rows: slice, columns: slice) -> Frame:
@@ -368,7 +379,8 @@ class Frame:
             name: value[..., rows, columns] for name, value in self.items() if name in _NAMES and name != _MATRIX_NAME
         }
         extra = {name: value[..., rows, columns] for name, value in self.extra.items()}
-        return replace(self, **cropped, extra=extra, skip=None)
+        layers = {name: value[..., rows, columns] for name, value in self.layers.items()}
+        return replace(self, **cropped, extra=extra, layers=layers, skip=None)
 
     def with_depth(self) -> Frame:
         """The same frame; without a depth but with positions and a camera, its depth is the clip w of the positions."""
@@ -386,24 +398,27 @@ class Frame:
         """Look at every value: repair what is a renderer's daily bread, refuse what would spoil the result.
 
         Pixels of ``color`` with NaN, infinity, a negative value or one above 1e16 get the mean of their usable 3x3
-        neighbours (0 if there is none), so that they never spread. Values of ``albedo`` and ``normal`` that overshoot
-        their range by rounding are clamped, and so are albedos up to 2 (rough conductors evaluated at the normal).
+        neighbours (0 if there is none), so that they never spread. A pixel that has such a value in a layer counts as
+        one of them, and all layers are replaced where ``color`` is, in the same way: what added up still does.
+        Values of ``albedo`` and ``normal`` that overshoot their range by rounding are clamped, and so are albedos up to
+        2 (rough conductors evaluated at the normal).
 
         Returns:
             The clean frame, and the number of pixels of ``color`` that were replaced.
 
         Raises:
-            InputError: another buffer holds NaN, an illegal infinity or a value far outside its range.
+            InputError: another buffer holds NaN, an illegal infinity or a value far outside its range; or a layer has
+                unusable values in more than a tenth of the pixels in which ``color`` has none.
         """
         return self.inspect()[:2]
 
     def inspect(self) -> Inspected:
         """As :meth:`validate`, and say what was seen of the features."""
-        changes: dict[str, Tensor | None] = {}
+        changes: dict[str, Any] = {}
         ranges: dict[str, tuple[float, float]] = {}
-        color, replaced = replace_invalid(self.color)
+        (color, *layers), replaced = _replace_invalid(self.color, self.layers)
         if replaced:
-            changes["color"] = color
+            changes |= {"color": color, "layers": dict(zip(self.layers, layers, strict=True))}
         for name, value in self.items():
             if name != "color":
                 clean, ranges[name] = _check_values(name, value)
@@ -412,7 +427,7 @@ class Frame:
         return Inspected(self.replace(**changes) if changes else self, replaced, ranges)
 
 
-_OF_HOSTS = ("extra", "statistics", "skip")
+_OF_HOSTS = ("extra", "layers", "statistics", "skip")
 _NAMES = tuple(each.name for each in fields(Frame) if each.name not in (*_OF_HOSTS, "hints"))
 
 
@@ -481,12 +496,31 @@ def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
         >>> replaced, clean[0, :, 1, 1].tolist()
         (1, [1.0, 1.0, 1.0])
     """
-    # One pass sees whether there is anything to look for: a NaN comes through.
-    low, high = torch.aminmax(color)
-    if low >= 0 and high <= LARGEST_RADIANCE and high < torch.inf:
-        return color, 0
+    (clean,), replaced = _replace_invalid(color, {})
+    return clean, replaced
+
+
+def _replace_invalid(color: Tensor, layers: Mapping[str, Tensor]) -> tuple[list[Tensor], int]:
+    """:func:`replace_invalid` of a color and its layers: the same pixels of each."""
+    images = [color, *layers.values()]
+    if all(map(_is_valid, images)):
+        return images, 0
     usable = by_rows(_usable, color)
-    return by_rows(_mended, color, usable, reach=1), int((~usable).sum())
+    for name, layer in layers.items():
+        of_layer = by_rows(_usable, layer)
+        if (broken := float((usable & ~of_layer).float().mean())) > _MOST_BROKEN:
+            raise InputError(
+                f"layer '{name}': expected radiance, not negative and finite, found something else in {broken:.0%} of "
+                "the pixels; leave it out"
+            )
+        usable = usable & of_layer
+    return [by_rows(_mended, image, usable, reach=1) for image in images], int((~usable).sum())
+
+
+def _is_valid(image: Tensor) -> bool:
+    # One pass sees whether there is anything to look for: a NaN comes through.
+    low, high = torch.aminmax(image)
+    return bool(low >= 0 and high <= LARGEST_RADIANCE and high < torch.inf)
 
 
 def _usable(color: Tensor) -> Tensor:
@@ -560,6 +594,17 @@ def _floats(name: str, value: ArrayLike) -> NDArray[Any]:
         array = array.astype(array.dtype.newbyteorder("="))
     shared = array.flags.writeable and all(each >= 0 and each % array.itemsize == 0 for each in array.strides)
     return array if shared else array.copy()
+
+
+def _check_layer(name: str, layer: object, color: Tensor) -> None:
+    if not isinstance(layer, Tensor) or not layer.is_floating_point():
+        found = layer.dtype if isinstance(layer, Tensor) else type(layer).__name__
+        raise InputError(f"layer '{name}': expected a floating-point torch.Tensor, found {found}")
+    if layer.shape != color.shape or layer.device != color.device:
+        raise InputError(
+            f"layer '{name}': expected shape {tuple(color.shape)} on {color.device} like 'color', found "
+            f"{tuple(layer.shape)} on {layer.device}"
+        )
 
 
 def _check_buffer(name: str, value: object) -> None:

@@ -41,6 +41,7 @@ def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...
         raise InputError(f"model: expected a pair (Output, state), found {type(found).__name__}")
     output, after = found
     _check_image(output, frame)
+    _check_layers(output, frame)
     _check_state(state, after, frame)
     return output, after
 
@@ -85,6 +86,18 @@ def _check_image(output: Any, frame: Frame) -> None:
         raise InputError(
             f"model: expected finite radiance, found {broken} NaN or infinite pixels; the frame is not kept: check "
             "the buffers for values far out of range and the network for weights that are"
+        )
+
+
+def _check_layers(output: Output, frame: Frame) -> None:
+    alpha = () if output.alpha is None else (("alpha", output.alpha, frame.color[:, :1].shape),)
+    for name, layer, shape in (*((key, each, frame.color.shape) for key, each in output.layers.items()), *alpha):
+        if not isinstance(layer, Tensor) or layer.shape != shape or not layer.is_floating_point():
+            found = f"{layer.dtype} {tuple(layer.shape)}" if isinstance(layer, Tensor) else type(layer).__name__
+            raise InputError(f"model: expected {name} as floating-point {tuple(shape)}, found {found}")
+    if output.layers and output.layers.keys() != frame.layers.keys():
+        raise InputError(
+            f"model: expected the layers {', '.join(frame.layers) or 'none'}, found {', '.join(output.layers)}"
         )
 
 

@@ -21,10 +21,16 @@ class Output(NamedTuple):
         image: ``(B, 3, H, W)`` scene-linear radiance in the unit of ``frame.color``.
         stages: images on the way to it by name, in order and of the same shape and unit, such as ``accumulated`` and
             ``initial``.
+        layers: ``(B, 3, H, W)`` parts of the image, one for each of ``frame.layers``, filtered with its kernels; they
+            sum to ``image``. Of a method without kernels none: whoever calls it splits the image, see
+            :func:`mcdenoise.models._layers.completed`.
+        alpha: ``(B, 1, H, W)`` the frame's, filtered with the same kernels, if ``frame.hints.alpha``; likewise.
     """
 
     image: Tensor
     stages: Mapping[str, Tensor] = {}
+    layers: Mapping[str, Tensor] = {}
+    alpha: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,20 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame, tells_motion
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import Journal, journal, note, timed
+from mcdenoise.models._layers import alpha_of, completed
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops import Surface, clamp_fireflies, motion_from_position
-from mcdenoise.ops._steps.history import COLOR, MEAN, SQUARE, blend, incoming, lights, without_history
+from mcdenoise.ops._steps.history import (
+    COLOR,
+    MEAN,
+    RECENT,
+    RECENT_MEAN,
+    SQUARE,
+    blend,
+    incoming,
+    lights,
+    without_history,
+)
 from mcdenoise.ops.fireflies import LIMIT
 from mcdenoise.ops.lag import THRESHOLD
 from mcdenoise.ops.temporal import Rule
@@ -48,6 +59,7 @@ class History(NamedTuple):
         surface: what was seen.
         view_projection: ``(B, 4, 4)`` by which camera.
         limit: ``(B, 1, 1, 1)`` of the fireflies of this shot, see :func:`mcdenoise.ops.clamp_fireflies`.
+        carried: of each layer, and then of the alpha, the channels of ``color`` that are no compressed radiance.
     """
 
     color: Tensor
@@ -55,6 +67,7 @@ class History(NamedTuple):
     surface: Surface
     view_projection: Tensor | None
     limit: Tensor
+    carried: tuple[Tensor, ...] = ()
 
 
 class Accumulated(Wrapper):
@@ -82,6 +95,9 @@ class Accumulated(Wrapper):
     the history. A light that is narrower than three pixels bleeds still. This needs the test for lag.
 
     Half-precision frames are accumulated in float32, which holds 10,000 frames as well as ten.
+
+    Layers and alpha have histories of the same places, weights and cuts, which the color alone decides on; where a
+    firefly is scaled down, all of its layers are.
 
     Args:
         inner: any method.
@@ -138,6 +154,7 @@ class Accumulated(Wrapper):
             accumulated, history, inner = self._accumulate(frame.with_depth(), history, inner)
         del frame
         output, inner = self.inner(accumulated, inner)
+        output = completed(accumulated, output)
         stages = {"accumulated": accumulated.color, **output.stages}
         after = None if history is None and inner is None else (history, inner)
         return output._replace(stages=stages), after
@@ -159,13 +176,16 @@ class Accumulated(Wrapper):
             limit = torch.where(limit > 0, limit, self._chosen(frame.color))
         entering = incoming(frame.color, None, limit, compared=compared)
         seen = lights(entering[:, MEAN]) if compared else None
+        carried: tuple[Tensor, ...] = ()
         still: bool | Tensor = False
         if not reset and history is not None:
             still = is_still(frame, history)
-            color, length, kept = self._blend(frame, entering, seen, history, still)
+            color, length, kept = self._blend(frame, entering, history.color, seen, history, still)
             cut = kept.mean() < _CUT_FRACTION
             if (found := journal()) is not None:
                 found.history = float(kept.mean())
+            if not compiling and not cut:
+                carried = self._blend_carried(frame, entering, seen, history, still)
             if compiling:
                 color = torch.where(cut, without_history(entering), color)
                 length = torch.where(cut, 1, length)
@@ -179,6 +199,7 @@ class Accumulated(Wrapper):
                     limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
         if reset:
             color, length = without_history(entering), torch.ones_like(entering[:, :1])
+            carried = tuple(torch.cat([part, part], 1) if compared else part for part in _entering(frame, entering))
             inner, still = None, False
         if (found := journal()) is not None:
             self._report(found, frame, reset, still=bool(still), can_move=can_move, keeps=keeps)
@@ -186,14 +207,38 @@ class Accumulated(Wrapper):
         if keeps:
             label = None if seen is None else seen * _steady(color)
             surface = Surface(frame.position, frame.normal, frame.depth, label)
-            after = History(color, length, surface, frame.view_projection, limit)
+            after = History(color, length, surface, frame.view_projection, limit, carried)
         hints = frame.hints._replace(still=not compiling and bool(still))
         # What was found of another image is not handed on.
         seen_inside = {"color": color[:, COLOR], "current": entering[:, COLOR], "length": length, "statistics": {}}
-        return frame.replace(**seen_inside, hints=hints), after, inner
+        return _with_carried(frame.replace(**seen_inside, hints=hints), carried), after, inner
+
+    def _blend_carried(
+        self, frame: Frame, entering: Tensor, seen: Tensor | None, history: History, still: bool | Tensor
+    ) -> tuple[Tensor, ...]:
+        """Layers and alpha of the frame with their histories.
+
+        Each goes through the blend in the place of the color, which decides nothing: its compressed radiance does.
+        """
+        decisive = entering[:, COLOR.stop :]
+        blended = []
+        for part, before in zip(_entering(frame, entering), history.carried, strict=True):
+            previous = [before[:, COLOR], history.color[:, MEAN.start : SQUARE.stop], before[:, COLOR.stop :]]
+            previous = [*previous, history.color[:, RECENT_MEAN]] if decisive.shape[1] else previous
+            together = torch.cat([part, decisive], 1), torch.cat(previous, 1)
+            color = self._blend(frame, *together, seen, history, still)[0]
+            recent = color[:, RECENT.start : RECENT_MEAN.start]
+            blended.append(torch.cat([color[:, COLOR], recent], 1) if decisive.shape[1] else color)
+        return tuple(blended)
 
     def _blend(
-        self, frame: Frame, entering: Tensor, seen: Tensor | None, history: History, still: bool | Tensor
+        self,
+        frame: Frame,
+        entering: Tensor,
+        before: Tensor,
+        seen: Tensor | None,
+        history: History,
+        still: bool | Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Color and length of the frame with its history, and how many pixels of each image have one."""
         motion = None
@@ -207,7 +252,7 @@ class Accumulated(Wrapper):
             # What tells how far two positions may be apart.
             surface, previous = surface._replace(position=None), previous._replace(position=None)
         return blend(
-            *(entering, history.color, history.length, motion, surface, previous),
+            *(entering, before, history.length, motion, surface, previous),
             alpha_min=self.alpha_min,
             rule=self.rule,
             position_limit=self.position_limit,
@@ -232,6 +277,28 @@ class Accumulated(Wrapper):
         why = alone or ("nothing moves in the image" if still and not frame.hints.keep_all else "")
         note("reproject", why or source, float(why != ""))
         note("remember", "for the next frame" if keeps else alone or "last frame", float(not keeps))
+
+
+def _entering(frame: Frame, entering: Tensor) -> list[Tensor]:
+    """Layers and alpha of a frame, ``(B, 3, H, W)`` each, as its color enters the history: without fireflies."""
+    parts = list(frame.layers.values())
+    if parts:
+        lit = frame.color > 0
+        scale = torch.where(lit, entering[:, COLOR] / torch.where(lit, frame.color, 1), 1)
+        parts = [part * scale for part in parts]
+    alpha = alpha_of(frame)
+    return [part.to(entering.dtype) for part in parts] + (
+        [] if alpha is None else [alpha.to(entering.dtype).expand(-1, COLOR.stop, -1, -1)]
+    )
+
+
+def _with_carried(frame: Frame, carried: tuple[Tensor, ...]) -> Frame:
+    """The frame with the layers and the alpha of its history."""
+    if not carried:
+        return frame
+    layers = {name: part[:, COLOR] for name, part in zip(frame.layers, carried, strict=False)}
+    alpha = frame.alpha if alpha_of(frame) is None else carried[-1][:, :1]
+    return frame.replace(layers=layers, alpha=alpha)
 
 
 def surface_before(frame: Frame) -> Surface:

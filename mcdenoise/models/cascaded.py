@@ -15,7 +15,7 @@ The paper is doi:10.1007/s00371-023-02951-6; equation numbers are its own. What 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import Accumulated
@@ -51,7 +52,9 @@ class _Network(nn.Module):
         super().__init__()
         self.unet = UNet(10, width)  # color 3, albedo 3, normal 3, depth 1
         self.heads = nn.ModuleList(Head(self.unet, scale, channels) for scale in range(UNet.scales))
-        self.fusions = nn.ModuleList(FusionModule() for _ in range(UNet.scales - 1))
+        self.fusions: Sequence[FusionModule] = nn.ModuleList(  # type: ignore[assignment]
+            FusionModule() for _ in range(UNet.scales - 1)
+        )
         self._radius = radius
 
     @property
@@ -82,6 +85,15 @@ class _Network(nn.Module):
         for image, fusion in zip(images[-2::-1], self.fusions, strict=True):
             fused = fusion(image, fused)  #                                                                     Eq. 2
         return fused
+
+    def fuse_with(self, images: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """The scales of an image in one, and those of what was filtered with it: means, with the same weights."""
+        fused, others = images[-1][:, :3], images[-1][:, 3:]
+        for image, fusion in zip(images[-2::-1], self.fusions, strict=True):
+            fine = image[:, :3]
+            others = fusion.mean(image[:, 3:], others, fusion.weight(fine, fused))
+            fused = fusion(fine, fused)
+        return fused, others
 
 
 class PixelNetwork(_Network):
@@ -122,6 +134,9 @@ class KernelNetwork(_Network):
         """See :class:`mcdenoise.models.Model`."""
         x, (albedo, normal, depth) = frame.color, self.features(frame)
         levels = self.unet(torch.cat([x, albedo, normal, depth], 1))
+        # Weights below zero say nothing of proportions.
+        others = carried(frame) if self.normalize == "softmax" else None
+        x = x if others is None else torch.cat([x, others], 1)
         images = []
         for scale, (head, level) in enumerate(zip(self.heads, levels, strict=True)):
             if scale:
@@ -132,7 +147,9 @@ class KernelNetwork(_Network):
             f1, f2, f3 = f.split(1, 1) if self.bilateral else (None, None, None)
             scales = [f1, f2] if f1 is not None and f2 is not None else []
             images.append(cross_bilateral_filter(x, w, guides, scales, f3, normalize=self.normalize))  #    Eqs. 4-8
-        return Output(self.fuse(images)), None
+        if others is None:
+            return Output(self.fuse(images)), None
+        return answered(frame, *self.fuse_with(images)), None
 
 
 class _NonNegative(Wrapper):
@@ -141,7 +158,8 @@ class _NonNegative(Wrapper):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         output, state = self.inner(frame, state)
-        return output._replace(image=output.image.clamp_min(0)), state
+        layers = {name: layer.clamp_min(0) for name, layer in output.layers.items()}
+        return output._replace(image=output.image.clamp_min(0), layers=layers), state
 
 
 @register_model("cascaded", "the paper's network to the letter: P+K, width 40, 5x5 kernels, bilateral weights")

@@ -15,13 +15,14 @@ and ``cascaded_v2_micro`` (0.08 of them) is one whose U-Nets begin at half the r
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
@@ -48,7 +49,9 @@ class _Network(nn.Module):
         super().__init__()
         self.unet = unet
         self.heads = nn.ModuleList(Head(unet, scale, channels) for scale in range(UNet.scales))
-        self.fusions = nn.ModuleList(LogFusion() for _ in range(UNet.scales - 1))
+        self.fusions: Sequence[LogFusion] = nn.ModuleList(  # type: ignore[assignment]
+            LogFusion() for _ in range(UNet.scales - 1)
+        )
         self._radius = radius
 
     @property
@@ -136,7 +139,8 @@ class KernelNetwork(_Network):
         frame, exposure, top = frame.replace(statistics=statistics), statistics["exposure"], statistics["top"]
         image = frame.color * exposure
         levels = self.unet(input_of(frame, image))
-        guides = guides_of(frame)
+        guides, others = guides_of(frame), carried(frame)
+        image = image if others is None else torch.cat([image, others], 1)
         scales: list[Tensor] = []
         # One for all scales: a tile of an image must not be filtered otherwise than the whole.
         with one_backend(image):
@@ -148,11 +152,16 @@ class KernelNetwork(_Network):
                 scales.append(cross_bilateral_filter(image, logits, guides, falloffs, distance, border="renormalize"))
                 if len(scales) < len(levels):
                     image, guides = downsample(image), [downsample(guide) for guide in guides]
+        if others is not None:
+            others = scales[-1][:, 3:]
         # Each scale is a weighted mean; their fusion could leave the range of the input.
-        fused = torch.log1p(scales[-1])
-        for scale in (1, 0):
-            fused = self.fusions[1 - scale](scales[scale], fused, None, None if scale else top, logarithms=True)
-        return Output(fused / exposure), None
+        fused = torch.log1p(scales[-1][:, :3])
+        for scale, fusion in ((1, self.fusions[0]), (0, self.fusions[1])):
+            fine = scales[scale][:, :3]
+            if others is not None:
+                others = fusion.mean(scales[scale][:, 3:], others, fusion.weight(torch.log1p(fine), fused))
+            fused = fusion(fine, fused, None, None if scale else top, logarithms=True)
+        return answered(frame, fused / exposure, others), None
 
 
 def _unet(width: int, half: bool, coarse_channels: int = 0) -> UNet:

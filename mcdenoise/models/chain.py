@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame, Skip
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
+from mcdenoise.models._layers import completed
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.exposed import Exposed
 
@@ -67,14 +68,17 @@ class Chain(nn.Module):
             # Of a tile, the first one has been given those of the whole image.
             frame = frame if name == self._names[0] and frame.statistics else prepared(method, frame)
             output, states[name] = method(frame.replace(skip=part), states[name])
-            image = output.image
             if skip is not None and known is not None:
-                image = torch.where(skip.mask, known.to(image.dtype), image)
+                image = torch.where(skip.mask, known.to(output.image.dtype), output.image)
+                output = output._replace(image=image)
+            output = completed(frame, output)
+            image = output.image
             stages |= {f"{name}.{stage}": each for stage, each in output.stages.items()}
             if name != last:
                 stages[name] = image
-            frame = frame.replace(color=image)
-        return Output(image, stages), states if any(each is not None for each in states.values()) else None
+            alpha = frame.alpha if output.alpha is None else output.alpha
+            frame = frame.replace(color=image, layers=output.layers, alpha=alpha)
+        return output._replace(stages=stages), states if any(each is not None for each in states.values()) else None
 
 
 def _has_statistics(model: Model) -> bool:

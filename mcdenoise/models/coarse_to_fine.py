@@ -47,6 +47,8 @@ class CoarseToFine(Wrapper):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
+        # Each size would have layers of its own; what is made of all of them has no kernels.
+        frame = frame.replace(layers={}, hints=frame.hints._replace(alpha=False))
         return Output(self._at(frame if frame.statistics else prepared(self.inner, frame), self.resolutions)), None
 
     def _at(self, frame: Frame, resolutions: int) -> Tensor:

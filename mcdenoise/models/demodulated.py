@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -50,17 +51,19 @@ class Demodulated(Wrapper):
         with timed("remodulate", device):
             # A network that ends with a convolution hands out its precision.
             stages = {name: _with(albedo, image) for name, image in output.stages.items() if wanted}
-            return Output(_with(albedo, output.image), stages), state
+            layers = {name: _with(albedo, layer) for name, layer in output.layers.items()}
+            return Output(_with(albedo, output.image), stages, layers, output.alpha), state
 
 
 def _without_albedo(frame: Frame) -> Frame:
     albedo = frame.albedo
     assert albedo is not None
-    changes = {
+    changes: dict[str, Any] = {
         name: by_rows(demodulate, image, albedo)
         for name, image in (("color", frame.color), ("current", frame.current))
         if image is not None
     }
+    changes["layers"] = {name: by_rows(demodulate, layer, albedo) for name, layer in frame.layers.items()}
     if frame.variance is not None:
         # That of a quotient is the variance over the square of the divisor.
         changes["variance"] = demodulate(demodulate(frame.variance, albedo), albedo)

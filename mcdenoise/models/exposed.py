@@ -34,7 +34,8 @@ class Exposed(Wrapper):
         exposure = frame.statistics["exposure"]
         output, state = self.inner(_scaled(frame, exposure), state)
         stages = {name: image / exposure for name, image in output.stages.items() if frame.hints.stages}
-        return Output(output.image / exposure, stages), state
+        layers = {name: layer / exposure for name, layer in output.layers.items()}
+        return Output(output.image / exposure, stages, layers, output.alpha), state
 
 
 def _scaled(frame: Frame, factor: Tensor) -> Frame:
@@ -43,4 +44,5 @@ def _scaled(frame: Frame, factor: Tensor) -> Frame:
     skip = frame.skip
     if skip is not None:
         skip = Skip(skip.mask, {name: image * factor for name, image in skip.images.items()})
-    return frame.replace(color=frame.color * factor, current=current, variance=variance, skip=skip)
+    layers = {name: layer * factor for name, layer in frame.layers.items()}
+    return frame.replace(color=frame.color * factor, current=current, variance=variance, layers=layers, skip=skip)

@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
@@ -69,8 +71,10 @@ class Guided(nn.Module):
         from kornia.filters import guided_blur
 
         guide, size = guide_of(frame, DEPTH_SCALE), 2 * self.radius + 1
-        image: Tensor = guided_blur(guide, frame.color, size, self.eps, border_type="replicate", separable=True)
-        return Output(image.clamp_min(0)), None
+        # The linear functions of all images in one: their coefficients are of the same guides.
+        images = frame.color if (others := carried(frame)) is None else torch.cat([frame.color, others], 1)
+        blurred: Tensor = guided_blur(guide, images, size, self.eps, border_type="replicate", separable=True)
+        return answered(frame, blurred[:, :3].clamp_min(0), None if others is None else blurred[:, 3:]), None
 
 
 @register_model("guided")

@@ -8,6 +8,7 @@ from torch import nn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
@@ -28,7 +29,7 @@ class Noisy(nn.Module):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        return Output(frame.color), None
+        return answered(frame, frame.color, carried(frame)), None
 
 
 @register_model("accumulated")

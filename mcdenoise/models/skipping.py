@@ -14,6 +14,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, Skip
 from mcdenoise.models._interface import Model, Output, State
 from mcdenoise.models._journal import note, timed
+from mcdenoise.models._layers import alpha_of, completed
 from mcdenoise.models._noise_free import noise_free
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.tiled import TILE
@@ -68,7 +69,7 @@ class Skipping(Wrapper):
     has fallen below it are passed through; tiles that have changed by less since they were last computed, and four
     tiles around them too, are not computed again. Neither switches to and fro: a tile that is passed through comes back
     only at twice the noise, and one is reused only when it changes by less than a quarter of the tolerance from frame
-    to frame.
+    to frame. Neither is done where layers or an alpha are asked for: their proportions change where the color does not.
 
     Args:
         inner: a method; where it is :class:`mcdenoise.models.Tiled`, or a chain of such, it computes no more than the
@@ -92,21 +93,24 @@ class Skipping(Wrapper):
         before, inner = (None, None) if state is None else state
         current = frame.color if frame.current is None else frame.current
         still = frame.hints.still and self.tolerance > 0 and not frame.hints.keep_all
+        # The color of a tile may have converged while light goes from one of its layers to another.
+        carries = bool(frame.layers) or alpha_of(frame) is not None
         with timed("plan", current.device):
             free = noise_free(frame)
             _note("noise-free pixels", free, "background and emitters are copied", exact=True)
-            kept = self._decided(frame, current, before) if still else None
+            kept = self._decided(frame, current, before) if still and not carries else None
             passed = None if kept is None else _pixels(kept.passed, frame.size)
             reused = None if kept is None else _pixels(kept.reused, frame.size)
-            _note("converged tiles", passed, f"noise below {self.tolerance:g}", exact=False)
-            _note("unchanged tiles", reused, f"change below {self.tolerance:g}", exact=False)
+            none = "layers or alpha are asked for" if still and carries else "there are none"
+            _note("converged tiles", passed, f"noise below {self.tolerance:g}", none, exact=False)
+            _note("unchanged tiles", reused, f"change below {self.tolerance:g}", none, exact=False)
             images = {} if before is None else before.images
             skip = _skip(free, passed, reused, current, frame.color, images)
         with timed("network", current.device):
             output, inner = self.inner(frame.replace(skip=skip), inner)
             if skip is not None:
                 image = torch.where(skip.mask, skip.images["image"].to(output.image.dtype), output.image)
-                output = output._replace(image=image)
+                output = completed(frame, output._replace(image=image))
         if frame.hints.last:
             kept = None
         elif kept is not None:
@@ -190,11 +194,11 @@ def _skip(
     return Skip(mask | free, {name: torch.where(free, current, image) for name, image in known.items()})
 
 
-def _note(name: str, pixels: Tensor | None, reason: str, *, exact: bool) -> None:
+def _note(name: str, pixels: Tensor | None, reason: str, none: str = "there are none", *, exact: bool) -> None:
     if torch.compiler.is_compiling():
         return
     fraction = 0.0 if pixels is None else int(pixels.count_nonzero()) / pixels.numel()
-    note(name, reason if fraction else "there are none", fraction, exact=exact)
+    note(name, reason if fraction else none, fraction, exact=exact)
 
 
 def _change(color: Tensor, weight: Tensor, old_color: Tensor, old_weight: Tensor, tile: int) -> Tensor:

@@ -19,6 +19,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import journal, timed
+from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import motion_to_previous, surface_before
 from mcdenoise.models.demodulated import Demodulated
@@ -34,7 +35,7 @@ class History(NamedTuple):
     """What is kept of a shot.
 
     Args:
-        light: ``(B, 3, H, W)`` accumulated and filtered once.
+        light: ``(B, 3 + C, H, W)`` accumulated and filtered once, with layers and alpha behind it.
         moments: ``(B, 2, H, W)`` of the luminance, accumulated.
         length: ``(B, 1, H, W)`` in frames.
         surface: what was seen.
@@ -114,12 +115,14 @@ class Svgf(nn.Module):
                 kept = filtered if level == 0 else kept
         surface = Surface(frame.position, normal, depth)
         after = History(kept, moments, length, surface, frame.view_projection)
-        return Output(filtered, {"accumulated": light}), after
+        output = answered(frame, filtered[:, :3], filtered[:, 3:] if light.shape[1] > 3 else None)
+        return output._replace(stages={"accumulated": light[:, :3]}), after
 
     def _accumulate(self, frame: Frame, history: History | None) -> tuple[Tensor, Tensor, Tensor]:
         """Sec. 4.1: light, moments and length with the history, where there is one."""
-        light = frame.color
-        entering = torch.cat([light, luminance_moments(light.clamp_max(_BRIGHTEST)).to(light.dtype)], 1)
+        color, others = frame.color, carried(frame)
+        light = color if others is None else torch.cat([color, others], 1)
+        entering = torch.cat([light, luminance_moments(color.clamp_max(_BRIGHTEST)).to(light.dtype)], 1)
         reset, motion = "first frame", None
         if history is not None:
             motion = motion_to_previous(frame, history.view_projection)
@@ -128,7 +131,7 @@ class Svgf(nn.Module):
         if (found := journal()) is not None:
             found.reset = reset
         if reset or history is None:
-            return light, entering[:, 3:], torch.ones_like(light[:, :1])
+            return light, entering[:, -2:], torch.ones_like(light[:, :1])
         both, length = accumulate(
             entering,
             torch.cat([history.light, history.moments], 1),
@@ -138,7 +141,7 @@ class Svgf(nn.Module):
             history.surface,
             alpha_min=self.alpha,
         )
-        return both[:, :3], both[:, 3:], length
+        return both[:, :-2], both[:, -2:], length
 
 
 @register_model("svgf")

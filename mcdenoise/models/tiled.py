@@ -20,6 +20,8 @@ TILE = 32
 _WORTHWHILE = 0.9
 # Of a method that does not say: some 64 feature channels in float32.
 _BYTES_PER_PIXEL = 4 * 64 + 4 * 54
+# What is put together of tiles beside the image and its stages, whose names have no colon.
+_LAYER, _ALPHA = "layer:", "alpha:"
 
 
 class Tiled(Wrapper):
@@ -70,14 +72,18 @@ class Tiled(Wrapper):
             output, after = self.inner(frame.crop(*around.slices))
             if after is not None:
                 raise TypeError("inner: expected a method without a state to compute in tiles, found one with a state")
-            for name, image in {"image": output.image, **output.stages}.items():
+            layers = {_LAYER + name: layer for name, layer in output.layers.items()}
+            alpha = {} if output.alpha is None else {_ALPHA: output.alpha}
+            for name, image in {"image": output.image, **output.stages, **layers, **alpha}.items():
                 if name not in results:
                     results[name] = _known(frame, name).to(image.dtype, copy=True)
                 kept.of(results[name]).copy_(kept.within(around).of(image))
         computed = sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1])
         note("network", f"on {computed:.0%} of the pixels", 1 - computed)
         image = results.pop("image") if results else _known(frame, "image")
-        return Output(image, results), None
+        covered = results.pop(_ALPHA) if _ALPHA in results else None
+        layers = {name: results.pop(_LAYER + name) for name in frame.layers if _LAYER + name in results}
+        return Output(image, results, layers, covered), None
 
     def _parts(self, frame: Frame) -> list[Region] | None:
         """The tiles to compute; ``None`` for the whole image at once."""
@@ -93,6 +99,10 @@ class Tiled(Wrapper):
 
 def _known(frame: Frame, stage: str) -> Tensor:
     """What stands where nothing is computed: the known result, or the input."""
+    if stage.startswith(_LAYER):
+        return frame.layers[stage.removeprefix(_LAYER)]
+    if stage == _ALPHA and frame.alpha is not None:
+        return frame.alpha
     known = None if frame.skip is None else frame.skip.of(stage)
     return frame.color if known is None else known
 

@@ -9,16 +9,41 @@ from mcdenoise.ops import laplacian_fusion, upsample
 from mcdenoise.ops._steps.network import gated_fusion
 
 
-class FusionModule(nn.Module):
+class _Fusion(nn.Module):
+    """What predicts the blending weight of two scales: one 3x3 convolution of both, and a sigmoid."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(6, 1, 3, padding=1)
+
+    def weight(self, fine: Tensor, coarse: Tensor) -> Tensor:
+        """The blending weight ``(B, 1, H, W)`` in (0, 1).
+
+        Args:
+            fine: ``(B, 3, H, W)`` in the unit of the module.
+            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` likewise.
+        """
+        both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)
+        return torch.sigmoid(self.conv(both))
+
+    @staticmethod
+    def mean(fine: Tensor, coarse: Tensor, weight: Tensor) -> Tensor:
+        """Weighted means of the pixels of both scales, for what has to stay between them: layers and alpha.
+
+        Args:
+            fine: ``(B, C, H, W)``, any unit.
+            coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` of the same unit.
+            weight: ``(B, 1, H, W)`` of the coarse one.
+        """
+        return torch.lerp(fine, upsample(coarse, (fine.shape[-2], fine.shape[-1])), weight.to(fine.dtype))
+
+
+class FusionModule(_Fusion):
     """FM of the paper's Fig. 2: predicts the blending weight of Eq. 2 from both images, and blends.
 
     ``alpha = sigmoid(conv3x3([i_f, U i_c]))``, ``o = i_f - alpha U D i_f + alpha U i_c``. The paper names the module
     and its input and leaves its layers open: it is one convolution here.
     """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(6, 1, 3, padding=1)
 
     def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
         """Fuse two scales.
@@ -27,20 +52,15 @@ class FusionModule(nn.Module):
             fine: ``(B, 3, H, W)`` i_f, radiance.
             coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` i_c, radiance.
         """
-        both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)
-        return laplacian_fusion(fine, coarse, torch.sigmoid(self.conv(both)))
+        return laplacian_fusion(fine, coarse, self.weight(fine, coarse))
 
 
-class LogFusion(nn.Module):
+class LogFusion(_Fusion):
     """:class:`FusionModule` of logarithms of radiance.
 
     In linear radiance the low frequencies of a lamp, exchanged between scales, would drag the pixels beside it far
     below zero.
     """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(6, 1, 3, padding=1)
 
     def forward(
         self,

@@ -44,7 +44,8 @@ def atrous(
     may lie beyond an edge. Pixels that hit nothing are alike in depth, and unlike all others.
 
     Args:
-        light: ``(B, 3, H, W)`` scene-linear radiance, usually demodulated, finite.
+        light: ``(B, 3 + C, H, W)`` scene-linear radiance, usually demodulated, finite; and any further images, which
+            are filtered with its weights.
         variance: ``(B, 1, H, W)`` of its luminance, 0 to 1e34, in its unit squared.
         normal: ``(B, 3, H, W)`` unit normals, 0 where nothing was hit; without them ``w_n = 1``.
         depth: ``(B, 1, H, W)`` distance, any unit, 0 to 1e35, ``inf`` where nothing was hit; without it ``w_z = 1``.
@@ -54,9 +55,9 @@ def atrous(
         sigma_l: tolerance of luminance, above 0, in standard deviations.
 
     Returns:
-        ``(B, 3, H, W)`` filtered light and ``(B, 1, H, W)`` variance of its luminance, each in its argument's dtype.
-        Half precision is computed in float32. A mean of the input, whatever the weights: the pixel itself has the
-        weight ``h`` at least.
+        ``(B, 3 + C, H, W)`` filtered light and ``(B, 1, H, W)`` variance of its luminance, each in its argument's
+        dtype. Half precision is computed in float32. A mean of the input, whatever the weights: the pixel itself has
+        the weight ``h`` at least.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
@@ -73,14 +74,16 @@ def atrous(
         >>> bool(filtered.var() < light.var() / 2), bool(variance.max() < 0.05)
         (True, True)
     """
-    sizes = check_shapes(light=(light, "B 3 H W"), variance=(variance, "B 1 H W"), **layouts(normal, depth))
+    sizes = check_shapes(light=(light, "B C H W"), variance=(variance, "B 1 H W"), **layouts(normal, depth))
+    if sizes["C"] < 3:
+        raise ValueError(f"light: expected at least 3 channels, found {sizes['C']}")
     _check_settings(step, sigma_z, sigma_n, sigma_l)
     if light.numel() == 0:
         return light, variance
     dtype = accumulator_dtype(light.dtype)
     height, width = sizes["H"], sizes["W"]
     image, noise = light.to(dtype), variance.to(dtype)
-    bright = luminance(image)
+    bright = luminance(image[:, :3])
     deviation = sigma_l * torch.sqrt(_blurred(noise) + _LEAST_DEVIATION**2)
     radius = 2 * step
     edge_weight = edge_stopping(normal, depth, dtype, radius, sigma_z, sigma_n)
@@ -89,7 +92,7 @@ def atrous(
     for _, dy, dx in offsets(5):
         dy, dx, h = dy * step, dx * step, _KERNEL[dy + 2] * _KERNEL[dx + 2]
         tap = shifted(padded, radius, dy, dx, height, width)
-        tap_light, tap_variance, tap_bright, inside = tap.split([3, 1, 1, 1], 1)
+        tap_light, tap_variance, tap_bright, inside = tap.split([sizes["C"], 1, 1, 1], 1)
         weight = h * inside * edge_weight(dy, dx)
         weight = weight * torch.exp(-bounded_quotient((tap_bright - bright).abs(), deviation))  # Eq. 5
         total = total + weight
