@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.data import Sequence
+from mcdenoise.data.exr import Image
 from mcdenoise.data.files import write_text
 from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
@@ -124,23 +125,30 @@ def denoise_sequence(
     stored = "with albedo" if sequence.color_has_albedo else "without albedo, which the reader multiplies back"
     report = SequenceReport(model, f"color is stored {stored}")
 
-    def write(number: int, image: Tensor, done: FrameReport) -> None:
+    def write(number: int, output: Output, done: FrameReport) -> None:
         start = time.perf_counter()
-        pixels = image[0].permute(1, 2, 0).cpu().numpy()
-        report.files[number] = sequence.write(out, number, pixels, output_layer=output_layer, full_float=full_float)
+        report.files[number] = sequence.write(
+            out,
+            number,
+            _pixels(output.image),
+            alpha=None if output.alpha is None else _pixels(output.alpha),
+            lights={name: _pixels(layer) for name, layer in output.layers.items()},
+            output_layer=output_layer,
+            full_float=full_float,
+        )
         done.beside["write"] = _since(start)
+
+    def step(frame: Frame) -> Output:
+        return denoiser.output(frame, stages=on_output is not None)
 
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
         seen: Tensor | None = None
         for number, frame, times in _read_frames(sequence, denoiser, reference=references):
-            if on_output is None:
-                image = _denoised(denoiser, sequence, number, denoiser, frame, times)
-            else:
-                output = _denoised(denoiser.output, sequence, number, denoiser, frame, times)
+            output = _denoised(step, sequence, number, denoiser, frame, times)
+            if on_output is not None:
                 on_output(frame, output)
-                image = output.image
-                del output
+                output = output._replace(stages={})
             seen, before = _thumbnail(frame), seen
             if _finds_nothing(denoiser.report) and _alike(seen, before):
                 report.alike.append(number)
@@ -149,8 +157,8 @@ def denoise_sequence(
             if writing is not None:
                 writing.result()
             report.frames[number] = denoiser.report
-            writing = writer.submit(write, number, image, denoiser.report)
-            del image
+            writing = writer.submit(write, number, output, denoiser.report)
+            del output
             if not denoiser.has_room_ahead:
                 writing.result()
             denoiser.report.milliseconds["waiting"] += _since(start)
@@ -237,6 +245,12 @@ def _denoised(
     denoiser.report.milliseconds = {"waiting": times.waiting, **denoiser.report.milliseconds}
     denoiser.report.beside["read"] = times.read
     return result
+
+
+def _pixels(image: Tensor) -> Image:
+    """``(H, W, C)`` of a batch of one."""
+    pixels: Image = image[0].permute(1, 2, 0).float().cpu().numpy()
+    return pixels
 
 
 def _thumbnail(frame: Frame) -> Tensor:

@@ -34,6 +34,8 @@ def denoise(
     color_without_albedo: bool = False,
     color_with_albedo: bool = False,
     output_layer: str | None = None,
+    layers: tuple[str, ...] = (),
+    alpha: bool = False,
     alpha_min: float | None = None,
     anti_lag: bool = True,
     full_float: bool = False,
@@ -65,6 +67,9 @@ def denoise(
         color_without_albedo: the noisy color was divided by the albedo, which is multiplied back.
         color_with_albedo: it was not; by default its values tell, and if they do not, it was not.
         output_layer: add the result as a layer of this name, and replace nothing.
+        layers: layers of light to denoise with it, by the same kernels, so that they still add up: names such as
+            DiffDir, or all.
+        alpha: denoise the alpha too, by the same kernels; else it stays as it was.
         alpha_min: smallest weight of the current frame in the accumulation, in (0, 1]; the model's own by default.
         anti_lag: give up the history where the light has changed.
         full_float: write the result as 32-bit floats, even where it was stored as half floats.
@@ -87,7 +92,14 @@ def denoise(
         torch.set_num_threads(threads)
     if alpha_min is not None and not 0 < alpha_min <= 1:
         raise InputError(f"--alpha-min: expected in (0, 1], found {alpha_min}")
-    opened = open_inputs(inputs, frames, map, without_albedo=color_without_albedo, with_albedo=color_with_albedo)
+    opened = open_inputs(
+        *(inputs, frames, map),
+        without_albedo=color_without_albedo,
+        with_albedo=color_with_albedo,
+        lights=layers,
+    )
+    if alpha and "alpha" not in opened.buffers:
+        raise InputError(f"--alpha: expected an alpha to denoise, found none in {opened.root}; leave the option out")
     if budget_ms is not None or max_error is not None:
         if weights is not None or model is not None:
             raise InputError("--budget-ms, --max-error: expected no --model or --weights: they choose it")
@@ -113,7 +125,7 @@ def denoise(
     if max_memory is not None:
         return_heap()
     denoiser = spelling.denoiser(
-        device=device, precision=precision, keep_all=keep_all, tile=tile, max_memory=max_memory, **settings
+        device=device, precision=precision, keep_all=keep_all, tile=tile, max_memory=max_memory, alpha=alpha, **settings
     )
     print_sequence(opened)
     began = time.perf_counter()

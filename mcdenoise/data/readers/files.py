@@ -18,7 +18,7 @@ from mcdenoise.data.images import Part, read_channels, read_image_header
 from mcdenoise.data.readers.cameras import convert, fit_camera
 from mcdenoise.data.readers.choice import Choice
 from mcdenoise.data.readers.layers import Layer
-from mcdenoise.data.readers.lights import Light
+from mcdenoise.data.readers.lights import Light, kept_together
 from mcdenoise.data.readers.names import FileGroup, pattern_of
 from mcdenoise.data.readers.rewrite import write_like
 from mcdenoise.data.readers.transfer import decode
@@ -114,14 +114,9 @@ class RenderedFiles:
             for name, layer in self.choice.layers.items()
             if number in self.groups[layer.group].files and (reference or name != "reference")
         }
-        for name, light in self.lights.items():
-            wanted |= {f"light {name} {i}": layer for i, layer in enumerate(light.layers)}
-        images = self.read(number, wanted)
-        lights = {}
-        for name, light in self.lights.items():
-            own = [images.pop(f"light {name} {i}")[..., :3] for i in range(len(light.layers))]
-            lights[name] = _tensor(light.radiance(own))
-        return self._as_frame(number, images, lights)
+        found = self._light_images(number) if self.lights else {}
+        lights = {name: _without_lossy_black(self.lights[name].radiance(own)) for name, own in found.items()}
+        return self._as_frame(number, self.read(number, wanted), lights)
 
     def write(
         self,
@@ -169,20 +164,34 @@ class RenderedFiles:
             replaced[layer.part, layer.channels[3]] = alpha[..., 0]
         elif alpha is not None and mask is not None and mask.group == layer.group:
             replaced[mask.part, mask.channels[0]] = alpha[..., 0]
-        for name, radiance in (lights or {}).items():
-            own = self.lights[name]
-            images = self.read(number, {str(i): each for i, each in enumerate(own.layers)})
-            pixels = own.stored(radiance, [images[str(i)][..., :3] for i in range(len(own.layers))])
-            replaced |= {(own.layers[0].part, c): pixels[..., i] for i, c in enumerate(own.layers[0].channels[:3])}
+        if lights:
+            replaced |= self._lights(number, lights)
         write_like(source, out / source.name, replaced, added=added, part=layer.part, full_float=full_float)
         return out / source.name
 
-    def _as_frame(self, number: int, images: dict[str, Image], lights: Mapping[str, Tensor]) -> Frame:
+    def _light_images(self, number: int) -> dict[str, list[Image]]:
+        """Of each layer of light its own pixels and, where it is divided by a color, those of that."""
+        wanted = {f"{name} {i}": each for name, own in self.lights.items() for i, each in enumerate(own.layers)}
+        images = self.read(number, wanted)
+        return {
+            name: [images[f"{name} {i}"][..., :3] for i in range(len(own.layers))] for name, own in self.lights.items()
+        }
+
+    def _lights(self, number: int, radiances: Mapping[str, Image]) -> dict[tuple[int, str], Image]:
+        """The channels of the layers of light, for clean radiances."""
+        images = self._light_images(number)
+        held = kept_together(radiances, {name: self.lights[name].keeps(images[name]) for name in radiances})
+        channels: dict[tuple[int, str], Image] = {}
+        for name, radiance in held.items():
+            layer, pixels = self.lights[name].layers[0], self.lights[name].stored(radiance, images[name])
+            channels |= {(layer.part, channel): pixels[..., i] for i, channel in enumerate(layer.channels[:3])}
+        return channels
+
+    def _as_frame(self, number: int, images: dict[str, Image], lights: Mapping[str, Image]) -> Frame:
         color = images["color"]
         if color.shape[2] > 3:
             images.setdefault("alpha", np.clip(color[..., 3:4], 0, 1))
-        # Lossy compression leaves black a little below 0.
-        images["color"] = np.where((color < 0) & (color > -_LOSSY), 0, color)[..., :3]
+        images["color"] = _without_lossy_black(color[..., :3])
         seen = ~nothing_hit(images["depth"]) if "depth" in images else None
         if "albedo" in images:
             images["albedo"] = np.clip(np.nan_to_num(images["albedo"], nan=0, posinf=1, neginf=0), 0, 1)
@@ -214,8 +223,7 @@ class RenderedFiles:
             buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
         if seen is not None:
             buffers["depth"] = _tensor(np.where(seen, images["depth"], np.inf))
-        frame = Frame(**buffers)
-        return frame.replace(layers=dict(lights)) if lights else frame
+        return Frame(**buffers, layers={name: _tensor(radiance) for name, radiance in lights.items()})
 
     def camera(self, number: int, images: Mapping[str, Image], seen: Mask | None) -> Array | None:
         """The world-to-clip matrix of a frame: the given one, or else that by which its positions are seen."""
@@ -282,6 +290,12 @@ class RenderedFiles:
         if name == "variance" and pixels.shape[2] < 3:
             return np.repeat(pixels[..., :1], 3, -1)
         return pixels[..., :channels]
+
+
+def _without_lossy_black(radiance: Image) -> Image:
+    """Radiance without what rounding and lossy compression leave below 0 where it was black."""
+    clean: Image = np.where((radiance < 0) & (radiance > -_LOSSY), 0, radiance)
+    return clean
 
 
 def hit(images: Mapping[str, Image], seen: Mask | None) -> Mask:

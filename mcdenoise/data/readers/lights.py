@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mcdenoise.data.exr import Image
+from mcdenoise.data.exr import Image, Mask
 from mcdenoise.data.readers.layers import Layer, named, recognise
 from mcdenoise.errors import InputError
 
@@ -42,6 +42,10 @@ _ADDED = {
 }
 
 
+# Of a color that light is divided by.
+_DARKEST = 1e-3
+
+
 @dataclass(frozen=True)
 class Light:
     """A layer of radiance.
@@ -57,15 +61,33 @@ class Light:
         result: Image = images[0] if len(images) == 1 else images[0] * images[1]
         return result
 
-    def stored(self, radiance: Image, images: Sequence[Image]) -> Image:
-        """The radiance as the layer keeps it, so that :meth:`radiance` of it is the same again.
+    def keeps(self, images: Sequence[Image]) -> Mask:
+        """Where the layer can hold light: not where it is divided by a color of nearly 0."""
+        kept: Mask = np.ones(images[0].shape, bool) if len(images) == 1 else images[1] > _DARKEST
+        return kept
 
-        Where it is divided by a color of 0 nothing can be kept, and what was there stays.
-        """
+    def stored(self, radiance: Image, images: Sequence[Image]) -> Image:
+        """The radiance as the layer keeps it, so that :meth:`radiance` of it is the same again."""
         if len(images) == 1:
             return radiance
-        result: Image = np.divide(radiance, images[1], out=images[0].astype(np.float32, copy=True), where=images[1] > 0)
+        result: Image = np.divide(radiance, images[1], out=np.zeros_like(radiance), where=self.keeps(images))
         return result
+
+
+def kept_together(radiances: Mapping[str, Image], kept: Mapping[str, Mask]) -> dict[str, Image]:
+    """Layers of the same sum, each with light only where it can hold some.
+
+    Filters carry light over an edge to where a layer is divided by a color of 0; there the others share it.
+
+    Args:
+        radiances: ``(H, W, 3)`` by layer.
+        kept: where each can hold light.
+    """
+    total = sum(radiances.values())
+    held = {name: np.where(kept[name], radiance, 0) for name, radiance in radiances.items()}
+    left = sum(held.values())
+    scale = np.divide(total, left, out=np.ones_like(total), where=left > 0)
+    return {name: (radiance * scale).astype(np.float32) for name, radiance in held.items()}
 
 
 def find_lights(where: str, layers: Sequence[Layer], color: Layer, names: Sequence[str]) -> Mapping[str, Light]:
