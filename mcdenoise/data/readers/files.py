@@ -147,27 +147,25 @@ class RenderedFiles:
             InputError: it cannot be written.
         """
         layer = self.choice.written[0]
-        source = self.file(layer, number)
-        replaced: dict[tuple[int, str], Image] = {}
+        files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
         added: dict[str, Image] = {}
         if output_layer is not None:
             names = [".".join((*layer.family, output_layer, letter)) for letter in "RGB"]
             added = {name: image[..., i] for i, name in enumerate(names)}
-        else:
-            replaced = {
-                (each.part, name): image[..., i]
-                for each in self.choice.written
-                for i, name in enumerate(each.channels[:3])
-            }
-        mask = self.choice.layers.get("alpha") if len(layer.channels) < 4 else None
-        if alpha is not None and len(layer.channels) > 3:
-            replaced[layer.part, layer.channels[3]] = alpha[..., 0]
-        elif alpha is not None and mask is not None and mask.group == layer.group:
-            replaced[mask.part, mask.channels[0]] = alpha[..., 0]
-        if lights:
-            replaced |= self._lights(number, lights)
-        write_like(source, out / source.name, replaced, added=added, part=layer.part, full_float=full_float)
-        return out / source.name
+        for each in self.choice.written if output_layer is None else ():
+            files[each.group] |= {(each.part, name): image[..., i] for i, name in enumerate(each.channels[:3])}
+        if alpha is not None:
+            own = layer if len(layer.channels) > 3 else self.choice.layers["alpha"]
+            files[own.group][own.part, own.channels[3 if own == layer else 0]] = alpha[..., 0]
+        for group, channels in self._lights(number, lights or {}).items():
+            files[group] |= channels
+        for group in {layer.group, *files}:
+            source, ours = self.groups[group].files[number], group == layer.group
+            target = out / source.name
+            write_like(
+                *(source, target, files[group]), added=added if ours else {}, part=layer.part, full_float=full_float
+            )
+        return out / self.file(layer, number).name
 
     def _light_images(self, number: int) -> dict[str, list[Image]]:
         """Of each layer of light its own pixels and, where it is divided by a color, those of that."""
@@ -177,15 +175,17 @@ class RenderedFiles:
             name: [images[f"{name} {i}"][..., :3] for i in range(len(own.layers))] for name, own in self.lights.items()
         }
 
-    def _lights(self, number: int, radiances: Mapping[str, Image]) -> dict[tuple[int, str], Image]:
-        """The channels of the layers of light, for clean radiances."""
+    def _lights(self, number: int, radiances: Mapping[str, Image]) -> dict[int, dict[tuple[int, str], Image]]:
+        """For each kind of file the channels of its layers of light, of clean radiances."""
+        if not radiances:
+            return {}
         images = self._light_images(number)
         held = kept_together(radiances, {name: self.lights[name].keeps(images[name]) for name in radiances})
-        channels: dict[tuple[int, str], Image] = {}
+        files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
         for name, radiance in held.items():
             layer, pixels = self.lights[name].layers[0], self.lights[name].stored(radiance, images[name])
-            channels |= {(layer.part, channel): pixels[..., i] for i, channel in enumerate(layer.channels[:3])}
-        return channels
+            files[layer.group] |= {(layer.part, each): pixels[..., i] for i, each in enumerate(layer.channels[:3])}
+        return files
 
     def _as_frame(self, number: int, images: dict[str, Image], lights: Mapping[str, Image]) -> Frame:
         color = images["color"]
