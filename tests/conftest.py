@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.color_space import import_colour
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.frame import Frame
 
 HEIGHT, WIDTH, FRAMES = 20, 24, 4

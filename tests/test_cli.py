@@ -24,7 +24,7 @@ from mcdenoise.models import create_model, list_models, pretrained_models, save_
 from mcdenoise.train import TrainConfig
 
 RGB = ["R", "G", "B"]
-POSITIONAL = {"folder", "sequence", "sequences", "scene", "images", "ops"}
+POSITIONAL = {"folder", "inputs", "sequence", "sequences", "scene", "images", "ops"}
 
 
 @pytest.fixture(autouse=True)
@@ -125,6 +125,17 @@ def test_help_names_every_option(run: Callable[..., tuple[int, str, str]], comma
     assert not re.search(r"--[a-z-]+ [^ ]+ +\((?:default|required)", text)
 
 
+@pytest.mark.parametrize("command", ["denoise", "inspect"])
+def test_help_on_the_frames_of_a_shot(run: Callable[..., tuple[int, str, str]], command: str) -> None:
+    text = run(command, "--help")[1]
+    assert text.startswith(f"usage: mcdenoise {command} [-h] [OPTIONS] INPUT [INPUT ...]\n")
+    assert "(default: )" not in text
+    assert "--map BUFFER=LAYER" in text
+    assert "--color-without-albedo " in text
+    assert "--no-color" not in text
+    assert ("'shot_%04d.exr'" in text) is (command == "denoise")
+
+
 def test_summary_and_version(run: Callable[..., tuple[int, str, str]], capsys: pytest.CaptureFixture[str]) -> None:
     status, text, _ = run("--help")
     assert status == 0
@@ -151,7 +162,7 @@ def test_unknown_command(refused: Callable[..., str]) -> None:
         (["denoise", "somewhere", "-o", "out", "--colour"], "--colour"),
         (["denoise", "somewhere", "-o", "out", "--threads", "many"], "--threads"),
         (["denoise", "somewhere", "-o", "out", "--alpha-min", "small"], "--alpha-min"),
-        (["denoise", "somewhere", "elsewhere", "-o", "out"], "elsewhere"),
+        (["evaluate", "somewhere", "elsewhere", "nowhere"], "nowhere"),
         (["models", "--json"], "--json"),
         (["train", "somewhere", "-o", "out", "--precision", "exact"], "--precision"),
     ],
@@ -314,7 +325,6 @@ def no_cameras(inputs: Path) -> None:
     ("spoil", "expected"),
     [
         (missing_buffer, "albedo2.exr: expected buffer 'albedo' for every frame"),
-        (missing_frame, "expected frame 1 after frame 0, found 2"),
         (another_size, "shading_normal3.exr: expected 24 x 20 pixels like the first color file, found 22 x 20"),
         (no_cameras, "camera_matrices.h: expected 'camera_matrices'"),
     ],
@@ -332,10 +342,32 @@ def test_a_sequence_that_does_not_fit_together_leaves_nothing(
     assert not out.exists()
 
 
+def test_a_missing_frame_is_told_and_gone_on_with(
+    run: Callable[..., tuple[int, str, str]], denoise: list[Any], small_sequence: Path, out: Path
+) -> None:
+    missing_frame(small_sequence / "inputs")
+    status, _, errors = run(*denoise)
+    assert (status, len(errors.splitlines())) == (0, 1)
+    assert "frames: 1 missing" in errors
+    assert sorted(path.stem for path in out.glob("*.exr")) == ["denoised0", "denoised2", "denoised3"]
+    report = json.loads((out / "denoise.json").read_text())
+    assert report["warnings"] == [errors.partition("warning: ")[2].strip()]
+    # Positions and cameras lead across the gap.
+    assert not report["frames"]["2"]["reset"]
+    assert report["frames"]["2"]["history"] > 0.5
+
+
+def test_training_refuses_a_missing_frame(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
+    missing_frame(small_sequence / "inputs")
+    message = refused("train", small_sequence, "-o", out, "--frames", "2", "--crop", "16")
+    assert "plane: expected frame 1 after frame 0, found 2" in message
+    assert not out.exists()
+
+
 def test_a_folder_that_is_no_sequence(refused: Callable[..., str], tmp_path: Path, weights: Path, out: Path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
-    for folder, found in ((tmp_path / "nowhere", "no such folder"), (weights, "a file"), (empty, "no color file")):
+    for folder, found in ((tmp_path / "nowhere", "no such folder"), (weights, "'.safetensors'"), (empty, "none")):
         message = refused("denoise", folder, "-o", out, "--weights", weights)
         assert str(folder) in message
         assert f"found {found}" in message
@@ -392,7 +424,7 @@ def test_denoise(run: Callable[..., tuple[int, str, str]], denoise: list[Any], o
     figures = tmp_path / "times.json"
     status, text, errors = run(*denoise, "--frames", "1,3", "--threads", "1", "--json", figures, "--keep-all")
     assert (status, errors) == (0, "")
-    assert "plane: bmfr layout, 2 frames of 24x20" in text
+    assert "plane: bmfr layout, 2 frames, 1 to 3, of 24x20" in text
     assert "accumulate: kept (positions and cameras)" in text
     assert "milliseconds a frame" in text
     assert sorted(path.name for path in out.iterdir()) == ["denoise.json", "denoised1.exr", "denoised3.exr"]
@@ -543,7 +575,9 @@ def test_train(
 
 def test_train_without_data(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
     assert "expected at least one sequence folder, found none" in refused("train", "-o", out)
-    assert "expected the folder of a sequence, found no such folder" in refused("train", "nowhere", "-o", out)
+    assert "expected a folder, an image, or a pattern such as shot_####.exr, found no such folder" in refused(
+        "train", "nowhere", "-o", out
+    )
     assert "expected images of at least 128 pixels" in refused("train", small_sequence, "-o", out, "--frames", "2")
     assert "steps: expected at least 1, found 0" in refused("train", small_sequence, "-o", out, "--steps", "0")
     assert not out.exists()
@@ -633,7 +667,7 @@ def test_a_process_denoises(denoise: list[Any], out: Path) -> None:
 def test_a_process_refuses_in_one_line(weights: Path, tmp_path: Path, out: Path) -> None:
     result = process("denoise", tmp_path / "nowhere", "-o", out, "--weights", weights)
     assert (result.returncode, result.stdout) == (2, "")
-    assert re.fullmatch(r"mcdenoise denoise: .*nowhere: expected the folder of a sequence.*\n", result.stderr)
+    assert re.fullmatch(r"mcdenoise denoise: .*nowhere: expected a folder, an image, or a pattern.*\n", result.stderr)
 
 
 def test_the_installed_command_helps() -> None:

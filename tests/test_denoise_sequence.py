@@ -15,7 +15,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-import mcdenoise.folder
 from mcdenoise import Denoiser, Frame, InputError, create_model
 from mcdenoise.cli import main
 from mcdenoise.data import Sequence, open_sequence, read_exr, write_exr
@@ -99,7 +98,7 @@ def test_a_sequence_is_written_with_its_numbers_and_metadata(small_sequence: Pat
 def test_full_floats_and_a_denoiser_that_was_used_before(small_sequence: Path, tmp_path: Path) -> None:
     sequence, denoiser = open_sequence(small_sequence, "1"), Denoiser(small_model())
     denoiser(open_sequence(small_sequence).frame(0))
-    denoise_sequence(sequence, tmp_path / "out", denoiser, "small", half=False)
+    denoise_sequence(sequence, tmp_path / "out", denoiser, "small", full_float=True)
     assert stored(tmp_path / "out" / "denoised1.exr") == "float"
     denoiser.reset()
     expected = denoiser(sequence.frame(1))[0].permute(1, 2, 0).numpy()
@@ -184,18 +183,18 @@ DELAY = 0.15
 
 def slowly(monkeypatch: pytest.MonkeyPatch, *, read: float = 0.0, write: float = 0.0) -> None:
     """Let reading a frame and writing one take so many seconds more."""
-    frame, write_exr = Sequence.frame, mcdenoise.folder.write_exr
+    frame, write_frame = Sequence.frame, Sequence.write
 
     def slow_frame(*arguments: Any, **options: Any) -> Frame:
         time.sleep(read)
         return frame(*arguments, **options)
 
-    def slow_write(*arguments: Any, **options: Any) -> None:
+    def slow_write(*arguments: Any, **options: Any) -> Path:
         time.sleep(write)
-        write_exr(*arguments, **options)
+        return write_frame(*arguments, **options)
 
     monkeypatch.setattr(Sequence, "frame", slow_frame)
-    monkeypatch.setattr("mcdenoise.folder.write_exr", slow_write)
+    monkeypatch.setattr(Sequence, "write", slow_write)
 
 
 def test_reading_and_writing_go_on_while_a_frame_is_denoised(
@@ -230,7 +229,7 @@ def test_reading_ahead_does_not_change_an_image(
     for name, ahead in (("ahead", True), ("alone", False)):
         denoiser = Denoiser(small_model())
         monkeypatch.setattr(type(denoiser._tiles), "has_room_ahead", lambda *_, room=ahead: room)
-        denoise_sequence(sequence, tmp_path / name, denoiser, "small", half=False)
+        denoise_sequence(sequence, tmp_path / name, denoiser, "small", full_float=True)
         assert denoiser.has_room_ahead is ahead
     for number in sequence.numbers:
         images = [read_exr(tmp_path / name / f"denoised{number}.exr")[0] for name in ("ahead", "alone")]

@@ -12,8 +12,12 @@ from mcdenoise.errors import InputError
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Json = Path | None
 # Frames of a shot: folders, files, patterns.
-Inputs = tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT [INPUT ...]")]]
+Inputs = tyro.conf.Positional[
+    Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT [INPUT ...]", help_behavior_hint="(required)")]
+]
 Map = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="BUFFER=LAYER")]]
+# On or off, and off without a word: that needs no second option which says so.
+Flag = tyro.conf.FlagCreatePairsOff[bool]
 
 # With very many threads torch does not fail but crashes.
 _MOST_THREADS = 1024

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from mcdenoise.cli._options import Inputs, Json, Map, Out, check_threads
+from mcdenoise.cli._options import Flag, Inputs, Json, Map, Out, check_threads
 from mcdenoise.cli._output import print_times, progress_bar, stages, warn, write_json
 from mcdenoise.cli.inspect import open_inputs, print_sequence
 from mcdenoise.denoiser import Precision
@@ -31,8 +31,8 @@ def denoise(
     threads: int | None = None,
     precision: Precision = "float32",
     map: Map = (),
-    color_without_albedo: bool = False,
-    color_with_albedo: bool = False,
+    color_without_albedo: Flag = False,
+    color_with_albedo: Flag = False,
     output_layer: str | None = None,
     layers: tuple[str, ...] = (),
     alpha: bool = False,
@@ -51,7 +51,7 @@ def denoise(
     """Denoise the frames of a shot: writes the same files, clean, to OUT, and OUT/denoise.json.
 
     Args:
-        inputs: a folder; files; or a pattern such as 'shot_####.exr', 'shot_%%04d.exr' or 'shot_*.exr'. Each may be an
+        inputs: a folder; files; or a pattern such as 'shot_####.exr', 'shot_%04d.exr' or 'shot_*.exr'. Each may be an
             EXR with layers, or one file a buffer; `mcdenoise inspect` shows what is taken from where.
         out: folder to write to: files of the same names, with the radiance replaced and all else as it was
             (of the BMFR layout: denoisedN.exr).
@@ -63,7 +63,7 @@ def denoise(
         device: cpu or cuda.
         threads: CPU threads; torch's choice by default.
         precision: of the network's convolutions; bfloat16 is faster on processors that have it.
-        map: layer of a buffer whose name does not tell, such as albedo=RGBA.diff; 'motion=' for none. Repeatable.
+        map: layer of a buffer whose name does not tell, such as albedo=RGBA.diff; 'motion=' for none.
         color_without_albedo: the noisy color was divided by the albedo, which is multiplied back.
         color_with_albedo: it was not; by default its values tell, and if they do not, it was not.
         output_layer: add the result as a layer of this name, and replace nothing.

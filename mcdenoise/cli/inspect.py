@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence as Sequential
 from pathlib import Path
 
-from mcdenoise.cli._options import Inputs, Json, Map
+from mcdenoise.cli._options import Flag, Inputs, Json, Map
 from mcdenoise.cli._output import print_rows, warn, write_json
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.errors import InputError
@@ -15,8 +15,8 @@ def inspect(
     inputs: Inputs,
     frames: str | None = None,
     map: Map = (),
-    color_without_albedo: bool = False,
-    color_with_albedo: bool = False,
+    color_without_albedo: Flag = False,
+    color_with_albedo: Flag = False,
     json: Json = None,
 ) -> None:
     """Show what would be read of the frames of a shot, from where, and why; denoises nothing.
@@ -24,7 +24,7 @@ def inspect(
     Args:
         inputs: a folder; files; or a pattern, as for `mcdenoise denoise`.
         frames: which frames, such as 0-59,70; all by default.
-        map: layer of a buffer whose name does not tell, such as albedo=RGBA.diff; 'motion=' for none. Repeatable.
+        map: layer of a buffer whose name does not tell, such as albedo=RGBA.diff; 'motion=' for none.
         color_without_albedo: the noisy color was divided by the albedo.
         color_with_albedo: it was not.
         json: write what is shown to this file too.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ class DataFolders:
 
         Raises:
             InputError: there is none to train on, a sequence has no references or not the features that the model
-                needs, none is long enough, or one is smaller than the crop.
+                needs, frames are missing between others, none is long enough, or one is smaller than the crop.
         """
         if not training:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
@@ -146,6 +147,12 @@ def _check_trainable(sequence: Sequence, wanted: frozenset[str]) -> None:
     if missing:
         names = ", ".join([*(name for name in _FEATURES if name in wanted), *sorted(wanted - set(_FEATURES))])
         raise InputError(f"{sequence.root}: expected {names} to train this model on, found no {missing[0]}")
+    for one, following in pairwise(sequence.numbers):
+        if following != one + 1:
+            raise InputError(
+                f"{sequence.root}: expected frame {one + 1} after frame {one}, found {following}; a clip to train on "
+                "has no gaps: render it, or keep the frames of each run in a folder of their own"
+            )
     without = sorted(set(sequence.numbers) - set(sequence.reference_numbers))
     if without:
         raise InputError(

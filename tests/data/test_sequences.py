@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from mcdenoise.data import open_sequence, read_exr, write_exr
-from mcdenoise.data.readers.bmfr import realisation_folder, write_bmfr_frame
 from mcdenoise.data.camera_matrices import CameraMatrices, read_camera_matrices, write_camera_matrices
+from mcdenoise.data.readers.bmfr import realisation_folder, write_bmfr_frame
 from mcdenoise.data.sequences import parse_frames, with_unique_names
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame

@@ -57,7 +57,7 @@ def test_errors_are_means_over_the_frames(sequence: Sequence) -> None:
 
 def test_the_errors_are_those_of_the_files_that_would_be_written(sequence: Sequence, tmp_path: Path) -> None:
     denoiser = Denoiser(Accumulated(same))
-    denoise_sequence(sequence, tmp_path / "out", denoiser, "accumulated", half=False)
+    denoise_sequence(sequence, tmp_path / "out", denoiser, "accumulated", full_float=True)
     written = evaluate_folder(sequence, tmp_path / "out", protocol="meng2020")
     found = evaluate_method(sequence, denoiser, "accumulated", protocol="meng2020")
     for name, table in written.tables.items():

@@ -19,8 +19,8 @@ import torch
 
 import mcdenoise
 from mcdenoise.data import open_sequence
-from mcdenoise.data.readers.bmfr import write_buffer
 from mcdenoise.data.exr import read_exr, write_exr
+from mcdenoise.data.readers.bmfr import write_buffer
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
