@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,17 @@ from mcdenoise.data.files import write_text
 from mcdenoise.data.images import FORMATS
 from mcdenoise.data.readers.cameras import convert, read_as
 from mcdenoise.data.readers.rewrite import write_like
-from mcdenoise.data.readers.values import Row, normal_is_encoded, nothing_hit, read_radiance
+from mcdenoise.data.readers.values import (
+    MOTION_PAIRS,
+    USUAL_MOTION,
+    Convention,
+    Pair,
+    Row,
+    normal_is_encoded,
+    nothing_hit,
+    read_motion,
+    read_radiance,
+)
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
 
@@ -72,6 +83,7 @@ class BmfrFolder:
     more_colors: Sequence[Mapping[int, Path]] = ()
     encoded_normals: bool = False
     camera_convention: str = ""
+    motion: Convention | None = USUAL_MOTION
     table: Sequence[Row] = ()
     warnings: Sequence[str] = ()
     unused: Sequence[str] = ()
@@ -85,6 +97,7 @@ class BmfrFolder:
     def buffers(self) -> frozenset[str]:
         """Names of the buffers that every frame has, as :meth:`frame` gives them."""
         present = {name for name, files in self.files.items() if all(number in files for number in self.numbers)}
+        present -= {"motion"} if self.motion is None else set()
         if self.cameras is not None:
             present |= {"view_projection", "depth"} if "position" in present else {"view_projection"}
         return frozenset(present)
@@ -116,6 +129,11 @@ class BmfrFolder:
                 matrix, distance = _view_depth(matrix, buffers["position"])
                 buffers.setdefault("depth", distance)
             buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
+        if self.motion is None:
+            buffers.pop("motion", None)
+        elif "motion" in buffers and self.motion != USUAL_MOTION:
+            stored = buffers["motion"][0].permute(1, 2, 0).numpy()
+            buffers["motion"] = torch.from_numpy(self.motion.apply(stored)).permute(2, 0, 1)[None].contiguous()
         if self.encoded_normals and "normal" in buffers:
             encoded = buffers["normal"]
             buffers["normal"] = torch.where((encoded != 0).any(1, keepdim=True), 2 * encoded - 1, 0)
@@ -263,15 +281,19 @@ def _look(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
     }
     words = {name: "" for name in sorted(folder.files) if folder.files[name]}
     warnings: list[str] = []
+    motion: Convention | None = USUAL_MOTION
+    if "motion" in words:
+        motion, words["motion"], warnings = read_motion(_pairs(folder), USUAL_MOTION)
     has_albedo = stated is not False
     if "albedo" not in folder.files:
         words["color"] = "radiance"
     elif stated is not None:
         words["color"] = f"{'with' if stated else 'without'} albedo, as stated"
     else:
-        has_albedo, words["color"], warnings = read_radiance(
+        has_albedo, words["color"], doubts = read_radiance(
             images["color"], np.clip(np.nan_to_num(images["albedo"]), 0, 1), images.get("reference"), None
         )
+        warnings += doubts
     encoded = "normal" in images and normal_is_encoded(images["normal"])
     if encoded:
         words["normal"] = "stored as n/2 + 1/2, decoded"
@@ -301,10 +323,26 @@ def _look(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
         color_has_albedo=has_albedo,
         encoded_normals=encoded,
         camera_convention=convention,
+        motion=motion,
         table=rows,
         warnings=warnings,
         unused=_unused(folder),
     )
+
+
+def _pairs(folder: BmfrFolder) -> list[Pair]:
+    """Neighbouring frames, by which the convention of their motion is told."""
+    kept = [name for name in ("albedo", "normal") if folder.files.get(name)] or ["color"]
+
+    def features(number: int) -> dict[str, Image]:
+        found = {name: folder._read(name, folder.files[name][number])[0].permute(1, 2, 0).numpy() for name in kept}
+        return {name: np.clip(np.nan_to_num(image), -1, 1) for name, image in found.items()}
+
+    following = [(a, b) for a, b in pairwise(folder.numbers) if b == a + 1][:MOTION_PAIRS]
+    motion = folder.files["motion"]
+    return [
+        (features(b), features(a), folder._read("motion", motion[b])[0].permute(1, 2, 0).numpy()) for a, b in following
+    ]
 
 
 def _unused(folder: BmfrFolder) -> list[str]:

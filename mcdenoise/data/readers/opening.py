@@ -20,20 +20,19 @@ from mcdenoise.data.readers.layers import Layer, layers_of
 from mcdenoise.data.readers.lights import find_lights
 from mcdenoise.data.readers.names import FileGroup, pattern_of
 from mcdenoise.data.readers.values import (
+    MOTION_PAIRS,
     USUAL_MOTION,
     Convention,
     Row,
-    match_motion,
     normal_is_encoded,
     nothing_hit,
+    read_motion,
     read_radiance,
 )
 from mcdenoise.errors import InputError
 
 # How motion is stored where the name of its layer tells: Blender's points to the frame before, in pixels, y up.
 _MOTION = {"vector": Convention(1, -1, "previous - current, y up, pixels")}
-# The pairs of frames that are looked at to tell what motion says.
-_PAIRS = 3
 # Pixels by which points move where a camera moves.
 _MOVED = 0.3
 # How far from the origin a camera is that sees positions in its own space, in distances of what it sees.
@@ -261,7 +260,7 @@ def _motion(shot: RenderedFiles) -> tuple[Convention, str]:
     kept = {"albedo", "normal"} & set(shot.choice.layers) or {"color"}
     pairs = []
     moved = False
-    following = [(a, b) for a, b in pairwise(shot.numbers) if b == a + 1][:_PAIRS]
+    following = [(a, b) for a, b in pairwise(shot.numbers) if b == a + 1][:MOTION_PAIRS]
     for before, now in following:
         wanted = {
             name: shot.choice.layers[name]
@@ -280,16 +279,11 @@ def _motion(shot: RenderedFiles) -> tuple[Convention, str]:
             "instead"
         )
         return given, "all zeros: not used"
-    chosen, told = match_motion(pairs, given)
+    chosen, words, warnings = read_motion(pairs, given)
+    shot.warnings += warnings
     if chosen is None:
         del shot.choice.layers["motion"]
-        shot.warnings.append(
-            "'motion': does not lead to what looks alike in the frame before, whichever way it is read; it is not used"
-        )
-        return given, "fits no neighbouring frame: not used"
-    if chosen[:2] != given[:2]:
-        shot.warnings.append(f"'motion': read as {chosen.words}, since only so frames match the ones before them")
-    return chosen, f"{chosen.words}{', as neighbouring frames match' if told else ''}"
+    return chosen or given, words
 
 
 def _camera_moved(

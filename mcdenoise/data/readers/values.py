@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -31,6 +31,8 @@ _MOVES, _LEAST_MOVING = 0.5, 64
 _BETTER = 0.85
 # And motion says something where it matches so much better than none.
 _TELLING = 0.98
+# How many pairs of frames are looked at.
+MOTION_PAIRS = 3
 
 
 class Row(NamedTuple):
@@ -239,13 +241,29 @@ def conventions(size: tuple[int, int], motion: Image) -> list[Convention]:
     ]
 
 
-def match_motion(
-    pairs: Sequence[tuple[Mapping[str, Image], Mapping[str, Image], Image]], given: Convention
-) -> tuple[Convention | None, bool]:
+# Features of a frame by name, those of the frame before, and the motion as stored.
+Pair: TypeAlias = tuple[Mapping[str, Image], Mapping[str, Image], Image]
+
+
+def read_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention | None, str, list[str]]:
+    """The convention of motion, see :func:`match_motion`, with the words for it, and what to warn of."""
+    chosen, told = match_motion(pairs, given)
+    if chosen is None:
+        warning = (
+            "'motion': does not lead to what looks alike in the frame before, whichever way it is read; it is not used"
+        )
+        return None, "fits no neighbouring frame: not used", [warning]
+    warnings = []
+    if chosen[:2] != given[:2]:
+        warnings = [f"'motion': read as {chosen.words}, since only so frames match the ones before them"]
+    return chosen, f"{chosen.words}{', as neighbouring frames match' if told else ''}", warnings
+
+
+def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention | None, bool]:
     """Which convention of motion leads to the pixels of the frame before that look alike.
 
     Args:
-        pairs: features of a frame by name, those of the frame before, and the motion as stored.
+        pairs: of neighbouring frames.
         given: the convention that the format is known for.
 
     Returns:
