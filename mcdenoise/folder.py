@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.data import Sequence, write_exr
+from mcdenoise.data.exr import Metadata
 from mcdenoise.data.files import write_text
 from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
@@ -75,6 +76,7 @@ def denoise_sequence(
     references: bool = False,
     on_frame: Callable[[], None] = lambda: None,
     on_output: Callable[[Frame, Output], None] | None = None,
+    on_written: Callable[[str, Tensor, Metadata], None] | None = None,
 ) -> SequenceReport:
     """Denoise a sequence and write ``OUT/denoisedN.exr`` and ``OUT/denoise.json``.
 
@@ -90,6 +92,8 @@ def denoise_sequence(
         references: read references too, for ``on_output``.
         on_frame: called after each denoised frame.
         on_output: called with each frame and its image with those on the way to it, which take memory of their own.
+        on_written: called with the name of each written file, without ``.exr``, its image ``(1, 3, H, W)`` and its
+            metadata, one after the other in the thread that writes; ``Preview.add`` is one.
 
     Raises:
         InputError: a file is damaged, a buffer has invalid values or one that the model needs is missing, the result is
@@ -105,8 +109,13 @@ def denoise_sequence(
     def write(number: int, image: Tensor, done: FrameReport) -> None:
         start = time.perf_counter()
         pixels = image[0].permute(1, 2, 0).cpu().numpy()
-        write_exr(out / f"denoised{number}.exr", pixels, ["R", "G", "B"], half=half, metadata=sequence.metadata(number))
+        path, metadata = out / f"denoised{number}.exr", sequence.metadata(number)
+        write_exr(path, pixels, ["R", "G", "B"], half=half, metadata=metadata)
         done.beside["write"] = _since(start)
+        if on_written is not None:
+            start = time.perf_counter()
+            on_written(path.stem, image, metadata)
+            done.beside["show"] = _since(start)
 
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
