@@ -18,7 +18,7 @@ from mcdenoise.data.png import Picture, caption, enlarge, write_png
 from mcdenoise.folder import SequenceReport, denoise_sequence, make_folder
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
-from mcdenoise.metrics import displayed
+from mcdenoise.metrics import display_codes
 from mcdenoise.models import DEFAULT, Output
 from mcdenoise.report import check_packages, write_report
 from mcdenoise.results import FILE
@@ -137,7 +137,7 @@ def _sheet(frame: Frame, output: Output) -> Picture:
 
 
 def _column(text: str, image: Tensor) -> Picture:
-    picture = (displayed(image[0]).permute(1, 2, 0).cpu().numpy() * 255 + 0.5).astype(np.uint8)
+    picture = display_codes(image[0]).permute(1, 2, 0).cpu().numpy()
     height, width, _ = picture.shape
     left, top, wide, high = _CLOSE_UP
     x, y = int(left * width), int(top * height)

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.data import Sequence
-from mcdenoise.data.exr import Image
+from mcdenoise.data.exr import Image, Metadata
 from mcdenoise.data.files import write_text
 from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
@@ -96,6 +96,7 @@ def denoise_sequence(
     references: bool = False,
     on_frame: Callable[[], None] = lambda: None,
     on_output: Callable[[Frame, Output], None] | None = None,
+    on_written: Callable[[str, Tensor, Metadata], None] | None = None,
 ) -> SequenceReport:
     """Denoise a sequence and write its files, clean (:meth:`mcdenoise.data.Sequence.write`), and ``OUT/denoise.json``.
 
@@ -112,6 +113,8 @@ def denoise_sequence(
         references: read references too, for ``on_output``.
         on_frame: called after each denoised frame.
         on_output: called with each frame and its image with those on the way to it, which take memory of their own.
+        on_written: called with the name of each written file, without ``.exr``, its image ``(1, 3, H, W)`` and its
+            metadata, one after the other in the thread that writes; ``Preview.add`` is one.
 
     Raises:
         InputError: a file is damaged, a buffer has invalid values or one that the model needs is missing, the result is
@@ -137,6 +140,10 @@ def denoise_sequence(
             full_float=full_float,
         )
         done.beside["write"] = _since(start)
+        if on_written is not None:
+            start = time.perf_counter()
+            on_written(report.files[number].stem, output.image, sequence.metadata(number))
+            done.beside["show"] = _since(start)
 
     def step(frame: Frame) -> Output:
         return denoiser.output(frame, stages=on_output is not None)

@@ -30,7 +30,7 @@ LIBRARY = SIGNAL | {
     "denoiser",
 }
 REPORTS = {"benchmark", "check", "evaluate", "folder", "methods", "report"}
-TOOLS = REPORTS | {"budget", "demo", "export", "train"}
+TOOLS = REPORTS | {"budget", "demo", "export", "preview", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),
@@ -67,7 +67,7 @@ FAST_FORMS = ("mcdenoise.ops._numba", "mcdenoise.ops._triton")
 # Rooms in which a file still imports one that imports it.
 CIRCULAR: set[str] = set()
 # `import mcdenoise` leaves these alone: optional, slow to load, or of use to the command line only.
-LAZY = {"OpenImageIO", "PIL", "colour", "jinja2", "matplotlib", "numba", "triton", "tyro"}
+LAZY = {"OpenImageIO", "PIL", "av", "colour", "jinja2", "matplotlib", "numba", "triton", "tyro"}
 LAZY |= {"drjit", "mitsuba", "pyoidn", "flip_evaluator", "lightning", "lightning_fabric", "tensorboard"}
 SECONDS = 0.5
 

@@ -19,6 +19,7 @@ from mcdenoise.frame import MOTION
 from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.methods import Spelling, parse_method
 from mcdenoise.models import DEFAULT, describe_weights
+from mcdenoise.preview import Preview
 
 
 def denoise(
@@ -46,6 +47,9 @@ def denoise(
     budget_ms: float | None = None,
     max_error: float | None = None,
     results: Path | None = None,
+    preview: bool = False,
+    preview_fps: float = 24.0,
+    preview_exposure: float | None = None,
     json: Json = None,
 ) -> None:
     """Denoise the frames of a shot: writes the same files, clean, to OUT, and OUT/denoise.json.
@@ -84,6 +88,9 @@ def denoise(
             slowest) that needs no more milliseconds a frame on this machine, measured once and without files.
         max_error: take the fastest one with an SMAPE that is no larger.
         results: folder of a finished benchmark to take errors from; those of the sequence's references by default.
+        preview: write OUT/preview/denoisedN.png too, on the sRGB curve, and OUT/preview.mp4 of several frames.
+        preview_fps: frames per second of that video.
+        preview_exposure: in stops; by default the first frame decides for all: its typical radiance is middle grey.
         json: write the run times to this file too.
     """
     keep_heap()
@@ -92,6 +99,8 @@ def denoise(
         torch.set_num_threads(threads)
     if alpha_min is not None and not 0 < alpha_min <= 1:
         raise InputError(f"--alpha-min: expected in (0, 1], found {alpha_min}")
+    if not preview and (preview_fps != 24.0 or preview_exposure is not None):
+        raise InputError("--preview-fps, --preview-exposure: expected together with --preview")
     opened = open_inputs(
         *(inputs, frames, map),
         without_albedo=color_without_albedo,
@@ -100,6 +109,9 @@ def denoise(
     )
     if alpha and "alpha" not in opened.buffers:
         raise InputError(f"--alpha: expected an alpha to denoise, found none in {opened.root}; leave the option out")
+    shown = None
+    if preview:
+        shown = Preview(out, video=len(opened) > 1, frames_per_second=preview_fps, exposure=preview_exposure)
     if budget_ms is not None or max_error is not None:
         if weights is not None or model is not None:
             raise InputError("--budget-ms, --max-error: expected no --model or --weights: they choose it")
@@ -139,8 +151,12 @@ def denoise(
             full_float=full_float,
             output_layer=output_layer,
             on_frame=lambda: progress.advance(task),
+            on_written=shown.add if shown else None,
         )
-    taken = time.perf_counter() - began
+        taken = time.perf_counter() - began
+        if shown:
+            task = progress.add_task("preview", total=len(opened))
+            shown.close(on_frame=lambda: progress.advance(task))
     for row in report.plan:
         print(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
     if report.replaced_pixels:
@@ -154,8 +170,10 @@ def denoise(
     warn(report.warnings)
     files = list(report.files.values())
     names = files[0].name if len(files) == 1 else f"{files[0].name} to {files[-1].name}"
-    print(f"{len(files)} {'frame' if len(files) == 1 else 'frames'} in {taken:.1f} s: {out / names}")
     write_json(json, {"model": report.model, "milliseconds": report.milliseconds, "beside": report.beside})
+    if shown:
+        print(f"preview: {shown.written[-1]}")
+    print(f"{len(files)} {'frame' if len(files) == 1 else 'frames'} in {taken:.1f} s: {out / names}")
 
 
 def _spelling(model: str | None, weights: Path | None) -> Spelling:

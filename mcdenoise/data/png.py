@@ -1,8 +1,9 @@
-"""PNG pictures through OpenImageIO: images side by side with captions, for people to look at."""
+"""PNG pictures through OpenImageIO, for people to look at: single ones, and images side by side with captions."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -14,6 +15,8 @@ from mcdenoise.errors import InputError
 Picture = NDArray[np.uint8]
 
 _CAPTION_HEIGHT = 28
+# The last chunk of every PNG, which is empty, and its checksum.
+_END = b"IEND\xae\x42\x60\x82"
 
 
 def write_png(path: Path, picture: Picture) -> None:
@@ -26,13 +29,56 @@ def write_png(path: Path, picture: Picture) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    height, width, channels = picture.shape
     with atomic_path(path) as temporary:
-        buffer = oiio.ImageBuf(oiio.ImageSpec(width, height, channels, "uint8"))
-        buffer.set_pixels(oiio.ROI(0, width, 0, height), np.ascontiguousarray(picture))
-        if not buffer.write(str(temporary)):
-            reason = buffer.geterror().splitlines()[0]
+        reason = _write(temporary, picture).replace(str(temporary), path.name)
+        if reason:
             raise InputError(f"{path}: cannot be written ({reason}); check the folder, its permissions and free space")
+
+
+def read_png(path: Path) -> Picture:
+    """Read an 8-bit picture that :func:`write_png` has written.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        ``(H, W, 3)``.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    file = oiio.ImageInput.open(str(path))
+    if file is None:
+        raise InputError(f"{path}: expected a PNG, found: {_reason(oiio)}")
+    pixels = file.read_image(0, 0, 0, 3, "uint8")
+    reason = _reason(file)
+    file.close()
+    if pixels is None or reason or file.spec().nchannels != 3:
+        raise InputError(f"{path}: expected a PNG of 3 channels, found: {reason or file.spec().nchannels}")
+    return np.asarray(pixels, dtype=np.uint8)
+
+
+def _write(path: Path, picture: Picture) -> str:
+    """Write the file and return why that failed, or an empty text."""
+    height, width, channels = picture.shape
+    spec = oiio.ImageSpec(width, height, channels, "uint8")
+    # The default of 6 takes more than twice as long, and saves 6 % of the bytes.
+    spec.attribute("png:compressionLevel", 4)
+    # Not an ImageBuf: of each file a note stays in OpenImageIO's cache, and with it a hole in the heap.
+    file = oiio.ImageOutput.create("png")
+    if file is None or not file.open(str(path), spec):
+        return _reason(file or oiio)
+    written = file.write_image(np.ascontiguousarray(picture))
+    reason = _reason(file)
+    if not file.close() or not written:
+        return reason or "writing failed"
+    # OpenImageIO does not notice a full disk: see whether the end is there.
+    return "" if path.read_bytes().endswith(_END) else "incomplete"
+
+
+def _reason(source: Any) -> str:
+    """The pending error of OpenImageIO in one line."""
+    return str(source.geterror()).strip().split("\n")[0]
 
 
 def caption(picture: Picture, text: str) -> Picture:

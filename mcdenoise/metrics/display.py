@@ -30,6 +30,22 @@ def displayed(image: Tensor) -> Tensor:
     return linear_rgb_to_rgb(image.clamp(0, 1))
 
 
+def display_codes(image: Tensor) -> Tensor:
+    """What :func:`displayed` gives as 8-bit codes: ``round(255 displayed)``.
+
+    Args:
+        image: ``(..., 3, H, W)`` scene-linear radiance, Rec. 709 primaries; no NaN.
+
+    Returns:
+        The same shape, uint8.
+
+    Example:
+        >>> display_codes(torch.tensor([0.0, 0.18, 1.0, 9.0]).expand(3, 1, 4))[0].tolist()
+        [[0, 118, 255, 255]]
+    """
+    return (displayed(image) * 255).round().to(torch.uint8)
+
+
 def psnr_srgb(image: Tensor, reference: Tensor) -> Tensor:
     """Peak signal-to-noise ratio as displayed: clamped to [0, 1], sRGB curve, peak 1.
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mcdenoise.metrics import displayed, psnr_srgb, smape_linear
+from mcdenoise.metrics import display_codes, psnr_srgb, smape_linear
 
 Image = NDArray[np.float32]
 Codes = NDArray[np.uint8]
@@ -56,8 +56,7 @@ def decode(codes: NDArray[Any]) -> NDArray[np.float64]:
 def to_srgb(radiance: Image) -> Codes:
     """As a display shows it at exposure 0: clamped to [0, 1], sRGB curve, 8 bit."""
     image = torch.from_numpy(np.nan_to_num(np.ascontiguousarray(radiance, dtype=np.float32)))
-    shown = displayed(image.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
-    return np.asarray(np.rint(shown.numpy() * 255), dtype=np.uint8)
+    return np.asarray(display_codes(image.permute(2, 0, 1)).permute(1, 2, 0).numpy())
 
 
 def halved(radiance: Image) -> Image:

@@ -1,0 +1,158 @@
+"""Videos: as many frames as pictures, the same pictures, and no file that is not whole."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mcdenoise.data.png import Picture
+from mcdenoise.data.video import write_video
+from mcdenoise.errors import InputError
+
+av = pytest.importorskip("av")
+
+
+def decode(path: Path) -> list[Picture]:
+    """The frames of a video, by what its file says of their colours."""
+    with av.open(path) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def gradient(height: int, width: int, blue: int = 60) -> Picture:
+    """Colours that change little from pixel to pixel, which chroma of half the resolution holds."""
+    rows, columns = np.mgrid[0:height, 0:width]
+    red, green = 40 + 150 * rows / height, 40 + 150 * columns / width
+    return np.stack([red, green, np.full_like(red, blue)], -1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("count", [1, 2, 11])
+def test_every_picture_is_a_frame(tmp_path: Path, count: int) -> None:
+    pictures = [gradient(48, 64, 20 * number) for number in range(count)]
+    write_video(tmp_path / "a.mp4", iter(pictures), 12.5)
+    frames = decode(tmp_path / "a.mp4")
+    assert len(frames) == count
+    for picture, frame in zip(pictures, frames, strict=True):
+        # A wrong matrix or range, or a neighbour in its place, is off by 6 codes and more.
+        assert np.abs(frame.astype(float) - picture).mean() < 3
+    with av.open(tmp_path / "a.mp4") as container:
+        stream = container.streams.video[0]
+        assert (stream.codec.name, stream.pix_fmt, float(stream.average_rate)) == ("h264", "yuv420p", 12.5)
+        assert float(stream.duration * stream.time_base) == pytest.approx(count / 12.5)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("color", "luma"),
+    # ITU-R BT.709: Y = 16 + 219 (0.2126 R + 0.7152 G + 0.0722 B).
+    [((255, 255, 255), 235), ((0, 0, 0), 16), ((255, 0, 0), 63), ((0, 255, 0), 173), ((0, 0, 255), 32)],
+)
+def test_colors_are_those_that_the_file_states(tmp_path: Path, color: tuple[int, int, int], luma: int) -> None:
+    write_video(tmp_path / "a.mp4", [np.full((32, 32, 3), color, np.uint8)])
+    with av.open(tmp_path / "a.mp4") as container:
+        frame = next(container.decode(video=0))
+        stated = (frame.color_primaries, frame.color_trc, frame.colorspace, frame.color_range)
+        # BT.709 primaries and matrix, IEC 61966-2-1 (sRGB) curve, 16 to 235.
+        assert stated == (1, 13, 1, 1)
+        assert abs(int(frame.to_ndarray(format="yuv420p")[16, 16]) - luma) <= 1
+
+
+@pytest.mark.parametrize(
+    ("size", "shown"),
+    [((1, 1), (2, 2)), ((3, 7), (4, 8)), ((45, 80), (46, 80)), ((2, 8192), (2, 4096)), ((8200, 50), (4096, 24))],
+)
+def test_sizes(tmp_path: Path, size: tuple[int, int], shown: tuple[int, int]) -> None:
+    write_video(tmp_path / "a.mp4", [gradient(*size)] * 3)
+    frames = decode(tmp_path / "a.mp4")
+    assert [frame.shape for frame in frames] == [(*shown, 3)] * 3
+    if size == (45, 80):
+        # Nothing is stretched: the row that is repeated is the last one.
+        assert np.abs(frames[0][:45].astype(float) - gradient(*size)).mean() < 3
+
+
+def test_what_cannot_be_written_leaves_the_old_video(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    write_video(path, [gradient(16, 16)] * 2)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="expected pictures of"):
+        write_video(path, [gradient(16, 16), gradient(16, 18)])
+    with pytest.raises(ValueError, match="expected at least one picture"):
+        write_video(path, [])
+
+    def interrupted() -> None:
+        write_video(path, (picture if number < 5 else 1 / 0 for number, picture in enumerate([gradient(16, 16)] * 6)))
+
+    with pytest.raises(ZeroDivisionError):
+        interrupted()
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(InputError, match="cannot be written"):
+        write_video(tmp_path / "missing" / "a.mp4", [gradient(16, 16)])
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, 1e9, float("nan"), float("inf")])
+def test_frame_rates_that_cannot_be(tmp_path: Path, rate: float) -> None:
+    with pytest.raises(InputError, match="frames per second: expected 1 to 1000"):
+        write_video(tmp_path / "a.mp4", [gradient(16, 16)], rate)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_the_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match=r"pip install 'mcdenoise\[preview\]'"):
+        write_video(tmp_path / "a.mp4", [gradient(16, 16)])
+
+
+_LIMITED = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from mcdenoise.data.video import write_video
+from mcdenoise.errors import InputError
+path = Path(sys.argv[1])
+noise = np.random.default_rng(0).integers(0, 255, (8, 96, 96, 3), dtype=np.uint8)
+unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+for room in (0, 100, 5000, 40000):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, unlimited[1]))
+    try:
+        write_video(path, noise)
+        message = "no error"
+    except InputError as error:
+        message = str(error)
+    resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+    assert "cannot be written" in message and "\\n" not in message, (room, message)
+    assert list(path.parent.iterdir()) == [], room
+print("done")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the file size through the POSIX resource limit")
+def test_a_full_disk_is_told(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", _LIMITED, str(tmp_path / "a.mp4")]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout) == (0, "done\n"), result.stderr
+
+
+_MEMORY = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from mcdenoise.data.video import write_video
+first = np.random.default_rng(0).integers(0, 255, (360, 640, 3), dtype=np.uint8)
+def peak(count):
+    write_video(Path(sys.argv[1]), (np.roll(first, number, 1) for number in range(count)))
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+before = peak(60)
+print((peak(240) - before) / first.nbytes)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="reads the peak of memory through the POSIX resource usage")
+def test_memory_does_not_grow_with_the_number_of_pictures(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", _MEMORY, str(tmp_path / "a.mp4")]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    # Held together, the other 180 pictures would take the memory of so many.
+    assert float(result.stdout) < 18
