@@ -150,11 +150,9 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ImageHeader]:
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: expected one of {', '.join(FORMATS)}, found '{path.suffix}'; convert the file")
     name = FORMATS[path.suffix.lower()]
-    config = oiio.ImageSpec()
-    config.attribute("oiio:RawColor", 1)
     file, reason = None, "damaged header"
     with suppress(UnicodeDecodeError, MemoryError):
-        file = oiio.ImageInput.open(str(path), config)
+        file = oiio.ImageInput.open(str(path), as_stored())
         reason = pending_error(oiio).replace(f"EXR Error ({path}): ", "")
     if file is None:
         raise InputError(
@@ -169,6 +167,14 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ImageHeader]:
     except BaseException:
         file.close()
         raise
+
+
+def as_stored() -> oiio.ImageSpec:
+    """A configuration for OpenImageIO to hand out samples as they are: of a PNG, alpha is not multiplied in."""
+    config = oiio.ImageSpec()
+    config.attribute("oiio:RawColor", 1)
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    return config
 
 
 def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:

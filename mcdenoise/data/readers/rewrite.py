@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 
 from mcdenoise.data.exr import LARGEST_HALF, Image, pending_error
 from mcdenoise.data.files import atomic_path
-from mcdenoise.data.images import FORMATS, read_image_header
+from mcdenoise.data.images import FORMATS, as_stored, read_channels, read_image_header
 from mcdenoise.data.readers.transfer import encode
 from mcdenoise.errors import InputError
 
@@ -94,15 +94,20 @@ def _stored(image: Image, kind: Any) -> Any:
 
 def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image]) -> str:
     """A file of one picture: its other channels, and what kind of numbers it has, stay."""
-    picture = oiio.ImageBuf(str(source))
-    spec = picture.spec()
-    pixels = np.asarray(picture.get_pixels(oiio.FLOAT), dtype=np.float32)
-    names = list(spec.channelnames)
-    light = np.stack([replaced[name] for name in names[:3]], -1)
-    display = read_image_header(source).parts[0].display_referred
-    pixels[..., :3] = encode(light) if display else light
-    if len(names) > 3 and names[3] in replaced:
-        pixels[..., 3] = replaced[names[3]]
-    clean = oiio.ImageBuf(spec)
-    clean.set_pixels(spec.roi, pixels)
-    return "" if clean.write(str(target)) else pending_error(clean)
+    header = read_image_header(source).parts[0]
+    pixels = read_channels(source, {0: header.channels})[0]
+    light = np.stack([replaced[name] for name in header.channels[:3]], -1)
+    pixels[..., :3] = encode(light) if header.display_referred else light
+    if len(header.channels) > 3 and header.channels[3] in replaced:
+        pixels[..., 3] = replaced[header.channels[3]]
+    file, output = oiio.ImageInput.open(str(source), as_stored()), oiio.ImageOutput.create(str(target))
+    if file is None or output is None:
+        return pending_error(oiio)
+    if not output.open(str(target), file.spec()) or not output.write_image(pixels) or not output.close():
+        return pending_error(output)
+    try:
+        # A full disk is not noticed otherwise.
+        read_channels(target, {0: header.channels})
+    except InputError as error:
+        return f"incomplete: {error}"
+    return ""
