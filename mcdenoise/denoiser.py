@@ -122,6 +122,7 @@ class Denoiser:
         buffers: Collection[str] | None = None,
         frames: int | None = None,
         size: tuple[int, int] | None = None,
+        layers: int = 0,
     ) -> None:
         """Forget the history: the next frame is the first of a shot. A cut and a change of size do so by themselves.
 
@@ -130,6 +131,7 @@ class Denoiser:
             frames: how many frames there will be, where that is known.
             size: their height and width, where that and the buffers are known. Then ``has_room_ahead`` says whether
                 there is memory to read the next frame while one is denoised.
+            layers: how many layers every frame will have.
 
         Raises:
             InputError: frames of this size cannot be denoised within ``max_memory``; the message says with what.
@@ -142,7 +144,9 @@ class Denoiser:
         self.has_room_ahead = size is not None and frames != 1
         if buffers is not None and size is not None:
             streaming = self.has_history(buffers)
-            shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else MOTION), streaming)
+            # With what is in none of them.
+            carried = layers + (layers > 0) + (self.alpha and "alpha" in buffers)
+            shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else MOTION), streaming, carried=carried)
             self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
 
     def detach(self) -> None:
@@ -247,7 +251,8 @@ class Denoiser:
 
     def _shot(self, frame: Frame) -> Frames:
         streaming = self.has_history(frame.buffers)
-        return Frames(frame.size, frame.buffers, streaming, self.has_room_ahead, frame.color.shape[0])
+        batch, carried = frame.color.shape[0], len(self._carried(frame))
+        return Frames(frame.size, frame.buffers, streaming, self.has_room_ahead, batch, carried)
 
     def _is_last(self) -> bool:
         """Whether no frame that follows can have a history."""

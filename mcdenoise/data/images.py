@@ -174,6 +174,8 @@ def as_stored() -> oiio.ImageSpec:
     config = oiio.ImageSpec()
     config.attribute("oiio:RawColor", 1)
     config.attribute("oiio:UnassociatedAlpha", 1)
+    # Portable float maps begin with the lowest row; without the hint, OpenImageIO may leave it at the top.
+    config.attribute("pnm:pfmflip", 1)
     return config
 
 

@@ -32,7 +32,11 @@ _MOST_EXCESS = 0.02
 
 
 def carried(frame: Frame) -> Tensor | None:
-    """Layers and alpha of a frame side by side ``(B, 3 L + 1, H, W)``, as far as they are asked for."""
+    """Layers and alpha of a frame side by side ``(B, 3 L + 1, H, W)``, as far as they are asked for.
+
+    For a method with kernels, which filters them as its color and hands the result to :func:`answered`; they need not
+    be in the unit of what it filters otherwise, since only their proportions count.
+    """
     images = [*frame.layers.values(), *([] if (alpha := alpha_of(frame)) is None else [alpha])]
     return torch.cat(images, 1) if images else None
 
@@ -43,7 +47,13 @@ def alpha_of(frame: Frame) -> Tensor | None:
 
 
 def answered(frame: Frame, image: Tensor, filtered: Tensor | None) -> Output:
-    """A method's output with what its kernels made of :func:`carried`."""
+    """A method's output with what its kernels made of :func:`carried`.
+
+    Args:
+        frame: that the method was given.
+        image: ``(B, 3, H, W)`` its result.
+        filtered: ``(B, 3 L + 1, H, W)``; ``None`` where nothing was carried, or there was no kernel for it.
+    """
     if filtered is None:
         return Output(image)
     parts = iter(filtered.split(3, 1))

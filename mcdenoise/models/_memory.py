@@ -31,6 +31,8 @@ _LOADED_LATER = 0.45 * GB
 _BYTES = 4
 # Channels of a history: a long and a recent past, what they are compared by, and the length.
 _KEPT = 10
+# Of a layer, measured: as given, without albedo, two histories of six, filtered at each scale, and what is on the way.
+_PER_CARRIED = 56
 # Buffers of a frame that are kept beside them.
 _SURFACE = ("position", "normal", "depth")
 _STATM = Path("/proc/self/statm")
@@ -198,6 +200,7 @@ class Frames(NamedTuple):
         streaming: a frame has a past, or will be one.
         ahead: the next frame is read, and the last one written, at the same time.
         batch: number of images.
+        carried: number of layers, with what is in none of them, and of alphas that are denoised.
     """
 
     size: tuple[int, int]
@@ -205,6 +208,7 @@ class Frames(NamedTuple):
     streaming: bool
     ahead: bool = False
     batch: int = 1
+    carried: int = 0
 
     @property
     def held(self) -> int:
@@ -232,7 +236,8 @@ class Frames(NamedTuple):
 
     def _bytes(self, channels: int) -> int:
         # The next frame, and the last result.
-        channels += self._channels() + 3 if self.ahead else 0
+        channels += self._channels() + 3 + 6 * self.carried if self.ahead else 0
+        channels += _PER_CARRIED * self.carried
         return self.batch * self.size[0] * self.size[1] * channels * _BYTES
 
 

@@ -20,7 +20,8 @@ class Chain(nn.Module):
     """One method after another, such as ``Chain(initial=P, final=K)`` of the paper's Eqs. 1 and 3.
 
     The output of each but the last is a stage under its name. Statistics of the whole image that one method has found
-    are there for the next, which looks for those only that depend on its own input.
+    are there for the next, which looks for those only that depend on its own input. So are the layers of the image that
+    it has made, of a method without kernels too (:func:`mcdenoise.models._layers.completed`).
 
     Args:
         methods: by name, in order.

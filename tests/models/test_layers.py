@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -412,3 +414,9 @@ def test_where_layers_are_asked_for_no_tile_is_passed_through_or_used_again() ->
     stages = denoiser.report.stages
     for name in ("converged tiles", "unchanged tiles"):
         assert (stages[name].skipped, stages[name].reason) == (0, "layers or alpha are asked for")
+
+
+def test_the_code_of_the_page_runs() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "layers.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(compile(block, "layers.md", "exec"), {"__name__": "page"})
