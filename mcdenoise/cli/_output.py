@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from mcdenoise.errors import printable
+
 
 def progress_bar() -> Progress:
     """A progress bar on stderr; silent when that is no terminal."""
@@ -37,7 +39,7 @@ def print_rows(rows: list[dict[str, str]]) -> None:
     if rows:
         table = Table(*rows[0])
         for row in rows:
-            table.add_row(*row.values())
+            table.add_row(*map(printable, row.values()))
         show(table)
 
 
@@ -54,7 +56,7 @@ def stages(milliseconds: dict[str, float]) -> str:
 def warn(warnings: Iterable[str]) -> None:
     """Say on stderr what is probably wrong, a line each."""
     for warning in warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        print(f"warning: {printable(warning)}", file=sys.stderr)
 
 
 def write_json(path: Path | None, content: Any) -> None:

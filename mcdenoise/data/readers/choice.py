@@ -124,7 +124,7 @@ def _color(
         pictures = [layer for layer in strangers if layer.is_color]
         if len(pictures) == 1:
             return pictures[0]
-        found = ", ".join(str(layer) for layer in [*pictures, *strangers][:12]) or "no layers of floats"
+        found = ", ".join(str(layer) for layer in dict.fromkeys([*pictures, *strangers][:12])) or "no layers of floats"
         raise InputError(f"{where}: expected noisy radiance, found {found}; name it with --map color=LAYER")
     least = min(rank for rank, _ in candidates)
     best = [layer for rank, layer in candidates if rank == least]
