@@ -11,6 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from mcdenoise.errors import printable
 
@@ -39,7 +40,8 @@ def print_rows(rows: list[dict[str, str]]) -> None:
     if rows:
         table = Table(*rows[0])
         for row in rows:
-            table.add_row(*map(printable, row.values()))
+            # As they stand: a layer's name may hold brackets, which are orders to a table.
+            table.add_row(*(Text(printable(each)) for each in row.values()))
         show(table)
 
 

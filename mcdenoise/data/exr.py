@@ -40,11 +40,13 @@ class ExrHeader:
         size: height and width of the data window in pixels.
         channels: channel names, in the order in which :func:`read_exr` returns them (R, G, B first).
         metadata: attributes that describe the picture: texts, numbers and tuples of numbers.
+        origin: row and column of its first pixel in the display window.
     """
 
     size: tuple[int, int]
     channels: list[str]
     metadata: Metadata
+    origin: tuple[int, int] = (0, 0)
 
 
 def read_exr_header(path: Path) -> ExrHeader:
@@ -158,7 +160,8 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
     if found:
         file.close()
         raise _unreadable(path, found, "render a flat EXR of at most 2^28 pixels")
-    return file, ExrHeader((spec.height, spec.width), list(spec.channelnames), picture_metadata(spec))
+    size, origin = (spec.height, spec.width), (spec.y, spec.x)
+    return file, ExrHeader(size, list(spec.channelnames), picture_metadata(spec), origin)
 
 
 def what_is_at(path: Path) -> str:

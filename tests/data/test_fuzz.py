@@ -70,7 +70,7 @@ def intact(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     for compression in COMPRESSIONS:
         write(folder / f"{compression}.exr", pixels, compression=compression)
     write(folder / "float.exr", pixels, "float")
-    write(folder / "uint.exr", pixels, "uint32")
+    write(folder / "uint.exr", pixels, "uint")
     write(folder / "tiled.exr", pixels, tile=8)
     write(folder / "mips.exr", pixels, tile=8, textureformat="Plain Texture")
     write(folder / "single.exr", pixels[..., :1])
@@ -150,7 +150,9 @@ def fuzz_matrices(tmp_path: Path, count: int, seed: int) -> None:
 def test_intact_files_are_read_or_refused_for_what_they_are(tmp_path: Path, intact: dict[str, bytes]) -> None:
     found = outcomes(tmp_path / "exr", {f"{kind}.exr": content for kind, content in intact.items()})
     assert {name: outcome.partition("found ")[2] for name, outcome in found.items() if outcome} == {
-        "deep.exr": "a deep image; render a flat EXR of at most 2^28 pixels"
+        "deep.exr": "a deep image; render a flat EXR of at most 2^28 pixels",
+        "mips.exr": "a texture of several resolutions; render a flat EXR of at most 2^28 pixels",
+        "uint.exr": "whole numbers; render a flat EXR of at most 2^28 pixels",
     }
 
 
