@@ -22,8 +22,8 @@ import torch
 from mcdenoise.benchmark import parse_sizes
 from mcdenoise.benchmark.machine import describe_machine
 from mcdenoise.benchmark.sizes import synthetic_frame
-from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.data.files import write_text
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT
 

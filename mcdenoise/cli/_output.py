@@ -11,6 +11,9 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
+
+from mcdenoise.errors import printable
 
 
 def progress_bar() -> Progress:
@@ -37,7 +40,8 @@ def print_rows(rows: list[dict[str, str]]) -> None:
     if rows:
         table = Table(*rows[0])
         for row in rows:
-            table.add_row(*row.values())
+            # As they stand: a layer's name may hold brackets, which are orders to a table.
+            table.add_row(*(Text(printable(each)) for each in row.values()))
         show(table)
 
 
@@ -54,7 +58,7 @@ def stages(milliseconds: dict[str, float]) -> str:
 def warn(warnings: Iterable[str]) -> None:
     """Say on stderr what is probably wrong, a line each."""
     for warning in warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+        print(f"warning: {printable(warning)}", file=sys.stderr)
 
 
 def write_json(path: Path | None, content: Any) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from mcdenoise.cli._options import Flag, Inputs, Json, Map
 from mcdenoise.cli._output import print_rows, warn, write_json
 from mcdenoise.data import Sequence, open_sequence
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, printable
 
 
 def inspect(
@@ -71,8 +71,8 @@ def print_sequence(sequence: Sequence) -> None:
     height, width = sequence.size
     numbers = sequence.numbers
     frames = f"frame {numbers[0]}" if len(numbers) == 1 else f"{len(numbers)} frames, {numbers[0]} to {numbers[-1]},"
-    print(f"{sequence.name}: {sequence.layout} layout, {frames} of {width}x{height}")
+    print(f"{printable(sequence.name)}: {sequence.layout} layout, {frames} of {width}x{height}")
     print_rows([{"buffer": row.buffer, "taken from": row.source, "read as": row.reading} for row in sequence.table])
     if sequence.unused:
-        print(f"not used: {', '.join(sequence.unused)}")
+        print(f"not used: {printable(', '.join(sequence.unused))}")
     warn(sequence.warnings)

@@ -79,6 +79,9 @@ def read_camera_matrices(path: Path) -> CameraMatrices:
     Raises:
         InputError: the file is missing, too large, incomplete, or holds something that is no finite number.
     """
+    # A link to nothing is told below; a pipe would wait for ever, a device never end.
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise InputError(f"{path}: expected a text file, found a folder, a device or a pipe; remove it")
     try:
         if os.path.getsize(path) > _LARGEST_FILE:
             raise InputError(

@@ -24,8 +24,9 @@ LARGEST_HALF = 65504.0
 LARGEST_PIXEL_COUNT = 2**28
 # Converted and compressed at a time: enough for all cores, and little beside a large image.
 _ROWS = 256
-# Black pixels in a byte of file: zlib's limit is 1032, and PXR24 drops a quarter before; DWA leaves one number of 64.
-_LARGEST_RATIO, _LARGEST_DWA_RATIO = 2_000, 200_000
+# Black pixels in a byte of file: zlib's limit is 1032, and PXR24 drops a quarter before; DWA leaves one number of 64, or
+# of a run of 128 bytes two.
+_LARGEST_RATIO, _LARGEST_DWA_RATIO = 2_000, 70_000
 # These describe how one file stores its pixels, not what they show; the next file has its own.
 _STORAGE_PREFIXES = ("oiio:", "openexr:", "compression")
 _TUPLE_TYPES = {"FramesPerSecond": "rational", "smpte:TimeCode": "timecode"}
@@ -39,11 +40,13 @@ class ExrHeader:
         size: height and width of the data window in pixels.
         channels: channel names, in the order in which :func:`read_exr` returns them (R, G, B first).
         metadata: attributes that describe the picture: texts, numbers and tuples of numbers.
+        origin: row and column of its first pixel in the display window.
     """
 
     size: tuple[int, int]
     channels: list[str]
     metadata: Metadata
+    origin: tuple[int, int] = (0, 0)
 
 
 def read_exr_header(path: Path) -> ExrHeader:
@@ -128,7 +131,8 @@ def write_exr(
 def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
     # os.path, because Path.is_file raises for a name that is too long or a folder that may not be entered.
     if not os.path.isfile(path):
-        raise _unreadable(path, "a folder" if os.path.isdir(path) else "no such file", "check the path")
+        raise _unreadable(path, what_is_at(path), "check the path")
+    check_name(path)
     file = oiio.ImageInput.open(str(path))
     if file is None:
         reason = pending_error(oiio).replace(f"EXR Error ({path}): ", "")
@@ -141,6 +145,13 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
         found = "a deep image"
     elif spec.nchannels < 1:
         found = "no channels"
+    elif any(str(kind) in ("uint", "int") for kind in (spec.format, *spec.channelformats)):
+        # Which OpenImageIO would scale by 2^-32.
+        found = "whole numbers"
+    elif {"RY", "BY"} <= set(spec.channelnames):
+        found = "luminance and chroma (Y, RY, BY), not R, G, B"
+    elif file.seek_subimage(0, 1):
+        found = "a texture of several resolutions"
     elif min(spec.width, spec.height) < 1 or spec.width * spec.height > LARGEST_PIXEL_COUNT:
         found = f"{spec.width} x {spec.height} pixels"
     elif is_hollow(path, spec, spec.width * spec.height * int(spec.pixel_bytes(True))):
@@ -149,7 +160,29 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
     if found:
         file.close()
         raise _unreadable(path, found, "render a flat EXR of at most 2^28 pixels")
-    return file, ExrHeader((spec.height, spec.width), list(spec.channelnames), picture_metadata(spec))
+    size, origin = (spec.height, spec.width), (spec.y, spec.x)
+    return file, ExrHeader(size, list(spec.channelnames), picture_metadata(spec), origin)
+
+
+def what_is_at(path: Path) -> str:
+    """What is there in place of a file, for people."""
+    if os.path.isdir(path):
+        return "a folder"
+    if os.path.exists(path):
+        return "a device or a pipe"
+    return "a link to nothing" if os.path.lexists(path) else "no such file"
+
+
+def check_name(path: Path) -> None:
+    """Refuse a name that OpenImageIO cannot be told.
+
+    Raises:
+        InputError: the bytes of the name are no UTF-8.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{path}: expected a name in UTF-8, found other bytes; rename the file") from error
 
 
 def is_hollow(path: Path, spec: oiio.ImageSpec, promised: int) -> bool:
@@ -164,11 +197,22 @@ def picture_metadata(spec: oiio.ImageSpec) -> Metadata:
     kept: Metadata = {}
     for attribute in spec.extra_attribs:
         value = attribute.value
+        if isinstance(value, str) and not value.isascii():
+            value = _as_text(value)
         if isinstance(value, tuple) and not all(isinstance(item, int | float) for item in value):
             continue
         if isinstance(value, str | int | float | tuple) and not attribute.name.startswith(_STORAGE_PREFIXES):
             kept[attribute.name] = value
     return kept
+
+
+def _as_text(text: str) -> str:
+    """Bytes that are no UTF-8 come as surrogates: old systems write Latin-1."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return text.encode(errors="surrogateescape").decode("latin-1")
+    return text
 
 
 def _set_attribute(spec: oiio.ImageSpec, name: str, value: MetadataValue) -> None:

@@ -15,7 +15,16 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 
-from mcdenoise.data.exr import LARGEST_PIXEL_COUNT, Image, Metadata, is_hollow, pending_error, picture_metadata
+from mcdenoise.data.exr import (
+    LARGEST_PIXEL_COUNT,
+    Image,
+    Metadata,
+    check_name,
+    is_hollow,
+    pending_error,
+    picture_metadata,
+    what_is_at,
+)
 from mcdenoise.errors import InputError
 
 # Those that are opened, by the names of OpenImageIO.
@@ -34,7 +43,11 @@ _LARGEST_PARTS, _LARGEST_CHANNELS = 1024, 4096
 # Rows that are decoded at a time, with all channels, of which few are wanted: a chunk of DWAB has 256.
 _ROWS = 256
 _EXR = {suffix for suffix, name in FORMATS.items() if name == "openexr"}
-_INTEGERS = {"uint32", "int32"}
+_INTEGERS = {"uint", "int"}
+# Chroma of an image that is stored as luminance and chroma: without its luminance no color, and subsampled mostly.
+_CHROMA = {"ry", "by"}
+# Beyond what OpenImageIO reads by default: a shot with all passes of 300 lights has more.
+oiio.attribute("limits:channels", _LARGEST_CHANNELS)
 
 
 @dataclass(frozen=True)
@@ -145,8 +158,8 @@ def _read(path: Path, file: oiio.ImageInput, index: int, part: Part, names: Sequ
 def _open(path: Path) -> tuple[oiio.ImageInput, ImageHeader]:
     # os.path, because Path.is_file raises for a name that is too long or a folder that may not be entered.
     if not os.path.isfile(path):
-        found = "a folder" if os.path.isdir(path) else "no such file"
-        raise InputError(f"{path}: expected an image, found {found}; check the path")
+        raise InputError(f"{path}: expected an image, found {what_is_at(path)}; check the path")
+    check_name(path)
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: expected one of {', '.join(FORMATS)}, found '{path.suffix}'; convert the file")
     name = FORMATS[path.suffix.lower()]
@@ -161,7 +174,7 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ImageHeader]:
     if file.format_name() != name:
         found = file.format_name()
         file.close()
-        raise _refused(path, f"a file of the format {found}, which its name does not say")
+        raise _refused(path, f"a file of the format {found}, which its name does not say", "name it after its format")
     try:
         return file, _header(path, file, name)
     except BaseException:
@@ -196,6 +209,8 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
         except UnicodeDecodeError as error:
             raise _refused(path, "names that are no text") from error
         pixels = spec.width * spec.height
+        if {channel.rpartition(".")[2].lower() for channel in channels} >= _CHROMA:
+            raise _refused(path, "luminance and chroma (Y, RY, BY)", "write it as R, G, B")
         if spec.deep:
             raise _refused(path, "a deep image")
         if not 1 <= spec.nchannels <= _LARGEST_CHANNELS:
@@ -208,6 +223,9 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
             raise _refused(
                 path, f"{spec.width} x {spec.height} pixels of {spec.nchannels} channels, but not their data"
             )
+        # The library that writes cannot read them.
+        if name == "openexr" and file.seek_subimage(len(parts), 1):
+            raise _refused(path, "a texture of several resolutions", "write the largest one alone")
         integers = frozenset(c for c, kind in zip(channels, kinds, strict=True) if kind in _INTEGERS)
         display = name in ("png", "tiff") and kinds[0] in ("uint8", "uint16") and "lin" not in space
         size, origin = (spec.height, spec.width), (spec.y, spec.x)
@@ -220,5 +238,5 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
     return ImageHeader(name, tuple(parts), metadata)
 
 
-def _refused(path: Path, found: str) -> InputError:
-    return InputError(f"{path}: expected an image, found {found}; render a flat image of at most 2^28 pixels")
+def _refused(path: Path, found: str, advice: str = "render a flat image of at most 2^28 pixels") -> InputError:
+    return InputError(f"{path}: expected an image, found {found}; {advice}")

@@ -1,12 +1,21 @@
-"""Reads each file of a folder in a process of its own, with little memory: one line of JSON for each on stdout."""
+"""Reads each file of a folder in a process of its own, with little memory: one line of JSON for each on stdout.
+
+With a second folder, each is opened as the shot of a renderer, and its frame is written there.
+"""
 
 import json
 import resource
 import sys
 from pathlib import Path
 
+import kornia.color  # noqa: F401 - before memory is counted
+import numpy as np
+import OpenEXR  # noqa: F401
+
 from mcdenoise.data.camera_matrices import read_camera_matrices
 from mcdenoise.data.exr import read_exr, read_exr_header
+from mcdenoise.data.images import read_channels, read_image_header
+from mcdenoise.data.sequences import open_sequence
 from mcdenoise.errors import InputError
 
 # Beyond what the libraries have taken already.
@@ -18,16 +27,46 @@ def taken() -> int:
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
 
-def main(folder: Path) -> None:
+def read_alone(path: Path) -> None:
+    """As a buffer of the BMFR layout, or its matrices."""
+    if path.suffix == ".h":
+        read_camera_matrices(path)
+    else:
+        read_exr_header(path)
+        read_exr(path)
+
+
+def read_and_write(path: Path, out: Path) -> None:
+    """All that is in it; then as a shot of one frame, which is written."""
+    header = read_image_header(path)
+    read_channels(path, {index: part.channels for index, part in enumerate(header.parts)})
+    sequence = open_sequence([path])
+    (number,) = sequence.numbers
+    frame = sequence.frame(number)
+    image = frame.color[0].permute(1, 2, 0).numpy()
+    out.mkdir()
+    try:
+        written = sequence.write(out, number, np.nan_to_num(image, posinf=1))
+    finally:
+        files = list(out.iterdir())
+        # Not yet there, or there whole; and nothing else.
+        if files and files != [out / path.name]:
+            raise AssertionError(f"left behind: {files}")
+    again = read_image_header(written)
+    read_channels(written, {index: part.channels for index, part in enumerate(again.parts)})
+    if [part.channels for part in again.parts] != [part.channels for part in header.parts]:
+        raise AssertionError(f"{path}: written with other channels")
+
+
+def main(folder: Path, out: Path | None) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (taken() + MEMORY, -1))
     for path in sorted(folder.iterdir()):
         print(json.dumps({"begun": path.name}), flush=True)
         try:
-            if path.suffix == ".h":
-                read_camera_matrices(path)
+            if out is None:
+                read_alone(path)
             else:
-                read_exr_header(path)
-                read_exr(path)
+                read_and_write(path, out / path.name)
             outcome = ""
         except InputError as error:
             outcome = str(error)
@@ -37,4 +76,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else None)

@@ -17,7 +17,16 @@ import torch
 from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices, read_camera_matrices
-from mcdenoise.data.exr import LARGEST_HALF, Image, Metadata, MetadataValue, read_exr, read_exr_header, write_exr
+from mcdenoise.data.exr import (
+    LARGEST_HALF,
+    ExrHeader,
+    Image,
+    Metadata,
+    MetadataValue,
+    read_exr,
+    read_exr_header,
+    write_exr,
+)
 from mcdenoise.data.files import write_text
 from mcdenoise.data.images import FORMATS
 from mcdenoise.data.readers.cameras import convert, read_as
@@ -50,7 +59,7 @@ _STEMS = {
 # What nobody else calls a buffer.
 _OWN_STEMS = {"shading_normal", "world_position"}
 _CHANNELS = {1: ["Y"], 2: ["X", "Y"], 3: ["R", "G", "B"]}
-_DESCRIPTION = "camera.json"
+_DESCRIPTION, _LARGEST_DESCRIPTION = "camera.json", 2**26
 _FULL_FLOAT = {"position", "previous_position"}
 
 
@@ -243,26 +252,26 @@ def open_bmfr(
     Raises:
         InputError: a file is missing or unreadable, or sizes or channels differ from what is expected.
     """
-    size = read_exr_header(files["color"][numbers[0]]).size
+    first = read_exr_header(files["color"][numbers[0]])
+    size = first.size
     used = {name for name in files if any(number in files[name] for number in numbers)} | {"reference"}
     for name in sorted(used):
         for number in numbers:
             if number in files[name]:
-                header = read_exr_header(files[name][number])
-                _check_file(name, files[name][number], header.size, header.channels, size)
+                _check_header(name, files[name][number], first)
             elif name != "reference":
                 missing = path / f"{_STEMS[name]}{number}.exr"
                 raise InputError(
                     f"{missing}: expected buffer '{name}' for every frame, found it for some; "
                     f"render it, or leave out all {_STEMS[name]} files"
                 )
-    cameras = read_camera_matrices(path / MATRICES) if (path / MATRICES).exists() else None
+    cameras = read_camera_matrices(path / MATRICES) if os.path.lexists(path / MATRICES) else None
     if cameras is not None and len(cameras) <= numbers[-1]:
         raise InputError(
             f"{path / MATRICES}: expected a matrix for frame {numbers[-1]}, found {len(cameras)} (frames 0 to "
             f"{len(cameras) - 1}); write all matrices, or choose fewer frames"
         )
-    more_colors = _find_realisations(path, numbers, size)
+    more_colors = _find_realisations(path, numbers, first)
     own = {name: files[name] for name in used}
     stated = _color_has_albedo(path, "albedo" in used) if color_has_albedo is None else color_has_albedo
     folder = BmfrFolder(path, own, numbers, size, cameras, stated is not False, more_colors)
@@ -355,7 +364,7 @@ def _unused(folder: BmfrFolder) -> list[str]:
     return list(kinds)
 
 
-def _find_realisations(path: Path, numbers: list[int], size: tuple[int, int]) -> list[dict[int, Path]]:
+def _find_realisations(path: Path, numbers: list[int], first: ExrHeader) -> list[dict[int, Path]]:
     """Color files of the realisations 1, 2, ... up to the first that some frame lacks: it is still being rendered."""
     found: list[dict[int, Path]] = []
     while os.path.isdir(folder := realisation_folder(path, 1 + len(found))):
@@ -363,8 +372,7 @@ def _find_realisations(path: Path, numbers: list[int], size: tuple[int, int]) ->
         if not all(number in colors for number in numbers):
             break
         for number in numbers:
-            header = read_exr_header(colors[number])
-            _check_file("color", colors[number], header.size, header.channels, size)
+            _check_header("color", colors[number], first)
         found.append(colors)
     return found
 
@@ -425,6 +433,18 @@ def write_buffer(
     write_exr(path, image, _CHANNELS[image.shape[2]], half=half, metadata=metadata)
 
 
+def _check_header(name: str, path: Path, first: ExrHeader) -> None:
+    """A file has the channels of its buffer, and the same pixels as the first color."""
+    header = read_exr_header(path)
+    _check_file(name, path, header.size, header.channels, first.size)
+    if header.origin != first.origin:
+        (top, left), (first_top, first_left) = header.origin, first.origin
+        raise InputError(
+            f"{path}: expected a data window that begins at {first_left}, {first_top} like that of the first color "
+            f"file, found {left}, {top}; render all buffers and frames in one window"
+        )
+
+
 def _check_file(
     name: str, path: Path, size: Iterable[int], channels: list[str], expected_size: tuple[int, int]
 ) -> None:
@@ -445,11 +465,15 @@ def _check_file(
 def _color_has_albedo(path: Path, albedo_present: bool) -> bool | None:
     """What ``camera.json`` says of it; ``None`` without one: then its values tell the published data from others."""
     description = path / _DESCRIPTION
-    if not description.exists():
+    if not os.path.lexists(description):
         # Without albedo there is nothing to multiply back: somebody's plain radiance, not the published data.
         return None if albedo_present else True
     try:
-        content = json.loads(description.read_text(encoding="utf-8"))
+        # A pipe would wait for ever, a device never end.
+        if not os.path.isfile(description):
+            raise OSError("no file")
+        with description.open(encoding="utf-8") as file:
+            content = json.loads(file.read(_LARGEST_DESCRIPTION))
         has_albedo = content.get("color_includes_albedo", True)
     except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise InputError(f"{description}: expected a JSON object, found something else; repair or remove it") from error

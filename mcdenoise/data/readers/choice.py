@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from mcdenoise.frame import BUFFERS
 
 # Buffers that somebody may map a layer to; the rest is no image of a frame.
 MAPPABLE = sorted(set(BUFFERS) - {"current", "length"})
+_READ_AT_ONCE = 16
 
 
 @dataclass
@@ -124,7 +125,7 @@ def _color(
         pictures = [layer for layer in strangers if layer.is_color]
         if len(pictures) == 1:
             return pictures[0]
-        found = ", ".join(str(layer) for layer in [*pictures, *strangers][:12]) or "no layers of floats"
+        found = ", ".join(str(layer) for layer in dict.fromkeys([*pictures, *strangers][:12])) or "no layers of floats"
         raise InputError(f"{where}: expected noisy radiance, found {found}; name it with --map color=LAYER")
     least = min(rank for rank, _ in candidates)
     best = [layer for rank, layer in candidates if rank == least]
@@ -159,7 +160,17 @@ def _twins(color: Layer, strangers: Sequence[Layer], read: Callable[[Layer], Ima
     if not others:
         return []
     pixels = read(color)[..., :3]
-    return [layer for layer in others if np.array_equal(read(layer)[..., :3], pixels, equal_nan=True)]
+    twins: list[Layer] = []
+    # Several at once, since each reading decompresses the whole file.
+    for first in range(0, len(others), _READ_AT_ONCE):
+        some = others[first : first + _READ_AT_ONCE]
+        together = read(replace(color, channels=tuple(name for layer in some for name in layer.channels[:3])))
+        twins += [
+            layer
+            for i, layer in enumerate(some)
+            if np.array_equal(together[..., 3 * i : 3 * i + 3], pixels, equal_nan=True)
+        ]
+    return twins
 
 
 def _by_values(

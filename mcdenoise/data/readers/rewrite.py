@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import io
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import OpenImageIO as oiio
 
 from mcdenoise.data.exr import LARGEST_HALF, Image, pending_error
 from mcdenoise.data.files import atomic_path
-from mcdenoise.data.images import FORMATS, as_stored, read_channels, read_image_header
+from mcdenoise.data.images import FORMATS, Part, as_stored, read_channels, read_image_header
 from mcdenoise.data.readers.transfer import encode
 from mcdenoise.errors import InputError
 
@@ -62,9 +64,14 @@ def _write_exr(
     part: int,
     full_float: bool,
 ) -> str:
-    # Both raise whatever the library below has to say, and nothing else can go wrong with a file that was read whole.
+    expected = read_image_header(source).parts
+    # Reading and writing raise whatever the library below has to say.
     try:
-        file = OpenEXR.File(str(source), separate_channels=True)
+        # A part that it cannot read it leaves out, and prints that.
+        with redirect_stdout(io.StringIO()):
+            file = OpenEXR.File(str(source), separate_channels=True)
+        if len(file.parts) != len(expected) or not all(map(_is_whole, file.parts, expected)):
+            return _write_through_oiio(source, target, expected, replaced, added, full_float)
         for (index, name), image in replaced.items():
             channel = file.parts[index].channels[name]
             channel.pixels = _stored(image, np.float32 if full_float else channel.pixels.dtype)
@@ -80,9 +87,53 @@ def _write_exr(
             main.channels = channels
         file.write(str(target))
         written = read_image_header(target)
+    except UnicodeDecodeError:
+        return _write_through_oiio(source, target, expected, replaced, added, full_float)
     except (RuntimeError, ValueError, TypeError, OSError, InputError) as error:
         return str(error).splitlines()[0] if str(error) else type(error).__name__
     return "" if len(written.parts) == len(file.parts) else "incomplete"
+
+
+def _is_whole(found: Any, part: Part) -> bool:
+    """Whether a part has been read: all its channels, as the other library sees them."""
+    channels = found.channels
+    return set(channels) == set(part.channels) and all(each.pixels.shape == part.size for each in channels.values())
+
+
+def _write_through_oiio(
+    source: Path,
+    target: Path,
+    parts: Sequence[Part],
+    replaced: Mapping[tuple[int, str], Image],
+    added: Mapping[str, Image],
+    full_float: bool,
+) -> str:
+    """What has texts that are no UTF-8: OpenImageIO keeps them, but scales whole numbers and loses rare attributes."""
+    if added or any(part.integers for part in parts):
+        return "its attributes are no UTF-8"
+    file, clean = oiio.ImageInput.open(str(source)), oiio.ImageOutput.create("openexr")
+    if file is None or clean is None:
+        return pending_error(oiio)
+    specs, images = [], []
+    for index, part in enumerate(parts):
+        spec = file.spec(index)
+        pixels = np.array(file.read_image(index, 0, 0, spec.nchannels, oiio.FLOAT), np.float32)
+        pixels = pixels.reshape(*part.size, spec.nchannels)
+        kinds = [str(kind) for kind in spec.channelformats] or [str(spec.format)] * spec.nchannels
+        for place, name in enumerate(part.channels):
+            if (index, name) in replaced:
+                half = kinds[place] == "half" and not full_float
+                pixels[..., place] = _stored(replaced[index, name], np.float16 if half else np.float32)
+        if full_float:
+            spec.set_format("float")
+        specs.append(spec)
+        images.append(pixels)
+    file.close()
+    for index, (spec, pixels) in enumerate(zip(specs, images, strict=True)):
+        opened = clean.open(str(target), spec, "AppendSubimage") if index else clean.open(str(target), tuple(specs))
+        if not opened or not clean.write_image(pixels):
+            return pending_error(clean) or "writing failed"
+    return "" if clean.close() else pending_error(clean) or "writing failed"
 
 
 def _stored(image: Image, kind: Any) -> Any:

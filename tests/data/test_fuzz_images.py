@@ -1,0 +1,174 @@
+"""Damaged and hostile files of every kind that renderers write: read whole and written whole, or refused in one line.
+
+Whatever was read is written again, so that no damage gets as far as the library that writes.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import OpenImageIO as oiio
+import pytest
+from damage import DAMAGES, Generator, assert_clear, flipped, flipped_header, noise, outcomes, spliced, truncated
+from damage import numbers as extreme_numbers
+
+RENDERERS = Path(__file__).with_name("renderers")
+COMPRESSIONS = ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB", "HTJ2K256", "HTJ2K32")
+SIZE = 19, 23
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="measures memory through /proc")
+
+
+def drawn(channels: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((*SIZE, channels), dtype=np.float32)
+
+
+def layers(kind: type = np.float16) -> dict[str, np.ndarray]:
+    names = [f"View.Combined.{c}" for c in "RGBA"] + [f"View.Denoising Albedo.{c}" for c in "RGB"]
+    names += [f"View.Denoising Normal.{c}" for c in "XYZ"] + ["View.Depth.Z", "View.Vector.X", "View.Vector.Y"]
+    return {name: drawn(1, i)[..., 0].astype(kind) for i, name in enumerate(names)}
+
+
+def write_exr(path: Path, *parts: dict[str, np.ndarray], compression: str = "ZIP", **header: object) -> None:
+    made = [
+        OpenEXR.Part(
+            {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": OpenEXR.scanlineimage, **header},
+            channels,
+            **({"name": f"part{i}"} if len(parts) > 1 else {}),
+        )
+        for i, channels in enumerate(parts)
+    ]
+    OpenEXR.File(made).write(str(path))
+
+
+def write_picture(path: Path, channels: int, kind: str, *, tile: int = 0, **attributes: object) -> None:
+    spec = oiio.ImageSpec(SIZE[1], SIZE[0], channels, kind)
+    spec.tile_width = spec.tile_height = tile
+    for name, value in attributes.items():
+        spec.attribute(name.replace("__", ":"), value)
+    file = oiio.ImageOutput.create(str(path))
+    assert file.open(str(path), spec), file.geterror()
+    assert file.write_image(drawn(channels))
+    assert file.close(), file.geterror()
+
+
+@pytest.fixture(scope="module")
+def intact(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """Small files of every kind, by name."""
+    folder = tmp_path_factory.mktemp("intact")
+    for compression in COMPRESSIONS:
+        # A few bytes of DWA may be a large black image, so that a larger file may ask for more than is allowed here.
+        small = {c: drawn(1)[..., 0].astype(np.float16) for c in "RGB"}
+        write_exr(folder / f"{compression}.exr", small if "DWA" in compression else layers(), compression=compression)
+    write_exr(folder / "floats.exr", layers(np.float32))
+    write_exr(folder / "parts.exr", layers(), {"X.R": drawn(1)[..., 0], "Y.Z": drawn(1)[..., 0]})
+    write_exr(folder / "tiled.exr", layers(), type=OpenEXR.tiledimage, tiles=OpenEXR.TileDescription())
+    write_picture(folder / "mips.exr", 3, "half", tile=16, textureformat="Plain Texture")
+    for name, layer in (("color", "rgb"), ("grey", "y")):
+        for endian in ("little", "big"):
+            write_picture(folder / f"{name}_{endian}.pfm", len(layer), "float", pnm__bigendian=int(endian == "big"))
+    write_picture(folder / "light.hdr", 3, "float")
+    write_picture(folder / "float.tif", 3, "float", compression="none")
+    write_picture(folder / "deflate.tif", 4, "uint16", compression="zip")
+    write_picture(folder / "tiled.tif", 3, "float", tile=16, compression="lzw")
+    for channels, name in ((1, "grey"), (3, "rgb"), (4, "rgba")):
+        for bits in (8, 16):
+            write_picture(folder / f"{name}{bits}.png", channels, f"uint{bits}")
+    files = {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+    files["blender5.exr"] = (RENDERERS / "blender5" / "shot_0001.exr").read_bytes()
+    files["palette.png"] = palette()
+    return files
+
+
+def chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def palette() -> bytes:
+    rows = b"".join(b"\0" + bytes((x + y) % 4 for x in range(SIZE[1])) for y in range(SIZE[0]))
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", SIZE[1], SIZE[0], 8, 3, 0, 0, 0))
+        + chunk(b"PLTE", bytes(range(12)))
+        + chunk(b"IDAT", zlib.compress(rows))
+        + chunk(b"IEND", b"")
+    )
+
+
+def absurd_sides(g: Generator, content: bytes) -> bytes:
+    """A header that speaks of another size, in the words of its format."""
+    w, h = (int(2 ** g.uniform(0, 31)) for _ in range(2))
+    if g.random() < 0.3:
+        w, h = 100_000, 100_000
+    elif g.random() < 0.5:
+        w, h = 2 ** int(g.integers(5, 15)), 2 ** int(g.integers(5, 14))
+    if content.startswith(b"\x89PNG"):
+        header = struct.pack(">II", w, h) + content[24:29]
+        return content[:8] + chunk(b"IHDR", header) + content[33:]
+    if content.startswith(b"II*"):
+        damaged = bytearray(content)
+        (start,) = struct.unpack_from("<I", content, 4)
+        (count,) = struct.unpack_from("<H", content, start)
+        for place in range(start + 2, start + 2 + 12 * count, 12):
+            (tag,) = struct.unpack_from("<H", content, place)
+            # Also tiles and strips as large as the image.
+            if tag in (256, 257, 278, 322, 323) and g.random() < 0.7:
+                struct.pack_into("<HHII", damaged, place, tag, 4, 1, w if tag in (256, 322) else h)
+        return bytes(damaged)
+    old = b"-Y %d +X %d" % SIZE if content.startswith(b"#?") else b"%d %d" % SIZE[::-1]
+    new = b"-Y %d +X %d" % (h, w) if content.startswith(b"#?") else b"%d %d" % (w, h)
+    return content.replace(old, new, 1)
+
+
+EXR_DAMAGES = (*DAMAGES,)
+OTHER_DAMAGES: tuple[Callable[[Generator, bytes], bytes], ...] = (
+    truncated,
+    flipped,
+    flipped_header,
+    spliced,
+    extreme_numbers,
+    absurd_sides,
+    absurd_sides,
+    noise,
+)
+
+
+def fuzz(tmp_path: Path, intact: dict[str, bytes], count: int, seed: int) -> None:
+    g, files = np.random.default_rng(seed), {}
+    for i in range(count):
+        name = sorted(intact)[i % len(intact)]
+        damages = EXR_DAMAGES if name.endswith(".exr") else OTHER_DAMAGES
+        damage = damages[int(g.integers(len(damages)))]
+        files[f"{damage.__name__}_{i:04d}x_{name}"] = damage(g, intact[name])
+    found = outcomes(tmp_path / "damaged", files, tmp_path / "written")
+    assert_clear(tmp_path / "damaged", found)
+    refused = {name for name, outcome in found.items() if outcome}
+    assert len(refused) > count / 3
+    assert {name for name in files if name.startswith("noise")} <= refused
+    for name in refused:
+        assert not list((tmp_path / "written").glob(f"{name}/*")), name
+
+
+def test_intact_files_come_out_as_they_went_in(tmp_path: Path, intact: dict[str, bytes]) -> None:
+    found = outcomes(tmp_path / "intact", intact, tmp_path / "written")
+    expected = dict.fromkeys(intact, "") | {
+        "mips.exr": "found a texture of several resolutions",
+        **dict.fromkeys(("grey8.png", "grey16.png", "grey_little.pfm", "grey_big.pfm"), "found grey"),
+    }
+    assert all((words in found[name]) and bool(words) == bool(found[name]) for name, words in expected.items())
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_damaged_images(tmp_path: Path, intact: dict[str, bytes], seed: int) -> None:
+    fuzz(tmp_path, intact, 160, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 10))
+def test_damaged_images_at_length(tmp_path: Path, intact: dict[str, bytes], seed: int) -> None:
+    fuzz(tmp_path, intact, 640, seed)

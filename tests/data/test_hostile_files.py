@@ -1,0 +1,217 @@
+"""Files that are whole and yet no image of a frame, or that have names to trip over: refused in one line, or read.
+
+The damaged ones are those of ``test_fuzz_images.py``.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import OpenImageIO as oiio
+import pytest
+from damage import assert_clear, outcomes_of
+
+from mcdenoise.cli.inspect import print_sequence
+from mcdenoise.data import open_sequence
+from mcdenoise.data.camera_matrices import MATRICES
+from mcdenoise.data.exr import read_exr, read_exr_header
+from mcdenoise.errors import InputError, printable
+
+SIZE = 11, 13
+# All that a terminal, a table, a path, `--map` or this project's own reading of names could trip over.
+NAMES = (
+    *("a\nb", "a\rb", "\x1b[31mred", "x\ty", "\x7f", "\x9b", "\u202eabc", "\u2028", "ä€𝄞", " ", "a,b", "a=b", "%s%n"),
+    *(".", "..", ".R", "R.", "R..G", "[bold]", "/", "\\", "'", '"', "$(id)", "*", "a" * 31, "b" * 32, "c" * 240),
+)
+
+
+def window(top: int, left: int, size: tuple[int, int] = SIZE) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([left, top], np.int32), np.array([left + size[1] - 1, top + size[0] - 1], np.int32)
+
+
+def pixels(size: tuple[int, int] = SIZE, kind: type = np.float16) -> np.ndarray:
+    values = np.random.default_rng(0).random(size)
+    return (values * 4e9).astype(kind) if kind is np.uint32 else values.astype(kind)
+
+
+def part(channels: object, name: str = "", size: tuple[int, int] = SIZE, **header: object) -> OpenEXR.Part:
+    made = channels if isinstance(channels, dict) else {each: pixels(size) for each in channels}
+    windows = {"displayWindow": window(0, 0), "dataWindow": window(0, 0, size)}
+    kind = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.scanlineimage}
+    return OpenEXR.Part(windows | kind | header, made, *([name] if name else []))
+
+
+def write(path: Path, *parts: OpenEXR.Part) -> Path:
+    OpenEXR.File(list(parts)).write(str(path))
+    return path
+
+
+def deep() -> dict[str, np.ndarray]:
+    samples = np.empty(SIZE, object)
+    for place in np.ndindex(SIZE):
+        samples[place] = np.ones(2, np.float16)
+    return {each: samples for each in "RGB"}
+
+
+def subsampled(path: Path) -> None:
+    """Only the header says so: the list of channels has the sampling at the end of each."""
+    content = write(path, part("RGB")).read_bytes()
+    start = content.index(b"B\0" + struct.pack("<i4B2i", 1, 0, 0, 0, 0, 1, 1)) + 2 + 8
+    path.write_bytes(content[:start] + struct.pack("<2i", 2, 2) + content[start + 8 :])
+
+
+def test_what_is_no_picture_is_named(tmp_path: Path) -> None:
+    folder = tmp_path / "files"
+    folder.mkdir()
+    whole = {each: pixels(kind=np.uint32) for each in "RGB"}
+    write(folder / "whole.exr", part(whole))
+    write(folder / "chroma.exr", part(["Y", "RY", "BY"]))
+    write(folder / "chroma_layer.exr", part(["View.color.Y", "View.color.RY", "View.color.BY"]))
+    write(folder / "deep.exr", part(deep(), type=OpenEXR.deepscanline))
+    write(folder / "deep_beside.exr", part("RGB", "flat"), part(deep(), "deep", type=OpenEXR.deepscanline))
+    write(folder / "sizes.exr", part("RGB", "first"), part(["albedo.R", "albedo.G", "albedo.B"], "second", (5, 7)))
+    elsewhere = part(["albedo.R", "albedo.G", "albedo.B"], "second", dataWindow=window(2, 1))
+    write(folder / "elsewhere.exr", part("RGB", "first"), elsewhere)
+    write(folder / "twice.exr", part("RGB", "one"), part("RGB", "two"))
+    write(folder / "many.exr", part([f"{i}.{each}" for i in range(1400) for each in "RGB"]))
+    subsampled(folder / "subsampled.exr")
+    picture = oiio.ImageBuf(oiio.ImageSpec(*SIZE, 3, "half"))
+    assert oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, picture, str(folder / "mips.exr"))
+    write(folder / "exr.png", part("RGB"))
+    for suffix in ("exr", "png", "hdr", "pfm", "tif"):
+        (folder / f"empty.{suffix}").touch()
+    (folder / "folder.exr").mkdir()
+    (folder / "nowhere.exr").symlink_to("nothing")
+    (folder / "loop.exr").symlink_to("loop.exr")
+    os.mkfifo(folder / "pipe.exr")
+    (folder / "endless.exr").symlink_to("/dev/zero")
+    shutil.copy(write(tmp_path / "intact.exr", part("RGB")), os.fsencode(folder) + b"/not\xff.exr")
+    found = outcomes_of(folder, tmp_path / "written")
+    # Another reason would be none of these files' own.
+    expected = {
+        "whole.exr": "found no layers of floats",
+        "chroma.exr": "found luminance and chroma",
+        "chroma_layer.exr": "found luminance and chroma",
+        "deep.exr": "found a deep image",
+        "deep_beside.exr": "found a deep image",
+        "sizes.exr": "found 7 x 5 pixels",
+        "elsewhere.exr": "found 13 x 11 pixels at 1, 2",
+        "twice.exr": "found one.RGB, two.RGB;",
+        "many.exr": "does not support 4200-channel images",
+        "subsampled.exr": "cannot be opened",
+        "mips.exr": "found a texture of several resolutions",
+        "exr.png": "found a file of the format openexr",
+        "folder.exr": "found a folder",
+        "nowhere.exr": "found a link to nothing",
+        "loop.exr": "found a link to nothing",
+        "pipe.exr": "found a device or a pipe",
+        "endless.exr": "found a device or a pipe",
+        "not\udcff.exr": "expected a name in UTF-8",
+        **{f"empty.{suffix}": "cannot be opened" for suffix in ("exr", "png", "hdr", "pfm", "tif")},
+    }
+    assert found.keys() == expected.keys()
+    for name, words in expected.items():
+        assert words in found[name], f"{name}: {found[name]}"
+    assert_clear(folder, {name: each for name, each in found.items() if "\udcff" not in name})
+    assert all(each.isprintable() for each in found.values())
+    assert not list((tmp_path / "written").glob("*/*"))
+
+
+def test_names_of_every_kind_are_read_written_and_spelled_out(tmp_path: Path) -> None:
+    folder = tmp_path / "files"
+    folder.mkdir()
+    for i, name in enumerate(NAMES):
+        write(folder / f"beside{i}.exr", part(["R", "G", "B", name, f"{name}.q"]))
+        write(folder / f"layer{i}.exr", part([f"{name}.Combined.{each}" for each in "RGB"]))
+        # Two that might be it: the message has their names.
+        write(folder / f"part{i}.exr", part("RGB", f"{name}1"), part("RGB", f"{name}2"))
+    for name in ("line\nbreak.exr", "\x1b[2J.exr", "%d####.exr", f"{'n' * 200}.exr", "-o.exr", " .exr"):
+        write(folder / name, part("RGB"))
+    found = outcomes_of(folder, tmp_path / "written")
+    assert_clear(folder, found)
+    # `.R` beside R, G, B is another red of theirs.
+    refused = {f"beside{NAMES.index('.R')}.exr", *(f"part{i}.exr" for i in range(len(NAMES)))}
+    assert {name for name, each in found.items() if each} == refused
+    for i, name in enumerate(NAMES):
+        assert f"{printable(name)}1.RGB" in found[f"part{i}.exr"]
+
+
+def test_a_thousand_layers(tmp_path: Path) -> None:
+    names = ["R", "G", "B", *(f"light {i}.{each}" for i in range(1000) for each in "RGB")]
+    sequence = open_sequence([write(tmp_path / "shot.exr", part(names))])
+    np.testing.assert_array_equal(sequence.frame(0).color[0, 0], pixels())
+
+
+def test_a_text_in_latin_1_stays(tmp_path: Path) -> None:
+    """As renderers on old systems write it: the library that writes here knows nothing but UTF-8."""
+    content = write(tmp_path / "shot.exr", part("RGB", owner="M?ller", extra=3)).read_bytes()
+    (tmp_path / "shot.exr").write_bytes(content.replace(b"M?ller", b"M\xfcller"))
+    sequence = open_sequence([tmp_path / "shot.exr"])
+    assert "Müller" in sequence.metadata(0).values()
+    (tmp_path / "out").mkdir()
+    written = sequence.write(tmp_path / "out", 0, np.full((*SIZE, 3), 0.25, np.float32))
+    assert b"M\xfcller\0"[:-1] in written.read_bytes()
+    image, channels, metadata = read_exr(written)
+    assert channels == ["R", "G", "B"] and metadata["extra"] == 3
+    np.testing.assert_array_equal(image, 0.25)
+    assert oiio.ImageInput.open(str(written)).spec().format == "half"
+
+
+@pytest.fixture
+def bmfr(tmp_path: Path) -> Path:
+    folder = tmp_path / "shot"
+    folder.mkdir()
+    for stem in ("color", "albedo", "shading_normal"):
+        write(folder / f"{stem}0.exr", part("RGB"))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("channels", "found"),
+    [
+        ({each: pixels(kind=np.uint32) for each in "RGB"}, "found whole numbers"),
+        ({each: pixels() for each in ("Y", "RY", "BY")}, "found luminance and chroma"),
+    ],
+)
+def test_bmfr_refuses_what_is_no_color(bmfr: Path, channels: dict[str, np.ndarray], found: str) -> None:
+    write(bmfr / "albedo0.exr", part(channels))
+    with pytest.raises(InputError, match=found):
+        open_sequence(bmfr)
+
+
+def test_bmfr_refuses_a_buffer_of_other_pixels(bmfr: Path) -> None:
+    write(bmfr / "albedo0.exr", part("RGB", dataWindow=window(3, -2)))
+    assert read_exr_header(bmfr / "albedo0.exr").origin == (3, -2)
+    with pytest.raises(InputError, match="begins at 0, 0 like that of the first color file, found -2, 3"):
+        open_sequence(bmfr)
+    # All of them there is a crop, and well.
+    for path in bmfr.iterdir():
+        write(path, part("RGB", dataWindow=window(3, -2)))
+    assert open_sequence(bmfr).size == SIZE
+
+
+@pytest.mark.parametrize("name", ["camera.json", MATRICES])
+@pytest.mark.parametrize("kind", ["link", "pipe", "device", "folder"])
+@pytest.mark.timeout(60)
+def test_what_is_there_and_cannot_be_read_is_not_missing(bmfr: Path, name: str, kind: str) -> None:
+    if kind == "pipe":
+        os.mkfifo(bmfr / name)
+    elif kind == "folder":
+        (bmfr / name).mkdir()
+    else:
+        (bmfr / name).symlink_to("nothing" if kind == "link" else "/dev/zero")
+    with pytest.raises(InputError, match=name):
+        open_sequence(bmfr)
+
+
+def test_the_screen_shows_names_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = [f"{name}.{each}" for name in ("[/x]", "[red]\x1b[2J", "[/x].Denoising Albedo") for each in "RGB"]
+    write(tmp_path / "shot.exr", part(["R", "G", "B", *names, "[red]\n.Depth.Z"]))
+    print_sequence(open_sequence([tmp_path / "shot.exr"], mapping=["albedo=[/x].Denoising Albedo"]))
+    shown = capsys.readouterr().out
+    assert "[/x].Denoising Albedo.RGB" in shown and r"[red]\n.Depth.Z" in shown and "\x1b" not in shown
