@@ -94,6 +94,17 @@ def miss(matrix: Array, position: Array, seen: Mask) -> float:
     return float(np.median(errors))
 
 
+def motion_to(matrix: Array, position: Array, seen: Mask) -> Array:
+    """``(H, W, 2)`` pixels from each pixel to where a matrix, as in :func:`miss`, sees its point; NaN where none is."""
+    height, width = seen.shape
+    rows, columns = np.mgrid[:height, :width]
+    clip = np.where(seen[..., None], position, np.nan) @ matrix[:3] + matrix[3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = (clip[..., :2] / clip[..., 3:] + 1) / 2 * (width, height) - 0.5
+    result: Array = pixels - np.stack([columns, rows], -1)
+    return result
+
+
 def read_as(matrix: Array, position: Array, seen: Mask) -> tuple[str, float]:
     """The convention by which a matrix sees a frame's positions at their pixels.
 

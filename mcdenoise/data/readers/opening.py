@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mcdenoise.data.camera_matrices import MATRICES, CameraMatrices, read_camera_matrices
+from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices, read_camera_matrices
 from mcdenoise.data.exr import Image
 from mcdenoise.data.images import ImageHeader, Part, read_channels, read_image_header
-from mcdenoise.data.readers.cameras import fit_camera, miss, read_as
+from mcdenoise.data.readers.cameras import fit_camera, motion_to, read_as
 from mcdenoise.data.readers.choice import choose
 from mcdenoise.data.readers.files import RenderedFiles, hit, world_to_camera
 from mcdenoise.data.readers.layers import Layer, layers_of
@@ -258,8 +258,7 @@ def _motion(shot: RenderedFiles) -> tuple[Convention, str]:
     layer = shot.choice.layers["motion"]
     given = _MOTION.get(layer.title.lower(), USUAL_MOTION)
     kept = {"albedo", "normal"} & set(shot.choice.layers) or {"color"}
-    pairs = []
-    moved = False
+    pairs, seen_elsewhere = [], []
     following = [(a, b) for a, b in pairwise(shot.numbers) if b == a + 1][:MOTION_PAIRS]
     for before, now in following:
         wanted = {
@@ -267,35 +266,39 @@ def _motion(shot: RenderedFiles) -> tuple[Convention, str]:
             for name in kept | {"motion"} | ({"position", "depth"} & set(shot.choice.layers))
         }
         images, previous = (shot.read(number, wanted) for number in (now, before))
-        moved |= _camera_moved(shot, (before, previous), (now, images))
+        elsewhere = _seen_elsewhere(shot, (before, previous), (now, images))
+        if elsewhere is not None:
+            seen_elsewhere.append((images["motion"], elsewhere))
         features, earlier = (
             {name: np.clip(np.nan_to_num(each[name][..., :3]), -1, 1) for name in kept} for each in (images, previous)
         )
         pairs.append((features, earlier, images["motion"]))
-    if pairs and moved and not any(motion.any() for *_, motion in pairs):
+    moved = any(np.nanmedian(np.linalg.norm(seen, axis=-1)) > _MOVED for _, seen in seen_elsewhere)
+    if moved and not any(motion.any() for *_, motion in pairs):
         del shot.choice.layers["motion"]
         shot.warnings.append(
             "'motion': all zeros although the camera moves, as Blender writes it with motion blur; positions are used "
             "instead"
         )
         return given, "all zeros: not used"
-    chosen, words, warnings = read_motion(pairs, given)
+    chosen, words, warnings = read_motion(pairs, given, seen_elsewhere)
     shot.warnings += warnings
     if chosen is None:
         del shot.choice.layers["motion"]
     return chosen or given, words
 
 
-def _camera_moved(
+def _seen_elsewhere(
     shot: RenderedFiles, before: tuple[int, Mapping[str, Image]], now: tuple[int, Mapping[str, Image]]
-) -> bool:
-    """Whether the camera of a frame sees the points of the next one elsewhere."""
+) -> Array | None:
+    """Pixels from each point of a frame to where the camera of the one before sees it, where these are known."""
     if not shot.has_camera:
-        return False
+        return None
     seens = [~nothing_hit(images["depth"]) if "depth" in images else None for _, images in (before, now)]
-    matrix = shot.camera(*before, seens[0])
-    position = now[1]["position"].astype(np.float64)
-    return matrix is not None and miss(matrix, position, hit(now[1], seens[1])) > _MOVED
+    matrix, known = shot.camera(*before, seens[0]), hit(now[1], seens[1])
+    if matrix is None or not known.any():
+        return None
+    return motion_to(matrix, now[1]["position"].astype(np.float64), known)
 
 
 def _span(values: Image) -> str:

@@ -29,6 +29,8 @@ _LARGEST_MOTION = 1e5
 _MOVES, _LEAST_MOVING = 0.5, 64
 # Another sign is taken where it matches so much better than the one that the format has.
 _BETTER = 0.85
+# Those that lead where cameras see the same points miss by no more than this, of how far these move.
+_EXACT = 0.5
 # And motion says something where it matches so much better than none.
 _TELLING = 0.98
 # How many pairs of frames are looked at.
@@ -245,9 +247,15 @@ def conventions(size: tuple[int, int], motion: Image) -> list[Convention]:
 Pair: TypeAlias = tuple[Mapping[str, Image], Mapping[str, Image], Image]
 
 
-def read_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention | None, str, list[str]]:
-    """The convention of motion, see :func:`match_motion`, with the words for it, and what to warn of."""
-    chosen, told = match_motion(pairs, given)
+def read_motion(
+    pairs: Sequence[Pair], given: Convention, seen_elsewhere: Sequence[tuple[Image, Array]] = ()
+) -> tuple[Convention | None, str, list[str]]:
+    """The convention of motion, with the words for it, and what to warn of.
+
+    Cameras tell it best, see :func:`match_cameras`, and else what the frames show, see :func:`match_motion`.
+    """
+    by_cameras = match_cameras(seen_elsewhere, given)
+    chosen, told = (by_cameras, True) if by_cameras else match_motion(pairs, given)
     if chosen is None:
         warning = (
             "'motion': does not lead to what looks alike in the frame before, whichever way it is read; it is not used"
@@ -272,21 +280,57 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
     """
     if not pairs:
         return given, False
-    candidates = conventions(pairs[0][2].shape[:2], np.concatenate([motion for *_, motion in pairs]))
-    known = next((each for each in candidates if each[:2] == given[:2]), None)
-    candidates = candidates if known else [given, *candidates]
-    given = known or given
+    given, candidates = _candidates([motion for *_, motion in pairs], given)
     moving = sum(int((np.abs(given.apply(m)).max(-1) > _MOVES).sum()) for *_, m in pairs)
     units = {each.words.rpartition(", ")[2] for each in candidates}
     if moving < _LEAST_MOVING and len(units) == 1:
         return given, False
     errors = {each: float(np.mean([_mismatch(*pair, each) for pair in pairs])) for each in candidates}
-    best = min(errors, key=lambda each: errors[each])
+    # Interpolation smooths what it moves by half a pixel: of two units that fit about as well, it is the usual one.
+    best = min(errors, key=lambda each: errors[each] / (_BETTER if "half" in each.words else 1))
     at_rest = float(np.mean([_mismatch(*pair, Convention(0, 0, "")) for pair in pairs]))
     if errors[best] > _TELLING * at_rest:
         contradicts = errors[best] > at_rest and moving > _LEAST_MOVING
         return (None, True) if contradicts else (given, False)
-    return (best, True) if errors[best] < _BETTER * errors[given] else (given, True)
+    # What hardly moves as it is given, and leads to what looks alike in another unit, is in that unit.
+    rescaled = moving < _LEAST_MOVING and abs(best.scale_x) != abs(given.scale_x)
+    return (best, True) if rescaled or errors[best] < _BETTER * errors[given] else (given, True)
+
+
+def match_cameras(pairs: Sequence[tuple[Image, Array]], given: Convention) -> Convention | None:
+    """Which convention of motion leads where the camera of the frame before sees the points of this one.
+
+    Args:
+        pairs: motion as stored, and ``(H, W, 2)`` pixels to where these points were seen, NaN where there is none.
+        given: the convention that the format is known for.
+
+    Returns:
+        The given one, unless another fits clearly better; ``None`` where points hardly move or none fits.
+    """
+    if not pairs:
+        return None
+    given, candidates = _candidates([motion for motion, _ in pairs], given)
+
+    def missed(convention: Convention) -> float:
+        moved = [
+            convention.apply(motion) if convention.scale_x else np.zeros_like(motion[..., :2]) for motion, _ in pairs
+        ]
+        away = [np.linalg.norm(m - seen, axis=-1) for m, (_, seen) in zip(moved, pairs, strict=True)]
+        return float(np.mean([np.median(each[~np.isnan(each)]) if (~np.isnan(each)).any() else 0 for each in away]))
+
+    errors = {each: missed(each) for each in candidates}
+    best = min(errors, key=lambda each: errors[each])
+    at_rest = missed(Convention(0, 0, ""))
+    if at_rest < _MOVES or errors[best] > _EXACT * at_rest:
+        return None
+    return best if errors[best] < _BETTER * errors[given] else given
+
+
+def _candidates(motions: Sequence[Image], given: Convention) -> tuple[Convention, list[Convention]]:
+    """The given convention, and all that are to be compared, with it."""
+    found = conventions(motions[0].shape[:2], np.concatenate(motions))
+    known = next((each for each in found if each[:2] == given[:2]), None)
+    return known or given, found if known else [given, *found]
 
 
 def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Image, convention: Convention) -> float:

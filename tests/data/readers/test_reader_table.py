@@ -1,0 +1,268 @@
+"""Every renderer: which layer is read as which buffer without a flag, and that the values are those of the scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from mcdenoise.data import Sequence, open_sequence
+
+Image = np.ndarray[Any, Any]
+
+# What is read of each, without a flag; what is computed from it is in no row.
+BLENDER = {
+    "color": "ViewLayer.Combined.RGBA",
+    "albedo": "ViewLayer.Denoising Albedo.RGB",
+    "normal": "ViewLayer.Denoising Normal.XYZ",
+    "depth": "ViewLayer.Depth.Z",
+    "position": "ViewLayer.Position.XYZ",
+    "motion": "ViewLayer.Vector.XYZW",
+}
+RENDERED = {
+    "blender": BLENDER,
+    "blender5": BLENDER | {"color": "ViewLayer.Noisy Image.RGBA"},
+    "blender_filtered": {name: text.replace("ViewLayer", "Main Layer v1.2") for name, text in BLENDER.items()},
+    "blender_denoised": {
+        "color": "ViewLayer.Noisy Image.RGBA",
+        "albedo": "ViewLayer.Denoising Albedo.RGB",
+        "normal": "ViewLayer.Denoising Normal.XYZ",
+        "depth": "ViewLayer.Denoising Depth.Z",
+    },
+    "blender_blur": BLENDER,
+    "blender_reference": {"color": "ViewLayer.Combined.RGBA"},
+    "mitsuba": {
+        "color": "RGB",
+        "albedo": "albedo.RGB",
+        "normal": "nn.XYZ",
+        "depth": "dd.y.T",
+        "position": "pos.XYZ",
+    },
+    "luxcore": {
+        "color": "RGB_####.exr",
+        "albedo": "ALBEDO_####.exr",
+        "normal": "AVG_SHADING_NORMAL_####.exr",
+        "depth": "DEPTH_####.exr",
+        "position": "POSITION_####.exr",
+        "alpha": "ALPHA_####.exr",
+    },
+}
+PBRT = {"color": "RGB", "albedo": "Albedo.RGB", "normal": "Ns.XYZ", "position": "P.XYZ", "variance": "Variance.RGB"}
+RENDERMAN = {
+    "color": "RGBA",
+    "albedo": "albedo.RGB",
+    "normal": "normal.XYZ",
+    "depth": "zfiltered",
+    "motion": "backward.XYZ",
+}
+NAMED = {
+    "pbrt": PBRT,
+    "pbrt_2021": PBRT,
+    "arnold": {
+        "color": "RGBA",
+        "albedo": "denoise_albedo.RGB",
+        "normal": "N.XYZ",
+        "depth": "Z",
+        "variance": "variance.RGB",
+    },
+    "renderman": RENDERMAN | {"color": "Ci.RGB", "alpha": "a"},
+    "renderman_rgba": RENDERMAN,
+    "vray": {
+        "color": "RGBA",
+        "albedo": "diffuseFilter.RGB",
+        "normal": "normals.XYZ",
+        "depth": "Z",
+        "motion": "velocity.XYZ",
+    },
+    "redshift": {
+        "color": "RGBA",
+        "albedo": "DiffuseFilter.RGBA",
+        "normal": "BumpNormals.RGB",
+        "depth": "Z",
+        "position": "WorldPosition.RGB",
+        "motion": "MotionVectors.RGB",
+    },
+    "octane": {
+        "color": "Beauty_Noisy.RGBA",
+        "albedo": "DiffuseFilter.RGB",
+        "normal": "ShadingNormal.RGB",
+        "depth": "Depth.Z",
+    },
+    "falcor": {
+        "color": "Mogwai.AccumulatePass.output.#.exr",
+        "albedo": "Mogwai.GBufferRT.diffuseOpacity.#.exr",
+        "normal": "Mogwai.GBufferRT.normW.#.exr",
+        "depth": "Mogwai.GBufferRT.linearZ.#.exr",
+        "position": "Mogwai.GBufferRT.posW.#.exr",
+        "motion": "Mogwai.GBufferRT.mvec.#.exr",
+    },
+}
+CAMERA_SPACE = {"pbrt", "pbrt_2021", "renderman", "renderman_rgba", "vray"}
+# How they store motion, where it is not as pixels, previous - current, y down.
+SIGNS = {
+    "vray": "current - previous, y down, pixels",
+    "redshift": "current - previous, y up, pixels",
+    "falcor": "previous - current, y down, parts of the image",
+}
+
+
+def taken(sequence: Sequence) -> dict[str, str]:
+    """Layers by buffer, or files where those have no names; without what is computed."""
+    rows = {row.buffer: row.source for row in sequence.table if row.buffer != "view_projection"}
+    return {buffer: source.partition(".exr ")[2] or source for buffer, source in rows.items()}
+
+
+def pixels(tensor: Any) -> Image:
+    result: Image = tensor[0].permute(1, 2, 0).numpy()
+    return result
+
+
+def projected(position: Image, matrix: Any) -> Image:
+    """Columns and rows of pixel centres at which a camera sees positions."""
+    clip = (
+        np.concatenate([position.astype(np.float64), np.ones_like(position[..., :1])], -1) @ matrix[0].double().numpy()
+    )
+    height, width = position.shape[:2]
+    result: Image = (clip[..., :2] / clip[..., 3:] + 1) / 2 * (width, height) - 0.5
+    return result
+
+
+def center(position: Image) -> Image:
+    rows, columns = np.indices(position.shape[:2])
+    return np.stack([columns, rows], -1)
+
+
+@pytest.mark.parametrize("renderer", RENDERED)
+def test_what_a_real_renderer_wrote_is_read_without_a_flag(renderer: str, rendered: Path) -> None:
+    folder = rendered / renderer
+    # Mitsuba's array without names of channels lies beside its frames.
+    sequence = open_sequence(folder / "frame.####.exr" if renderer == "mitsuba" else folder)
+    assert taken(sequence) == RENDERED[renderer]
+    assert list(sequence.warnings) == []
+    assert sequence.color_has_albedo
+    for number in sequence.numbers:
+        frame = sequence.frame(number)
+        frame.validate()
+        assert {name for name, _ in frame.items()} == sequence.buffers
+        if "depth" in sequence.buffers:
+            assert 0.1 < frame.depth.isinf().float().mean() < 0.3
+
+
+@pytest.mark.parametrize("renderer", NAMED)
+def test_what_has_the_names_of_another_is_read_without_a_flag(renderer: str, others: Any, tmp_path: Path) -> None:
+    others.write(renderer, tmp_path)
+    sequence = open_sequence(tmp_path)
+    assert taken(sequence) == NAMED[renderer]
+    assert sequence.numbers == [1, 2, 3]
+    assert sequence.color_has_albedo
+    said = {row.buffer: row.reading for row in sequence.table}
+    # What differs from what is usual is worth a word; nothing else is.
+    words = [f"'motion': read as {SIGNS.get(renderer)}, since only so frames match the ones before them"]
+    assert list(sequence.warnings) == (words if renderer in SIGNS else [])
+    for number in sequence.numbers:
+        truth, frame = others.read(number), sequence.frame(number)
+        frame.validate()
+        hit = truth["hit"]
+        np.testing.assert_array_equal(pixels(frame.color), np.maximum(truth["color"], 0))
+        np.testing.assert_array_equal(pixels(frame.albedo), truth["albedo"])
+        normal = others.to_camera(truth, truth["normal"]) if renderer in CAMERA_SPACE else truth["normal"]
+        # Encoding into 0 to 1 and back rounds twice.
+        np.testing.assert_allclose(pixels(frame.normal), np.clip(normal, -1, 1), atol=2e-7)
+        np.testing.assert_array_equal(np.isfinite(pixels(frame.depth)[..., 0]), hit)
+        # pbrt has no depth: it is that of the positions.
+        np.testing.assert_allclose(pixels(frame.depth)[hit][:, 0], truth["depth"][hit], rtol=2e-5)
+        if frame.alpha is not None:
+            np.testing.assert_array_equal(pixels(frame.alpha)[..., 0], truth["alpha"])
+        if frame.variance is not None:
+            np.testing.assert_allclose(pixels(frame.variance), others.variance(truth["color"]), rtol=1e-6)
+        if "position" in sequence.buffers:
+            np.testing.assert_allclose(pixels(frame.position)[hit], truth["position"][hit], atol=2e-5)
+        if "motion" in sequence.buffers:
+            np.testing.assert_allclose(pixels(frame.motion)[hit], truth["motion"][hit], atol=1e-5)
+            # Nothing is known of the sky's.
+            assert np.isinf(pixels(frame.motion)[~hit]).all()
+    if "motion" in sequence.buffers:
+        assert said["motion"].startswith(SIGNS.get(renderer, "previous - current, y down, pixels"))
+
+
+@pytest.mark.parametrize("renderer", ["pbrt", "redshift", "falcor"])
+def test_cameras_found_from_positions_lead_where_motion_does(renderer: str, others: Any, tmp_path: Path) -> None:
+    others.write(renderer, tmp_path)
+    sequence = open_sequence(tmp_path)
+    frames = [sequence.frame(number) for number in sequence.numbers]
+    for number, before, now in zip(sequence.numbers[1:], frames[:-1], frames[1:], strict=True):
+        truth = others.read(number)
+        # The floor stands still; the object above it does not.
+        still = truth["hit"] & (np.abs(truth["position"][..., 2]) < 1e-5)
+        position = pixels(now.position)
+        here, there = projected(position, now.view_projection), projected(position, before.view_projection)
+        np.testing.assert_allclose(here[truth["hit"]], center(position)[truth["hit"]], atol=1e-3)
+        np.testing.assert_allclose((there - here)[still], truth["motion"][still], atol=2e-3)
+
+
+def layer(path: Path, name: str, components: str) -> Image:
+    """A layer as the library of the format reads it, whatever part it is in."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = {each: channel.pixels for part in file.parts for each, channel in part.channels.items()}
+    return np.stack([channels[f"{name}.{each}" if name else each] for each in components], -1).astype(np.float32)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_the_values_of_blender(number: int, rendered: Path) -> None:
+    frame = open_sequence(rendered / "blender").frame(number)
+    path = rendered / "blender" / f"shot_{number:04d}.exr"
+    vector = layer(path, "ViewLayer.Vector", "XY")
+    hit = layer(path, "ViewLayer.Depth", "Z")[..., 0] < 1e9
+    np.testing.assert_array_equal(pixels(frame.motion)[hit], vector[hit] * (1, -1))
+    assert np.isinf(pixels(frame.motion)[~hit]).all()
+    np.testing.assert_array_equal(pixels(frame.depth)[hit], layer(path, "ViewLayer.Depth", "Z")[hit])
+    np.testing.assert_array_equal(pixels(frame.normal), layer(path, "ViewLayer.Denoising Normal", "XYZ").clip(-1, 1))
+    np.testing.assert_array_equal(pixels(frame.albedo), layer(path, "ViewLayer.Denoising Albedo", "RGB").clip(0, 1))
+    np.testing.assert_array_equal(pixels(frame.position)[hit], layer(path, "ViewLayer.Position", "XYZ")[hit])
+    # The sky is so far away that it moves with the camera's turning alone, and is seen where it is.
+    position = pixels(frame.position)
+    np.testing.assert_allclose(projected(position, frame.view_projection), center(position), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("renderer", "eye", "target", "up", "row", "near"),
+    [
+        # Means over a pixel, in 16 bits.
+        ("mitsuba/frame.####.exr", (-0.5, 1.5, 5.0), (0, 0.9, 0), (0, 1, 0), 0, 0.05),
+        # Points anywhere within half a pixel of the centre, each a row below where the camera sees it.
+        ("luxcore", (-0.5, -5.0, 1.5), (0, 0, 0.9), (0, 0, 1), 1, 0.25),
+    ],
+)
+def test_positions_move_as_the_known_camera_does(
+    renderer: str,
+    eye: tuple[float, ...],
+    target: tuple[float, ...],
+    up: tuple[float, ...],
+    row: int,
+    near: float,
+    rendered: Path,
+) -> None:
+    sequence = open_sequence(rendered / renderer)
+    frames = {number: sequence.frame(number) for number in sequence.numbers}
+    for number in sequence.numbers[1:]:
+        position = pixels(frames[number].position)
+        hit = np.isfinite(pixels(frames[number].depth)[..., 0])
+        there = projected(position, frames[number - 1].view_projection)
+        known = looking_at(np.array(eye) + (0.15 * (number - 1), 0, 0), np.array(target), np.array(up), position)
+        known += (0, row)
+        assert np.median(np.linalg.norm(there - known, axis=-1)[hit]) < near
+        # They move by twice as much at least.
+        assert np.median(np.linalg.norm(known - center(position), axis=-1)[hit]) > 2 * near
+
+
+def looking_at(eye: Image, target: Image, up: Image, position: Image) -> Image:
+    """Pixels at which a camera with 50 degrees in the width sees positions."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
+    x, y, z = np.moveaxis((position - eye) @ np.stack([right, np.cross(forward, right), forward]).T, -1, 0)
+    height, width = position.shape[:2]
+    focal = width / 2 / np.tan(np.radians(25))
+    return np.stack([width / 2 + focal * x / z, height / 2 + focal * y / z], -1) - 0.5
