@@ -16,6 +16,7 @@ This file stands alone. It imports Blender's Python module ``bpy``, which is und
 mcdenoise, and nothing of mcdenoise imports it.
 """
 
+import atexit
 import os
 import re
 import shlex
@@ -228,9 +229,13 @@ def register():
     for kind in CLASSES:
         bpy.utils.register_class(kind)
     bpy.types.Scene.denoise_animation = bpy.props.PointerProperty(type=DenoiseAnimationSettings)
+    if bpy.app.module:
+        # As a Python module, Blender 4.5 never ends while a panel or an operator is registered.
+        atexit.register(unregister)
 
 
 def unregister():
+    atexit.unregister(unregister)
     del bpy.types.Scene.denoise_animation
     for kind in reversed(CLASSES):
         bpy.utils.unregister_class(kind)
