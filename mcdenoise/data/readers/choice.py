@@ -61,6 +61,9 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
         if text:
             choice.layers[buffer] = _mapped(where, layers, buffer, text)
             choice.reasons[buffer] = "as asked for"
+    if not candidates["color"] and "color" not in mapping and len(references := candidates["reference"]) == 1:
+        # Alone it is a picture like any other.
+        candidates["color"], candidates["reference"] = references, []
     color = choice.layers.get("color") or _color(where, candidates["color"], strangers, mapping)
     choice.layers["color"] = color
     for buffer in NAMES:
