@@ -14,9 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mcdenoise.data import Sequence, read_exr
+from mcdenoise.data import Sequence
 from mcdenoise.data.color_space import to_rec709
-from mcdenoise.data.exr import read_exr_header
+from mcdenoise.data.readers.opening import open_result
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate.noise import noise_floor, reference_noise
@@ -195,8 +195,8 @@ def evaluate_folder(
 
     Args:
         sequence: frames with references.
-        folder: an EXR image of each, see :func:`find_images`: channels R, G, B (an alpha is ignored), scene-linear,
-            with the primaries that its ``chromaticities`` state, or else Rec. 709. The references have those that the
+        folder: an EXR image of each, see :func:`find_images`: alone or among other layers, scene-linear, with the
+            primaries that its ``chromaticities`` state, or else Rec. 709. The references have those that the
             color files state.
         protocol: name in :data:`mcdenoise.metrics.PROTOCOLS`; its values come beside the strict ones.
         on_frame: called with the number of each frame that is done.
@@ -363,22 +363,17 @@ def _explain(table: Table, temporal: Iterable[str]) -> None:
 
 
 def _check_header(path: Path, size: tuple[int, int]) -> None:
-    header = read_exr_header(path)
-    if header.channels[:3] != ["R", "G", "B"] or header.channels[3:] not in ([], ["A"]):
+    height, width = open_result(path).size
+    if (height, width) != size:
         raise InputError(
-            f"{path}: expected channels R, G, B, found {', '.join(header.channels[:8])}; write the color alone"
-        )
-    if header.size != size:
-        raise InputError(
-            f"{path}: expected {size[1]} x {size[0]} pixels like the sequence, found {header.size[1]} x "
-            f"{header.size[0]}; denoise at the size of the references"
+            f"{path}: expected {size[1]} x {size[0]} pixels like the sequence, found {width} x {height}; "
+            "denoise at the size of the references"
         )
 
 
 def _read(sequence: Sequence, number: int, path: Path) -> tuple[Tensor, Frame, Tensor]:
     """Image, frame and reference, both images with the primaries of Rec. 709."""
-    pixels, _, metadata = read_exr(path)
-    image = torch.from_numpy(pixels[..., :3]).permute(2, 0, 1)[None].contiguous()
+    image, metadata = open_result(path).read()
     bad = ~torch.isfinite(image).all(1)[0]
     if bad.any():
         row, column = bad.nonzero()[0].tolist()

@@ -64,7 +64,7 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
     if not candidates["color"] and "color" not in mapping and len(references := candidates["reference"]) == 1:
         # Alone it is a picture like any other.
         candidates["color"], candidates["reference"] = references, []
-    color = choice.layers.get("color") or _color(where, candidates["color"], strangers, mapping)
+    color = choice.layers.get("color") or _color(where, candidates["color"], strangers, layers)
     choice.layers["color"] = color
     for buffer in NAMES:
         if buffer not in choice.layers and buffer not in mapping:
@@ -121,14 +121,14 @@ def _mapped(where: str, layers: Sequence[Layer], buffer: str, text: str) -> Laye
 
 
 def _color(
-    where: str, candidates: Sequence[tuple[int, Layer]], strangers: Sequence[Layer], mapping: Mapping[str, str]
+    where: str, candidates: Sequence[tuple[int, Layer]], strangers: Sequence[Layer], layers: Sequence[Layer]
 ) -> Layer:
     if not candidates:
         # A single picture of unknown name is what is to be denoised.
         pictures = [layer for layer in strangers if layer.is_color]
         if len(pictures) == 1:
             return pictures[0]
-        found = ", ".join(str(layer) for layer in dict.fromkeys([*pictures, *strangers][:12])) or "no layers of floats"
+        found = ", ".join(str(layer) for layer in dict.fromkeys([*pictures, *layers][:12])) or "no layers of floats"
         raise InputError(f"{where}: expected noisy radiance, found {found}; name it with --map color=LAYER")
     least = min(rank for rank, _ in candidates)
     best = [layer for rank, layer in candidates if rank == least]

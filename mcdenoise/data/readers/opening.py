@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices, read_camera_matrices
-from mcdenoise.data.exr import Image
+from mcdenoise.data.exr import Image, Metadata
 from mcdenoise.data.images import ImageHeader, Part, read_channels, read_image_header
 from mcdenoise.data.readers.cameras import fit_camera, motion_to, read_as
 from mcdenoise.data.readers.choice import choose
@@ -77,6 +79,44 @@ def open_files(
     shot = replace(shot, lights=found, cameras=_cameras(shot))
     _look(shot, color_has_albedo)
     return shot
+
+
+@dataclass(frozen=True)
+class Result:
+    """The radiance of one file: that which has been denoised, if it holds some that has not as well.
+
+    Args:
+        path: the file.
+        layer: of the radiance.
+        size: height and width in pixels.
+    """
+
+    path: Path
+    layer: Layer
+    size: tuple[int, int]
+
+    def read(self) -> tuple[Tensor, Metadata]:
+        """``(1, 3, H, W)`` radiance, and the attributes of the file.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        pixels = read_channels(self.path, {self.layer.part: self.layer.channels[:3]})[self.layer.part]
+        image = torch.from_numpy(pixels).permute(2, 0, 1)[None].contiguous()
+        return image, read_image_header(self.path).metadata
+
+
+def open_result(path: Path) -> Result:
+    """Find the radiance of a file that a denoiser wrote, alone or among other layers.
+
+    Raises:
+        InputError: the file cannot be read, or does not tell which layer is its radiance.
+    """
+    parts = read_image_header(path).parts
+    layers = layers_of(0, "", parts)
+    chosen = choose(str(path), layers, {}, lambda layer: read_channels(path, {layer.part: layer.channels})[layer.part])
+    (layer, *_) = chosen.written
+    return Result(path, layer, parts[layer.part].size)
 
 
 def _check(shot: RenderedFiles) -> None:

@@ -33,7 +33,7 @@ RENDERED = {
         "depth": "ViewLayer.Denoising Depth.Z",
     },
     "blender_blur": BLENDER,
-    "blender_reference": {"color": "ViewLayer.Combined.RGBA"},
+    "blender_reference": {"color": "reference_####.exr"},
     "mitsuba": {
         "color": "RGB",
         "albedo": "albedo.RGB",
