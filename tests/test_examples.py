@@ -9,15 +9,15 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from mcdenoise.data import open_sequence, read_exr, write_exr
+from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.models import create_model, save_weights
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+RENDERERS = Path(__file__).parent / "data" / "renderers"
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data" / "train"
 # A busy machine takes several times as long as a quiet one.
 SECONDS = 240
@@ -415,22 +415,12 @@ def test_mitsuba_denoiser_denoises_a_still_and_optimises_where_mitsuba_different
     assert float(found[2]) < float(found[1])
 
 
-def test_layers_of_a_shot_of_cycles_are_compared(tmp_path: Path) -> None:
-    """Files with the passes and names of Cycles, not rendered by it."""
-    light, surface = ("DiffDir", "DiffInd", "GlossDir", "GlossInd", "TransDir", "TransInd", "Emit", "Env"), "Denoising "
-    colors = ("DiffCol", "GlossCol", "TransCol", "Combined", f"{surface}Albedo")
-    names = [f"ViewLayer.{name}.{channel}" for name in (*light, *colors) for channel in "RGB"]
-    names += [
-        f"ViewLayer.{name}" for name in (*(f"{surface}Normal.{c}" for c in "XYZ"), "Depth.Z", "Vector.X", "Vector.Y")
-    ]
-    for stem in ("noisy_0001", "noisy_0002", "reference_0001"):
-        passes = {name: torch.rand(24, 40).numpy() for name in names}
-        for channel in "RGB":
-            parts = {name: passes[f"ViewLayer.{name}.{channel}"] for name in (*light, *colors)}
-            kinds = (parts[f"{k}Col"] * (parts[f"{k}Dir"] + parts[f"{k}Ind"]) for k in ("Diff", "Gloss", "Trans"))
-            passes[f"ViewLayer.Combined.{channel}"] = sum(kinds) + parts["Emit"] + parts["Env"]
-        write_exr(tmp_path / f"{stem}.exr", np.stack(list(passes.values()), -1), names, half=False)
-    lines = run("layers/compare.py", tmp_path, "cascaded_v2_micro").splitlines()
+def test_layers_of_a_shot_of_blender_are_compared(tmp_path: Path) -> None:
+    for path in (RENDERERS / "blender").iterdir():
+        for name in (path.name, path.name.replace("shot", "reference")):
+            shutil.copy(path, tmp_path / name)
+    title, *lines = run("layers.py", tmp_path, "cascaded_v2_micro").splitlines()
+    assert title.startswith("8 layers: ViewLayer.DiffDir, ")
     assert [line.split(" | ")[0] for line in lines[2:]] == [
         "| `cascaded_v2_micro`, color alone",
         "| with layers",

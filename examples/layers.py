@@ -1,0 +1,95 @@
+"""Error of denoised layers of light, and what they cost, on a shot that Blender rendered with its light passes.
+
+    python examples/blender/render.py -o shot --frames 8 --samples 1 --filter none
+    python examples/blender/render.py -o shot --name reference --frames 8 --samples 256 --filter none --seed 1001
+    python examples/layers.py shot [METHOD...]
+
+Each method denoises the shot three times: the color alone, the color with its layers, and every layer by itself. Errors
+are squared differences from the reference over ``reference color^2 + 0.01``, times 1000, and SMAPE; of the layers, the
+sum of the former and the mean of the latter. Times are medians over the frames after the first, without files. The last
+column is how far the sum of the layers is from the color, on average, relative to its mean.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mcdenoise import Denoiser, Frame
+from mcdenoise.data import open_sequence
+from mcdenoise.errors import InputError
+from mcdenoise.metrics import smape_linear
+
+METHODS = ("cascaded_v2", "cascaded_v2_small", "cascaded_v2_tiny", "joint_bilateral", "oidn")
+Images = dict[str, Tensor]
+
+
+def load(files: Path) -> list[Frame]:
+    """The frames of a shot with all their layers of light."""
+    sequence = open_sequence(files, lights=["all"])
+    return [sequence.frame(number) for number in sequence.numbers]
+
+
+def denoised(frames: list[Frame], denoise: Callable[[Frame], Images]) -> tuple[list[Images], float]:
+    """Images by name of each frame, and milliseconds for one."""
+    images, times = [], []
+    for frame in frames:
+        start = time.perf_counter()
+        images.append(denoise(frame))
+        times.append(1e3 * (time.perf_counter() - start))
+    return images, sorted(times[1:])[len(times[1:]) // 2]
+
+
+def report(name: str, images: list[Images], milliseconds: float, references: list[Frame]) -> None:
+    """One row: time, errors of the color and of the layers, and how the layers add up."""
+    names = ["color", *references[0].layers]
+    errors, smapes, apart = [], [], []
+    for found, reference in zip(images, references, strict=True):
+        truth = {"color": reference.color, **reference.layers}
+        scale = reference.color.square() + 0.01
+        errors.append([1e3 * float(((found[each] - truth[each]).square() / scale).mean()) for each in names])
+        smapes.append([float(smape_linear(found[each], truth[each])) for each in names])
+        total = torch.stack([found[each] for each in names[1:]]).sum(0)
+        apart.append(float((total - found["color"]).abs().mean() / found["color"].mean()))
+    (color, *layers), (color_smape, *layer_smapes) = torch.tensor([errors, smapes]).mean(1).tolist()
+    figures = f"{color:.1f} | {color_smape:.4f} | {sum(layers):.1f} | {sum(layer_smapes) / len(layers):.4f}"
+    print(f"| {name} | {milliseconds:.0f} ms | {figures} | {sum(apart) / len(apart):.1e} |", flush=True)
+
+
+def main(shot: Path, methods: Sequence[str]) -> None:
+    """Print a table."""
+    frames, references = (load(shot / f"{kind}_####.exr") for kind in ("shot", "reference"))
+    names = ("color", *frames[0].layers)
+    print(f"{len(names) - 1} layers: {', '.join(names[1:])}")
+    print("| | time | color | SMAPE | layers | SMAPE | sum |\n|---|--:|--:|--:|--:|--:|--:|")
+    for method in methods:
+        alone, together = Denoiser(method), Denoiser(method)
+        _, milliseconds = denoised(frames, lambda frame, alone=alone: {"color": alone(frame)})
+        print(f"| `{method}`, color alone | {milliseconds:.0f} ms | | | | | |")
+
+        def with_layers(frame: Frame, denoiser: Denoiser = together) -> Images:
+            output = denoiser.output(frame, stages=False)
+            return {"color": output.image, **output.layers}
+
+        report("with layers", *denoised(frames, with_layers), references)
+        each = {name: Denoiser(method) for name in names}
+
+        def by_itself(frame: Frame, denoisers: dict[str, Denoiser] = each) -> Images:
+            images = {"color": frame.color, **frame.layers}
+            return {name: denoisers[name](frame.replace(color=images[name], layers={})) for name in names}
+
+        report("every layer by itself", *denoised(frames, by_itself), references)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(f"usage: {sys.argv[0]} SHOT [METHOD...]")
+    try:
+        main(Path(sys.argv[1]), sys.argv[2:] or METHODS)
+    except InputError as error:
+        sys.exit(f"{sys.argv[0]}: {error}")
