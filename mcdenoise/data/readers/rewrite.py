@@ -12,9 +12,13 @@ import OpenImageIO as oiio
 
 from mcdenoise.data.exr import LARGEST_HALF, Image, pending_error
 from mcdenoise.data.files import atomic_path
-from mcdenoise.data.images import FORMATS, read_image_header
+from mcdenoise.data.images import FORMATS, read_image_header, read_picture
+from mcdenoise.data.readers.attributes import put_back, readable
 from mcdenoise.data.readers.transfer import encode
 from mcdenoise.errors import InputError
+
+# The name and the checksum of the empty chunk with which every PNG ends.
+_PNG_END = b"IEND\xaeB`\x82"
 
 
 def write_like(
@@ -62,10 +66,13 @@ def _write_exr(
     part: int,
     full_float: bool,
 ) -> str:
-    # Both raise whatever the library below has to say, and nothing else can go wrong with a file that was read whole.
+    # They raise whatever the library below has to say, and nothing else can go wrong with a file that was read whole.
     try:
-        file = OpenEXR.File(str(source), separate_channels=True)
+        with readable(source, target.with_suffix(".copy.exr")) as (path, strange):
+            file = OpenEXR.File(str(path), separate_channels=True)
         for (index, name), image in replaced.items():
+            if index >= len(file.parts) or name not in file.parts[index].channels:
+                return f"{source} has changed meanwhile"
             channel = file.parts[index].channels[name]
             channel.pixels = _stored(image, np.float32 if full_float else channel.pixels.dtype)
         if added:
@@ -79,6 +86,8 @@ def _write_exr(
                 channels[name] = OpenEXR.Channel(name, _stored(image, kind))
             main.channels = channels
         file.write(str(target))
+        if strange:
+            put_back(target, strange)
         written = read_image_header(target)
     except (RuntimeError, ValueError, TypeError, OSError, InputError) as error:
         return str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -94,15 +103,24 @@ def _stored(image: Image, kind: Any) -> Any:
 
 def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image]) -> str:
     """A file of one picture: its other channels, and what kind of numbers it has, stay."""
-    picture = oiio.ImageBuf(str(source))
-    spec = picture.spec()
-    pixels = np.asarray(picture.get_pixels(oiio.FLOAT), dtype=np.float32)
+    spec, pixels = read_picture(source)
     names = list(spec.channelnames)
     light = np.stack([replaced[name] for name in names[:3]], -1)
     display = read_image_header(source).parts[0].display_referred
     pixels[..., :3] = encode(light) if display else light
     if len(names) > 3 and names[3] in replaced:
         pixels[..., 3] = replaced[names[3]]
-    clean = oiio.ImageBuf(spec)
-    clean.set_pixels(spec.roi, pixels)
-    return "" if clean.write(str(target)) else pending_error(clean)
+    output = oiio.ImageOutput.create(str(target))
+    if output is None or not output.open(str(target), spec):
+        return pending_error(output or oiio) or "writing failed"
+    written = output.write_image(pixels)
+    if not output.close() or not written:
+        return pending_error(output) or "writing failed"
+    # A disk that is full is not told: see whether the pixels are there.
+    try:
+        read_picture(target)
+    except InputError as error:
+        return f"incomplete: {error}"
+    if target.suffix.lower() == ".png" and not target.read_bytes().endswith(_PNG_END):
+        return "incomplete"
+    return ""

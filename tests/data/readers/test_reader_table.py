@@ -251,7 +251,7 @@ def test_positions_move_as_the_known_camera_does(
         position = pixels(frames[number].position)
         hit = np.isfinite(pixels(frames[number].depth)[..., 0])
         there = projected(position, frames[number - 1].view_projection)
-        known = looking_at(np.array(eye) + (0.15 * (number - 1), 0, 0), np.array(target), np.array(up), position)
+        known = looking_at(np.add(eye, (0.15 * (number - 1), 0, 0)), np.array(target), np.array(up), position)
         known += (0, row)
         assert np.median(np.linalg.norm(there - known, axis=-1)[hit]) < near
         # They move by twice as much at least.
