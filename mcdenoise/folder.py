@@ -297,8 +297,7 @@ def make_folder(out: Path) -> None:
 
 def _check_apart(sequence: Sequence, out: Path) -> None:
     """Results have the names of what they were made of: they must not take its place."""
-    source = sequence.root if sequence.root.is_dir() else sequence.root.parent
-    if out.resolve() in (source.resolve(), (source / "inputs").resolve()):
+    if out.resolve() in {folder.resolve() for folder in (*sequence.folders, sequence.root)}:
         raise InputError(
             f"{out}: expected another folder than that of the input, found the same; choose one to write to"
         )

@@ -125,6 +125,22 @@ def read_channels(path: Path, wanted: Mapping[int, Sequence[str]]) -> dict[int, 
         file.close()
 
 
+def read_picture(path: Path) -> tuple[oiio.ImageSpec, Image]:
+    """Read all channels of the first image of a file, and what says how it is stored.
+
+    Not through ``oiio.ImageBuf``, which reads a PFM upside down.
+
+    Raises:
+        InputError: as :func:`read_channels`.
+    """
+    file, header = _open(path)
+    try:
+        file.seek_subimage(0, 0)
+        return file.spec(), _read(path, file, 0, header.parts[0], header.parts[0].channels)
+    finally:
+        file.close()
+
+
 def _read(path: Path, file: oiio.ImageInput, index: int, part: Part, names: Sequence[str]) -> Image:
     places = [part.channels.index(name) for name in names]
     first, end = min(places), max(places) + 1

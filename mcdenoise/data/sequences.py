@@ -62,6 +62,11 @@ class Sequence:
     def __len__(self) -> int:
         return len(self.numbers)
 
+    @property
+    def folders(self) -> set[Path]:
+        """Where the files lie; what is written has their names, and may not be written there."""
+        return self._source.folders
+
     def frame(self, number: int, reference: bool = True, realisation: int = 0) -> Frame:
         """Read one frame: a batch of 1, float32, on the CPU; values are not validated.
 

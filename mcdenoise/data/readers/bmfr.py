@@ -98,6 +98,11 @@ class BmfrFolder:
     unused: Sequence[str] = ()
 
     @property
+    def folders(self) -> set[Path]:
+        """Where the files lie."""
+        return {self.path}
+
+    @property
     def realisations(self) -> int:
         """How many noisy colors every frame in use has."""
         return 1 + len(self.more_colors)

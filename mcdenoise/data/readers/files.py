@@ -89,6 +89,11 @@ class RenderedFiles:
         return frozenset(present)
 
     @property
+    def folders(self) -> set[Path]:
+        """Where the files lie."""
+        return {path.parent for group in self.groups for path in group.files.values()}
+
+    @property
     def unused(self) -> list[str]:
         """Layers that look like buffers and are not used."""
         return [self.named(layer) for layer in self.choice.unused]

@@ -78,7 +78,7 @@ class Layer:
     anonymous: bool = False
 
     def __str__(self) -> str:
-        letters = "".join(each.upper() for each in self.components) if all(self.components) else ""
+        letters = "".join(each[0].upper() if each in _ORDER else each.upper() for each in self.components if each)
         return ".".join(filter(None, (self.name, letters))) or self.channels[0]
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,13 @@ import OpenImageIO as oiio
 
 from mcdenoise.data.exr import LARGEST_HALF, Image, pending_error
 from mcdenoise.data.files import atomic_path
-from mcdenoise.data.images import FORMATS, Part, as_stored, read_channels, read_image_header
+from mcdenoise.data.images import FORMATS, Part, read_image_header, read_picture
+from mcdenoise.data.readers.attributes import put_back, readable
 from mcdenoise.data.readers.transfer import encode
 from mcdenoise.errors import InputError
+
+# The name and the checksum of the empty chunk with which every PNG ends.
+_PNG_END = b"IEND\xaeB`\x82"
 
 
 def write_like(
@@ -68,10 +72,10 @@ def _write_exr(
     # Reading and writing raise whatever the library below has to say.
     try:
         # A part that it cannot read it leaves out, and prints that.
-        with redirect_stdout(io.StringIO()):
-            file = OpenEXR.File(str(source), separate_channels=True)
+        with readable(source, target.with_suffix(".copy.exr")) as (path, strange), redirect_stdout(io.StringIO()):
+            file = OpenEXR.File(str(path), separate_channels=True)
         if len(file.parts) != len(expected) or not all(map(_is_whole, file.parts, expected)):
-            return _write_through_oiio(source, target, expected, replaced, added, full_float)
+            return f"{source} has changed meanwhile, or has parts that cannot be written again"
         for (index, name), image in replaced.items():
             channel = file.parts[index].channels[name]
             channel.pixels = _stored(image, np.float32 if full_float else channel.pixels.dtype)
@@ -86,9 +90,9 @@ def _write_exr(
                 channels[name] = OpenEXR.Channel(name, _stored(image, kind))
             main.channels = channels
         file.write(str(target))
+        if strange:
+            put_back(target, strange)
         written = read_image_header(target)
-    except UnicodeDecodeError:
-        return _write_through_oiio(source, target, expected, replaced, added, full_float)
     except (RuntimeError, ValueError, TypeError, OSError, InputError) as error:
         return str(error).splitlines()[0] if str(error) else type(error).__name__
     return "" if len(written.parts) == len(file.parts) else "incomplete"
@@ -100,42 +104,6 @@ def _is_whole(found: Any, part: Part) -> bool:
     return set(channels) == set(part.channels) and all(each.pixels.shape == part.size for each in channels.values())
 
 
-def _write_through_oiio(
-    source: Path,
-    target: Path,
-    parts: Sequence[Part],
-    replaced: Mapping[tuple[int, str], Image],
-    added: Mapping[str, Image],
-    full_float: bool,
-) -> str:
-    """What has texts that are no UTF-8: OpenImageIO keeps them, but scales whole numbers and loses rare attributes."""
-    if added or any(part.integers for part in parts):
-        return "its attributes are no UTF-8"
-    file, clean = oiio.ImageInput.open(str(source)), oiio.ImageOutput.create("openexr")
-    if file is None or clean is None:
-        return pending_error(oiio)
-    specs, images = [], []
-    for index, part in enumerate(parts):
-        spec = file.spec(index)
-        pixels = np.array(file.read_image(index, 0, 0, spec.nchannels, oiio.FLOAT), np.float32)
-        pixels = pixels.reshape(*part.size, spec.nchannels)
-        kinds = [str(kind) for kind in spec.channelformats] or [str(spec.format)] * spec.nchannels
-        for place, name in enumerate(part.channels):
-            if (index, name) in replaced:
-                half = kinds[place] == "half" and not full_float
-                pixels[..., place] = _stored(replaced[index, name], np.float16 if half else np.float32)
-        if full_float:
-            spec.set_format("float")
-        specs.append(spec)
-        images.append(pixels)
-    file.close()
-    for index, (spec, pixels) in enumerate(zip(specs, images, strict=True)):
-        opened = clean.open(str(target), spec, "AppendSubimage") if index else clean.open(str(target), tuple(specs))
-        if not opened or not clean.write_image(pixels):
-            return pending_error(clean) or "writing failed"
-    return "" if clean.close() else pending_error(clean) or "writing failed"
-
-
 def _stored(image: Image, kind: Any) -> Any:
     if kind == np.float16:
         # Rounding would turn a firefly into infinity, which spreads through every filter downstream.
@@ -145,20 +113,24 @@ def _stored(image: Image, kind: Any) -> Any:
 
 def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image]) -> str:
     """A file of one picture: its other channels, and what kind of numbers it has, stay."""
-    header = read_image_header(source).parts[0]
-    pixels = read_channels(source, {0: header.channels})[0]
-    light = np.stack([replaced[name] for name in header.channels[:3]], -1)
-    pixels[..., :3] = encode(light) if header.display_referred else light
-    if len(header.channels) > 3 and header.channels[3] in replaced:
-        pixels[..., 3] = replaced[header.channels[3]]
-    file, output = oiio.ImageInput.open(str(source), as_stored()), oiio.ImageOutput.create(str(target))
-    if file is None or output is None:
-        return pending_error(oiio)
-    if not output.open(str(target), file.spec()) or not output.write_image(pixels) or not output.close():
-        return pending_error(output)
+    spec, pixels = read_picture(source)
+    names = list(spec.channelnames)
+    light = np.stack([replaced[name] for name in names[:3]], -1)
+    display = read_image_header(source).parts[0].display_referred
+    pixels[..., :3] = encode(light) if display else light
+    if len(names) > 3 and names[3] in replaced:
+        pixels[..., 3] = replaced[names[3]]
+    output = oiio.ImageOutput.create(str(target))
+    if output is None or not output.open(str(target), spec):
+        return pending_error(output or oiio) or "writing failed"
+    written = output.write_image(pixels)
+    if not output.close() or not written:
+        return pending_error(output) or "writing failed"
+    # A disk that is full is not told: see whether the pixels are there.
     try:
-        # A full disk is not noticed otherwise.
-        read_channels(target, {0: header.channels})
+        read_picture(target)
     except InputError as error:
         return f"incomplete: {error}"
+    if target.suffix.lower() == ".png" and not target.read_bytes().endswith(_PNG_END):
+        return "incomplete"
     return ""

@@ -1,0 +1,255 @@
+"""Cameras found from the positions that they see, and cameras checked by them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mcdenoise.data import open_sequence
+from mcdenoise.data.camera_matrices import read_camera_matrices, write_camera_matrices
+from mcdenoise.data.images import read_channels
+from mcdenoise.data.readers.cameras import convert, fit_camera, miss, motion_to, read_as
+
+Array = np.ndarray[Any, Any]
+HEIGHT, WIDTH = 54, 96
+EYE, TARGET, UP = np.array([1.5, -6.0, 2.5]), np.array([0.2, 0.5, 0.8]), np.array([0.0, 0.0, 1.0])
+# Half the width of what is seen at distance 1.
+TANGENT = 0.6
+
+
+def axes(eye: Array, target: Array, up: Array) -> Array:
+    """Rows: right, down, forward."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def matrix(eye: Array = EYE, target: Array = TARGET, up: Array = UP, tangent: float = TANGENT) -> Array:
+    """The row-vector world-to-clip matrix, clip y down, clip w the distance along the axis; clip z is w."""
+    rows = axes(eye, target, up)
+    columns = np.stack([rows[0] / tangent, rows[1] / tangent * WIDTH / HEIGHT, rows[2], rows[2]], 1)
+    return np.concatenate([columns, -(eye @ columns)[None]])
+
+
+def rays(offset: Array | float = 0.0) -> Array:
+    """Directions of the centres of pixels, or of other points in them, with length 1 along the axis."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    at = np.stack([columns, rows], -1) + 0.5 + offset
+    screen = at / (WIDTH, HEIGHT) * 2 - 1
+    own = axes(EYE, TARGET, UP)
+    return own[2] + TANGENT * (screen[..., :1] * own[0] + HEIGHT / WIDTH * screen[..., 1:] * own[1])
+
+
+def room(directions: Array, origin: Array = EYE) -> Array:
+    """Where rays meet a floor, a wall, a wall on the left or a ball."""
+    distances = [(0 - origin[..., 2]) / directions[..., 2], (3 - origin[..., 1]) / directions[..., 1]]
+    distances.append((-3 - origin[..., 0]) / directions[..., 0])
+    away, radius = origin - np.array([0.3, 0.0, 1.0]), 0.9
+    a, b, c = (directions**2).sum(-1), (directions * away).sum(-1), (away**2).sum(-1) - radius**2
+    found = b**2 - a * c
+    distances.append(np.where(found > 0, (-b - np.sqrt(np.maximum(found, 0))) / a, -1))
+    stacked = np.stack([np.broadcast_to(each, directions.shape[:2]) for each in distances])
+    nearest = np.where(stacked > 0, stacked, np.inf).min(0)
+    return origin + nearest[..., None] * directions
+
+
+ALL = np.ones((HEIGHT, WIDTH), bool)
+
+
+def test_the_camera_of_exact_positions() -> None:
+    position = room(rays())
+    found = fit_camera(position, ALL)
+    expected = matrix()
+    np.testing.assert_allclose(found.matrix, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(found.eye, EYE, atol=1e-6)
+    assert found.error < 1e-6
+    # Clip w is the depth along the axis.
+    depth = (position - EYE) @ axes(EYE, TARGET, UP)[2]
+    np.testing.assert_allclose(position @ found.matrix[:3, 3] + found.matrix[3, 3], depth, rtol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+@pytest.mark.parametrize("offset", [(0, 0, 0), (1000.0, -500.0, 300.0)])
+def test_units_and_origin_of_the_world_do_not_matter(scale: float, offset: tuple[float, ...]) -> None:
+    position = (room(rays()) + offset) * scale
+    found = fit_camera(position, ALL)
+    # Of 64 bits, a thousand widths away.
+    assert miss(found.matrix, position, ALL) < 1e-6
+    np.testing.assert_allclose(found.eye / scale, EYE + offset, atol=1e-5)
+
+
+def test_a_camera_that_looks_from_all_sides() -> None:
+    for seed in range(20):
+        turn, _ = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))
+        position = room(rays()) @ turn * np.linalg.det(turn)
+        found = fit_camera(position, ALL)
+        assert found.error < 1e-6
+        np.testing.assert_allclose(found.eye, EYE @ turn * np.linalg.det(turn), atol=1e-5)
+
+
+def test_an_orthographic_camera() -> None:
+    own = axes(EYE, TARGET, UP)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    screen = np.stack([(columns + 0.5) / WIDTH * 2 - 1, (rows + 0.5) / HEIGHT * 2 - 1], -1)
+    origin = EYE + 2 * screen[..., :1] * own[0] + 2 * HEIGHT / WIDTH * screen[..., 1:] * own[1]
+    position = room(np.broadcast_to(own[2], (HEIGHT, WIDTH, 3)), origin)
+    found = fit_camera(position, ALL)
+    assert found.error < 1e-6
+    # Without a perspective w is 1 everywhere.
+    np.testing.assert_allclose(position @ found.matrix[:3, 3] + found.matrix[3, 3], 1, atol=1e-6)
+    expected = np.concatenate([own[0] / 2, [-(EYE @ own[0]) / 2]])
+    np.testing.assert_allclose(found.matrix[:, 0], expected, atol=1e-6)
+
+
+def test_points_of_one_plane_tell_no_camera() -> None:
+    direction = rays()
+    floor = EYE + (0 - EYE[2]) / direction[..., 2:] * direction
+    down = direction[..., 2] < -0.05
+    assert down.sum() > 1000
+    assert fit_camera(floor, down) is None
+    # With noise of 32 bits it is a plane still.
+    assert fit_camera(floor.astype(np.float32).astype(np.float64), down) is None
+
+
+def test_what_is_no_image_of_positions_tells_no_camera() -> None:
+    random = np.random.default_rng(0)
+    assert fit_camera(random.standard_normal((HEIGHT, WIDTH, 3)), ALL) is None
+    assert fit_camera(np.zeros((HEIGHT, WIDTH, 3)), ALL) is None
+    assert fit_camera(room(rays()), np.zeros_like(ALL)) is None
+    few = np.zeros_like(ALL)
+    few[:3, :3] = True
+    assert fit_camera(room(rays()), few) is None
+    # Nor do unit vectors, which a normal has.
+    vectors = random.standard_normal((HEIGHT, WIDTH, 3))
+    assert fit_camera(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True), ALL) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_one_in_five_points_elsewhere(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    position = room(rays())
+    elsewhere = random.random((HEIGHT, WIDTH)) < 0.2
+    position[elsewhere] += random.standard_normal((int(elsewhere.sum()), 3)) * 0.5
+    found = fit_camera(position, ALL)
+    assert np.abs(projected(room(rays()), found.matrix) - projected(room(rays()), matrix())).max() < 0.05
+
+
+def projected(position: Array, view_projection: Array) -> Array:
+    """Pixels from the corner of the image."""
+    clip = np.concatenate([position, np.ones_like(position[..., :1])], -1) @ view_projection
+    result: Array = (clip[..., :2] / clip[..., 3:] + 1) / 2 * (WIDTH, HEIGHT)
+    return result
+
+
+def test_means_over_pixels() -> None:
+    random = np.random.default_rng(0)
+    samples = [room(rays(random.uniform(-0.5, 0.5, (HEIGHT, WIDTH, 2)))) for _ in range(16)]
+    position = np.mean(samples, 0)
+    found = fit_camera(position, ALL)
+    # A mean of 16 is off by 0.29 / 4 pixels in each direction; the camera is that of thousands of them.
+    assert found.error < 0.15
+    assert np.abs(projected(room(rays()), found.matrix) - projected(room(rays()), matrix())).max() < 0.1
+
+
+# Real renderers
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_the_camera_of_blender(number: int, rendered: Path, others: Any) -> None:
+    channels = {0: [f"ViewLayer.{each}" for each in ("Position.X", "Position.Y", "Position.Z", "Depth.Z")]}
+    pixels = read_channels(rendered / "blender" / f"shot_{number:04d}.exr", channels)[0].astype(np.float64)
+    found = fit_camera(pixels[..., :3], pixels[..., 3] < 1e9)
+    place = others.CAMERA + (number - 1) * others.STEP
+    # Positions of 32 bits up to 13 are exact to 1e-6, and a ray of a pixel is 0.02 wide.
+    np.testing.assert_allclose(found.eye, place, atol=1e-4)
+    forward = (others.TARGET - place) / np.linalg.norm(others.TARGET - place)
+    np.testing.assert_allclose(found.matrix[:3, 3], forward, atol=1e-4)
+    # A focal length of 30 on a sensor of 36 millimetres.
+    assert np.linalg.norm(found.matrix[:3, 0] - found.matrix[:3, 0] @ forward * forward) == pytest.approx(
+        60 / 36, rel=1e-4
+    )
+    assert found.error < 1e-4
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_the_camera_of_mitsuba(number: int, rendered: Path) -> None:
+    path = rendered / "mitsuba" / f"frame.{number:04d}.exr"
+    position = read_channels(path, {0: ["pos.X", "pos.Y", "pos.Z"]})[0].astype(np.float64)
+    found = fit_camera(position, (position != 0).any(-1))
+    # Means of four points anywhere in a pixel, in 16 bits: to a few hundredths of 5 units.
+    np.testing.assert_allclose(found.eye, (-0.5 + 0.15 * number, 1.5, 5.0), atol=0.05)
+    assert found.error < 0.3
+
+
+# Conventions
+
+
+def test_how_a_matrix_is_written() -> None:
+    position, right = room(rays()), matrix()
+    for convention in ("", "y up", "transposed", "transposed, y up"):
+        # What turns it back is what has been done to it: a mirror first, and then a transpose.
+        stored = right.copy()
+        if "y up" in convention:
+            stored[:, 1] *= -1
+        if "transposed" in convention:
+            stored = stored.T
+        found, error = read_as(stored, position, ALL)
+        assert found == convention
+        assert error < 1e-6
+        np.testing.assert_allclose(convert(stored, found), right)
+        assert stored is not convert(stored, found)
+    # Negated, it sees the same.
+    assert read_as(-right, position, ALL)[0] == ""
+    other = matrix(eye=np.add(EYE, (2, 0, 1)))
+    found, error = read_as(other, position, ALL)
+    assert found == "unknown"
+    assert error > 5
+
+
+def test_motion_of_still_points_under_a_moving_camera() -> None:
+    position, before = room(rays()), matrix(eye=np.add(EYE, (0.2, 0.1, 0)))
+    seen = ALL.copy()
+    seen[:5] = False
+    found = motion_to(before, position, seen)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    expected = projected(position, before) - np.stack([columns, rows], -1) - 0.5
+    np.testing.assert_allclose(found[seen], expected[seen], atol=1e-9)
+    assert np.isnan(found[~seen]).all()
+    assert np.abs(motion_to(matrix(), position, ALL)).max() < 1e-9
+
+
+@pytest.mark.parametrize("convention", ["", "y up", "transposed", "transposed, y up"])
+def test_matrices_of_a_folder_are_read_in_any_convention(convention: str, small_sequence: Path) -> None:
+    path = small_sequence / "inputs" / "camera_matrices.h"
+    sequence = open_sequence(small_sequence)
+    expected = [sequence.frame(number).view_projection for number in sequence.numbers]
+    cameras = read_camera_matrices(path)
+    stored = []
+    for number in sequence.numbers:
+        each = cameras.view_projection(number, sequence.size).copy()
+        if "y up" in convention:
+            each[:, 1] *= -1
+        stored.append(each.T if "transposed" in convention else each)
+    write_camera_matrices(path, replace(cameras, matrices=np.stack(stored)), "plane")
+    opened = open_sequence(small_sequence)
+    assert len(opened.warnings) == (convention != "")
+    assert all(convention in warning for warning in opened.warnings)
+    for number, matrix_of_frame in zip(opened.numbers, expected, strict=True):
+        frame = opened.frame(number)
+        frame.validate()
+        np.testing.assert_allclose(frame.view_projection, matrix_of_frame, rtol=1e-4, atol=1e-5)
+
+
+def test_matrices_of_something_else_are_told(small_sequence: Path) -> None:
+    path = small_sequence / "inputs" / "camera_matrices.h"
+    cameras = read_camera_matrices(path)
+    moved = np.stack([cameras.view_projection(n, (20, 24)) for n in range(4)])
+    moved[:, 3, 0] += 3
+    write_camera_matrices(path, replace(cameras, matrices=moved), "plane")
+    (warning,) = open_sequence(small_sequence).warnings
+    assert "camera_matrices.h" in warning
+    assert "whichever way they are read" in warning

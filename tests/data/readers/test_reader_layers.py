@@ -1,0 +1,390 @@
+"""Layers: which channels belong together, which buffer their name says they are, and what somebody asks for instead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mcdenoise.cli import main
+from mcdenoise.data import open_sequence
+from mcdenoise.data.images import Part, read_channels
+from mcdenoise.data.readers.choice import MAPPABLE, parse_mapping
+from mcdenoise.data.readers.layers import NAMES, fits, layers_of, named, recognise
+
+SIZE = (24, 32)
+
+
+def part(channels: str, name: str = "", integers: str = "") -> Part:
+    names = tuple(each.replace("~", " ") for each in channels.split())
+    return Part(name, SIZE, (0, 0), names, frozenset(integers.split()), False)
+
+
+def found(channels: str, label: str = "render") -> dict[str, str]:
+    """The buffers of a file's layers, by the layers."""
+    layers = layers_of(0, label, [part(channels)])
+    return {str(layer): recognised[0] for layer in layers if (recognised := recognise(layer)) is not None}
+
+
+def three(name: str, components: str = "RGB") -> str:
+    return " ".join(f"{name}.{each}" for each in components)
+
+
+# As they are called in the files of each renderer; ~ stands for a blank.
+TABLE = {
+    "blender 4": [
+        (three("ViewLayer.Combined", "BGRA"), "ViewLayer.Combined.RGBA", "color"),
+        (three("ViewLayer.Noisy~Image"), "ViewLayer.Noisy Image.RGB", "color"),
+        (three("ViewLayer.Denoising~Albedo"), "ViewLayer.Denoising Albedo.RGB", "albedo"),
+        (three("ViewLayer.DiffCol"), "ViewLayer.DiffCol.RGB", "albedo"),
+        (three("ViewLayer.Denoising~Normal", "XYZ"), "ViewLayer.Denoising Normal.XYZ", "normal"),
+        (three("ViewLayer.Normal", "XYZ"), "ViewLayer.Normal.XYZ", "normal"),
+        ("ViewLayer.Depth.Z", "ViewLayer.Depth.Z", "depth"),
+        ("ViewLayer.Depth.V", "ViewLayer.Depth.V", "depth"),
+        ("ViewLayer.Denoising~Depth.Z", "ViewLayer.Denoising Depth.Z", "depth"),
+        (three("ViewLayer.Position", "XYZ"), "ViewLayer.Position.XYZ", "position"),
+        (three("ViewLayer.Vector", "WXYZ"), "ViewLayer.Vector.XYZW", "motion"),
+        (three("ViewLayer.GlossDir"), "ViewLayer.GlossDir.RGB", None),
+        (three("ViewLayer.Shadow~Catcher"), "ViewLayer.Shadow Catcher.RGB", None),
+        ("ViewLayer.Debug~Sample~Count.X", "ViewLayer.Debug Sample Count.X", None),
+        (three("ViewLayer.CryptoObject00", "RGBA"), "ViewLayer.CryptoObject00.RGBA", None),
+    ],
+    "view layers with dots and blanks": [
+        (three("Main~Layer~v1.2.Combined"), "Main Layer v1.2.Combined.RGB", "color"),
+        (three("a.b.c.Denoising~Albedo"), "a.b.c.Denoising Albedo.RGB", "albedo"),
+        (three("Depth.Normal", "XYZ"), "Depth.Normal.XYZ", "normal"),
+        (three("ViewLayer.Combined.left"), "ViewLayer.Combined.left.RGB", "color"),
+        ("ViewLayer.Depth.right.Z", "ViewLayer.Depth.right.Z", "depth"),
+    ],
+    "mitsuba": [
+        ("B G R", "render.RGB", "color"),
+        (three("albedo"), "albedo.RGB", "albedo"),
+        (three("sh_normal", "XYZ"), "sh_normal.XYZ", "normal"),
+        (three("geo_normal", "XYZ"), "geo_normal.XYZ", "normal"),
+        ("dd.y.T R G B", "dd.y.T", None),
+        (three("nn", "XYZ"), "nn.XYZ", None),
+        (three("position", "XYZ"), "position.XYZ", "position"),
+    ],
+    "pbrt": [
+        (three("Albedo"), "Albedo.RGB", "albedo"),
+        (three("Ns", "XYZ"), "Ns.XYZ", "normal"),
+        (three("N", "XYZ"), "N.XYZ", "normal"),
+        ("Nsx Nsy Nsz Nx Ny Nz", "Nsx", None),
+        (three("P", "XYZ"), "P.XYZ", "position"),
+        (three("Variance"), "Variance.RGB", "variance"),
+        (three("RelativeVariance"), "RelativeVariance.RGB", None),
+        ("dzdx dzdy", "dzdx", None),
+    ],
+    "arnold": [
+        ("A B G R Z", "RGBA", "color"),
+        ("A B G R Z", "Z", "depth"),
+        (three("denoise_albedo"), "denoise_albedo.RGB", "albedo"),
+        (three("diffuse_albedo"), "diffuse_albedo.RGB", "albedo"),
+        (three("specular_albedo"), "specular_albedo.RGB", None),
+        (three("N", "XYZ"), "N.XYZ", "normal"),
+        (three("motionvector", "RG"), "motionvector.RG", "motion"),
+        (three("variance"), "variance.RGB", "variance"),
+        (three("diffuse_direct"), "diffuse_direct.RGB", None),
+    ],
+    "renderman": [
+        ("Ci.r Ci.g Ci.b a", "Ci.RGB", "color"),
+        ("Ci.r Ci.g Ci.b a", "a", "alpha"),
+        (three("albedo", "rgb"), "albedo.RGB", "albedo"),
+        (three("albedo_var", "rgb"), "albedo_var.RGB", None),
+        (three("albedo_mse", "rgb"), "albedo_mse.RGB", None),
+        (three("normal", "xyz"), "normal.XYZ", "normal"),
+        ("zfiltered R G B", "zfiltered", "depth"),
+        ("zfiltered_var R G B", "zfiltered_var", None),
+        (three("backward", "xyz"), "backward.XYZ", "motion"),
+        (three("forward", "xyz"), "forward.XYZ", None),
+        ("sampleCount R G B", "sampleCount", None),
+    ],
+    "v-ray": [
+        (three("diffuseFilter"), "diffuseFilter.RGB", "albedo"),
+        (three("normals", "XYZ"), "normals.XYZ", "normal"),
+        (three("VRayZDepth"), "VRayZDepth.RGB", "depth"),
+        (three("velocity", "XYZ"), "velocity.XYZ", "motion"),
+        (three("effectsResult"), "effectsResult.RGB", None),
+    ],
+    "redshift": [
+        (three("DiffuseFilter"), "DiffuseFilter.RGB", "albedo"),
+        (three("BumpNormals"), "BumpNormals.RGB", "normal"),
+        (three("WorldPosition"), "WorldPosition.RGB", "position"),
+        (three("MotionVectors"), "MotionVectors.RGB", "motion"),
+    ],
+    "octane": [
+        (three("Beauty", "RGBA"), "Beauty.RGBA", "color"),
+        (three("Beauty_Noisy", "RGBA"), "Beauty_Noisy.RGBA", "color"),
+        (three("OptixNormals"), "OptixNormals.RGB", "normal"),
+    ],
+    "corona": [
+        (three("VisibleNormals", "XYZ"), "VisibleNormals.XYZ", "normal"),
+        (three("VisibleDiffuse"), "VisibleDiffuse.RGB", "albedo"),
+    ],
+    "tungsten": [
+        (three("albedo"), "albedo.RGB", "albedo"),
+        (three("normalVariance"), "normalVariance.RGB", None),
+    ],
+}
+ROWS = [(renderer, *row) for renderer, rows in TABLE.items() for row in rows]
+
+
+@pytest.mark.parametrize(("renderer", "channels", "layer", "buffer"), ROWS, ids=[f"{r[0]}: {r[2]}" for r in ROWS])
+def test_the_names_of_every_renderer(renderer: str, channels: str, layer: str, buffer: str | None) -> None:
+    # Beside others, and so a layer of its own, unless the file holds nothing else.
+    layers = layers_of(0, "render", [part(channels if layer == "render.RGB" else f"{channels} other.R other.T")])
+    assert found(f"{channels} other.R other.T" if layer != "render.RGB" else channels).get(layer) == buffer
+    assert sum(len(each.channels) for each in layers) >= len(channels.split())
+
+
+@pytest.mark.parametrize("buffer", NAMES)
+def test_every_spelling_in_the_table_of_names_is_recognised(buffer: str) -> None:
+    for row in NAMES[buffer]:
+        for name in row.split():
+            layer = layers_of(0, "file", [part(f"{three(f'View.{name}')} x.y")])[0]
+            assert recognise(layer) == (buffer, [name in each.split() for each in NAMES[buffer]].index(True)), name
+
+
+@pytest.mark.parametrize(
+    ("label", "buffer"),
+    [
+        ("albedo", "albedo"),
+        ("kitchenAlbedo", "albedo"),
+        ("kitchen_albedo", "albedo"),
+        ("albedo_kitchen", "albedo"),
+        ("shot02_albedo", "albedo"),
+        ("Mogwai.GBufferRT.normW", "normal"),
+        ("AVG_SHADING_NORMAL", "normal"),
+        ("room_depth", "depth"),
+        ("vase", "color"),
+        ("kitchen", "color"),
+        ("hdr", "color"),
+        ("kitchenVariance", "variance"),
+        ("kitchenAlbedoVariance", None),
+        ("kitchen_normal_variance", None),
+        ("albedo_variance", None),
+        ("specular_albedo", None),
+        ("sample_count", None),
+        ("reference", "reference"),
+        ("光_albedo", "albedo"),
+    ],
+)
+def test_a_file_of_one_picture_is_what_its_name_says(label: str, buffer: str | None) -> None:
+    (layer,) = layers_of(0, label, [part("B G R")])
+    assert layer.anonymous
+    assert layer.channels == ("R", "G", "B")
+    assert (recognise(layer) or (None,))[0] == buffer
+
+
+def test_channels_belong_together() -> None:
+    names = [
+        str(each)
+        for each in layers_of(0, "x", [part("A B G R Z Nx Ny Nz dzdx dzdy u v crypto.R id", "", "crypto.R id")])
+    ]
+    assert names == ["RGBA", "Z", "N.XYZ", "dzdx", "dzdy", "u", "v"]
+    assert [str(each) for each in layers_of(0, "x", [part("X Y Z other.T")])] == ["XYZ", "other.T"]
+    assert [str(each) for each in layers_of(0, "x", [part("red green blue other.T")])] == ["RGB", "other.T"]
+    assert [str(each) for each in layers_of(0, "flow", [part("u v")])] == ["flow.UV"]
+
+
+def test_parts_name_their_layers() -> None:
+    parts = [part("R G B A", "beauty"), part("R G B", "albedo"), part("Z", "depth"), part("X Y Z", "shading normal")]
+    layers = layers_of(0, "render", parts)
+    assert [(str(each), each.part) for each in layers] == [
+        ("beauty.RGBA", 0),
+        ("albedo.RGB", 1),
+        ("depth.Z", 2),
+        ("shading normal.XYZ", 3),
+    ]
+    assert [(recognise(each) or ("",))[0] for each in layers] == ["color", "albedo", "depth", "normal"]
+
+
+@pytest.mark.parametrize(
+    ("buffer", "channels", "does"),
+    [
+        ("color", "c.R c.G c.B", True),
+        ("color", "c.R c.G", False),
+        ("depth", "c.Z", True),
+        ("depth", "c.R c.G c.B", True),
+        ("depth", "c.X c.Y c.Z", False),
+        ("motion", "c.X c.Y", True),
+        ("motion", "c.X", False),
+        ("variance", "c.R", True),
+        ("variance", "c.R c.G", False),
+    ],
+)
+def test_channels_that_a_buffer_needs(buffer: str, channels: str, does: bool) -> None:
+    assert fits(buffer, layers_of(0, "", [part(f"{channels} other.T")])[0]) is does
+
+
+# What somebody asks for
+
+
+@pytest.fixture
+def layered(save: Callable[..., Path], tmp_path: Path) -> Path:
+    """A still with two layers of color in one view, a normal of another name, and a depth."""
+    random = np.random.default_rng(0)
+    names = (
+        "View.Combined.R View.Combined.G View.Combined.B View.Combined.A View.RGBA tint.R View.RGBA tint.G "
+        "View.RGBA tint.B View.N1.X View.N1.Y View.N1.Z View.Depth.Z a.R b.R c.R"
+    ).replace("RGBA tint", "RGBA~tint")
+    channels = {name.replace("~", " "): random.random(SIZE, np.float32) for name in names.split()}
+    return save(tmp_path / "shot" / "still.0007.exr", channels)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "RGBA tint",
+        "View.RGBA tint",
+        "View.RGBA tint.RGB",
+        "RGBA tint.RGB",
+        "View.RGBA tint.R,View.RGBA tint.G,View.RGBA tint.B",
+        " View.RGBA tint.R , View.RGBA tint.G, View.RGBA tint.B ",
+    ],
+)
+def test_a_layer_is_asked_for_in_any_of_its_forms(text: str, layered: Path) -> None:
+    sequence = open_sequence(layered, mapping=[f"albedo={text}"])
+    names = [f"View.RGBA tint.{each}" for each in "RGB"]
+    expected = read_channels(layered, {0: names})[0]
+    np.testing.assert_array_equal(sequence.frame(7).albedo[0].permute(1, 2, 0).numpy(), expected)
+    (row,) = [row for row in sequence.table if row.buffer == "albedo"]
+    assert row.reading.startswith("as asked for")
+
+
+def test_channels_of_several_layers_make_a_buffer(layered: Path) -> None:
+    sequence = open_sequence(layered, mapping=["albedo=c.R,a.R,b.R"], color_has_albedo=True)
+    expected = read_channels(layered, {0: ["c.R", "a.R", "b.R"]})[0]
+    np.testing.assert_array_equal(sequence.frame(7).albedo[0].permute(1, 2, 0).numpy(), expected)
+
+
+def test_a_buffer_can_be_done_without(layered: Path) -> None:
+    assert open_sequence(layered).buffers == {"color", "alpha", "depth"}
+    assert open_sequence(layered, mapping=["depth="]).buffers == {"color", "alpha"}
+
+
+@pytest.mark.parametrize(
+    ("texts", "expected"),
+    [
+        (["albedo=DiffCol"], "expected one layer for --map albedo=DiffCol, found none; there are View.Combined.RGBA"),
+        (["albedo=Depth"], "expected 3 channels for --map albedo=Depth, found 1"),
+        (["motion=View.Depth.Z"], "expected 2 channels for --map motion=View.Depth.Z, found 1"),
+        (["albedo=a.R,nothing.R,b.R"], "expected one layer for --map albedo=a.R,nothing.R,b.R, found none"),
+        (["albdeo=N1"], "expected BUFFER=LAYER with a buffer of albedo, alpha"),
+        (["albedo"], "found 'albedo'"),
+        (["=N1"], "found '=N1'"),
+        (["color="], "expected a layer for 'color', found none"),
+        (["albedo=N1", "albedo=Combined"], "expected BUFFER=LAYER"),
+        (["length=N1"], "expected BUFFER=LAYER"),
+    ],
+)
+def test_what_cannot_be_asked_for(
+    texts: list[str], expected: str, layered: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
+) -> None:
+    assert expected in refused(open_sequence, layered, mapping=texts)
+    with pytest.raises(SystemExit) as stop:
+        main(["inspect", str(layered), *[each for text in texts for each in ("--map", text)]])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert expected in error
+    assert error.count("\n") == 1
+
+
+def test_every_buffer_can_be_asked_for() -> None:
+    assert parse_mapping([f"{buffer} = Some Layer" for buffer in MAPPABLE]) == dict.fromkeys(MAPPABLE, "Some Layer")
+    assert {"color", "albedo", "normal", "depth", "position", "motion", "reference"} <= set(MAPPABLE)
+
+
+@pytest.mark.parametrize(
+    ("channels", "flags"),
+    [
+        ("Beauty.R Beauty.G Beauty.B Combined.R Combined.G Combined.B", ["color=Beauty", "color=Combined"]),
+        ("A.Combined.R A.Combined.G A.Combined.B B.Combined.R B.Combined.G B.Combined.B", ["color=A.Combined"]),
+        (
+            "R G B albedo.R albedo.G albedo.B diffuse_albedo.R diffuse_albedo.G diffuse_albedo.B",
+            ["albedo=albedo", "albedo=diffuse_albedo", "albedo="],
+        ),
+    ],
+)
+def test_two_candidates_are_refused_with_what_decides(
+    channels: str, flags: list[str], save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    path = save(tmp_path / "a.exr", {name: np.ones(SIZE) for name in channels.split()})
+    message = refused(open_sequence, path)
+    assert f"--map {flags[0]}" in message
+    for flag in flags:
+        assert open_sequence(path, mapping=[flag]).size == SIZE
+
+
+@pytest.mark.parametrize("folder", ["blender_stereo", "blender5_stereo"])
+def test_each_eye_is_an_image_of_its_own(
+    folder: str, rendered: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    path = rendered / folder / "shot_0001.exr"
+    message = refused(open_sequence, path)
+    assert "ViewLayer.Combined.left.RGBA, ViewLayer.Combined.right.RGBA" in message
+    assert "choose with --map color=ViewLayer.Combined.left" in message
+    images = {}
+    for eye in ("left", "right"):
+        sequence = open_sequence(path, mapping=[f"color=Combined.{eye}"])
+        sources = {row.buffer: row.source for row in sequence.table}
+        assert sources == {
+            "color": f"shot_0001.exr ViewLayer.Combined.{eye}.RGBA",
+            "albedo": f"shot_0001.exr ViewLayer.Denoising Albedo.{eye}.RGB",
+            "normal": f"shot_0001.exr ViewLayer.Denoising Normal.{eye}.XYZ",
+            "depth": f"shot_0001.exr ViewLayer.Denoising Depth.{eye}.Z",
+        }
+        frame = sequence.frame(1)
+        frame.validate()
+        images[eye] = frame.color
+        # Its own eye is written, and the other one stays.
+        (tmp_path / eye).mkdir()
+        written = sequence.write(tmp_path / eye, 1, np.zeros((*sequence.size, 3), np.float32))
+        other = {"left": "right", "right": "left"}[eye]
+        again = {
+            each: open_sequence(written, mapping=[f"color=Combined.{each}"]).frame(1).color for each in (eye, other)
+        }
+        assert not again[eye].any()
+        assert again[other].any()
+    assert not images["left"].equal(images["right"])
+
+
+def test_the_noisy_image_is_read_and_the_clean_one_replaced(rendered: Path) -> None:
+    sequence = open_sequence(rendered / "blender_denoised")
+    (row,) = [row for row in sequence.table if row.buffer == "color"]
+    assert row.source.endswith("ViewLayer.Noisy Image.RGBA")
+    assert row.reading.startswith("not denoised yet; 'ViewLayer.Combined.RGBA' has been, and gets the result")
+    asked = open_sequence(rendered / "blender_denoised", mapping=["color=Combined"])
+    assert not asked.frame(1).color.equal(sequence.frame(1).color)
+
+
+def test_layers_of_no_known_name_are_told_by_their_values(
+    rendered: Path, save: Callable[..., Path], tmp_path: Path
+) -> None:
+    names = [f"{layer}.{each}" for layer in ("nn", "pos", "albedo") for each in ("RGB" if layer == "albedo" else "XYZ")]
+    pixels = read_channels(rendered / "mitsuba" / "frame.0001.exr", {0: ["R", "G", "B", *names]})[0]
+    called: dict[str, Any] = dict(zip(["R", "G", "B", *names], np.moveaxis(pixels, -1, 0), strict=True))
+    renamed = {name.replace("nn.", "first.").replace("pos.", "second."): image for name, image in called.items()}
+    sequence = open_sequence(save(tmp_path / "a.exr", renamed))
+    sources = {row.buffer: row.source for row in sequence.table}
+    assert sources["normal"] == "a.exr first.XYZ"
+    assert sources["position"] == "a.exr second.XYZ"
+    # Somebody who does not want them has the last word.
+    assert "normal" not in open_sequence(tmp_path / "a.exr", mapping=["normal="]).buffers
+
+
+def test_no_radiance_at_all(save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]) -> None:
+    path = save(tmp_path / "a.exr", {"Depth.Z": np.ones(SIZE), "N.X": np.ones(SIZE)})
+    assert "expected noisy radiance, found" in refused(open_sequence, path)
+    assert "name it with --map color=LAYER" in refused(open_sequence, path)
+
+
+def test_named_takes_the_whole_name_first() -> None:
+    layers = layers_of(0, "", [part(f"{three('Albedo')} {three('View.Albedo')} {three('View.Albedo.left')}")])
+    assert [str(each) for each in named(layers, "Albedo")] == ["Albedo.RGB"]
+    assert [str(each) for each in named(layers, "View.Albedo")] == ["View.Albedo.RGB"]
+    assert [str(each) for each in named(layers, "left")] == ["View.Albedo.left.RGB"]
+    assert named(layers, "bedo") == []

@@ -1,0 +1,316 @@
+"""Values: what they say of themselves, on frames whose truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mcdenoise.data import open_sequence
+from mcdenoise.data.readers.values import (
+    USUAL_MOTION,
+    Convention,
+    albedo_included,
+    albedo_included_as_in,
+    conventions,
+    is_direction,
+    match_cameras,
+    match_motion,
+    normal_is_encoded,
+    nothing_hit,
+    read_radiance,
+)
+
+Image = np.ndarray[Any, Any]
+HEIGHT, WIDTH = 96, 160
+
+
+def texture(kind: str) -> Image:
+    """Albedo of checks, in colors or in greys, or of one color everywhere."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    checks = ((rows // 5 + columns // 7) % 3)[..., None]
+    if kind == "colored":
+        return np.choose(checks, [[0.8, 0.3, 0.1], [0.2, 0.5, 0.6], [0.6, 0.6, 0.2]]).astype(np.float32)
+    if kind == "grey":
+        return np.choose(checks, [[0.8], [0.15], [0.4]]).repeat(3, -1).astype(np.float32)
+    return np.full((HEIGHT, WIDTH, 3), [0.6, 0.4, 0.3], np.float32)
+
+
+def light(seed: int) -> Image:
+    """One sample a pixel of smooth light: most paths find nothing, few find a lamp, and those are bright."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    smooth = 1 + 0.5 * np.sin(rows / 40) * np.cos(columns / 50)
+    random = np.random.default_rng(seed)
+    path = np.where(random.random((HEIGHT, WIDTH)) < 0.4, random.pareto(2.5, (HEIGHT, WIDTH)) * 2, 0.05)
+    # The noise of a path is nearly the same in all channels.
+    tint = 1 + 0.05 * random.standard_normal((HEIGHT, WIDTH, 3))
+    return (smooth * path)[..., None].astype(np.float32) * tint.clip(0.5, 1.5).astype(np.float32) * (1, 0.9, 0.8)
+
+
+@pytest.mark.parametrize("kind", ["colored", "grey"])
+@pytest.mark.parametrize("seed", range(5))
+def test_one_noisy_frame_tells_whether_the_albedo_is_in(kind: str, seed: int) -> None:
+    albedo, irradiance = texture(kind), light(seed)
+    with_it, without = albedo_included(albedo * irradiance, albedo), albedo_included(irradiance, albedo)
+    assert with_it.included is True
+    assert without.included is False
+    # By how many percent light grows with albedo is 1 or 0, to a few of its errors.
+    assert with_it.elasticity == pytest.approx(1, abs=5 * with_it.error + 0.02)
+    assert without.elasticity == pytest.approx(0, abs=5 * without.error + 0.02)
+    # A frame of zeros and NaN in places says the same.
+    spoilt = np.where(np.random.default_rng(seed).random((HEIGHT, WIDTH, 1)) < 0.02, np.nan, albedo * irradiance)
+    assert albedo_included(spoilt, albedo).included is True
+
+
+@pytest.mark.parametrize("included", [True, False])
+def test_one_color_everywhere_tells_nothing(included: bool) -> None:
+    albedo, irradiance = texture("one"), light(0)
+    color = albedo * irradiance if included else irradiance
+    assert albedo_included(color, albedo).included is None
+    assert read_radiance(color, albedo, None, None)[0] is True
+    # Neither does what nobody sees.
+    assert albedo_included(color, np.zeros_like(albedo)).included is None
+    assert albedo_included(np.zeros_like(color), texture("colored")).included is None
+
+
+def test_radiance_is_read_as_stated_or_as_its_reference_or_as_it_seems() -> None:
+    albedo, irradiance = texture("colored"), light(0)
+    color = albedo * irradiance
+    for stated in (True, False):
+        assert read_radiance(color, albedo, None, stated)[0] is stated
+        assert read_radiance(irradiance, albedo, None, stated)[0] is stated
+    assert read_radiance(color, albedo, None, None)[0] is True
+    included, words, warnings = read_radiance(irradiance, albedo, None, None)
+    assert included is False
+    assert "multiplied back" in words
+    # What is no ordinary radiance is worth a warning, with the flag that decides.
+    assert len(warnings) == 1
+    assert "--color-with-albedo" in warnings[0]
+    # Where the texture tells nothing, the reference does.
+    flat = texture("one")
+    reference = flat * light(1)
+    assert albedo_included_as_in(reference, flat * irradiance, flat) is True
+    assert albedo_included_as_in(reference, irradiance, flat) is False
+    assert read_radiance(irradiance, flat, reference, None)[0] is False
+    assert albedo_included_as_in(reference, irradiance, np.ones_like(flat)) is None
+
+
+@pytest.mark.parametrize(
+    ("folder", "color", "albedo", "number"),
+    [
+        ("blender", "ViewLayer.Combined", "ViewLayer.Denoising Albedo", 2),
+        ("blender_filtered", "Main Layer v1.2.Combined", "Main Layer v1.2.Denoising Albedo", 7),
+        ("blender5", "ViewLayer.Noisy Image", "ViewLayer.Denoising Albedo", 1),
+        ("luxcore", "RGB", "ALBEDO", 1),
+        ("mitsuba", "", "albedo", 2),
+    ],
+)
+def test_the_data_of_renderers_with_and_without_albedo(
+    folder: str, color: str, albedo: str, number: int, rendered: Path, save: Callable[..., Path], tmp_path: Path
+) -> None:
+    frame = open_sequence(
+        rendered / folder / "frame.####.exr" if folder == "mitsuba" else rendered / folder, str(number)
+    ).frame(number)
+    radiance, reflected = (image[0].permute(1, 2, 0).numpy() for image in (frame.color, frame.albedo))
+    for divided in (False, True):
+        stored = np.where(reflected > 0, radiance / np.maximum(reflected, 1e-6), 0) if divided else radiance
+        channels = dict(zip("RGB", np.moveaxis(stored, -1, 0), strict=True))
+        channels |= {f"albedo.{each}": reflected[..., i] for i, each in enumerate("RGB")}
+        path = save(tmp_path / str(divided) / "still.exr", channels)
+        opened = open_sequence(path)
+        if folder == "mitsuba" and divided:
+            # Matt checks far away, gold and glass: these 2304 pixels do not tell, and it is said what to do if so.
+            assert opened.color_has_albedo
+            assert any("--color-without-albedo" in warning for warning in opened.warnings)
+            continue
+        assert opened.color_has_albedo is not divided
+        assert any("multiplied back" in warning for warning in opened.warnings) is divided
+        # The other way round, if somebody says so.
+        assert open_sequence(path, color_has_albedo=divided).color_has_albedo is divided
+
+
+# Normals
+
+
+def directions(seed: int, count: int = 2000) -> Image:
+    vectors = np.random.default_rng(seed).standard_normal((40, count // 40, 3))
+    return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
+
+
+@pytest.mark.parametrize("noise", [0, 0.02, 0.1])
+@pytest.mark.parametrize("shortened", [False, True])
+def test_normals_signed_or_encoded(noise: float, shortened: bool) -> None:
+    normal = directions(0)
+    random = np.random.default_rng(1)
+    if shortened:
+        # At edges a filter makes means of several.
+        normal = normal * np.where(random.random((*normal.shape[:2], 1)) < 0.3, 0.5, 1)
+    noisy = normal + noise * random.standard_normal(normal.shape)
+    assert not normal_is_encoded(noisy.astype(np.float32))
+    encoded = (noisy / 2 + 0.5).clip(0, 1).astype(np.float32)
+    assert normal_is_encoded(encoded)
+    # With the sky at 0, whichever of both it is.
+    encoded[:8] = 0
+    assert normal_is_encoded(encoded)
+    noisy[:8] = 0
+    assert not normal_is_encoded(noisy.astype(np.float32))
+
+
+def test_normals_that_all_point_to_one_side() -> None:
+    # A view of a floor and two walls, in which nothing is negative: signed all the same.
+    signed = np.zeros((30, 30, 3), np.float32)
+    signed[:10, :, 0], signed[10:20, :, 1], signed[20:, :, 2] = 1, 1, 1
+    assert not normal_is_encoded(signed)
+    assert normal_is_encoded(signed / 2 + 0.5)
+    towards = np.broadcast_to(np.float32([0.6, 0.64, 0.48]), (8, 8, 3))
+    assert not normal_is_encoded(towards)
+    assert normal_is_encoded(towards / 2 + 0.5)
+    assert not normal_is_encoded(np.zeros((8, 8, 3), np.float32))
+    assert is_direction(signed)
+    assert not is_direction(signed * 3)
+    assert not is_direction(np.zeros((8, 8, 3), np.float32))
+
+
+# Depth
+
+
+@pytest.mark.parametrize("background", [0.0, -1.0, 65504.0, 1e10, 1e30, 3.4e38, np.inf, -np.inf, np.nan])
+def test_every_background_of_depth_is_infinity(background: float, save: Callable[..., Path], tmp_path: Path) -> None:
+    depth = np.full((12, 16), 7.5, np.float32)
+    depth[:4] = background
+    depth[5, 5] = 9e8
+    np.testing.assert_array_equal(nothing_hit(depth), np.arange(12)[:, None] < np.full(16, 4))
+    path = save(tmp_path / "a.exr", {**dict.fromkeys("RGB", np.ones((12, 16))), "Z": depth})
+    sequence = open_sequence(path)
+    frame = sequence.frame(0)
+    frame.validate()
+    assert frame.depth[0, 0, :4].isinf().all()
+    np.testing.assert_array_equal(frame.depth[0, 0, 4:].numpy(), depth[4:])
+    (row,) = [row for row in sequence.table if row.buffer == "depth"]
+    assert "background: 33%" in row.reading
+
+
+# Motion
+
+
+def moving(shift: tuple[float, float], size: tuple[int, int] = (60, 100)) -> tuple[dict[str, Image], dict[str, Image]]:
+    """Features of a frame and of the one before, in which every point was (x, y) pixels farther; y down."""
+
+    def pattern(x: Image, y: Image) -> Image:
+        waves = [np.sin(x / 3.1 + y / 7.3), np.sin(x / 5.7 - y / 4.1), np.sin(x / 8.9 + y / 2.9)]
+        return (np.stack(waves, -1) / 2 + 0.5).astype(np.float32)
+
+    rows, columns = np.mgrid[: size[0], : size[1]].astype(np.float64)
+    return {"albedo": pattern(columns, rows)}, {"albedo": pattern(columns - shift[0], rows - shift[1])}
+
+
+SHIFT = (5.0, 3.0)
+UNITS = {"pixels": (1.0, 1.0), "parts of the image": (100.0, 60.0), "parts of half the image": (50.0, 30.0)}
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("signs", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
+@pytest.mark.parametrize("given", [USUAL_MOTION, Convention(1, -1, "previous - current, y up, pixels")])
+def test_two_frames_tell_sign_and_unit(unit: str, signs: tuple[int, int], given: Convention) -> None:
+    now, before = moving(SHIFT)
+    scale = np.multiply(signs, UNITS[unit])
+    stored = np.broadcast_to((SHIFT / scale).astype(np.float32), (60, 100, 2))
+    found, told = match_motion([(now, before, stored)], given)
+    assert found is not None
+    assert told
+    assert (found.scale_x, found.scale_y) == tuple(scale)
+    np.testing.assert_allclose(found.apply(stored), np.broadcast_to(SHIFT, stored.shape), rtol=1e-6)
+    first, second, last = found.words.split(", ")
+    assert (first == "previous - current") is (signs[0] > 0)
+    assert (second == "y down") is (signs[0] == signs[1])
+    assert last == unit
+    # Cameras that see the points say the same.
+    seen = np.broadcast_to(np.array(SHIFT), stored.shape)
+    assert match_cameras([(stored, seen)], given)[:2] == tuple(scale)
+
+
+def test_the_known_convention_stays_where_nothing_moves() -> None:
+    now, before = moving((0, 0))
+    given = Convention(1, -1, "previous - current, y up, pixels")
+    still = np.zeros((60, 100, 2), np.float32)
+    assert match_motion([(now, before, still)], given) == (given, False)
+    assert match_motion([], given) == (given, False)
+    assert match_cameras([(still, still.astype(np.float64))], given) is None
+    assert match_cameras([], given) is None
+    # Less than half a pixel says nothing of the sign.
+    now, before = moving((0.2, 0.1))
+    stored = np.broadcast_to(np.float32([0.2, -0.1]), still.shape)
+    assert match_motion([(now, before, stored)], given)[0][:2] == given[:2]
+
+
+def test_motion_that_contradicts_what_is_seen_is_none() -> None:
+    now, before = moving((0, 0))
+    random = np.random.default_rng(0)
+    stored = random.uniform(-20, 20, (60, 100, 2)).astype(np.float32)
+    assert match_motion([(now, before, stored)], USUAL_MOTION) == (None, True)
+    assert match_cameras([(stored, np.full(stored.shape, 4.0))], USUAL_MOTION) is None
+
+
+def test_huge_motion_is_unknown_motion() -> None:
+    stored = np.float32([[[1, 2], [1e10, 0], [np.nan, 0], [np.inf, 0], [0, -1e30]]])
+    applied = USUAL_MOTION.apply(stored)
+    np.testing.assert_array_equal(applied[0, 0], (1, 2))
+    assert np.isinf(applied[0, 1:]).all()
+    assert {each.words.rpartition(", ")[2] for each in conventions((1, 5), stored)} == set(UNITS)
+    assert {each.words.rpartition(", ")[2] for each in conventions((1, 5), stored * 4)} == {"pixels"}
+
+
+def test_motion_in_files_is_told_by_the_frames(save: Callable[..., Path], tmp_path: Path) -> None:
+    """A shot of three frames that pans by 5 and 3 pixels, stored as current - previous in parts of the image."""
+    for number in range(3):
+        albedo = moving((-SHIFT[0] * number, -SHIFT[1] * number))[1]["albedo"]
+        channels = {name: albedo[..., i] for i, name in enumerate("RGB")}
+        channels |= {f"albedo.{name}": albedo[..., i] for i, name in enumerate("RGB")}
+        channels |= {"mv.X": np.full((60, 100), -SHIFT[0] / 100), "mv.Y": np.full((60, 100), -SHIFT[1] / 60)}
+        # Blender's name, and not what Blender writes.
+        save(tmp_path / "parts" / f"a.{number}.exr", channels)
+        vector = {"Vector.X": np.full((60, 100), SHIFT[0]), "Vector.Y": np.full((60, 100), SHIFT[1])}
+        save(tmp_path / "vector" / f"a.{number}.exr", {k: v for k, v in channels.items() if k[:2] != "mv"} | vector)
+        wrong = np.random.default_rng(number).uniform(-20, 20, (2, 60, 100))
+        save(tmp_path / "wrong" / f"a.{number}.exr", channels | {"mv.X": wrong[0], "mv.Y": wrong[1]})
+    for folder, words in (
+        ("parts", "current - previous, y down, parts of the image"),
+        ("vector", "previous - current, y down, pixels"),
+    ):
+        sequence = open_sequence(tmp_path / folder)
+        assert list(sequence.warnings) == [
+            f"'motion': read as {words}, since only so frames match the ones before them"
+        ]
+        for number in sequence.numbers:
+            motion = sequence.frame(number).motion[0].permute(1, 2, 0).numpy()
+            np.testing.assert_allclose(motion, np.broadcast_to(SHIFT, motion.shape), rtol=1e-6)
+    sequence = open_sequence(tmp_path / "wrong")
+    assert "motion" not in sequence.buffers
+    assert sequence.frame(1).motion is None
+    assert any("does not lead to what looks alike" in warning for warning in sequence.warnings)
+
+
+def test_zero_motion_is_dropped_where_the_camera_moves(others: Any, save: Callable[..., Path], tmp_path: Path) -> None:
+    """As Blender writes it with motion blur."""
+    first: dict[str, Any] = {}
+    for number in (1, 2, 3):
+        truth = others.read(number)
+        channels = {name: truth["color"][..., i] for i, name in enumerate("RGB")}
+        channels |= {f"Position.{name}": truth["position"][..., i] for i, name in enumerate("XYZ")}
+        channels |= {f"Vector.{name}": np.zeros((36, 64)) for name in "XYZW"}
+        channels["Depth.Z"] = truth["depth"]
+        save(tmp_path / "moves" / f"a_{number}.exr", channels)
+        # The first frame again and again: nothing moves, and zeros are right.
+        first = first or channels
+        save(tmp_path / "stays" / f"a_{number}.exr", first)
+    sequence = open_sequence(tmp_path / "moves")
+    assert "motion" not in sequence.buffers
+    assert any("all zeros although the camera moves" in warning for warning in sequence.warnings)
+    assert sequence.frame(2).motion is None
+    still = open_sequence(tmp_path / "stays")
+    assert "motion" in still.buffers
+    assert list(still.warnings) == []
+    assert not still.frame(2).motion.any()
