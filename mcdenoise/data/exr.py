@@ -24,8 +24,8 @@ LARGEST_HALF = 65504.0
 LARGEST_PIXEL_COUNT = 2**28
 # Converted and compressed at a time: enough for all cores, and little beside a large image.
 _ROWS = 256
-# Black pixels in a byte of file: zlib's limit is 1032, and PXR24 drops a quarter before; DWA leaves one number of 64, or
-# of a run of 128 bytes two.
+# Black pixels in a byte of file: zlib's limit is 1032, and PXR24 drops a quarter before; DWA leaves one number of 64,
+# or of a run of 128 bytes two.
 _LARGEST_RATIO, _LARGEST_DWA_RATIO = 2_000, 70_000
 # These describe how one file stores its pixels, not what they show; the next file has its own.
 _STORAGE_PREFIXES = ("oiio:", "openexr:", "compression")

@@ -157,7 +157,8 @@ def test_a_text_in_latin_1_stays(tmp_path: Path) -> None:
     written = sequence.write(tmp_path / "out", 0, np.full((*SIZE, 3), 0.25, np.float32))
     assert b"M\xfcller\0"[:-1] in written.read_bytes()
     image, channels, metadata = read_exr(written)
-    assert channels == ["R", "G", "B"] and metadata["extra"] == 3
+    assert channels == ["R", "G", "B"]
+    assert metadata["extra"] == 3
     np.testing.assert_array_equal(image, 0.25)
     assert oiio.ImageInput.open(str(written)).spec().format == "half"
 
@@ -214,4 +215,6 @@ def test_the_screen_shows_names_as_they_are(tmp_path: Path, capsys: pytest.Captu
     write(tmp_path / "shot.exr", part(["R", "G", "B", *names, "[red]\n.Depth.Z"]))
     print_sequence(open_sequence([tmp_path / "shot.exr"], mapping=["albedo=[/x].Denoising Albedo"]))
     shown = capsys.readouterr().out
-    assert "[/x].Denoising Albedo.RGB" in shown and r"[red]\n.Depth.Z" in shown and "\x1b" not in shown
+    assert "[/x].Denoising Albedo.RGB" in shown
+    assert r"[red]\n.Depth.Z" in shown
+    assert "\x1b" not in shown
