@@ -17,6 +17,7 @@ from mcdenoise.data.readers.bmfr import BmfrFolder, find_frames, is_bmfr, open_b
 from mcdenoise.data.readers.choice import parse_mapping
 from mcdenoise.data.readers.files import RenderedFiles
 from mcdenoise.data.readers.names import find_files, group_files
+from mcdenoise.data.readers.noisebase import NoisebaseFiles, find_zips, open_noisebase
 from mcdenoise.data.readers.opening import open_files
 from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError
@@ -57,7 +58,7 @@ class Sequence:
     table: Sequential[Row] = field(repr=False)
     warnings: Sequential[str]
     unused: Sequential[str] = field(repr=False)
-    _source: BmfrFolder | RenderedFiles = field(repr=False)
+    _source: BmfrFolder | NoisebaseFiles | RenderedFiles = field(repr=False)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -177,7 +178,7 @@ def open_sequence(
 
     Args:
         path: a folder, or the one that has a folder ``inputs`` inside it; a file; a pattern such as ``shot_####.exr``;
-            or several of these.
+            or several of these. Zips of Noisebase: one of a sequence, or those of its frames, or the folder of these.
         frames: which frames to use, such as ``"0-59,70"``; all of them by default.
         mapping: layers by buffer where names do not tell, such as ``"albedo=RGBA.diff"``; ``"motion="`` for none.
         color_has_albedo: whether radiance has the albedo in it; told by the files' values by default.
@@ -190,6 +191,7 @@ def open_sequence(
     given = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
     if not given:
         raise InputError("input: expected a folder, a file or a pattern, found nothing")
+    where = str(given[0]) if len(given) == 1 else f"{given[0]} and {len(given) - 1} more"
     folder = _bmfr_folder(given)
     found: list[str] = []
 
@@ -198,12 +200,15 @@ def open_sequence(
         found.extend(_gaps(present) if frames is None else [])
         return numbers
 
-    source: BmfrFolder | RenderedFiles
+    source: BmfrFolder | NoisebaseFiles | RenderedFiles
     if folder is not None and not mapping and not lights:
         files = find_frames(folder) or {"color": {}}
         source, layout = open_bmfr(folder, files, chosen(sorted(files["color"])), color_has_albedo), "bmfr"
+    elif zips := find_zips(given):
+        if mapping or lights:
+            raise InputError(f"{where}: expected neither --map nor --layers, found one: these arrays have their names")
+        source, layout = open_noisebase(zips, chosen, where=where), "noisebase"
     else:
-        where = str(given[0]) if len(given) == 1 else f"{given[0]} and {len(given) - 1} more"
         paths = find_files([folder] if folder is not None else given)
         if not paths:
             raise InputError(f"{where}: expected images that a renderer wrote, found none; check the path")
@@ -296,7 +301,7 @@ def _summary(numbers: list[int]) -> str:
     return f"{numbers[0]} to {numbers[-1]}"
 
 
-def _wrap(root: Path, layout: str, source: BmfrFolder | RenderedFiles, gaps: list[str]) -> Sequence:
+def _wrap(root: Path, layout: str, source: BmfrFolder | NoisebaseFiles | RenderedFiles, gaps: list[str]) -> Sequence:
     name = root.resolve().name
     if name == "inputs":
         name = root.resolve().parent.name

@@ -9,7 +9,7 @@ import numpy as np
 
 from mcdenoise.data.exr import Image
 from mcdenoise.data.readers.cameras import fit_camera
-from mcdenoise.data.readers.layers import NAMES, Layer, fits, named, recognise
+from mcdenoise.data.readers.layers import NAMES, Layer, fits, is_about_a_buffer, named, recognise
 from mcdenoise.data.readers.values import is_direction
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS
@@ -83,7 +83,8 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
         choice.written += twins
         choice.reasons["color"] = f"the same as {', '.join(map(str, twins))}, which gets the result too"
     used = {*choice.layers.values(), *choice.written}
-    choice.unused = [layer for own in candidates.values() for _, layer in own if layer not in used]
+    known = [layer for own in candidates.values() for _, layer in own]
+    choice.unused = [layer for layer in [*known, *filter(is_about_a_buffer, strangers)] if layer not in used]
     return choice
 
 

@@ -54,6 +54,9 @@ _COLORS = ({"r", "g", "b"}, {"red", "green", "blue"})
 _ABOUT = {"variance", "var", "mse", "noice", "error", "count"}
 # And what stands behind these is a buffer of another kind of light.
 _OTHERS = {"specular", "glossy", "transmission", "light", "shadow", "forward", "relative"}
+# Tungsten's `colorA` and `colorB` are means of half the samples each: what they are halves of comes first.
+_HALF = re.compile(r"(?<=[a-z])[AB]")
+_HALF_RANK = 10
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+")
 
 
@@ -159,6 +162,10 @@ def recognise(layer: Layer) -> tuple[str, int] | None:
     if not layer.name:
         return ("color", _ROOT_RANK) if layer.is_color else None
     last = layer.title
+    if layer.anonymous and _HALF.fullmatch(last, len(last) - 1):
+        whole = recognise(replace(layer, name=last[:-1]))
+        if whole is not None and whole[0] != "alpha":
+            return whole[0], whole[1] + _HALF_RANK
     words = [word.lower() for word in _WORD.findall(last)]
     starts = [(words[start:], words[:start]) for start in range(len(words))]
     # What a file is may also stand before its shot.
@@ -180,6 +187,12 @@ def recognise(layer: Layer) -> tuple[str, int] | None:
     if layer.anonymous and layer.is_color and not (_ABOUT | _OTHERS) & set(words):
         return "color", _ROOT_RANK + 1
     return None
+
+
+def is_about_a_buffer(layer: Layer) -> bool:
+    """Whether a layer's name speaks of something about a buffer that is not the color, such as ``albedoVariance``."""
+    words = [word.lower() for word in _WORD.findall(layer.title)]
+    return bool(_ABOUT & set(words[-1:])) and any("".join(words[i:-1]) in _RANKS for i in range(len(words) - 1))
 
 
 def _split(name: str) -> list[str]:

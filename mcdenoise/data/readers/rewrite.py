@@ -68,9 +68,9 @@ def _write_exr(
     part: int,
     full_float: bool,
 ) -> str:
-    expected = read_image_header(source).parts
     # Reading and writing raise whatever the library below has to say.
     try:
+        expected = read_image_header(source).parts
         # A part that it cannot read it leaves out, and prints that.
         with readable(source, target.with_suffix(".copy.exr")) as (path, strange), redirect_stdout(io.StringIO()):
             file = OpenEXR.File(str(path), separate_channels=True)

@@ -1,0 +1,339 @@
+"""Noisebase's arrays, written by zarr from numbers that are known; none of the published files is here.
+
+What is expected follows from the equations of the format, in float64.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from damage import Generator, flipped, spliced, truncated
+
+from mcdenoise.data import open_sequence, read_exr
+from mcdenoise.data.readers import noisebase
+from mcdenoise.data.readers.noisebase import open_noisebase
+from mcdenoise.data.sequences import Sequence
+from mcdenoise.errors import InputError
+
+zarr = pytest.importorskip("zarr")
+
+# Of the image that the frames are crops of, and theirs.
+WHOLE, SIZE, SAMPLES, FRAMES = (30, 40), (20, 24), 6, 3
+CROP = (4, 7)
+EXPOSURE = (-3.0, 2.5)
+
+
+def matrices() -> np.ndarray:
+    """World to clip for row vectors, as DirectX has them: a camera at (0.1 t, 0, -3) that looks along z, y up."""
+    focal = 1.5
+    projection = np.array([[focal * WHOLE[0] / WHOLE[1], 0, 0, 0], [0, focal, 0, 0], [0, 0, 1.001, 1], [0, 0, -0.1, 0]])
+    views = []
+    for number in range(FRAMES):
+        view = np.eye(4)
+        view[3, :3] = -0.1 * number, 0, 3
+        views.append(view @ projection)
+    return np.array(views).astype(np.float32)
+
+
+def encode(radiance: np.ndarray) -> np.ndarray:
+    """``(4, ...)`` bytes of ``(3, ...)``: the least exponent under which the largest channel is at most 1."""
+    low, high = EXPOSURE
+    exponents = np.exp((np.arange(256) + 1) / 256 * (high - low) + low)
+    exponent = np.searchsorted(exponents, radiance.max(0)).clip(0, 255)
+    return np.concatenate([np.rint(radiance / exponents[exponent] * 255), exponent[None]]).astype(np.uint8)
+
+
+def decode(coded: np.ndarray) -> np.ndarray:
+    low, high = EXPOSURE
+    return coded[:3] / 255.0 * np.exp((coded[3].astype(np.float64) + 1) / 256 * (high - low) + low)
+
+
+def arrays(number: int, samples: int = SAMPLES) -> dict[str, np.ndarray]:
+    """One frame: a slanted, wavy surface, hit by each sample at its place in the pixel; sky in the uppermost rows."""
+    g, camera = np.random.default_rng(number), matrices()[number].astype(np.float64)
+    rows, columns = np.mgrid[: SIZE[0], : SIZE[1]] + np.array(CROP)[:, None, None]
+    spread = g.random((2, *SIZE, samples))
+    x = (columns[..., None] + spread[0]) / WHOLE[1] * 2 - 1
+    y = 1 - (rows[..., None] + spread[1]) / WHOLE[0] * 2
+    depth = 4 + x - y + 0.5 * np.sin(5 * x) * np.cos(4 * y)
+    position = np.stack([depth * x / camera[0, 0], depth * y / camera[1, 1], depth - 3]) + np.array(
+        [0.1 * number, 0, 0]
+    ).reshape(3, 1, 1, 1)
+    radiance = g.exponential(size=(3, *SIZE, samples)) * 0.8
+    normal, diffuse = g.uniform(-0.6, 0.6, (3, *SIZE, samples)), g.random((3, *SIZE, samples))
+    normal[:, :3], diffuse[:, :3] = 0, 0
+    return {
+        "color": encode(np.minimum(radiance, 10)),
+        "exposure": np.array(EXPOSURE, np.float32),
+        "reference": g.random((3, *SIZE)).astype(np.float32),
+        "position": position.astype(np.float32),
+        "motion": g.normal(size=(3, *SIZE, samples)).astype(np.float32),
+        "normal": normal.astype(np.float16),
+        "diffuse": diffuse.astype(np.float16),
+        "view_proj_mat": matrices()[number],
+        "crop_offset": np.array(CROP, np.int32),
+        "camera_position": np.array([0.1 * number, 0, -3], np.float32),
+    }
+
+
+def write(path: Path, content: dict[str, np.ndarray], axis: bool = False, **chunks: Any) -> Path:
+    """As the published files are: chunks of one frame and four samples, LZ4HC."""
+    from numcodecs import Blosc
+
+    with zarr.storage.ZipStore(path, mode="w") as store:
+        group = zarr.create_group(store, zarr_format=2)
+        for name, values in content.items():
+            shape = list(values.shape)
+            if axis:
+                shape[0] = 1
+            if values.ndim - axis == 4:
+                shape[-1] = 4
+            array = group.create_array(
+                name,
+                shape=values.shape,
+                dtype=values.dtype,
+                chunks=chunks.get(name, tuple(shape)),
+                compressors=Blosc("lz4hc", 9),
+            )
+            array[...] = values
+    return path
+
+
+@pytest.fixture(autouse=True)
+def whole_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The published sets are crops of 1920 x 1080; here the image is smaller."""
+    monkeypatch.setattr(noisebase, "_RENDERED", WHOLE)
+
+
+def frames_of(folder: Path) -> Path:
+    folder.mkdir()
+    for number in range(FRAMES):
+        write(folder / f"frame{number:04d}.zip", arrays(number))
+    return folder
+
+
+def training_set(path: Path) -> Path:
+    frames = [arrays(number) for number in range(FRAMES)]
+    return write(path, {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}, axis=True)
+
+
+@pytest.fixture(params=["test", "training"])
+def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Sequence:
+    if request.param == "test":
+        return open_sequence(frames_of(tmp_path / "scene"))
+    return open_sequence(training_set(tmp_path / "scene.zip"))
+
+
+def test_what_is_found(opened: Sequence) -> None:
+    assert opened.layout == "noisebase"
+    assert opened.numbers == opened.reference_numbers == list(range(FRAMES))
+    assert opened.size == SIZE
+    assert not opened.warnings
+    assert not opened.unused
+    assert opened.buffers == {row.buffer for row in opened.table}
+    frame = opened.frame(1)
+    assert opened.buffers == {name for name, _ in frame.items()}
+    assert opened.frame(1, reference=False).reference is None
+    words = {row.buffer: row.reading for row in opened.table}
+    assert f"cropped from {WHOLE[1]} x {WHOLE[0]}" in words["view_projection"]
+
+
+@pytest.mark.parametrize("number", range(FRAMES))
+def test_means_and_variance_are_those_of_the_samples(opened: Sequence, number: int) -> None:
+    frame, known = opened.frame(number), arrays(number)
+    samples = decode(known["color"])
+    expected = {
+        "color": samples.mean(-1),
+        "variance": samples.var(-1, ddof=1) / SAMPLES,
+        "albedo": known["diffuse"].astype(np.float64).mean(-1),
+        "normal": known["normal"].astype(np.float64).mean(-1),
+        "position": known["position"].astype(np.float64).mean(-1),
+        "previous_position": (known["position"].astype(np.float64) + known["motion"]).mean(-1),
+        "reference": known["reference"],
+    }
+    for name, values in expected.items():
+        # Sums in double precision, rounded once to single.
+        np.testing.assert_allclose(getattr(frame, name)[0].numpy(), values, rtol=3e-7, atol=1e-7, err_msg=name)
+    np.testing.assert_array_equal(opened.reference(number), frame.reference)
+
+
+def test_radiance_comes_back_from_its_bytes() -> None:
+    """The encoder of this page is one: a byte of 255 is the error of half a step."""
+    radiance = np.random.default_rng(0).uniform(0.1, 10, (3, 1000))
+    assert np.abs(decode(encode(radiance)) - radiance).max() < 10 * np.exp(5.5 / 256) / 255 / 2 + 1e-6
+
+
+def test_positions_are_seen_at_their_pixels(tmp_path: Path) -> None:
+    """Each at its own place within a pixel, with one sample in the middle of it."""
+    content = arrays(2, samples=1)
+    rows, columns = np.mgrid[: SIZE[0], : SIZE[1]]
+    frame = open_sequence(write(tmp_path / "frame2.zip", content)).frame(2)
+    assert frame.variance is None
+    position = frame.position[0].double().permute(1, 2, 0).numpy()
+    clip = np.concatenate([position, np.ones((*SIZE, 1))], -1) @ frame.view_projection[0].double().numpy()
+    u, v = ((clip[..., i] / clip[..., 3] + 1) / 2 for i in (0, 1))
+    spread = np.random.default_rng(2).random((2, *SIZE, 1))[..., 0]
+    # Single precision of positions and matrix: some 1e-6 of a coordinate of a few units, over 40 pixels.
+    np.testing.assert_allclose(u * SIZE[1], columns + spread[0], atol=1e-3)
+    np.testing.assert_allclose(v * SIZE[0], rows + spread[1], atol=1e-3)
+    depth = frame.depth[0, 0].numpy()
+    assert np.isinf(depth[:3]).all()
+    np.testing.assert_allclose(depth[3:], clip[3:, :, 3], rtol=1e-6)
+
+
+def test_a_frame_that_is_no_crop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(noisebase, "_RENDERED", (1080, 1920))
+    content = arrays(0)
+    content["crop_offset"] = np.array([28, 0], np.int32)
+    whole = np.diag([WHOLE[1] / SIZE[1], WHOLE[0] / SIZE[0], 1, 1])
+    # The camera of these pixels alone; the offset is for what is cut off afterwards.
+    matrix = content["view_proj_mat"].astype(np.float64)
+    clip = matrix @ whole
+    clip[:, 0] += matrix[:, 3] * (WHOLE[1] / SIZE[1] - 2 * CROP[1] / SIZE[1] - 1)
+    clip[:, 1] -= matrix[:, 3] * (WHOLE[0] / SIZE[0] - 2 * CROP[0] / SIZE[0] - 1)
+    content["view_proj_mat"] = clip.astype(np.float32)
+    sequence = open_sequence(write(tmp_path / "frame0.zip", content))
+    assert "view_projection" in sequence.buffers
+    flip = np.diag([1, -1, 1, 1])
+    np.testing.assert_allclose(sequence.frame(0).view_projection[0], content["view_proj_mat"] @ flip, rtol=1e-6)
+
+
+def test_a_camera_of_something_else_is_told(tmp_path: Path) -> None:
+    content = arrays(0) | {"view_proj_mat": np.eye(4, dtype=np.float32)}
+    sequence = open_sequence(write(tmp_path / "frame0.zip", content))
+    assert "view_proj_mat" in sequence.warnings[0]
+    assert not sequence.buffers & {"view_projection", "depth"}
+    assert sequence.frame(0).view_projection is None
+
+
+def test_what_is_written(opened: Sequence, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    image = np.random.default_rng(0).random((*SIZE, 3)).astype(np.float16).astype(np.float32)
+    path = opened.write(tmp_path / "out", 1, image)
+    assert path.name in ("frame0001.exr", "scene_0001.exr")
+    pixels, channels, _ = read_exr(path)
+    assert channels == ["R", "G", "B"]
+    np.testing.assert_array_equal(pixels, image)
+    with pytest.raises(InputError, match="--output-layer"):
+        opened.write(tmp_path, 1, image, output_layer="clean")
+
+
+def test_any_chunks_and_no_compression(tmp_path: Path) -> None:
+    content = arrays(0)
+    chunks = {"color": (4, 7, 5, 3), "position": (2, 9, 24, 4), "reference": (1, 20, 11)}
+    expected = open_sequence(write(tmp_path / "frame0.zip", content)).frame(0)
+    found = open_sequence(write(tmp_path / "other0.zip", content, **chunks)).frame(0)
+    for name, values in found.items():
+        np.testing.assert_allclose(values, getattr(expected, name), rtol=1e-6, atol=1e-7, err_msg=name)
+
+
+def test_what_does_not_belong_together(tmp_path: Path) -> None:
+    folder = frames_of(tmp_path / "scene")
+    write(folder / "frame0003.zip", {k: v for k, v in arrays(0).items() if k != "normal"})
+    with pytest.raises(InputError, match=r"frame0003.zip: expected array 'normal' of shape \(3, 20, 24, 6\)"):
+        open_sequence(folder)
+    assert open_sequence(folder, "0-2").numbers == [0, 1, 2]
+    write(folder / "walk0000.zip", arrays(0))
+    with pytest.raises(InputError, match="one sequence, found files of 2 names"):
+        open_sequence(folder)
+    both = [training_set(tmp_path / "a.zip"), training_set(tmp_path / "b.zip")]
+    with pytest.raises(InputError, match="one sequence, found 2"):
+        open_sequence(both)
+    with pytest.raises(InputError, match="--map"):
+        open_sequence(both[0], mapping=["albedo=diffuse"])
+
+
+def test_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "frame0.zip", arrays(0))
+    monkeypatch.setitem(__import__("sys").modules, "numcodecs", None)
+    with pytest.raises(InputError, match=r"mcdenoise\[noisebase\]"):
+        open_sequence(path)
+
+
+def changed(path: Path, target: Path, change: dict[str, bytes | None]) -> Path:
+    """A copy of a zip with other contents of some entries, or without them."""
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as copy:
+        for name in source.namelist():
+            content = change.get(name, source.read(name))
+            if content is not None:
+                copy.writestr(name, content)
+    return target
+
+
+def described(path: Path, name: str, **values: Any) -> dict[str, bytes | None]:
+    with zipfile.ZipFile(path) as file:
+        return {f"{name}/.zarray": json.dumps(json.loads(file.read(f"{name}/.zarray")) | values).encode()}
+
+
+def test_bombs_and_lies_are_told_before_memory_is_taken(tmp_path: Path) -> None:
+    path = write(tmp_path / "frame0.zip", arrays(0))
+    huge = [4, 2**14, 2**14, 6]
+    first = "color/0.0.0.0"
+    with zipfile.ZipFile(path) as file:
+        chunk = file.read(first)
+    lying = {
+        "chunk": {first: chunk[:4] + (2**31 - 1).to_bytes(4, "little") + chunk[8:]},
+        "short": {first: chunk[:10]},
+        "empty": {first: b""},
+        "missing": {first: None},
+        "shape": described(path, "color", shape=huge),
+        "chunks": described(path, "color", shape=huge, chunks=huge),
+        "bomb": described(path, "color", shape=[4, 2**14, 2**13, 1], chunks=[4, 2**14, 2**13, 1], compressor=None)
+        | {first: bytes(2**28)},
+        "negative": described(path, "color", shape=[4, -20, -24, 6]),
+        "words": described(path, "color", shape="many"),
+        "deep": {"color/.zarray": b"[" * 50_000},
+        "object": described(path, "color", dtype="|O"),
+        "pickle": described(path, "color", filters=[{"id": "pickle"}]),
+        "codec": described(path, "color", compressor={"id": "lzma"}),
+        "order": described(path, "normal", order="F"),
+        "three": described(path, "normal", zarr_format=3),
+        "samples": described(path, "normal", shape=[3, *SIZE, SAMPLES + 1]),
+        "exposure": described(path, "exposure", shape=[3]),
+        "without": {"exposure/.zarray": None},
+    }
+    tracemalloc = pytest.importorskip("tracemalloc")
+    for name, change in lying.items():
+        copy = changed(path, tmp_path / f"{name}.zip", change)
+        tracemalloc.start()
+        with pytest.raises(InputError, match=f"{name}.zip") as told:
+            open_noisebase([copy], lambda numbers: numbers, where=str(copy)).frame(0)
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert most < 2**22, f"{name}: {most}"
+        assert str(told.value).isprintable(), name
+        assert len(str(told.value)) < 700 + len(str(copy)), name
+
+
+def test_damaged_zips(tmp_path: Path) -> None:
+    """Cut, flipped and spliced; bytes of chunks too, beyond the reach of the zip's own checksums."""
+    g: Generator = np.random.default_rng(0)
+    path = write(tmp_path / "frame0.zip", arrays(0))
+    content, refused, count = path.read_bytes(), {}, 150
+    with zipfile.ZipFile(path) as file:
+        names = file.namelist()
+        entries = {name: file.read(name) for name in names}
+    damages = (truncated, flipped, spliced)
+    for i in range(count):
+        target, damage = tmp_path / f"{i}.zip", damages[i % 3]
+        if i % 2:
+            target.write_bytes(damage(g, content))
+        else:
+            name = names[int(g.integers(len(names)))]
+            changed(path, target, {name: damage(g, entries[name]) if entries[name] else b""})
+        with warnings.catch_warnings():
+            # zipfile warns of names that come twice.
+            warnings.simplefilter("ignore", UserWarning)
+            try:
+                sequence = open_sequence(target)
+                sequence.frame(sequence.numbers[0])
+            except InputError as error:
+                refused[target] = str(error)
+    assert len(refused) > count / 2
+    assert all(message.isprintable() and str(target) in message for target, message in refused.items())
