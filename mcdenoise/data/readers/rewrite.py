@@ -22,6 +22,8 @@ from mcdenoise.errors import InputError
 # The name and the checksum of the empty chunk with which every PNG ends.
 _PNG_END = b"IEND\xaeB`\x82"
 
+_LIBRARY_ERRORS = (RuntimeError, ValueError, TypeError, OSError, InputError)
+
 
 def write_like(
     source: Path,
@@ -74,28 +76,36 @@ def _write_exr(
         # A part that it cannot read it leaves out, and prints that.
         with readable(source, target.with_suffix(".copy.exr")) as (path, strange), redirect_stdout(io.StringIO()):
             file = OpenEXR.File(str(path), separate_channels=True)
-        if len(file.parts) != len(expected) or not all(map(_is_whole, file.parts, expected)):
-            return f"{source} has changed meanwhile, or has parts that cannot be written again"
-        for (index, name), image in replaced.items():
-            channel = file.parts[index].channels[name]
-            channel.pixels = _stored(image, np.float32 if full_float else channel.pixels.dtype)
-        if added:
-            main = file.parts[part]
-            kinds = {channel.pixels.dtype for channel in main.channels.values()} - {np.dtype(np.uint32)}
-            kind = np.float32 if full_float or kinds != {np.dtype(np.float16)} else np.float16
-            channels = dict(main.channels)
-            for name, image in added.items():
-                if name in channels:
-                    return f"it has a channel '{name}' already"
-                channels[name] = OpenEXR.Channel(name, _stored(image, kind))
-            main.channels = channels
+        whole = len(file.parts) == len(expected) and all(map(_is_whole, file.parts, expected))
+    except _LIBRARY_ERRORS as error:
+        return f"{source} cannot be read again: {_first_line(error)}"
+    if not whole:
+        return f"{source} has changed meanwhile, or has parts that cannot be written again"
+    for (index, name), image in replaced.items():
+        channel = file.parts[index].channels[name]
+        channel.pixels = _stored(image, np.float32 if full_float else channel.pixels.dtype)
+    if added:
+        main = file.parts[part]
+        kinds = {channel.pixels.dtype for channel in main.channels.values()} - {np.dtype(np.uint32)}
+        kind = np.float32 if full_float or kinds != {np.dtype(np.float16)} else np.float16
+        channels = dict(main.channels)
+        for name, image in added.items():
+            if name in channels:
+                return f"it has a channel '{name}' already"
+            channels[name] = OpenEXR.Channel(name, _stored(image, kind))
+        main.channels = channels
+    try:
         file.write(str(target))
         if strange:
             put_back(target, strange)
         written = read_image_header(target)
-    except (RuntimeError, ValueError, TypeError, OSError, InputError) as error:
-        return str(error).splitlines()[0] if str(error) else type(error).__name__
-    return "" if len(written.parts) == len(file.parts) else "incomplete"
+    except _LIBRARY_ERRORS as error:
+        return _first_line(error)
+    return "" if len(written.parts) == len(expected) else "incomplete"
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _is_whole(found: Any, part: Part) -> bool:
