@@ -58,9 +58,9 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
             strangers.append(layer)
     if not candidates["color"]:
         # A shot may have a letter for a name, such as a_0001.exr, that stands for a buffer elsewhere.
-        for own in candidates.values():
-            strangers += [layer for _, layer in own if _is_letter(layer)]
-            own[:] = [(rank, layer) for rank, layer in own if not _is_letter(layer)]
+        for ranked in candidates.values():
+            strangers += [layer for _, layer in ranked if _is_letter(layer)]
+            ranked[:] = [(rank, layer) for rank, layer in ranked if not _is_letter(layer)]
     for buffer, text in mapping.items():
         if text:
             choice.layers[buffer] = _mapped(where, layers, buffer, text)
