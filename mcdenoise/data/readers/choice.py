@@ -57,6 +57,11 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
             candidates[found[0]].append((found[1], layer))
         else:
             strangers.append(layer)
+    if not candidates["color"]:
+        # A shot may have a letter for a name, such as a_0001.exr, that stands for a buffer elsewhere.
+        for ranked in candidates.values():
+            strangers += [layer for _, layer in ranked if _is_letter(layer)]
+            ranked[:] = [(rank, layer) for rank, layer in ranked if not _is_letter(layer)]
     for buffer, text in mapping.items():
         if text:
             choice.layers[buffer] = _mapped(where, layers, buffer, text)
@@ -103,6 +108,10 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
             raise InputError("--map: expected a layer for 'color', found none; no frame can do without")
         mapping[buffer] = layer
     return mapping
+
+
+def _is_letter(layer: Layer) -> bool:
+    return layer.anonymous and layer.is_color and len(layer.name) == 1
 
 
 def _mapped(where: str, layers: Sequence[Layer], buffer: str, text: str) -> Layer:

@@ -68,10 +68,6 @@ def _matches(pattern: Path) -> list[Path]:
     # Digits alone stand for a number: `shot_####.exr` is not `shot_0001_mask.exr`.
     pieces = re.split(f"({_PLACEHOLDER.pattern})", name)
     wild = any(mark in name for mark in "*?[")
-    expression = "".join(
-        rf"[0-9]{{{_least_digits(piece)},9}}" if i % 2 else (_translated(piece) if wild else re.escape(piece))
-        for i, piece in enumerate(pieces)
-    )
     if len(pieces) == 1 and not wild:
         raise InputError(
             f"{pattern}: expected a folder, an image, or a pattern such as shot_####.exr, found "
@@ -79,8 +75,16 @@ def _matches(pattern: Path) -> list[Path]:
         )
     if not os.path.isdir(folder):
         raise InputError(f"{pattern}: expected files, found no folder {folder}; check the path")
-    found = [path for path in _listed(folder) if re.fullmatch(expression, path.name)]
-    if not found:
+    listed = _listed(folder)
+    # Brackets are a part of some names; where they are none, they and the other marks stand for what varies.
+    for translated in (re.escape, _translated) if wild else (re.escape,):
+        expression = "".join(
+            rf"[0-9]{{{_least_digits(piece)},9}}" if i % 2 else translated(piece) for i, piece in enumerate(pieces)
+        )
+        found = [path for path in listed if re.fullmatch(expression, path.name)]
+        if found:
+            break
+    else:
         raise InputError(f"{pattern}: expected files with such names, found none; check the pattern")
     return found
 
@@ -174,9 +178,12 @@ def _oidn_groups(found: Iterable[tuple[Path, re.Match[str]]]) -> list[FileGroup]
 
 def pattern_of(group: FileGroup) -> str:
     """The names of a kind of files, with # for the digits of the frame."""
-    number, path = next(iter(group.files.items()))
-    digits = [found for found in _DIGITS.finditer(path.stem) if int(found[0]) == number]
-    if len(group.files) == 1 or not digits:
-        return path.name
-    start, end = digits[-1].span()
-    return f"{path.name[:start]}{'#' * (end - start)}{path.name[end:]}"
+    path = next(iter(group.files.values()))
+    digits = list(_DIGITS.finditer(path.stem))
+    if len(group.files) > 1:
+        for place in range(len(digits) - 1, -1, -1):
+            found = [(number, _DIGITS.findall(each.stem)[place : place + 1]) for number, each in group.files.items()]
+            if all(own and int(own[0]) == number for number, own in found):
+                start, end = digits[place].span()
+                return f"{path.name[:start]}{'#' * (end - start)}{path.name[end:]}"
+    return path.name

@@ -173,6 +173,31 @@ def test_windows_attributes_and_whole_numbers_stay(tmp_path: Path) -> None:
         assert written["owner"] == "Zoë"
 
 
+@pytest.mark.parametrize("order", ["increasingY", "randomY"])
+def test_tiles_stay(order: str, tmp_path: Path) -> None:
+    source = tmp_path / "tiles.exr"
+    spec = oiio.ImageSpec(50, 40, 4, "half")
+    spec.channelnames = tuple("RGBZ")
+    spec.tile_width, spec.tile_height, spec.tile_depth = 16, 32, 1
+    spec.attribute("openexr:lineOrder", order)
+    output = oiio.ImageOutput.create(str(source))
+    assert output.open(str(source), spec)
+    assert output.write_image(noise(40, 50, 4))
+    assert output.close()
+    (tmp_path / "out").mkdir()
+    path = open_sequence(source).write(tmp_path / "out", 0, rainbow(40, 50))
+    same_but_for(source, path, {"R", "G", "B"})
+    ((written, _),) = stored(path)
+    assert (written["tiles"].xSize, written["tiles"].ySize) == (16, 32)
+
+
+def test_a_texture_is_no_frame(tmp_path: Path, refused: Callable[..., str]) -> None:
+    picture = oiio.ImageBuf(oiio.ImageSpec(64, 64, 3, "half"))
+    path = tmp_path / "texture.exr"
+    assert oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, picture, str(path), oiio.ImageSpec())
+    assert "found a texture with mipmap levels" in refused(open_sequence, path)
+
+
 def test_full_floats_are_for_what_is_replaced(save: Callable[..., Path], tmp_path: Path) -> None:
     source = save(tmp_path / "a" / "still.exr", {name: noise(*SIZE) for name in "RGBAZ"}, "half")
     (tmp_path / "out").mkdir()

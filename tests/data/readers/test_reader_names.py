@@ -1,0 +1,321 @@
+"""File names: what somebody means by a folder, a file or a pattern, and which digits count the frames."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mcdenoise.data import open_sequence
+from mcdenoise.data.readers.names import find_files, group_files, pattern_of
+
+SIZE = (8, 12)
+D = Path("/d")
+
+
+def groups(*names: str) -> dict[str, dict[int, str]]:
+    """The kinds of files, by their pattern."""
+    return {
+        pattern_of(group): {number: path.name for number, path in group.files.items()}
+        for group in group_files([D / name for name in names])[0]
+    }
+
+
+@pytest.fixture
+def image(save: Callable[..., Path], tmp_path: Path) -> Callable[..., list[Path]]:
+    """Write small pictures of red, green and blue; the red of each is its place among them."""
+
+    def written(*names: str) -> list[Path]:
+        return [
+            save(tmp_path / name, {"R": np.full(SIZE, i + 1), "G": np.ones(SIZE), "B": np.ones(SIZE)})
+            for i, name in enumerate(names)
+        ]
+
+    return written
+
+
+# Which digits count
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["shot_0001", "shot_0002"], {"shot_####": [1, 2]}),
+        (["a1", "a2", "a10"], {"a#": [1, 2, 10]}),
+        (["7", "8"], {"#": [7, 8]}),
+        (["frame.0099", "frame.0100"], {"frame.####": [99, 100]}),
+        (["f999999", "f1000000"], {"f######": [999999, 1000000]}),
+        (["render_1080p_0001", "render_1080p_0002"], {"render_1080p_####": [1, 2]}),
+        (["render_0001_1080p", "render_0002_1080p"], {"render_####_1080p": [1, 2]}),
+        (["2024-05-01_0001", "2024-05-01_0002"], {"2024-05-01_####": [1, 2]}),
+        (["color_v1_0001", "color_v2_0001"], {"color_v#_0001": [1, 2]}),
+        (["color_v1_0002", "color_v2_0002"], {"color_v#_0002": [1, 2]}),
+        (["shot 1 (0003)", "shot 1 (0004)"], {"shot 1 (####)": [3, 4]}),
+        (["bild_ä_٣_001", "bild_ä_٣_002"], {"bild_ä_٣_###": [1, 2]}),
+        (["a[1]_01", "a[1]_02"], {"a[1]_##": [1, 2]}),
+        (
+            ["shot02_0012_albedo", "shot02_0013_albedo", "shot02_0012", "shot02_0013"],
+            {"shot02_####_albedo": [12, 13], "shot02_####": [12, 13]},
+        ),
+        (
+            ["shot01_0001", "shot01_0002", "shot02_0001", "shot02_0002"],
+            {"shot01_####": [1, 2], "shot02_####": [1, 2]},
+        ),
+        (["color", "albedo"], {"color": [0], "albedo": [0]}),
+        (["render_0007", "albedo"], {"render_0007": [7], "albedo": [7]}),
+        (["render_0007", "albedo_0007", "normal"], {"render_0007": [7], "albedo_0007": [7], "normal": [7]}),
+        (["kitchen2", "kitchenAlbedo2"], {"kitchen2": [2], "kitchenAlbedo2": [2]}),
+        # Two stills are no buffers of each other.
+        (["a_0005", "b_0006"], {"a_0005": [5], "b_0006": [6]}),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_which_digits_count_the_frames(names: list[str], expected: dict[str, list[int]]) -> None:
+    found = groups(*[f"{name}.exr" for name in names])
+    assert {pattern.removesuffix(".exr"): list(files) for pattern, files in found.items()} == expected
+    assert sorted(name for files in found.values() for name in files.values()) == sorted(
+        f"{name}.exr" for name in names
+    )
+
+
+def test_suffixes_and_folders_keep_kinds_apart() -> None:
+    assert groups("a.1.hdr", "a.2.hdr", "a_albedo.1.png", "a_albedo.2.png") == {
+        "a.#.hdr": {1: "a.1.hdr", 2: "a.2.hdr"},
+        "a_albedo.#.png": {1: "a_albedo.1.png", 2: "a_albedo.2.png"},
+    }
+    assert len(groups("a_0001.EXR", "a_0002.exr")) == 1
+    found, _ = group_files([D / "color" / "0001.exr", D / "albedo" / "0001.exr"])
+    assert len(found) == 2
+
+
+def test_two_files_of_a_frame_are_refused(refused: Callable[..., str]) -> None:
+    message = refused(group_files, [D / "shot_0001.exr", D / "shot_1.exr"])
+    assert "shot_1.exr: expected one file a frame, found shot_0001.exr as well" in message
+
+
+# What somebody means
+
+
+@pytest.mark.parametrize(
+    ("pattern", "expected"),
+    [
+        ("shot_####.exr", ["shot_0001.exr", "shot_0002.exr", "shot_10003.exr"]),
+        ("shot_%04d.exr", ["shot_0001.exr", "shot_0002.exr", "shot_10003.exr"]),
+        ("shot_%d.exr", ["shot_0001.exr", "shot_0002.exr", "shot_10003.exr"]),
+        ("shot_#####.exr", ["shot_10003.exr"]),
+        ("shot_*.exr", ["shot_0001.exr", "shot_0001_mask.exr", "shot_0002.exr", "shot_10003.exr"]),
+        ("shot_000[12].exr", ["shot_0001.exr", "shot_0002.exr"]),
+        ("shot_000[!1].exr", ["shot_0002.exr"]),
+        ("shot_000?.exr", ["shot_0001.exr", "shot_0002.exr"]),
+        ("shot_????_mask.exr", ["shot_0001_mask.exr"]),
+        ("*_####.exr", ["shot_0001.exr", "shot_0002.exr", "shot_10003.exr", "ä b_0001.exr", "x[1]_0001.exr"]),
+        ("x[1]_0001.exr", ["x[1]_0001.exr"]),
+        ("x[1]_####.exr", ["x[1]_0001.exr"]),
+        ("ä b_%04d.exr", ["ä b_0001.exr"]),
+        ("*", None),
+    ],
+)
+def test_patterns(pattern: str, expected: list[str] | None, image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    names = ["shot_0001.exr", "shot_0001_mask.exr", "shot_0002.exr", "shot_10003.exr", "ä b_0001.exr", "x[1]_0001.exr"]
+    folder = "a folder [2] #1"
+    image(*[f"{folder}/{name}" for name in (*names, ".hidden_0001.exr")])
+    (tmp_path / folder / "notes.txt").write_text("no image")
+    assert {path.name for path in find_files([tmp_path / folder / pattern])} == set(
+        names if expected is None else expected
+    )
+    assert {path.name for path in find_files([tmp_path / folder])} == set(names)
+
+
+def test_several_inputs_are_taken_once(image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    one, two, _ = image("a_0001.exr", "a_0002.exr", "b_0001.exr")
+    assert find_files([two, tmp_path / "a_####.exr", one]) == [two, one]
+    sequence = open_sequence([two, one])
+    assert sequence.numbers == [1, 2]
+    assert [float(sequence.frame(number).color[0, 0, 0, 0]) for number in (1, 2)] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (["nowhere"], "no such folder or file"),
+        (["nowhere/shot_####.exr"], "found no folder"),
+        (["x_####.exr"], "found none; check the pattern"),
+        (["*.hdr"], "found none; check the pattern"),
+        (["empty"], "found none"),
+        (["notes.txt"], "expected one of .exr"),
+        (["dangling.exr"], "dangling.exr: expected an image, found no such file"),
+        (["folder_with_dangling"], "dangling.exr: expected an image, found no such file"),
+        (["a_0001.exr", "nowhere.exr"], "nowhere.exr"),
+        ([f"{'x' * 300}.exr"], "no such folder or file"),
+        ([f"{'x' * 300}_####.exr"], "found none"),
+        ([], "found nothing"),
+    ],
+)
+def test_what_is_not_there(
+    given: Sequence[str], expected: str, image: Callable[..., list[Path]], tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    image("a_0001.exr")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "folder_with_dangling").mkdir()
+    (tmp_path / "notes.txt").write_text("no image")
+    for folder in (tmp_path, tmp_path / "folder_with_dangling"):
+        (folder / "dangling.exr").symlink_to(tmp_path / "gone.exr")
+    message = refused(open_sequence, [tmp_path / each for each in given])
+    assert expected in message
+
+
+# Shots
+
+
+@pytest.mark.parametrize(("start", "digits"), [(0, 1), (1, 4), (97, 2), (1001, 4), (0, 9)])
+def test_any_start_and_padding(start: int, digits: int, image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    numbers = range(start, start + 4)
+    image(*[f"shot/render.{number:0{digits}d}.exr" for number in numbers])
+    sequence = open_sequence(tmp_path / "shot")
+    assert (sequence.numbers, sequence.name, list(sequence.warnings)) == (list(numbers), "shot", [])
+    assert [float(sequence.frame(number).color[0, 0, 0, 0]) for number in numbers] == [1, 2, 3, 4]
+    (tmp_path / "out").mkdir()
+    path = sequence.write(tmp_path / "out", start + 2, np.ones((*SIZE, 3), np.float32))
+    assert path.name == f"render.{start + 2:0{digits}d}.exr"
+
+
+def test_gaps_are_told(image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    image(*[f"shot/a_{number:03d}.exr" for number in (3, 4, 6, 10, 11)])
+    sequence = open_sequence(tmp_path / "shot")
+    assert sequence.numbers == [3, 4, 6, 10, 11]
+    (warning,) = sequence.warnings
+    assert warning.startswith("frames: 5, 7-9 missing;")
+    # Those that somebody chooses have gaps on purpose.
+    assert list(open_sequence(tmp_path / "shot", "3,10-11").warnings) == []
+    image(*[f"many/a_{number}.exr" for number in range(0, 40, 2)])
+    (warning,) = open_sequence(tmp_path / "many").warnings
+    assert "1, 3, 5, 7, 9, 11, 13, 15 and 11 more missing" in warning
+
+
+def test_two_shots_are_refused_with_what_decides(
+    image: Callable[..., list[Path]], tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    image(*[f"all/shot{shot:02d}_{number:04d}.exr" for shot in (1, 2) for number in (1, 2)])
+    message = refused(open_sequence, tmp_path / "all")
+    assert "found shot01.RGB, shot02.RGB" in message
+    assert "choose with --map color=shot01, or give only the files of one shot" in message
+    for sequence in (
+        open_sequence(tmp_path / "all", mapping=["color=shot02"]),
+        open_sequence(tmp_path / "all" / "shot02_####.exr"),
+    ):
+        assert sequence.numbers == [1, 2]
+        assert float(sequence.frame(1).color[0, 0, 0, 0]) == 3
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["color.exr", "albedo.exr", "normal.exr"],
+        ["render_0007.exr", "albedo.exr", "normal.exr"],
+        ["render_0007.exr", "render_0007_albedo.exr", "render_0007_normal.exr"],
+        ["kitchen.exr", "kitchenAlbedo.exr", "kitchenNormal.exr"],
+        ["shot02_0012.exr", "shot02_0012_albedo.exr", "shot02_0012_normal.exr"],
+        ["Küche 3.exr", "Küche 3 albedo.exr", "Küche 3 normal.exr"],
+    ],
+    ids=lambda names: names[0],
+)
+def test_buffers_of_a_still(names: list[str], image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    image(*[f"still/{name}" for name in names])
+    sequence = open_sequence(tmp_path / "still")
+    assert sequence.buffers == {"color", "albedo", "normal"}
+    assert len(sequence) == 1
+    taken = {row.buffer: row.source for row in sequence.table}
+    assert taken == dict(zip(("color", "albedo", "normal"), names, strict=True))
+    assert float(sequence.frame(sequence.numbers[0]).color[0, 0, 0, 0]) == 1
+
+
+def test_tungsten_writes_a_file_a_buffer(image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    buffers = ("", "Albedo", "Normal", "Depth")
+    image(*[f"kitchen/kitchen{buffer}{end}.exr" for buffer in buffers for end in ("", "Variance")])
+    sequence = open_sequence(tmp_path / "kitchen")
+    assert {row.buffer: row.source for row in sequence.table} == {
+        "color": "kitchen.exr",
+        "albedo": "kitchenAlbedo.exr",
+        "normal": "kitchenNormal.exr",
+        "depth": "kitchenDepth.exr",
+        "variance": "kitchenVariance.exr",
+    }
+    # Whose variance it is, the names say.
+    assert float(sequence.frame(0).variance[0, 0, 0, 0]) == 2
+
+
+def test_the_layout_of_oidn(image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    image(
+        *[f"training/{name}_0008spp.{kind}.exr" for name in ("bath", "kitchen") for kind in ("hdr", "alb", "nrm")],
+        "training/kitchen_4096spp.hdr.exr",
+        "training/kitchen_0064spp.hdr.exr",
+    )
+    sequence = open_sequence(tmp_path / "training")
+    # Each name is a still of its own.
+    assert (sequence.layout, sequence.numbers, sequence.reference_numbers) == ("oidn", [0, 1], [1])
+    assert sequence.buffers == {"color", "albedo", "normal"}
+    frame = sequence.frame(1)
+    # The fewest samples are denoised, the most are the reference.
+    assert (float(frame.color[0, 0, 0, 0]), float(frame.reference[0, 0, 0, 0])) == (4, 7)
+    (tmp_path / "out").mkdir()
+    written = [sequence.write(tmp_path / "out", number, np.ones((*SIZE, 3), np.float32)).name for number in (0, 1)]
+    assert written == ["bath_0008spp.hdr.exr", "kitchen_0008spp.hdr.exr"]
+    # One alone is a still as well.
+    alone = open_sequence(tmp_path / "training" / "bath_*.exr")
+    assert (alone.layout, alone.numbers) == ("oidn", [0])
+
+
+def test_a_buffer_that_some_frames_lack_is_told(
+    image: Callable[..., list[Path]], tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    image("a_0001.exr", "a_0002.exr", "a_0003.exr", "a_albedo_0001.exr", "a_albedo_0003.exr")
+    message = refused(open_sequence, tmp_path)
+    assert "a_albedo_####.exr: expected buffer 'albedo' for every frame, found none for frame 2" in message
+    assert "leave the buffer out with --map albedo=" in message
+    assert open_sequence(tmp_path, mapping=["albedo="]).buffers == {"color"}
+    assert open_sequence(tmp_path, "1,3").buffers == {"color", "albedo"}
+
+
+@pytest.mark.parametrize("letter", ["a", "n", "p", "z", "N", "x"])
+def test_a_shot_may_have_a_letter_for_a_name(letter: str, image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    image(f"s/{letter}_1.exr", f"s/{letter}_2.exr", f"s/{letter}_albedo_1.exr", f"s/{letter}_albedo_2.exr")
+    assert open_sequence(tmp_path / "s").buffers == {"color", "albedo"}
+    # Beside radiance it is what it stands for.
+    image("t/beauty_1.exr", f"t/{letter}_1.exr")
+    meaning = {"a": "alpha", "n": "normal", "p": "position", "z": "depth"}.get(letter.lower())
+    taken = {row.buffer: row.source for row in open_sequence(tmp_path / "t").table}
+    assert taken["color"] == "beauty_1.exr"
+    assert meaning is None or taken[meaning] == f"{letter}_1.exr"
+
+
+def test_what_is_no_radiance_is_not_denoised(
+    image: Callable[..., list[Path]], tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    image("albedo_1.exr", "normal_1.exr")
+    assert "expected noisy radiance, found" in refused(open_sequence, tmp_path)
+
+
+def test_links_are_files(image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    (path,) = image("data/a.exr")
+    (tmp_path / "shot").mkdir()
+    for number in (1, 2):
+        (tmp_path / "shot" / f"a_{number}.exr").symlink_to(path)
+    (tmp_path / "link").symlink_to(tmp_path / "shot")
+    assert open_sequence(tmp_path / "link").numbers == [1, 2]
+
+
+def test_files_and_frames_of_other_sizes_are_told(
+    image: Callable[..., list[Path]], save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    image("s/a_1.exr", "s/a_2.exr", "s/albedo_1.exr", "s/albedo_2.exr")
+    save(tmp_path / "s" / "a_2.exr", dict.fromkeys("RGB", np.ones((8, 13))))
+    assert "a_2.exr: expected 12 x 8 pixels like the first color file, found 13 x 8" in refused(
+        open_sequence, tmp_path / "s"
+    )
+    shutil.copy(tmp_path / "s" / "a_1.exr", tmp_path / "s" / "a_2.exr")
+    save(tmp_path / "s" / "albedo_2.exr", dict.fromkeys("RGBX", np.ones(SIZE)))
+    save(tmp_path / "s" / "albedo_1.exr", dict.fromkeys("RGB", np.ones((9, 12))))
+    assert "albedo_1.exr: expected 'albedo' in the pixels of the color" in refused(open_sequence, tmp_path / "s")
