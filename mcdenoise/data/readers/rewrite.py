@@ -14,7 +14,7 @@ import OpenImageIO as oiio
 
 from mcdenoise.data.exr import LARGEST_HALF, Image, pending_error
 from mcdenoise.data.files import atomic_path
-from mcdenoise.data.images import FORMATS, Part, read_image_header
+from mcdenoise.data.images import FORMATS, Part, read_channels, read_image_header
 from mcdenoise.data.readers.transfer import encode
 from mcdenoise.errors import InputError
 
@@ -133,7 +133,7 @@ def _write_through_oiio(
         opened = clean.open(str(target), spec, "AppendSubimage") if index else clean.open(str(target), tuple(specs))
         if not opened or not clean.write_image(pixels):
             return pending_error(clean) or "writing failed"
-    return "" if clean.close() else pending_error(clean) or "writing failed"
+    return _missing(target) if clean.close() else pending_error(clean) or "writing failed"
 
 
 def _stored(image: Image, kind: Any) -> Any:
@@ -156,4 +156,14 @@ def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image]) ->
         pixels[..., 3] = replaced[names[3]]
     clean = oiio.ImageBuf(spec)
     clean.set_pixels(spec.roi, pixels)
-    return "" if clean.write(str(target)) else pending_error(clean)
+    return _missing(target) if clean.write(str(target)) else pending_error(clean)
+
+
+def _missing(written: Path) -> str:
+    """OpenImageIO does not notice when the last kilobytes no longer fit on the disk: see whether they are there."""
+    try:
+        parts = read_image_header(written).parts
+        read_channels(written, {index: part.channels for index, part in enumerate(parts)})
+    except InputError:
+        return "incomplete"
+    return ""
