@@ -276,3 +276,15 @@ def test_a_full_disk_is_told_to_the_last_byte(tmp_path: Path, name: str, kind: s
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
         assert not list(out.iterdir()), room
+
+
+def test_whole_numbers_beside_a_text_in_latin_1_are_told(tmp_path: Path) -> None:
+    """Which neither library can pass on: one reads no such text, and the other scales such numbers."""
+    channels = {"id": pixels(kind=np.uint32), **{each: pixels() for each in "RGB"}}
+    content = write(tmp_path / "shot.exr", part(channels, owner="M?ller")).read_bytes()
+    (tmp_path / "shot.exr").write_bytes(content.replace(b"M?ller", b"M\xfcller"))
+    sequence, out = open_sequence([tmp_path / "shot.exr"]), tmp_path / "out"
+    out.mkdir()
+    with pytest.raises(InputError, match=r"shot\.exr: expected .* texts that are no UTF-8"):
+        sequence.write(out, 0, np.zeros((*SIZE, 3), np.float32))
+    assert not list(out.iterdir())

@@ -19,6 +19,10 @@ from mcdenoise.data.readers.transfer import encode
 from mcdenoise.errors import InputError
 
 
+class _NotReadError(Exception):
+    """OpenEXR does not read all that OpenImageIO has read."""
+
+
 def write_like(
     source: Path,
     target: Path,
@@ -71,7 +75,7 @@ def _write_exr(
         with redirect_stdout(io.StringIO()):
             file = OpenEXR.File(str(source), separate_channels=True)
         if len(file.parts) != len(expected) or not all(map(_is_whole, file.parts, expected)):
-            return _write_through_oiio(source, target, expected, replaced, added, full_float)
+            raise _NotReadError
         for (index, name), image in replaced.items():
             channel = file.parts[index].channels[name]
             channel.pixels = _stored(image, np.float32 if full_float else channel.pixels.dtype)
@@ -87,7 +91,7 @@ def _write_exr(
             main.channels = channels
         file.write(str(target))
         written = read_image_header(target)
-    except UnicodeDecodeError:
+    except (_NotReadError, UnicodeDecodeError):
         return _write_through_oiio(source, target, expected, replaced, added, full_float)
     except (RuntimeError, ValueError, TypeError, OSError, InputError) as error:
         return str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -110,7 +114,10 @@ def _write_through_oiio(
 ) -> str:
     """What has texts that are no UTF-8: OpenImageIO keeps them, but scales whole numbers and loses rare attributes."""
     if added or any(part.integers for part in parts):
-        return "its attributes are no UTF-8"
+        raise InputError(
+            f"{source}: expected channels and attributes that OpenEXR reads, found others, such as texts that are no "
+            "UTF-8; render the file again without them"
+        )
     file, clean = oiio.ImageInput.open(str(source)), oiio.ImageOutput.create("openexr")
     if file is None or clean is None:
         return pending_error(oiio)
