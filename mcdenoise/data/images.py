@@ -7,6 +7,8 @@ as 32-bit floats; every failure is told in one line.
 from __future__ import annotations
 
 import os
+import struct
+import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -43,6 +45,7 @@ _LARGEST_PARTS, _LARGEST_CHANNELS = 1024, 4096
 # Rows that are decoded at a time, with all channels, of which few are wanted: a chunk of DWAB has 256.
 _ROWS = 256
 _EXR = {suffix for suffix, name in FORMATS.items() if name == "openexr"}
+_PNG = b"\x89PNG\r\n\x1a\n"
 _INTEGERS = {"uint", "int"}
 # Chroma of an image that is stored as luminance and chroma: without its luminance no color, and subsampled mostly.
 _CHROMA = {"ry", "by"}
@@ -179,6 +182,8 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ImageHeader]:
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: expected one of {', '.join(FORMATS)}, found '{path.suffix}'; convert the file")
     name = FORMATS[path.suffix.lower()]
+    if name == "png" and not _png_is_whole(path):
+        raise InputError(f"{path}: expected an image, found a PNG with damaged or missing data; copy the file again")
     file, reason = None, "damaged header"
     with suppress(UnicodeDecodeError, MemoryError):
         file = oiio.ImageInput.open(str(path), as_stored())
@@ -206,6 +211,32 @@ def as_stored() -> oiio.ImageSpec:
     # Portable float maps begin with the lowest row; without the hint, OpenImageIO may leave it at the top.
     config.attribute("pnm:pfmflip", 1)
     return config
+
+
+def _png_is_whole(path: Path) -> bool:
+    """Whether all chunks of a PNG are there and have their checksums; what is none is left to others.
+
+    The library says of damaged chunks what it has to say on the screen, and does not miss the last ones.
+    """
+    try:
+        left = os.path.getsize(path) - len(_PNG)
+        with path.open("rb") as file:
+            if file.read(len(_PNG)) != _PNG:
+                return True
+            while left >= 12:
+                length, kind = struct.unpack(">I4s", file.read(8))
+                left -= length + 12
+                # Told before memory is taken for them.
+                if left < 0:
+                    return False
+                content = file.read(length)
+                if file.read(4) != struct.pack(">I", zlib.crc32(content, zlib.crc32(kind))):
+                    return False
+                if kind == b"IEND":
+                    return True
+    except (OSError, struct.error) as error:
+        raise InputError(f"{path}: cannot be read ({error}); check its permissions") from error
+    return False
 
 
 def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 from torch import Tensor
 
 from mcdenoise.data.exr import Image, Metadata
@@ -23,6 +24,8 @@ from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 
+# Files may hold any values, also infinite ones, which are checked where a frame is used: numpy need not warn of them.
+_any_values = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 _LARGEST_FRAME_COUNT = 1_000_000
 
 
@@ -68,6 +71,7 @@ class Sequence:
         """Where the files lie; what is written has their names, and may not be written there."""
         return self._source.folders
 
+    @_any_values
     def frame(self, number: int, reference: bool = True, realisation: int = 0) -> Frame:
         """Read one frame: a batch of 1, float32, on the CPU; values are not validated.
 
@@ -97,6 +101,7 @@ class Sequence:
         # They lead to a frame that was not chosen, and not to the one before in this sequence.
         return frame.replace(motion=None, previous_position=None)
 
+    @_any_values
     def reference(self, number: int) -> Tensor:
         """Read the reference of one frame, and nothing else.
 
@@ -123,6 +128,7 @@ class Sequence:
         self._check(number)
         return self._source.metadata(number)
 
+    @_any_values
     def write(
         self,
         out: Path,
@@ -166,6 +172,7 @@ class Sequence:
             )
 
 
+@_any_values
 def open_sequence(
     path: Path | Sequential[Path],
     frames: str | None = None,

@@ -6,6 +6,8 @@ With a second folder, each is opened as the shot of a renderer, and its frame is
 import json
 import resource
 import sys
+import traceback
+import warnings
 from pathlib import Path
 
 import kornia.color  # noqa: F401 - before memory is counted
@@ -59,6 +61,8 @@ def read_and_write(path: Path, out: Path) -> None:
 
 
 def main(folder: Path, out: Path | None) -> None:
+    # They would stand on the screen beside the one line.
+    warnings.simplefilter("error")
     resource.setrlimit(resource.RLIMIT_AS, (taken() + MEMORY, -1))
     for path in sorted(folder.iterdir()):
         print(json.dumps({"begun": path.name}), flush=True)
@@ -71,7 +75,8 @@ def main(folder: Path, out: Path | None) -> None:
         except InputError as error:
             outcome = str(error)
         except BaseException as error:
-            outcome = f"!{type(error).__name__}: {error}"
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            outcome = f"!{type(error).__name__} at {Path(place.filename).name}:{place.lineno}: {error}"
         print(json.dumps({"file": path.name, "outcome": outcome}), flush=True)
 
 

@@ -6,6 +6,7 @@ The damaged ones are those of ``test_fuzz_images.py``.
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import struct
 from pathlib import Path
@@ -218,3 +219,72 @@ def test_the_screen_shows_names_as_they_are(tmp_path: Path, capsys: pytest.Captu
     assert "[/x].Denoising Albedo.RGB" in shown
     assert r"[red]\n.Depth.Z" in shown
     assert "\x1b" not in shown
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_any_values_are_read_and_written_without_a_warning(tmp_path: Path, seed: int) -> None:
+    """Infinite ones and none at all too; more of them in some layers than in others, and in some all alike."""
+    g, size = np.random.default_rng(seed), (40, 48)
+    wild = np.array([np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-45, 0, -1, 65504], np.float32)
+    names = {"Combined": "RGBA", "Denoising Albedo": "RGB", "Normal": "XYZ", "Depth": "Z", "Position": "XYZ"}
+    names |= {"Vector": "XYZW", "Noisy Image": "RGB", "own": "XYZ"}
+    for number in range(3):
+        channels = {}
+        for name, letters in names.items():
+            amount = g.choice([0, 0.01, 0.5, 1])
+            chosen = wild if g.random() < 0.7 else wild[g.integers(len(wild))][None]
+            for letter in letters:
+                values = g.normal(size=size).astype(np.float32)
+                where = g.random(size) < amount
+                values[where] = g.choice(chosen, int(where.sum()))
+                channels[f"View.{name}.{letter}"] = values
+        windows = {"displayWindow": window(0, 0, size)}
+        write(tmp_path / f"shot{number}.exr", part(channels, size=size, **windows))
+    sequence = open_sequence(tmp_path)
+    (tmp_path / "out").mkdir()
+    for number in sequence.numbers:
+        assert sequence.frame(number).size == size
+        sequence.write(tmp_path / "out", number, np.zeros((*size, 3), np.float32))
+
+
+@pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="limits the file size through the POSIX resource limit"
+)
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("pic.exr", "half"), ("pic.png", "uint8"), ("pic.tif", "float"), ("pic.hdr", "float"), ("pic.pfm", "float")],
+)
+def test_a_full_disk_is_told_to_the_last_byte(tmp_path: Path, name: str, kind: str) -> None:
+    """OpenImageIO says nothing of what it still holds back when the disk is full."""
+    size = 70, 90
+    noise = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
+    file = oiio.ImageOutput.create(name)
+    assert file.open(str(tmp_path / name), oiio.ImageSpec(size[1], size[0], 3, kind))
+    assert file.write_image(noise)
+    assert file.close()
+    sequence, out = open_sequence([tmp_path / name]), tmp_path / "out"
+    out.mkdir()
+    # As large as the file will be.
+    length = sequence.write(out, 0, noise).stat().st_size
+    (out / name).unlink()
+    unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for room in (100, length // 2, length - 5000, length - 100, length - 1):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, unlimited[1]))
+        try:
+            with pytest.raises(InputError, match="cannot be written"):
+                sequence.write(out, 0, noise)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+        assert not list(out.iterdir()), room
+
+
+def test_whole_numbers_beside_a_text_in_latin_1_are_told(tmp_path: Path) -> None:
+    """Which neither library can pass on: one reads no such text, and the other scales such numbers."""
+    channels = {"id": pixels(kind=np.uint32), **{each: pixels() for each in "RGB"}}
+    content = write(tmp_path / "shot.exr", part(channels, owner="M?ller")).read_bytes()
+    (tmp_path / "shot.exr").write_bytes(content.replace(b"M?ller", b"M\xfcller"))
+    sequence, out = open_sequence([tmp_path / "shot.exr"]), tmp_path / "out"
+    out.mkdir()
+    with pytest.raises(InputError, match=r"shot\.exr: expected .* texts that are no UTF-8"):
+        sequence.write(out, 0, np.zeros((*SIZE, 3), np.float32))
+    assert not list(out.iterdir())

@@ -50,8 +50,6 @@ _LARGEST_RATIO, _SMALL = 300, 2**16
 _LARGEST_DESCRIPTION, _LARGEST_SAMPLES, _BLOSC_HEADER = 2**16, 4096, 16
 # Pixels by which points may miss their own, in the median: samples are spread over a pixel.
 _NEAR = 1.5
-# What the arrays hold may be anything; a frame's values are checked where it is used.
-_any_values = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 @dataclass(frozen=True)
@@ -130,7 +128,6 @@ class NoisebaseFiles:
         with _opened(self.files[number]) as file:
             return _tensor(_mean(file, _described(file, "reference"), self._index(number)))
 
-    @_any_values
     def frame(self, number: int, *, reference: bool = True, realisation: int = 0) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`.
 
@@ -264,7 +261,6 @@ def open_noisebase(
     return shot
 
 
-@_any_values
 def _look(shot: NoisebaseFiles) -> None:
     """Find out which pixels the matrices are of, from the positions of the first frame."""
     mean = f"mean of {shot.samples} samples"
@@ -310,7 +306,6 @@ def _seen(means: Mapping[str, Array]) -> Mask:
     return seen
 
 
-@_any_values
 def _radiance(
     file: zipfile.ZipFile, array: _ZarrArray, exposure: Array, index: int | None
 ) -> tuple[Array, Array | None]:
@@ -333,7 +328,6 @@ def _radiance(
     return mean, np.maximum(squares / samples - mean**2, 0) / (samples - 1)
 
 
-@_any_values
 def _mean(file: zipfile.ZipFile, array: _ZarrArray, index: int | None) -> Array:
     """``(C, H, W)`` mean over the samples, where there are any."""
     sampled = array.name != "reference"
@@ -464,6 +458,5 @@ def _blosc() -> Any:
     return blosc
 
 
-@_any_values
 def _tensor(image: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32))[None]
