@@ -179,7 +179,15 @@ class RenderedFiles:
             images = self.read(number, {str(i): each for i, each in enumerate(own.layers)})
             pixels = own.stored(radiance, [images[str(i)][..., :3] for i in range(len(own.layers))])
             replaced |= {(own.layers[0].part, c): pixels[..., i] for i, c in enumerate(own.layers[0].channels[:3])}
-        write_like(source, out / source.name, replaced, added=added, part=layer.part, full_float=full_float)
+        write_like(
+            source,
+            out / source.name,
+            replaced,
+            added=added,
+            part=layer.part,
+            like=layer.channels[0],
+            full_float=full_float,
+        )
         return out / source.name
 
     def _as_frame(self, number: int, images: dict[str, Image], lights: Mapping[str, Tensor]) -> Frame:
