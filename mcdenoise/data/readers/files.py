@@ -168,7 +168,11 @@ class RenderedFiles:
             source, ours = self.groups[group].files[number], group == layer.group
             target = out / source.name
             write_like(
-                *(source, target, files[group]), added=added if ours else {}, part=layer.part, full_float=full_float
+                *(source, target, files[group]),
+                added=added if ours else {},
+                part=layer.part,
+                like=layer.channels[0],
+                full_float=full_float,
             )
         return out / self.file(layer, number).name
 

@@ -32,6 +32,7 @@ def write_like(
     *,
     added: Mapping[str, Image],
     part: int = 0,
+    like: str = "",
     full_float: bool = False,
 ) -> None:
     """Write ``target`` as ``source`` is: the same container, parts, channels, types, attributes, windows, compression.
@@ -42,6 +43,7 @@ def write_like(
         replaced: ``(H, W)`` pixels by part and channel.
         added: the same of new channels, by name.
         part: the part that they are added to.
+        like: the channel of that part whose type they have.
         full_float: store all of these as 32-bit floats, whatever was there.
 
     Raises:
@@ -49,7 +51,7 @@ def write_like(
     """
     with atomic_path(target) as temporary:
         if FORMATS.get(source.suffix.lower()) == "openexr":
-            reason = _write_exr(source, temporary, replaced, added, part, full_float)
+            reason = _write_exr(source, temporary, replaced, added, part, like, full_float)
         elif added:
             raise InputError(
                 f"{source}: expected an EXR to add a layer to, found '{source.suffix}'; replace its picture"
@@ -68,6 +70,7 @@ def _write_exr(
     replaced: Mapping[tuple[int, str], Image],
     added: Mapping[str, Image],
     part: int,
+    like: str,
     full_float: bool,
 ) -> str:
     # Reading and writing raise whatever the library below has to say.
@@ -86,8 +89,7 @@ def _write_exr(
         channel.pixels = _stored(image, np.float32 if full_float else channel.pixels.dtype)
     if added:
         main = file.parts[part]
-        kinds = {channel.pixels.dtype for channel in main.channels.values()} - {np.dtype(np.uint32)}
-        kind = np.float32 if full_float or kinds != {np.dtype(np.float16)} else np.float16
+        kind = np.float32 if full_float or like not in main.channels else main.channels[like].pixels.dtype
         channels = dict(main.channels)
         for name, image in added.items():
             if name in channels:

@@ -289,12 +289,14 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
     # Interpolation smooths what it moves by half a pixel: of two units that fit about as well, it is the usual one.
     best = min(errors, key=lambda each: errors[each] / (_BETTER if "half" in each.words else 1))
     at_rest = float(np.mean([_mismatch(*pair, Convention(0, 0, "")) for pair in pairs]))
-    if errors[best] > _TELLING * at_rest:
+    better = errors[best] < _BETTER * errors[given]
+    # No better than none, or hardly: that says something only where the given one is far worse.
+    if errors[best] > at_rest or (errors[best] > _TELLING * at_rest and not better):
         contradicts = errors[best] > at_rest and moving > _LEAST_MOVING
         return (None, True) if contradicts else (given, False)
     # What hardly moves as it is given, and leads to what looks alike in another unit, is in that unit.
     rescaled = moving < _LEAST_MOVING and abs(best.scale_x) != abs(given.scale_x)
-    return (best, True) if rescaled or errors[best] < _BETTER * errors[given] else (given, True)
+    return (best, True) if rescaled or better else (given, True)
 
 
 def match_cameras(pairs: Sequence[tuple[Image, Array]], given: Convention) -> Convention | None:
@@ -334,7 +336,11 @@ def _candidates(motions: Sequence[Image], given: Convention) -> tuple[Convention
 
 
 def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Image, convention: Convention) -> float:
-    """Mean difference of features and of those to which a motion leads; pixels that it leads outside count as 1."""
+    """Mean difference of features and of those to which a motion leads.
+
+    What it leads outside counts as twice what would differ at rest: a fast pan is no worse for it than others, and a
+    motion that leads everything outside is.
+    """
     moved = convention.apply(motion) if convention.scale_x else np.zeros_like(motion[..., :2])
     height, width = moved.shape[:2]
     rows, columns = np.mgrid[:height, :width]
@@ -347,6 +353,6 @@ def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Ima
     for name, image in now.items():
         source = torch.from_numpy(before[name]).permute(2, 0, 1)[None]
         found = F.grid_sample(source, grid, align_corners=False, padding_mode="border")[0].permute(1, 2, 0).numpy()
-        error = np.minimum(np.abs(found - image).mean(-1), 1)
-        total += float(np.where(inside, error, 1)[known].mean()) if known.any() else 1.0
+        error, at_rest = (np.minimum(np.abs(each - image).mean(-1), 1) for each in (found, before[name]))
+        total += float(np.where(inside, error, 2 * at_rest.mean())[known].mean()) if known.any() else 1.0
     return total

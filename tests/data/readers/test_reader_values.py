@@ -254,6 +254,50 @@ def test_motion_that_contradicts_what_is_seen_is_none() -> None:
     assert match_cameras([(stored, np.full(stored.shape, 4.0))], USUAL_MOTION) is None
 
 
+@pytest.mark.parametrize("contrast", [0.05, 1.0])
+@pytest.mark.parametrize("pan", [(32.0, 4.0), (-20.0, 15.0)])
+def test_a_fast_pan_is_no_contradiction(pan: tuple[float, float], contrast: float) -> None:
+    # A third of the points come in from outside, on noisy features with little contrast.
+    random = np.random.default_rng(0)
+    now, before = (
+        {
+            name: (image * contrast + 0.02 * random.random(image.shape)).astype(np.float32)
+            for name, image in each.items()
+        }
+        for each in moving(pan)
+    )
+    for sign in (1, -1):
+        stored = np.broadcast_to(np.float32(pan) * sign, (60, 100, 2))
+        found, told = match_motion([(now, before, stored)], USUAL_MOTION)
+        assert told
+        assert found is not None
+        assert found[:2] == (sign, sign)
+        # Stored in pixels, it is not taken for parts of the image, which lead everything outside.
+        parts = Convention(100 * sign, 60 * sign, "parts of the image")
+        assert match_motion([(now, before, stored)], parts)[0][:2] == (sign, sign)
+
+
+@pytest.mark.parametrize("frames", [(1, 2), (2, 3), (3, 4)])
+@pytest.mark.parametrize("signs", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
+@pytest.mark.parametrize("features", [("albedo", "normal"), ("albedo",), ("normal",), ("albedo", "turned")])
+def test_two_small_frames_of_a_renderer_tell_the_sign(
+    frames: tuple[int, int], signs: tuple[int, int], features: tuple[str, ...], others: Any
+) -> None:
+    """At one sample a pixel, where points move by a pixel."""
+    sources = [others.read(number) for number in frames]
+    for source in sources:
+        source["turned"] = others.to_camera(source, source["normal"])
+    before, now = ({name: source[name].clip(-1, 1).astype(np.float32) for name in features} for source in sources)
+    stored = (sources[1]["motion"] * signs).astype(np.float32)
+    found, told = match_motion([(now, before, stored)], Convention(-signs[0], -signs[1], "the wrong one"))
+    assert told
+    assert found is not None
+    assert found[:2] == signs
+    # The right one stays.
+    right = Convention(signs[0], signs[1], "the right one")
+    assert match_motion([(now, before, stored)], right)[0][:2] == signs
+
+
 def test_huge_motion_is_unknown_motion() -> None:
     stored = np.float32([[[1, 2], [1e10, 0], [np.nan, 0], [np.inf, 0], [0, -1e30]]])
     applied = USUAL_MOTION.apply(stored)

@@ -1,0 +1,102 @@
+"""`mcdenoise inspect` and `mcdenoise denoise` on what renderers wrote."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from mcdenoise.cli import main
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Status, standard output and standard error of a command."""
+
+    def call(*arguments: Any) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as stop:
+            main([str(argument) for argument in arguments])
+        return (int(stop.value.code or 0), *capsys.readouterr())
+
+    return call
+
+
+def test_inspect_prints_what_is_read_and_writes_nothing(run: Run, rendered: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(rendered / "blender", tmp_path / "shot")
+    status, text, errors = run("inspect", folder, "--json", tmp_path / "found.json")
+    assert (status, errors) == (0, "")
+    assert text.startswith("shot: files layout, 4 frames, 1 to 4, of 64x36\n")
+    told = json.loads((tmp_path / "found.json").read_text())
+    assert [row["buffer"] for row in told["read"]][:3] == ["color", "albedo", "normal"]
+    assert told["frames"] == [1, 2, 3, 4]
+    assert told["unused"] == [
+        f"shot_####.exr ViewLayer.{name}" for name in ("DiffCol.RGB", "Normal.XYZ", "Denoising Depth.Z")
+    ]
+    words = " ".join(text.split())
+    for word in ("not used: shot_####.exr ViewLayer.DiffCol.RGB", "1e+10, read as infinity"):
+        assert word in words
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["found.json", "shot"]
+    assert len(list(folder.iterdir())) == 4
+
+
+def test_inspect_warns_on_standard_error(run: Run, others: Any, tmp_path: Path) -> None:
+    others.write("vray", tmp_path, frames=(1, 2, 4))
+    status, text, errors = run("inspect", tmp_path)
+    assert status == 0
+    gap, motion = errors.splitlines()
+    assert gap.startswith("warning: frames: 3 missing; the history begins anew behind a gap")
+    assert motion.startswith("warning: 'motion': read as current - previous, y down, pixels, since only so")
+    assert "3 frames, 1 to 4, of 64x36" in text
+
+
+def test_both_flags_of_the_albedo_are_one_too_many(run: Run, rendered: Path) -> None:
+    status, _, errors = run("inspect", rendered / "blender", "--color-with-albedo", "--color-without-albedo")
+    assert status == 2
+    assert "expected one of them, found both" in errors
+    assert errors.count("\n") == 1
+    for flag, words in (
+        ("--color-with-albedo", "with albedo, as stated"),
+        ("--color-without-albedo", "without albedo"),
+    ):
+        status, text, errors = run("inspect", rendered / "blender", flag)
+        assert (status, errors) == (0, "")
+        assert words in " ".join(text.replace("│", " ").split())
+
+
+def channels(path: Path) -> dict[str, Any]:
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: each.pixels.copy() for part in file.parts for name, each in part.channels.items()}
+
+
+@pytest.mark.parametrize("option", [(), ("--output-layer", "Clean"), ("--full-float",)])
+def test_a_shot_goes_in_and_comes_out(option: tuple[str, ...], run: Run, rendered: Path, tmp_path: Path) -> None:
+    out = tmp_path / "clean"
+    status, text, errors = run(
+        *("denoise", rendered / "blender" / "shot_####.exr", "-o", out, "--model", "accumulated", "--frames", "2-4"),
+        *option,
+    )
+    assert (status, errors) == (0, "")
+    assert text.rstrip().endswith(f"{out / 'shot_0002.exr'} to shot_0004.exr")
+    assert sorted(path.name for path in out.iterdir()) == ["denoise.json", *(f"shot_000{i}.exr" for i in (2, 3, 4))]
+    assert json.loads((out / "denoise.json").read_text())["read"][0]["buffer"] == "color"
+    for number in (3, 4):
+        old, new = (channels(folder / f"shot_000{number}.exr") for folder in (rendered / "blender", out))
+        beauty = [f"ViewLayer.Combined.{each}" for each in "RGB"]
+        replaced = [f"ViewLayer.Clean.{each}" for each in "RGB"] if "Clean" in option else beauty
+        kept = set(old) - set(replaced)
+        assert all(np.array_equal(new[name], old[name]) for name in kept)
+        assert {new[name].dtype.name for name in replaced} == ({"float32"} if "--full-float" in option else {"float16"})
+        # Less noise: neighbours differ by less.
+        rough = [
+            np.mean([np.abs(np.diff(np.log1p(each[name].astype(np.float32)), axis=1)).mean() for name in names])
+            for each, names in ((new, replaced), (old, beauty))
+        ]
+        assert rough[0] < 0.95 * rough[1]
