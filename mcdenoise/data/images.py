@@ -260,9 +260,6 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
             raise _refused(path, "luminance and chroma (Y, RY, BY)", "write it as R, G, B")
         if spec.deep:
             raise _refused(path, "a deep image")
-        # Coarser levels would be those of the noisy image still.
-        if file.seek_subimage(len(parts), 1):
-            raise _refused(path, "a texture with mipmap levels")
         if not 1 <= spec.nchannels <= _LARGEST_CHANNELS:
             raise _refused(path, f"{spec.nchannels} channels")
         if min(spec.width, spec.height) < 1 or pixels > LARGEST_PIXEL_COUNT or spec.depth > 1:
@@ -273,7 +270,7 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
             raise _refused(
                 path, f"{spec.width} x {spec.height} pixels of {spec.nchannels} channels, but not their data"
             )
-        # The library that writes cannot read them.
+        # The library that writes cannot read them, and coarser levels would be those of the noisy image still.
         if name == "openexr" and file.seek_subimage(len(parts), 1):
             raise _refused(path, "a texture of several resolutions", "write the largest one alone")
         integers = frozenset(c for c, kind in zip(channels, kinds, strict=True) if kind in _INTEGERS)
