@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import MOTION, Frame, Hints, Layout, tells_motion
+from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
 from mcdenoise.models import DEFAULT, Journal, Model, Output, State, create_model, listening, timed
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
@@ -268,22 +268,11 @@ def denoise(
     albedo: ArrayLike | None = None,
     normal: ArrayLike | None = None,
     depth: ArrayLike | None = None,
-    position: ArrayLike | None = None,
-    view_projection: ArrayLike | None = None,
-    diffuse: ArrayLike | None = None,
-    specular: ArrayLike | None = None,
-    specular_albedo: ArrayLike | None = None,
-    roughness: ArrayLike | None = None,
-    hit_distance: ArrayLike | None = None,
-    emission: ArrayLike | None = None,
-    variance: ArrayLike | None = None,
-    alpha: ArrayLike | None = None,
-    samples: ArrayLike | None = None,
-    extra: Mapping[str, ArrayLike] | None = None,
     model: str | Model | nn.Module = DEFAULT,
     device: torch.device | str = "cpu",
     precision: Precision = "float32",
-    **settings: Any,
+    extra: Mapping[str, ArrayLike] | None = None,
+    **others: Any,
 ) -> NDArray[np.float32]:
     """Denoise a still: arrays in, an array out.
 
@@ -294,26 +283,16 @@ def denoise(
         color: ``(H, W, 3)`` in the layout ``"HWC"``, ``(3, H, W)`` in ``"CHW"``: scene-linear radiance of any float
             dtype. Pixels that are NaN, infinite, negative or above 1e16 are replaced, see :class:`Denoiser`.
         layout: of every array, the result's too. It is never guessed: an array of another layout is refused.
-        albedo: like ``color``, in [0, 1]; this and the following are what the renderer wrote besides, all optional; for
-            shapes see :meth:`mcdenoise.Frame.from_numpy`, for meanings :class:`mcdenoise.Frame`.
+        albedo: like ``color``, in [0, 1]; this and the following are what the renderer wrote besides, all optional.
         normal: like ``color``, in [-1, 1].
         depth: ``(H, W)`` or with the axis of the channel.
-        position: like ``color``; with ``view_projection`` it stands for a depth.
-        view_projection: ``(4, 4)``.
-        diffuse: like ``color``.
-        specular: like ``color``.
-        specular_albedo: like ``color``.
-        roughness: like ``depth``.
-        hit_distance: like ``depth``.
-        emission: like ``color``.
-        variance: like ``color``.
-        alpha: like ``depth``; it is there for models that use it, and is not denoised.
-        samples: ``(S, H, W, C)`` or ``(S, C, H, W)``.
-        extra: further buffers by name.
         model: as of :class:`Denoiser`.
         device: where to run; the result comes back from it.
         precision: as of :class:`Denoiser`.
-        settings: further arguments of :class:`Denoiser`, such as ``weights``, and settings of the model.
+        extra: further buffers by name.
+        others: further buffers of :class:`mcdenoise.Frame`, such as ``position``, see
+            :meth:`mcdenoise.Frame.from_numpy`; further arguments of :class:`Denoiser`, such as ``weights``; and
+            settings of the model.
 
     Returns:
         The clean image, float32 whatever the dtype of ``color``, in its layout, contiguous, with memory of its own.
@@ -328,25 +307,9 @@ def denoise(
         >>> clean.shape, clean.dtype
         ((24, 32, 3), dtype('float32'))
     """
-    frame = Frame.from_numpy(
-        color,
-        layout=layout,
-        albedo=albedo,
-        normal=normal,
-        depth=depth,
-        position=position,
-        view_projection=view_projection,
-        diffuse=diffuse,
-        specular=specular,
-        specular_albedo=specular_albedo,
-        roughness=roughness,
-        hit_distance=hit_distance,
-        emission=emission,
-        variance=variance,
-        alpha=alpha,
-        samples=samples,
-        extra=extra,
-    )
+    settings = {name: value for name, value in others.items() if name not in OF_RENDERERS}
+    buffers = {name: value for name, value in others.items() if name in OF_RENDERERS}
+    frame = Frame.from_numpy(color, layout=layout, albedo=albedo, normal=normal, depth=depth, extra=extra, **buffers)
     denoiser = Denoiser(model, device=device, precision=precision, **settings)
     denoiser.reset(frames=1)
     image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()

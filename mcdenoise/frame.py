@@ -242,24 +242,8 @@ class Frame:
         color: ArrayLike,
         *,
         layout: Layout = "HWC",
-        albedo: ArrayLike | None = None,
-        normal: ArrayLike | None = None,
-        depth: ArrayLike | None = None,
-        position: ArrayLike | None = None,
-        motion: ArrayLike | None = None,
-        previous_position: ArrayLike | None = None,
-        view_projection: ArrayLike | None = None,
-        diffuse: ArrayLike | None = None,
-        specular: ArrayLike | None = None,
-        specular_albedo: ArrayLike | None = None,
-        roughness: ArrayLike | None = None,
-        hit_distance: ArrayLike | None = None,
-        emission: ArrayLike | None = None,
-        variance: ArrayLike | None = None,
-        alpha: ArrayLike | None = None,
-        samples: ArrayLike | None = None,
-        reference: ArrayLike | None = None,
         extra: Mapping[str, ArrayLike] | None = None,
+        **buffers: ArrayLike | None,
     ) -> Frame:
         """A frame of one image, as a renderer's Python interface hands over its buffers: arrays without a batch.
 
@@ -270,28 +254,13 @@ class Frame:
         Args:
             color: ``(H, W, 3)`` in the layout ``"HWC"``, ``(3, H, W)`` in ``"CHW"``.
             layout: of every array. It is never guessed: an array of another layout is refused.
-            albedo: like ``color``; for the meaning of each buffer see :class:`Frame`.
-            normal: like ``color``.
-            depth: ``(H, W)``, as every buffer of one channel may be, or with the axis of the channel.
-            position: like ``color``.
-            motion: of two channels.
-            previous_position: like ``color``.
-            view_projection: ``(4, 4)``.
-            diffuse: like ``color``.
-            specular: like ``color``.
-            specular_albedo: like ``color``.
-            roughness: like ``depth``.
-            hit_distance: like ``depth``.
-            emission: like ``color``.
-            variance: like ``color``.
-            alpha: like ``depth``.
-            samples: ``(S, H, W, C)`` or ``(S, C, H, W)``.
-            reference: like ``color``.
             extra: further buffers by name, each ``(H, W)`` or of any number of channels.
+            buffers: those of :class:`Frame` by their names, such as ``albedo``, in the same layout; one channel may be
+                ``(H, W)``, samples are ``(S, H, W, C)`` or ``(S, C, H, W)``, ``view_projection`` is ``(4, 4)``.
 
         Raises:
-            InputError: an array has another layout, size or number of channels, or holds no floats; the message names
-                it, in the shapes of the layout.
+            InputError: an array has another layout, size or number of channels, or holds no floats, or there is no
+                buffer of that name; the message names it, in the shapes of the layout.
 
         Example:
             >>> import numpy as np
@@ -305,35 +274,19 @@ class Frame:
         """
         if layout not in LAYOUTS:
             raise InputError(f"layout: expected one of {', '.join(LAYOUTS)}, found {layout!r}")
-        given: dict[str, ArrayLike | None] = {
-            "albedo": albedo,
-            "normal": normal,
-            "depth": depth,
-            "position": position,
-            "motion": motion,
-            "previous_position": previous_position,
-            "view_projection": view_projection,
-            "diffuse": diffuse,
-            "specular": specular,
-            "specular_albedo": specular_albedo,
-            "roughness": roughness,
-            "hit_distance": hit_distance,
-            "emission": emission,
-            "variance": variance,
-            "alpha": alpha,
-            "samples": samples,
-            "reference": reference,
-        }
+        if unknown := set(buffers) - OF_RENDERERS:
+            known = ", ".join(sorted(OF_RENDERERS))
+            raise InputError(f"buffer '{min(unknown)}': expected one of {known}; others go into extra={{...}}")
         image = _of_array("color", color, layout, None)
         size = (image.shape[2], image.shape[3])
-        buffers: dict[str, Any] = {
-            name: _of_array(name, value, layout, size) for name, value in given.items() if value is not None
+        given: dict[str, Any] = {
+            name: _of_array(name, value, layout, size) for name, value in buffers.items() if value is not None
         }
         for name in extra or {}:
             if name in _NAMES:
                 raise InputError(f"extra: expected names that Frame does not know, found '{name}'; pass {name}=...")
         others = {name: _of_array(name, value, layout, size) for name, value in (extra or {}).items()}
-        return cls(color=image, **buffers, extra=others)
+        return cls(color=image, **given, extra=others)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -429,6 +382,8 @@ class Frame:
 
 _OF_HOSTS = ("extra", "layers", "statistics", "skip")
 _NAMES = tuple(each.name for each in fields(Frame) if each.name not in (*_OF_HOSTS, "hints"))
+# What a renderer hands over beside the color; the rest is what wrappers add.
+OF_RENDERERS = frozenset(_NAMES) - {"color", "current", "length"}
 
 
 def _flatten(frame: Frame) -> tuple[list[Any], tuple[tuple[str, ...], Hints]]:
