@@ -313,7 +313,7 @@ def _look(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
         words["normal"] = "stored as n/2 + 1/2, decoded"
     convention, cameras = "", folder.cameras
     if cameras is not None and "position" in images:
-        position = images["position"].astype(np.float64)
+        position = images["position"]
         seen = (position != 0).any(-1)
         if "normal" in images:
             seen &= (images["normal"] != 0).any(-1)

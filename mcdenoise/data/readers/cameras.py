@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mcdenoise.data.camera_matrices import Array
-from mcdenoise.data.exr import Mask
+from mcdenoise.data.exr import Image, Mask
 
 # Pixels are compared on a grid of about so many.
 _POINTS = 4096
@@ -33,7 +33,7 @@ class FittedCamera(NamedTuple):
     eye: Array
 
 
-def fit_camera(position: Array, seen: Mask) -> FittedCamera | None:
+def fit_camera(position: Image | Array, seen: Mask) -> FittedCamera | None:
     r"""Find the camera from the positions that its pixels show, by the direct linear transform.
 
     Each pixel says :math:`P a = u\,P c` and :math:`P b = v\,P c` of the columns a, b, c of the matrix (Hartley and
@@ -84,7 +84,7 @@ def fit_camera(position: Array, seen: Mask) -> FittedCamera | None:
     return FittedCamera(matrix[:, [0, 1, 2, 2]], error, eye)
 
 
-def miss(matrix: Array, position: Array, seen: Mask) -> float:
+def miss(matrix: Array, position: Image | Array, seen: Mask) -> float:
     """By how many pixels points miss their own, in the median, seen by a row-vector matrix with clip y down."""
     points, pixels, size = _sampled(position, seen)
     if not len(points):
@@ -94,7 +94,7 @@ def miss(matrix: Array, position: Array, seen: Mask) -> float:
     return float(np.median(errors))
 
 
-def motion_to(matrix: Array, position: Array, seen: Mask) -> Array:
+def motion_to(matrix: Array, position: Image | Array, seen: Mask) -> Array:
     """``(H, W, 2)`` pixels from each pixel to where a matrix, as in :func:`miss`, sees its point; NaN where none is."""
     height, width = seen.shape
     rows, columns = np.mgrid[:height, :width]
@@ -105,7 +105,7 @@ def motion_to(matrix: Array, position: Array, seen: Mask) -> Array:
     return result
 
 
-def read_as(matrix: Array, position: Array, seen: Mask) -> tuple[str, float]:
+def read_as(matrix: Array, position: Image | Array, seen: Mask) -> tuple[str, float]:
     """The convention by which a matrix sees a frame's positions at their pixels.
 
     Returns:
@@ -130,7 +130,7 @@ def convert(matrix: Array, convention: str) -> Array:
     return result
 
 
-def _sampled(position: Array, seen: Mask) -> tuple[Array, Array, Array]:
+def _sampled(position: Image | Array, seen: Mask) -> tuple[Array, Array, Array]:
     """Points ``(N, 3)`` of a grid of pixels, and where they are seen, in pixels from the corner; width and height."""
     height, width = position.shape[:2]
     step = max(1, int(np.sqrt(height * width / _POINTS)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from mcdenoise.frame import BUFFERS
 
 # Buffers that somebody may map a layer to; the rest is no image of a frame.
 MAPPABLE = sorted(set(BUFFERS) - {"current", "length"})
-_READ_AT_ONCE = 16
+_ALL, _LOWEST = slice(None), slice(-16, None)
 
 
 @dataclass
@@ -36,14 +37,18 @@ class Choice:
     unused: list[Layer] = field(default_factory=list)
 
 
-def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read: Callable[[Layer], Image]) -> Choice:
+# Some rows of the pixels of a layer in the first frame.
+Read: TypeAlias = Callable[[Layer, slice], Image]
+
+
+def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read: Read) -> Choice:
     """Choose the layer of each buffer.
 
     Args:
         where: what the layers are of, for messages.
         layers: all of a frame.
         mapping: names of layers by buffer, as somebody gave them; an empty one stands for none.
-        read: the pixels of a layer in the first frame, to look at where names do not tell.
+        read: what to look at where names do not tell.
 
     Raises:
         InputError: there is no color, or two layers that might be it; or what is asked for is not there.
@@ -167,33 +172,33 @@ def _best(where: str, buffer: str, candidates: Sequence[tuple[int, Layer]], colo
     return best[0]
 
 
-def _twins(color: Layer, strangers: Sequence[Layer], read: Callable[[Layer], Image]) -> list[Layer]:
+def _twins(color: Layer, strangers: Sequence[Layer], read: Read) -> list[Layer]:
     """Layers that hold the color once more: Mitsuba writes that of a nested integrator twice."""
     others = [layer for layer in strangers if layer.is_color and (layer.group, layer.part) == (color.group, color.part)]
     if not others:
         return []
-    pixels = read(color)[..., :3]
-    twins: list[Layer] = []
-    # Several at once, since each reading decompresses the whole file.
-    for first in range(0, len(others), _READ_AT_ONCE):
-        some = others[first : first + _READ_AT_ONCE]
-        together = read(replace(color, channels=tuple(name for layer in some for name in layer.channels[:3])))
-        twins += [
-            layer
-            for i, layer in enumerate(some)
-            if np.array_equal(together[..., 3 * i : 3 * i + 3], pixels, equal_nan=True)
-        ]
-    return twins
+    # A few rows of all of them tell most apart: each reading decompresses all layers of its rows.
+    together = replace(color, channels=tuple(name for layer in [color, *others] for name in layer.channels[:3]))
+    first, *rest = np.split(read(together, _LOWEST), len(others) + 1, -1)
+    alike = [layer for layer, pixels in zip(others, rest, strict=True) if np.array_equal(first, pixels, equal_nan=True)]
+    if not alike:
+        return []
+    whole = read(color, _ALL)[..., :3]
+    return [layer for layer in alike if np.array_equal(read(layer, _ALL)[..., :3], whole, equal_nan=True)]
 
 
-def _by_values(
-    choice: Choice, strangers: Sequence[Layer], mapping: Mapping[str, str], read: Callable[[Layer], Image]
-) -> None:
+def _by_values(choice: Choice, strangers: Sequence[Layer], mapping: Mapping[str, str], read: Read) -> None:
     """Layers with names of somebody's own, such as those of Mitsuba: depths end in T, normals have unit length."""
-    vectors = [layer for layer in strangers if layer.components == ("x", "y", "z")]
     depths = [layer for layer in strangers if layer.components == ("t",)]
-    directions = [layer for layer in vectors if is_direction(read(layer))] if vectors else []
-    points = [layer for layer in vectors if layer not in directions and _tell_a_camera(read(layer))]
+    directions: list[Layer] = []
+    points: list[Layer] = []
+    named_already = {"normal", "position"} <= {*choice.layers, *mapping}
+    for layer in [] if named_already else [each for each in strangers if each.components == ("x", "y", "z")]:
+        vectors = read(layer, _ALL)
+        if is_direction(vectors):
+            directions.append(layer)
+        elif fit_camera(vectors, (vectors != 0).any(-1)) is not None:
+            points.append(layer)
     for buffer, found, why in (
         ("depth", depths, "by its component T"),
         ("normal", directions, "by its values: vectors of unit length"),
@@ -202,8 +207,3 @@ def _by_values(
         if buffer not in choice.layers and buffer not in mapping and len(found) == 1:
             choice.layers[buffer] = found[0]
             choice.reasons[buffer] = why
-
-
-def _tell_a_camera(vectors: Image) -> bool:
-    position = vectors.astype(np.float64)
-    return fit_camera(position, (position != 0).any(-1)) is not None

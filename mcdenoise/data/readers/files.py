@@ -18,7 +18,7 @@ from mcdenoise.data.images import Part, read_channels, read_image_header
 from mcdenoise.data.readers.cameras import convert, fit_camera
 from mcdenoise.data.readers.choice import Choice
 from mcdenoise.data.readers.layers import Layer
-from mcdenoise.data.readers.lights import Light, kept_together
+from mcdenoise.data.readers.lights import Light, keeps, kept_together, stored
 from mcdenoise.data.readers.names import FileGroup, pattern_of
 from mcdenoise.data.readers.rewrite import write_like
 from mcdenoise.data.readers.transfer import decode
@@ -119,9 +119,13 @@ class RenderedFiles:
             for name, layer in self.choice.layers.items()
             if number in self.groups[layer.group].files and (reference or name != "reference")
         }
-        found = self._light_images(number) if self.lights else {}
-        lights = {name: _without_lossy_black(self.lights[name].radiance(own)) for name, own in found.items()}
-        return self._as_frame(number, self.read(number, wanted), lights)
+        wanted |= {f"{name} {i}": each for name, own in self.lights.items() for i, each in enumerate(own.layers)}
+        images = self.read(number, wanted)
+        lights = {
+            name: _without_lossy_black(own.radiance([images.pop(f"{name} {i}") for i in range(len(own.layers))]))
+            for name, own in self.lights.items()
+        }
+        return self._as_frame(number, images, lights)
 
     def write(
         self,
@@ -176,23 +180,17 @@ class RenderedFiles:
             )
         return out / self.file(layer, number).name
 
-    def _light_images(self, number: int) -> dict[str, list[Image]]:
-        """Of each layer of light its own pixels and, where it is divided by a color, those of that."""
-        wanted = {f"{name} {i}": each for name, own in self.lights.items() for i, each in enumerate(own.layers)}
-        images = self.read(number, wanted)
-        return {
-            name: [images[f"{name} {i}"][..., :3] for i in range(len(own.layers))] for name, own in self.lights.items()
-        }
-
     def _lights(self, number: int, radiances: Mapping[str, Image]) -> dict[int, dict[tuple[int, str], Image]]:
         """For each kind of file the channels of its layers of light, of clean radiances."""
         if not radiances:
             return {}
-        images = self._light_images(number)
-        held = kept_together(radiances, {name: self.lights[name].keeps(images[name]) for name in radiances})
+        colors = self.read(
+            number, {name: self.lights[name].layers[1] for name in radiances if self.lights[name].layers[1:]}
+        )
+        held = kept_together(radiances, {name: keeps(colors.get(name)) for name in radiances})
         files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
         for name, radiance in held.items():
-            layer, pixels = self.lights[name].layers[0], self.lights[name].stored(radiance, images[name])
+            layer, pixels = self.lights[name].layers[0], stored(radiance, colors.get(name))
             files[layer.group] |= {(layer.part, each): pixels[..., i] for i, each in enumerate(layer.channels[:3])}
         return files
 
@@ -218,12 +216,13 @@ class RenderedFiles:
                 images["motion"] = np.where(seen | (motion != 0), motion, np.float32(np.inf))
         matrix = self.camera(number, images, seen)
         if matrix is not None and "position" in images:
-            position = images["position"].astype(np.float64)
             known = hit(images, seen)
-            w = np.where(known[..., None], position, 0) @ matrix[:3, 3] + matrix[3, 3]
+            position = np.where(known[..., None], images["position"], 0)
+            # In double precision, without a copy of all positions in it.
+            w = np.einsum("hwc,c->hw", position, matrix[:3, 3]) + matrix[3, 3]
             images.setdefault("depth", np.where(known & (w > 0), w, 0)[..., None].astype(np.float32))
-            sky = _far_points(matrix, float(w[known].max(initial=1)), self.size)
-            images["position"] = np.where(known[..., None], position, sky).astype(np.float32)
+            position[~known] = _far_points(matrix, float(w[known].max(initial=1)), ~known)
+            images["position"] = position
             seen = ~nothing_hit(images["depth"])
         if self.drops_positions or matrix is None:
             images.pop("position", None)
@@ -240,7 +239,7 @@ class RenderedFiles:
             return convert(self.cameras.view_projection(number, self.size), self.camera_convention)
         if not self.has_camera or "position" not in images:
             return None
-        found = fit_camera(images["position"].astype(np.float64), hit(images, seen))
+        found = fit_camera(images["position"], hit(images, seen))
         return None if found is None else found.matrix
 
     def named(self, layer: Layer) -> str:
@@ -291,7 +290,8 @@ class RenderedFiles:
                 f"{path}: expected {width} x {height} pixels like the first color file, found "
                 f"{found_width} x {found_height}; render all buffers and frames at one size"
             )
-        if self.part(layer).display_referred and name in _LIGHT:
+        # Layers of light have names of their own.
+        if self.part(layer).display_referred and (name in _LIGHT or name not in BUFFERS):
             pixels = np.concatenate([decode(pixels[..., :3]), pixels[..., 3:]], -1)
         channels = BUFFERS[name].channels if name in BUFFERS else 3
         if name in ("color", "motion"):
@@ -325,11 +325,10 @@ def world_to_camera(metadata: Metadata) -> Array | None:
     return None
 
 
-def _far_points(matrix: Array, depth: float, size: tuple[int, int]) -> Array:
-    """Points far behind all others that a camera sees at its pixels: where the sky is, so that it can be followed."""
-    height, width = size
-    rows, columns = np.mgrid[:height, :width]
-    screen = np.stack([(columns + 0.5) / width * 2 - 1, (rows + 0.5) / height * 2 - 1, np.ones(size)], -1)
+def _far_points(matrix: Array, depth: float, sky: Mask) -> Array:
+    """``(N, 3)`` points far behind all others that a camera sees where the sky is, so that it can be followed."""
+    (height, width), (rows, columns) = sky.shape, np.nonzero(sky)
+    screen = np.stack([(columns + 0.5) / width * 2 - 1, (rows + 0.5) / height * 2 - 1, np.ones(len(rows))], -1)
     columns_used = matrix[:, [0, 1, 3]]
     result: Array = (_SKY * depth * screen - columns_used[3]) @ np.linalg.pinv(columns_used[:3])
     return result

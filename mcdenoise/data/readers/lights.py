@@ -61,20 +61,21 @@ class Light:
         result: Image = images[0] if len(images) == 1 else images[0] * images[1]
         return result
 
-    def keeps(self, images: Sequence[Image]) -> Mask:
-        """Where the layer can hold light: not where it is divided by a color of nearly 0."""
-        kept: Mask = np.ones(images[0].shape, bool) if len(images) == 1 else images[1] > _DARKEST
-        return kept
 
-    def stored(self, radiance: Image, images: Sequence[Image]) -> Image:
-        """The radiance as the layer keeps it, so that :meth:`radiance` of it is the same again."""
-        if len(images) == 1:
-            return radiance
-        result: Image = np.divide(radiance, images[1], out=np.zeros_like(radiance), where=self.keeps(images))
-        return result
+def keeps(color: Image | None) -> Mask | bool:
+    """Where a layer that is divided by a color, or by none, can hold light: not where that is nearly 0."""
+    return True if color is None else np.greater(color, _DARKEST)
 
 
-def kept_together(radiances: Mapping[str, Image], kept: Mapping[str, Mask]) -> dict[str, Image]:
+def stored(radiance: Image, color: Image | None) -> Image:
+    """Radiance as its layer keeps it, so that :meth:`Light.radiance` of it is the same again."""
+    if color is None:
+        return radiance
+    result: Image = np.divide(radiance, color, out=np.zeros_like(radiance), where=color > _DARKEST)
+    return result
+
+
+def kept_together(radiances: Mapping[str, Image], kept: Mapping[str, Mask | bool]) -> dict[str, Image]:
     """Layers of the same sum, each with light only where it can hold some.
 
     Filters carry light over an edge to where a layer is divided by a color of 0; there the others share it.

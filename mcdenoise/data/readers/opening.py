@@ -66,9 +66,9 @@ def open_files(
     headers = [read_image_header(next(iter(group.files.values()))) for group in groups]
     layers = [layer for i, header in enumerate(headers) for layer in layers_of(i, groups[i].label, header.parts)]
 
-    def read_first(layer: Layer) -> Image:
+    def read_first(layer: Layer, rows: slice) -> Image:
         path = next(iter(groups[layer.group].files.values()))
-        return read_channels(path, {layer.part: layer.channels})[layer.part]
+        return read_channels(path, {layer.part: layer.channels}, rows)[layer.part]
 
     choice = choose(where, layers, mapping, read_first)
     color = choice.layers["color"]
@@ -114,7 +114,11 @@ def open_result(path: Path) -> Result:
     """
     parts = read_image_header(path).parts
     layers = layers_of(0, "", parts)
-    chosen = choose(str(path), layers, {}, lambda layer: read_channels(path, {layer.part: layer.channels})[layer.part])
+
+    def read(layer: Layer, rows: slice) -> Image:
+        return read_channels(path, {layer.part: layer.channels}, rows)[layer.part]
+
+    chosen = choose(str(path), layers, {}, read)
     (layer, *_) = chosen.written
     return Result(path, layer, parts[layer.part].size)
 
@@ -213,7 +217,7 @@ def _look(shot: RenderedFiles, color_has_albedo: bool | None) -> None:
     elif shot.cameras is not None:
         readings["view_projection"] = ["no positions to check it with"]
     if "motion" in images:
-        shot.motion, said = _motion(shot)
+        shot.motion, said = _motion(shot, images)
         readings["motion"].append(said)
     for name, words in readings.items():
         layer = chosen.get(name)
@@ -238,7 +242,7 @@ def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
 
 
 def _look_at_positions(shot: RenderedFiles, images: dict[str, Image], readings: dict[str, list[str]]) -> None:
-    position = images["position"].astype(np.float64)
+    position = images["position"]
     known = hit(images, ~nothing_hit(images["depth"]) if "depth" in images else None)
     words = readings.setdefault("view_projection", [])
     if shot.cameras is not None:
@@ -288,24 +292,29 @@ def _last(shot: RenderedFiles) -> dict[str, Image]:
 def _is_in_camera_space(shot: RenderedFiles, images: Mapping[str, Image]) -> bool:
     """Whether the camera that sees the positions of a frame is their origin."""
     known = hit(images, ~nothing_hit(images["depth"]) if "depth" in images else None)
-    found = fit_camera(images["position"].astype(np.float64), known)
+    found = fit_camera(images["position"], known)
     distance = np.linalg.norm(images["position"][known], axis=-1)
     return found is not None and bool(np.linalg.norm(found.eye) < _ORIGIN * np.median(distance))
 
 
-def _motion(shot: RenderedFiles) -> tuple[Convention, str]:
-    """The convention of the motion, by comparing neighbouring frames; motion that is none goes."""
+def _motion(shot: RenderedFiles, first: Mapping[str, Image]) -> tuple[Convention, str]:
+    """The convention of the motion, by comparing neighbouring frames; motion that is none goes.
+
+    Args:
+        shot: the files.
+        first: all of its first frame.
+    """
     layer = shot.choice.layers["motion"]
     given = _MOTION.get(layer.title.lower(), USUAL_MOTION)
     kept = {"albedo", "normal"} & set(shot.choice.layers) or {"color"}
     pairs, seen_elsewhere = [], []
     following = [(a, b) for a, b in pairwise(shot.numbers) if b == a + 1][:MOTION_PAIRS]
+    names = kept | {"motion"} | ({"position", "depth"} & set(shot.choice.layers))
+    wanted = {name: shot.choice.layers[name] for name in names}
+    last, images = shot.numbers[0], first
     for before, now in following:
-        wanted = {
-            name: shot.choice.layers[name]
-            for name in kept | {"motion"} | ({"position", "depth"} & set(shot.choice.layers))
-        }
-        images, previous = (shot.read(number, wanted) for number in (now, before))
+        previous = images if last == before else shot.read(before, wanted)
+        last, images = now, shot.read(now, wanted)
         elsewhere = _seen_elsewhere(shot, (before, previous), (now, images))
         if elsewhere is not None:
             seen_elsewhere.append((images["motion"], elsewhere))
@@ -338,7 +347,7 @@ def _seen_elsewhere(
     matrix, known = shot.camera(*before, seens[0]), hit(now[1], seens[1])
     if matrix is None or not known.any():
         return None
-    return motion_to(matrix, now[1]["position"].astype(np.float64), known)
+    return motion_to(matrix, now[1]["position"], known)
 
 
 def _span(values: Image) -> str:
