@@ -157,7 +157,7 @@ def denoise_sequence(
                 on_output(frame, output)
                 output = output._replace(stages={})
             seen, before = _thumbnail(frame), seen
-            if _finds_nothing(denoiser.report) and _alike(seen, before):
+            if _finds_nothing(denoiser.report, frame) and _alike(seen, before):
                 report.alike.append(number)
             del frame
             start = time.perf_counter()
@@ -266,8 +266,10 @@ def _thumbnail(frame: Frame) -> Tensor:
     return F.adaptive_avg_pool2d(shown, (min(16, frame.size[0]), min(16, frame.size[1])))
 
 
-def _finds_nothing(done: FrameReport) -> bool:
-    return done.history is not None and done.history < _MOST
+def _finds_nothing(done: FrameReport, frame: Frame) -> bool:
+    """Whether most pixels that show something have no history. Where nothing is hit, there may be none."""
+    hit = frame.color.amax(1) > 0 if frame.depth is None else frame.depth.isfinite()
+    return done.history is not None and done.history < _MOST * float(hit.float().mean())
 
 
 def _alike(one: Tensor, other: Tensor | None) -> bool:

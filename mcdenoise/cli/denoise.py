@@ -88,7 +88,7 @@ def denoise(
             slowest) that needs no more milliseconds a frame on this machine, measured once and without files.
         max_error: take the fastest one with an SMAPE that is no larger.
         results: folder of a finished benchmark to take errors from; those of the sequence's references by default.
-        preview: write OUT/preview/denoisedN.png too, on the sRGB curve, and OUT/preview.mp4 of several frames.
+        preview: write a PNG of each file to OUT/preview too, on the sRGB curve, and OUT/preview.mp4 of several frames.
         preview_fps: frames per second of that video.
         preview_exposure: in stops; by default the first frame decides for all: its typical radiance is middle grey.
         json: write the run times to this file too.
@@ -107,6 +107,8 @@ def denoise(
         with_albedo=color_with_albedo,
         lights=layers,
     )
+    if output_layer is not None:
+        opened.check_output_layer(output_layer)
     if alpha and "alpha" not in opened.buffers:
         raise InputError(f"--alpha: expected an alpha to denoise, found none in {opened.root}; leave the option out")
     shown = None

@@ -75,4 +75,7 @@ def print_sequence(sequence: Sequence) -> None:
     print_rows([{"buffer": row.buffer, "taken from": row.source, "read as": row.reading} for row in sequence.table])
     if sequence.unused:
         print(f"not used: {printable(', '.join(sequence.unused))}")
+    if sequence.unknown:
+        names = printable(", ".join(sequence.unknown))
+        print(f"unknown: {names}; --map BUFFER=LAYER or --layers LAYER takes them")
     warn(sequence.warnings)

@@ -46,7 +46,7 @@ _LARGEST_PARTS, _LARGEST_CHANNELS = 1024, 4096
 # cost a frame of 60 channels twice the time, and hundreds of megabytes; fewer would decode a chunk again.
 _ROWS = {"none": 16, "rle": 16, "zips": 16, "zip": 16, "pxr24": 16, "piz": 32, "b44": 32, "b44a": 32, "dwaa": 32}
 _MOST_ROWS = 256
-_EXR = {suffix for suffix, name in FORMATS.items() if name == "openexr"}
+EXR_SUFFIXES = {suffix for suffix, name in FORMATS.items() if name == "openexr"}
 _PNG = b"\x89PNG\r\n\x1a\n"
 _INTEGERS = {"uint", "int"}
 # Chroma of an image that is stored as luminance and chroma: without its luminance no color, and subsampled mostly.
@@ -156,7 +156,7 @@ def _read(
     height, width = part.size
     try:
         spec = file.spec(index)
-        if spec.tile_width or path.suffix.lower() not in _EXR:
+        if spec.tile_width or path.suffix.lower() not in EXR_SUFFIXES:
             pixels = file.read_image(index, 0, first, end, oiio.FLOAT)
             found = None if pixels is None else np.asarray(pixels).reshape(height, width, -1)[rows][..., picked]
         else:

@@ -14,6 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from mcdenoise.data.exr import Image, Metadata
+from mcdenoise.data.images import FORMATS
 from mcdenoise.data.readers.bmfr import BmfrFolder, find_frames, is_bmfr, open_bmfr
 from mcdenoise.data.readers.choice import parse_mapping
 from mcdenoise.data.readers.files import RenderedFiles
@@ -47,6 +48,7 @@ class Sequence:
         table: what each buffer was taken from.
         warnings: what is probably wrong, a line each.
         unused: files and layers that look like buffers and are not used.
+        unknown: layers with names that say nothing.
     """
 
     root: Path
@@ -61,6 +63,7 @@ class Sequence:
     table: Sequential[Row] = field(repr=False)
     warnings: Sequential[str]
     unused: Sequential[str] = field(repr=False)
+    unknown: Sequential[str] = field(repr=False)
     _source: BmfrFolder | NoisebaseFiles | RenderedFiles = field(repr=False)
 
     def __len__(self) -> int:
@@ -129,6 +132,19 @@ class Sequence:
         return self._source.metadata(number)
 
     @_any_values
+    def check_output_layer(self, name: str) -> None:
+        """See that a layer of this name can be added.
+
+        Raises:
+            InputError: it cannot: the name is no word, the files have a layer of it already, or they have no layers.
+        """
+        if not isinstance(self._source, RenderedFiles):
+            raise InputError(
+                f"{self.root}: expected files with layers to add '{name}' to, found the {self.layout} layout; "
+                "leave out --output-layer: the files stay as they are"
+            )
+        self._source.check_output_layer(name)
+
     def write(
         self,
         out: Path,
@@ -161,6 +177,8 @@ class Sequence:
             InputError: the file cannot be written.
         """
         self._check(number)
+        if output_layer is not None:
+            self.check_output_layer(output_layer)
         return self._source.write(
             out, number, image, alpha=alpha, lights=lights, output_layer=output_layer, full_float=full_float
         )
@@ -218,7 +236,11 @@ def open_sequence(
     else:
         paths = find_files([folder] if folder is not None else given)
         if not paths:
-            raise InputError(f"{where}: expected images that a renderer wrote, found none; check the path")
+            others = ", ".join(sorted({each.suffix for each in given[0].glob("*.*")})[:8]) if given[0].is_dir() else ""
+            raise InputError(
+                f"{where}: expected images that a renderer wrote ({', '.join(FORMATS)}), found "
+                f"{f'only {others}' if others else 'none'}; check the path"
+            )
         groups, layout = group_files(paths)
         source = open_files(
             groups,
@@ -325,5 +347,6 @@ def _wrap(root: Path, layout: str, source: BmfrFolder | NoisebaseFiles | Rendere
         table=source.table,
         warnings=[*gaps, *source.warnings],
         unused=source.unused,
+        unknown=source.unknown if isinstance(source, RenderedFiles) else (),
         _source=source,
     )

@@ -171,11 +171,6 @@ class BmfrFolder:
         full_float: bool = False,
     ) -> Path:
         """Write ``denoisedN.exr``; see :meth:`mcdenoise.data.Sequence.write`. There is neither alpha nor a layer."""
-        if output_layer is not None:
-            raise InputError(
-                f"{self.path}: expected files with layers to add '{output_layer}' to, found one file a buffer; "
-                "leave out --output-layer: the color files stay as they are"
-            )
         source = self.files["color"][number]
         target = out / f"denoised{source.name.removeprefix(_STEMS['color'])}"
         names = read_exr_header(source).channels

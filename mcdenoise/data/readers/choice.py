@@ -29,12 +29,14 @@ class Choice:
         reasons: why, where it is not the name that says so.
         written: the layers that the result replaces: mostly that of the color, and those that are equal to it.
         unused: layers that look like buffers and are not used.
+        unknown: layers with names that say nothing.
     """
 
     layers: dict[str, Layer] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
     written: list[Layer] = field(default_factory=list)
     unused: list[Layer] = field(default_factory=list)
+    unknown: list[Layer] = field(default_factory=list)
 
 
 # Some rows of the pixels of a layer in the first frame.
@@ -95,6 +97,7 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
     used = {*choice.layers.values(), *choice.written}
     known = [layer for own in candidates.values() for _, layer in own]
     choice.unused = [layer for layer in [*known, *filter(is_about_a_buffer, strangers)] if layer not in used]
+    choice.unknown = [layer for layer in strangers if layer not in used and layer not in choice.unused]
     return choice
 
 
@@ -148,10 +151,10 @@ def _color(
     least = min(rank for rank, _ in candidates)
     best = [layer for rank, layer in candidates if rank == least]
     if len(best) > 1:
-        raise InputError(
-            f"{where}: expected one layer of noisy radiance, found {', '.join(map(str, best[:8]))}; "
-            f"choose with --map color={best[0].name or best[0]}, or give only the files of one shot"
-        )
+        alike = len({str(layer) for layer in best}) < len(best)
+        advice = "give only the files of one shot" if alike else f"choose with --map color={best[0].name or best[0]}"
+        found = ", ".join(layer.place for layer in best[:8])
+        raise InputError(f"{where}: expected one layer of noisy radiance, found {found}; {advice}")
     return best[0]
 
 

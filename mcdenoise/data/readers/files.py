@@ -14,12 +14,12 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import Array, CameraMatrices
 from mcdenoise.data.exr import Image, Mask, Metadata
-from mcdenoise.data.images import Part, read_channels, read_image_header
+from mcdenoise.data.images import EXR_SUFFIXES, Part, read_channels, read_image_header
 from mcdenoise.data.readers.cameras import convert, fit_camera
 from mcdenoise.data.readers.choice import Choice
 from mcdenoise.data.readers.layers import Layer
-from mcdenoise.data.readers.lights import Light, keeps, kept_together, stored
-from mcdenoise.data.readers.names import FileGroup, pattern_of
+from mcdenoise.data.readers.lights import Light, is_light, keeps, kept_together, stored
+from mcdenoise.data.readers.names import FileGroup
 from mcdenoise.data.readers.rewrite import write_like
 from mcdenoise.data.readers.transfer import decode
 from mcdenoise.data.readers.values import USUAL_MOTION, Convention, Row, nothing_hit
@@ -96,7 +96,13 @@ class RenderedFiles:
     @property
     def unused(self) -> list[str]:
         """Layers that look like buffers and are not used."""
-        return [self.named(layer) for layer in self.choice.unused]
+        return [layer.place for layer in self.choice.unused]
+
+    @property
+    def unknown(self) -> list[str]:
+        """Layers with names that say nothing, and that nobody has asked for."""
+        lit = {layer for light in self.lights.values() for layer in light.layers}
+        return [layer.place for layer in self.choice.unknown if layer not in lit and not is_light(layer)]
 
     @property
     def reference_numbers(self) -> list[int]:
@@ -126,6 +132,21 @@ class RenderedFiles:
             for name, own in self.lights.items()
         }
         return self._as_frame(number, images, lights)
+
+    def check_output_layer(self, name: str) -> None:
+        """See :meth:`mcdenoise.data.Sequence.check_output_layer`."""
+        layer = self.choice.written[0]
+        path = self.file(layer, self.numbers[0])
+        if path.suffix.lower() not in EXR_SUFFIXES:
+            raise InputError(f"{path}: expected an EXR to add a layer to, found '{path.suffix}'; replace its picture")
+        if not name.strip() or "." in name or not name.isprintable():
+            raise InputError(f"--output-layer: expected a name without dots, found {name!r}")
+        prefix = ".".join((*layer.family, name))
+        taken = [each for each in self.part(layer).channels if each == prefix or each.startswith(f"{prefix}.")]
+        if taken:
+            raise InputError(
+                f"{path}: expected a new name for --output-layer, found '{taken[0]}' in the file; choose another"
+            )
 
     def write(
         self,
@@ -241,10 +262,6 @@ class RenderedFiles:
             return None
         found = fit_camera(images["position"], hit(images, seen))
         return None if found is None else found.matrix
-
-    def named(self, layer: Layer) -> str:
-        """A layer and its file, for people."""
-        return pattern_of(self.groups[layer.group]) + ("" if layer.anonymous else f" {layer}")
 
     def part(self, layer: Layer) -> Part:
         """The part that a layer is in, of the first file of its kind."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from mcdenoise.data.images import Part
 from mcdenoise.frame import BUFFERS
@@ -71,6 +71,7 @@ class Layer:
         channels: their names in the file: R, G, B, A or X, Y, Z, W.
         components: the last words of these, in small letters.
         anonymous: whether only the name of the file says what it is.
+        files: how the files are called, for people.
     """
 
     group: int
@@ -79,10 +80,16 @@ class Layer:
     channels: tuple[str, ...]
     components: tuple[str, ...]
     anonymous: bool = False
+    files: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         letters = "".join(each[0].upper() if each in _ORDER else each.upper() for each in self.components if each)
         return ".".join(filter(None, (self.name, letters))) or self.channels[0]
+
+    @property
+    def place(self) -> str:
+        """Its files and, unless these alone say what it is, itself; for people."""
+        return self.files if self.anonymous and self.files else f"{self.files} {self}".strip()
 
     @property
     def title(self) -> str:

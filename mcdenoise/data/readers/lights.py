@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 
 import numpy as np
 
@@ -91,6 +92,12 @@ def kept_together(radiances: Mapping[str, Image], kept: Mapping[str, Mask | bool
     return {name: (radiance * scale).astype(np.float32) for name, radiance in held.items()}
 
 
+def is_light(layer: Layer) -> bool:
+    """Whether a layer is known as light, or as a color that light is divided by, or as none: mattes of objects."""
+    colors, mattes = set(_DIVIDED.values()), ("Crypto", "Debug", "Index", "Material Index", "Object Index")
+    return layer.title in _ADDED | colors or layer.title.startswith(("Combined_", *mattes))
+
+
 def find_lights(where: str, layers: Sequence[Layer], color: Layer, names: Sequence[str]) -> Mapping[str, Light]:
     """The layers of light that somebody asks for.
 
@@ -98,26 +105,32 @@ def find_lights(where: str, layers: Sequence[Layer], color: Layer, names: Sequen
         where: what the layers are of, for messages.
         layers: all of a frame.
         color: that of the radiance; of several view layers, its own is meant.
-        names: of layers, or ``all`` for those that are known to add up.
+        names: of layers, also as patterns such as ``Combined_*``; ``all`` for those that are known to add up.
 
     Raises:
         InputError: there is no such layer, or it has no three channels.
     """
-    own = [layer for layer in layers if layer.family == color.family or layer.anonymous]
-    if list(names) == [ALL]:
-        names = [layer.name for layer in own if layer.title in _ADDED and len(layer.channels) >= 3]
-        if not names:
-            raise InputError(
-                f"{where}: expected layers of light for --layers all, found none that are known; name them"
-            )
-    lights: dict[str, Light] = {}
+    own = [layer for layer in layers if (layer.family == color.family or layer.anonymous) and layer != color]
+    expanded: list[str] = []
     for name in names:
+        known = [layer for layer in own if layer.is_color and recognise(layer) is None]
+        if name == ALL:
+            expanded += [layer.name for layer in known if layer.title in _ADDED]
+        elif any(mark in name for mark in "*?["):
+            expanded += [layer.name for layer in known if fnmatchcase(layer.title, name)]
+        else:
+            expanded.append(name)
+            continue
+        if not expanded:
+            raise InputError(f"{where}: expected layers of light for --layers {name}, found none; name them")
+    lights: dict[str, Light] = {}
+    for name in expanded:
         found = named(own, name) or named(layers, name)
         if len(found) != 1 or not found[0].is_color or found[0] == color:
-            pictures = ", ".join(str(layer) for layer in layers if layer.is_color and recognise(layer) is None)
+            pictures = ", ".join(str(layer) for layer in own if layer.title in _ADDED) or "the others: none is known"
             raise InputError(
                 f"{where}: expected one layer of light for --layers {name}, found "
-                f"{', '.join(map(str, found)) or 'none'}; choose among {pictures or 'none: there are no other layers'}"
+                f"{', '.join(map(str, found)) or 'none'}; choose among {pictures}"
             )
         (layer,) = found
         colors = [each for each in own if each.title == _DIVIDED.get(layer.title) and each.family == layer.family]

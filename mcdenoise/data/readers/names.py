@@ -16,7 +16,8 @@ from mcdenoise.errors import InputError
 # OIDN's training data: `name_0008spp.hdr.exr`, whose digits count samples.
 _OIDN = re.compile(r"(?P<name>.+?)_(?P<samples>[0-9]{1,9})spp\.(?P<buffer>hdr|ldr|alb|nrm|z)", re.IGNORECASE)
 _PLACEHOLDER = re.compile(r"#+|%0?[0-9]*d")
-_DIGITS = re.compile(r"([0-9]{1,18})")
+# A minus counts where no word goes before it: `shot_-0002`, and not `shot-0002`.
+_DIGITS = re.compile(r"((?:(?<=[_. ])-)?[0-9]{1,18})")
 
 
 @dataclass(frozen=True)

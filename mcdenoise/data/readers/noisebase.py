@@ -170,11 +170,6 @@ class NoisebaseFiles:
         :meth:`mcdenoise.data.Sequence.write`; there is neither alpha nor a layer.
         """
         source = self.files[number]
-        if output_layer is not None:
-            raise InputError(
-                f"{source}: expected files with layers to add '{output_layer}' to, found samples; leave out "
-                "--output-layer: the zips stay as they are"
-            )
         target = out / (f"{source.stem}_{number:04d}.exr" if self.axis else f"{source.stem}.exr")
         write_exr(target, image, ["R", "G", "B"], half=not full_float)
         return target

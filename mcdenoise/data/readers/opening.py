@@ -64,7 +64,11 @@ def open_files(
         InputError: the files do not tell what they are, do not fit together, or cannot be read.
     """
     headers = [read_image_header(next(iter(group.files.values()))) for group in groups]
-    layers = [layer for i, header in enumerate(headers) for layer in layers_of(i, groups[i].label, header.parts)]
+    layers = [
+        replace(layer, files=pattern_of(group))
+        for i, (group, header) in enumerate(zip(groups, headers, strict=True))
+        for layer in layers_of(i, group.label, header.parts)
+    ]
 
     def read_first(layer: Layer, rows: slice) -> Image:
         path = next(iter(groups[layer.group].files.values()))
@@ -221,8 +225,11 @@ def _look(shot: RenderedFiles, color_has_albedo: bool | None) -> None:
         readings["motion"].append(said)
     for name, words in readings.items():
         layer = chosen.get(name)
-        source = shot.named(layer) if layer else MATRICES if shot.cameras else "the positions"
+        source = layer.place if layer else MATRICES if shot.cameras else "the positions"
         shot.table.append(Row(name, source, "; ".join(words)))
+    for light in shot.lights.values():
+        layer, *colors = light.layers
+        shot.table.append(Row("layer", layer.place, f"times {colors[0]}" if colors else "light"))
 
 
 def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list[str], stated: bool | None) -> None:

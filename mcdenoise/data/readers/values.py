@@ -33,6 +33,9 @@ _BETTER = 0.85
 _EXACT = 0.5
 # And motion says something where it matches so much better than none.
 _TELLING = 0.98
+# It contradicts the frames where it is so much worse than none, and moves so many pixels this far: less blurs what it
+# compares, and is no evidence.
+_CONTRADICTS, _FAR = 1.1, 2.0
 # How many pairs of frames are looked at.
 MOTION_PAIRS = 3
 
@@ -292,7 +295,8 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
     better = errors[best] < _BETTER * errors[given]
     # No better than none, or hardly: that says something only where the given one is far worse.
     if errors[best] > at_rest or (errors[best] > _TELLING * at_rest and not better):
-        contradicts = errors[best] > at_rest and moving > _LEAST_MOVING
+        far = sum(int((np.abs(given.apply(m)).max(-1) > _FAR).sum()) for *_, m in pairs)
+        contradicts = errors[best] > _CONTRADICTS * at_rest and far > _LEAST_MOVING
         return (None, True) if contradicts else (given, False)
     # What hardly moves as it is given, and leads to what looks alike in another unit, is in that unit.
     rescaled = moving < _LEAST_MOVING and abs(best.scale_x) != abs(given.scale_x)
