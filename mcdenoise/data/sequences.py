@@ -44,6 +44,7 @@ class Sequence:
         table: what each buffer was taken from.
         warnings: what is probably wrong, a line each.
         unused: files and layers that look like buffers and are not used.
+        lights: names of the layers of light that every frame has as ``layers``.
     """
 
     root: Path
@@ -58,6 +59,7 @@ class Sequence:
     table: Sequential[Row] = field(repr=False)
     warnings: Sequential[str]
     unused: Sequential[str] = field(repr=False)
+    lights: Sequential[str]
     _source: BmfrFolder | NoisebaseFiles | RenderedFiles = field(repr=False)
 
     def __len__(self) -> int:
@@ -318,5 +320,6 @@ def _wrap(root: Path, layout: str, source: BmfrFolder | NoisebaseFiles | Rendere
         table=source.table,
         warnings=[*gaps, *source.warnings],
         unused=source.unused,
+        lights=list(source.lights) if isinstance(source, RenderedFiles) else [],
         _source=source,
     )
