@@ -206,7 +206,7 @@ class _Times(NamedTuple):
 def _read_frames(sequence: Sequence, denoiser: Denoiser, *, reference: bool) -> Iterator[tuple[int, Frame, _Times]]:
     """Each frame, and meanwhile the next one is read, if there is room for it. Resets the denoiser."""
     buffers = sequence.buffers - (set() if reference else {"reference"})
-    denoiser.reset(buffers, len(sequence), sequence.size)
+    denoiser.reset(buffers, len(sequence), sequence.size, len(sequence.lights))
     denoiser.frames_stay = True
     streaming = denoiser.has_history(buffers)
 

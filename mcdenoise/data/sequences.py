@@ -49,6 +49,7 @@ class Sequence:
         warnings: what is probably wrong, a line each.
         unused: files and layers that look like buffers and are not used.
         unknown: layers with names that say nothing.
+        lights: names of the layers of light that every frame has as ``layers``.
     """
 
     root: Path
@@ -64,6 +65,7 @@ class Sequence:
     warnings: Sequential[str]
     unused: Sequential[str] = field(repr=False)
     unknown: Sequential[str] = field(repr=False)
+    lights: Sequential[str]
     _source: BmfrFolder | NoisebaseFiles | RenderedFiles = field(repr=False)
 
     def __len__(self) -> int:
@@ -348,5 +350,6 @@ def _wrap(root: Path, layout: str, source: BmfrFolder | NoisebaseFiles | Rendere
         warnings=[*gaps, *source.warnings],
         unused=source.unused,
         unknown=source.unknown if isinstance(source, RenderedFiles) else (),
+        lights=list(source.lights) if isinstance(source, RenderedFiles) else [],
         _source=source,
     )

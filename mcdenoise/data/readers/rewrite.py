@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
-from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -76,8 +74,9 @@ def _write_exr(
     # Reading and writing raise whatever the library below has to say.
     try:
         expected = read_image_header(source).parts
-        # A part that it cannot read it leaves out, and prints that.
-        with readable(source, target.with_suffix(".copy.exr")) as (path, strange), redirect_stdout(io.StringIO()):
+        # A part that it cannot read it leaves out, and prints that: to keep it quiet would be to take from all other
+        # threads what they print meanwhile.
+        with readable(source, target.with_suffix(".copy.exr")) as (path, strange):
             file = OpenEXR.File(str(path), separate_channels=True)
         whole = len(file.parts) == len(expected) and all(map(_is_whole, file.parts, expected))
     except _LIBRARY_ERRORS as error:

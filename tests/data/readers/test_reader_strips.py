@@ -49,5 +49,7 @@ def test_light_of_display_values_is_made_linear_like_the_color(save: Callable[..
     codes = np.random.default_rng(0).integers(1, 255, (24, 32, 3)) / 255
     for name in ("color", "emission"):
         save(tmp_path / f"{name}.png", dict(zip("RGB", codes.transpose(2, 0, 1), strict=True)), "uint8")
-    frame = open_sequence(tmp_path, lights=("emission",)).frame(0)
+    opened = open_sequence(tmp_path, lights=("emission",))
+    assert list(opened.lights) == ["emission"]
+    frame = opened.frame(0)
     np.testing.assert_allclose(frame.layers["emission"].numpy(), frame.color.numpy(), rtol=1e-5)

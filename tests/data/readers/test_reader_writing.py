@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -196,6 +197,25 @@ def test_a_texture_is_no_frame(tmp_path: Path, refused: Callable[..., str]) -> N
     path = tmp_path / "texture.exr"
     assert oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, picture, str(path), oiio.ImageSpec())
     assert "found a texture of several resolutions" in refused(open_sequence, path)
+
+
+def test_other_threads_print_while_a_file_is_written(
+    save: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = save(tmp_path / "a.exr", dict(zip("RGB", noise(3, 1024, 1024), strict=True)), "half")
+    writers = [
+        threading.Thread(target=write_like, args=(source, tmp_path / f"{i}.exr", {}), kwargs={"added": {}})
+        for i in range(2)
+    ]
+    shown = sys.stdout
+    for writer in writers:
+        writer.start()
+    count = 0
+    while any(writer.is_alive() for writer in writers):
+        print("here")
+        count += 1
+    assert sys.stdout is shown
+    assert capsys.readouterr().out.count("here") == count
 
 
 def test_full_floats_are_for_what_is_replaced(save: Callable[..., Path], tmp_path: Path) -> None:
