@@ -165,7 +165,9 @@ def run(sequence: Path, out: Path, *options: str) -> int:
 def test_the_command_line(small_sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert run(small_sequence, out, "--preview", "--preview-fps", "12", "--preview-exposure", "-1", "--full-float") == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"preview: {out / 'preview.mp4'}"
+    preview, results = capsys.readouterr().out.splitlines()[-2:]
+    assert preview == f"preview: {out / 'preview.mp4'}"
+    assert results.endswith(f"{out / 'denoised0.exr'} to denoised3.exr")
     assert len(frames_of(out / "preview.mp4")) == 4
     for number in range(4):
         radiance = read_exr(out / f"denoised{number}.exr")[0]

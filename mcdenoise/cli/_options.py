@@ -15,6 +15,7 @@ Json = Path | None
 Inputs = tyro.conf.Positional[
     Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT [INPUT ...]", help_behavior_hint="(required)")]
 ]
+Layers = Annotated[tuple[str, ...], tyro.conf.arg(metavar="LAYER [LAYER ...]", help_behavior_hint="")]
 Map = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="BUFFER=LAYER")]]
 # On or off, and off without a word: that needs no second option which says so.
 Flag = tyro.conf.FlagCreatePairsOff[bool]

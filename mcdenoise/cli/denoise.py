@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from mcdenoise.cli._options import Flag, Inputs, Json, Map, Out, check_threads
+from mcdenoise.cli._options import Flag, Inputs, Json, Layers, Map, Out, check_threads
 from mcdenoise.cli._output import print_times, progress_bar, stages, warn, write_json
 from mcdenoise.cli.inspect import open_inputs, print_sequence
 from mcdenoise.denoiser import Precision
@@ -35,8 +35,8 @@ def denoise(
     color_without_albedo: Flag = False,
     color_with_albedo: Flag = False,
     output_layer: str | None = None,
-    layers: tuple[str, ...] = (),
-    alpha: bool = False,
+    layers: Layers = (),
+    alpha: Flag = False,
     alpha_min: float | None = None,
     anti_lag: bool = True,
     full_float: bool = False,

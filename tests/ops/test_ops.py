@@ -274,7 +274,7 @@ REFUSED: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], type[Ex
     (ops.clamp_fireflies, (THREE,), {"limit": float("nan")}, ValueError, "limit: expected above 0, found nan"),
     (ops.clamp_fireflies, (THREE,), {"kernel_size": 4}, ValueError, "kernel_size: expected odd and at least 3"),
     (ops.ClampFireflies, (), {"kernel_size": 1}, ValueError, "kernel_size: expected odd and at least 3, found 1"),
-    (ops.atrous, (ONE, ONE), {}, ValueError, "light: expected shape (B, 3, H, W), found (1, 1, 4, 5)"),
+    (ops.atrous, (ONE, ONE), {}, ValueError, "light: expected at least 3 channels, found 1"),
     (ops.atrous, (THREE, THREE), {}, ValueError, "variance: expected shape (B, 1, H, W), found (1, 3, 4, 5)"),
     (ops.atrous, (THREE, ONE, ONE), {}, ValueError, "normal: expected shape (B, 3, H, W), found (1, 1, 4, 5)"),
     (ops.atrous, (THREE, ONE, None, ONE.int()), {}, TypeError, "depth: expected a floating-point dtype"),

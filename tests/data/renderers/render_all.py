@@ -1,6 +1,6 @@
 """Make the files of this folder again: every command that rendered one, and nothing else.
 
-    python make.py --blender PYTHON --blender5 PYTHON --mitsuba PYTHON --luxcore PYTHON
+    python render_all.py --blender PYTHON --blender5 PYTHON --mitsuba PYTHON --luxcore PYTHON
 
 Each option names a Python interpreter that can import ``bpy`` 4.5, ``bpy`` 5.0, ``mitsuba`` 3 or ``pyluxcore`` 2.11;
 what has none is not made. The tests need no renderer: what they wrote lies here. ``README.md`` tells what is in it.
