@@ -175,7 +175,7 @@ def test_the_command_line(small_sequence: Path, tmp_path: Path, capsys: pytest.C
         assert np.abs(shown(out, f"denoised{number}").ravel() - np.array(expected)).max() <= 1
     assert "show" in json.loads((out / "denoise.json").read_text())["beside"]
     assert run(small_sequence, out, "--preview", "--frames", "2") == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"preview: {out / 'preview' / 'denoised2.png'}"
+    assert capsys.readouterr().out.splitlines()[-2] == f"preview: {out / 'preview' / 'denoised2.png'}"
     assert not (out / "preview.mp4").exists()
 
 

@@ -72,7 +72,7 @@ def denoise(
         color_with_albedo: it was not; by default its values tell, and if they do not, it was not.
         output_layer: add the result as a layer of this name, and replace nothing.
         layers: layers of light to denoise with it, by the same kernels, so that they still add up: names such as
-            DiffDir, or all.
+            DiffDir or Combined_*, or all.
         alpha: denoise the alpha too, by the same kernels; else it stays as it was.
         alpha_min: smallest weight of the current frame in the accumulation, in (0, 1]; the model's own by default.
         anti_lag: give up the history where the light has changed.

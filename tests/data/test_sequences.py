@@ -322,7 +322,7 @@ def test_damaged_pixels_are_refused_when_the_frame_is_read(small_sequence: Path)
 def test_folder_that_is_no_sequence(tmp_path: Path) -> None:
     assert "no such folder" in refused(lambda: open_sequence(tmp_path / "missing"))
     (tmp_path / "notes.txt").write_text("color0.exr")
-    assert "expected images that a renderer wrote, found none" in refused(lambda: open_sequence(tmp_path))
+    assert "found only .txt; check the path" in refused(lambda: open_sequence(tmp_path))
     assert "found '.txt'" in refused(lambda: open_sequence(tmp_path / "notes.txt"))
 
 

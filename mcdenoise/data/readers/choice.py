@@ -152,9 +152,10 @@ def _color(
     best = [layer for rank, layer in candidates if rank == least]
     if len(best) > 1:
         alike = len({str(layer) for layer in best}) < len(best)
-        advice = "give only the files of one shot" if alike else f"choose with --map color={best[0].name or best[0]}"
+        ways = [] if alike else [f"choose with --map color={best[0].name or best[0]}"]
+        ways += ["give only the files of one shot"] if len({layer.group for layer in best}) > 1 else []
         found = ", ".join(layer.place for layer in best[:8])
-        raise InputError(f"{where}: expected one layer of noisy radiance, found {found}; {advice}")
+        raise InputError(f"{where}: expected one layer of noisy radiance, found {found}; {', or '.join(ways)}")
     return best[0]
 
 

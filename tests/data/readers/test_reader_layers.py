@@ -325,7 +325,7 @@ def test_each_eye_is_an_image_of_its_own(
 ) -> None:
     path = rendered / folder / "shot_0001.exr"
     message = refused(open_sequence, path)
-    assert "ViewLayer.Combined.left.RGBA, ViewLayer.Combined.right.RGBA" in message
+    assert "ViewLayer.Combined.left.RGBA, shot_0001.exr ViewLayer.Combined.right.RGBA; choose" in message
     assert "choose with --map color=ViewLayer.Combined.left" in message
     images = {}
     for eye in ("left", "right"):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mcdenoise.data import open_sequence
+from mcdenoise.data import open_sequence, write_exr
 from mcdenoise.data.readers.names import find_files, group_files, pattern_of
 
 SIZE = (8, 12)
@@ -200,7 +200,7 @@ def test_two_shots_are_refused_with_what_decides(
 ) -> None:
     image(*[f"all/shot{shot:02d}_{number:04d}.exr" for shot in (1, 2) for number in (1, 2)])
     message = refused(open_sequence, tmp_path / "all")
-    assert "found shot01.RGB, shot02.RGB" in message
+    assert "found shot01_####.exr, shot02_####.exr; choose" in message
     assert "choose with --map color=shot01, or give only the files of one shot" in message
     for sequence in (
         open_sequence(tmp_path / "all", mapping=["color=shot02"]),
@@ -319,3 +319,20 @@ def test_files_and_frames_of_other_sizes_are_told(
     save(tmp_path / "s" / "albedo_2.exr", dict.fromkeys("RGBX", np.ones(SIZE)))
     save(tmp_path / "s" / "albedo_1.exr", dict.fromkeys("RGB", np.ones((9, 12))))
     assert "albedo_1.exr: expected 'albedo' in the pixels of the color" in refused(open_sequence, tmp_path / "s")
+
+
+def test_negative_numbers_count_where_no_word_goes_before(image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    image(*[f"all/shot_{number}.exr" for number in ("-0002", "-0001", "0000", "0001")])
+    assert open_sequence(tmp_path / "all").numbers == [-2, -1, 0, 1]
+    image(*[f"dash/shot-{number:04d}.exr" for number in (1, 2)])
+    assert open_sequence(tmp_path / "dash").numbers == [1, 2]
+
+
+def test_two_shots_of_the_same_layers_are_told_by_their_files(tmp_path: Path, refused: Callable[..., str]) -> None:
+    pixels = np.ones((8, 8, 6), np.float32)
+    for shot in ("one", "other"):
+        write_exr(
+            tmp_path / f"{shot}_0001.exr", pixels, [f"View.{n}.{c}" for n in ("Combined", "DiffCol") for c in "RGB"]
+        )
+    message = refused(open_sequence, tmp_path)
+    assert "found one_0001.exr View.Combined.RGB, other_0001.exr View.Combined.RGB; give only the files of" in message

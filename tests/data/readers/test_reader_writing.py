@@ -128,8 +128,14 @@ def test_a_layer_that_is_there_already_is_not_added(
 ) -> None:
     sequence = open_sequence(rendered / "blender")
     image = rainbow(*sequence.size)
-    message = refused(sequence.write, tmp_path, 1, image, output_layer="Combined")
-    assert "it has a channel 'ViewLayer.Combined.R' already" in message
+    for name, found in (
+        ("Combined", "'ViewLayer.Combined.R'"),
+        ("Depth", "'ViewLayer.Depth.Z'"),
+        ("", "''"),
+        ("a.b", "'a.b'"),
+    ):
+        assert f"found {found}" in refused(sequence.write, tmp_path, 1, image, output_layer=name)
+        assert f"found {found}" in refused(sequence.check_output_layer, name)
     assert list(tmp_path.iterdir()) == []
 
 
