@@ -64,8 +64,8 @@ class MitsubaDenoiser:
             looked at, as by OptiX.
         normals: whether shading normals will be given; unlike OptiX, also without albedo.
         temporal: whether calls are the frames of a shot, with flow; else each is a still.
-        denoise_alpha: whether alpha, the second or fourth channel, is denoised, too: as if it were the color of a white
-            surface, which takes as long again. Else it stays as it is.
+        denoise_alpha: whether alpha, the second or fourth channel, is denoised, too, with the kernels of the color;
+            else, and by a method without kernels, it stays as it is.
         model: as of :class:`mcdenoise.Denoiser`.
         device: of torch. By default a GPU for the CUDA variants, where torch has one, else the CPU.
         precision: as of :class:`mcdenoise.Denoiser`.
@@ -275,19 +275,14 @@ class MitsubaDenoiser:
             features["normal"] = _planes(buffers["normals"]).clamp(-1, 1)
         if "flow" in buffers:
             features["motion"] = -_planes(buffers["flow"])
-        with_alpha = self._denoise_alpha and alpha.shape[1] > 0
-        if with_alpha:
-            # A second image of the batch: what is not covered by a surface is black, and the surface white.
-            color = torch.cat([color, alpha.expand(-1, 3, -1, -1)])
-            features = {
-                name: torch.cat([each, torch.ones_like(each) if name == "albedo" else each])
-                for name, each in features.items()
-            }
-        denoiser.differentiable = differentiable
-        image = denoiser(Frame(color, **features)).to(noisy.device)
-        if with_alpha:
-            alpha = image[1:].mean(1, keepdim=True).clamp(0, 1)
-        clean = image[:1] if colors == 3 else image[:1].mean(1, keepdim=True)
+        if alpha.shape[1]:
+            features["alpha"] = alpha.clamp(0, 1)
+        denoiser.differentiable, denoiser.alpha = differentiable, self._denoise_alpha
+        output = denoiser.output(Frame(color, **features), stages=False)
+        image = output.image.to(noisy.device)
+        if output.alpha is not None:
+            alpha = output.alpha.to(noisy.device)
+        clean = image if colors == 3 else image.mean(1, keepdim=True)
         return torch.cat([clean, alpha], 1)[0].permute(1, 2, 0).contiguous()
 
     def _checked(self, noisy: Tensor, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
