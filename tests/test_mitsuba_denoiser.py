@@ -156,7 +156,8 @@ def test_alpha_is_denoised_on_request(mi: Any) -> None:
     denoisers = [MitsubaDenoiser((WIDTH, HEIGHT), denoise_alpha=on, model=MODEL) for on in (False, True)]
     kept, denoised = (np.array(denoiser(mi.Bitmap(noisy))) for denoiser in denoisers)
     assert np.array_equal(kept[..., 3], noisy[..., 3])
-    np.testing.assert_array_equal(denoised[..., :3], kept[..., :3])
+    # Compiled for another number of channels, sums of 25 taps at three scales may round in another order.
+    np.testing.assert_allclose(denoised[..., :3], kept[..., :3], rtol=75 * 2**-23)
     assert denoised[..., 3].min() >= 0
     assert denoised[..., 3].max() <= 1
     assert denoised[..., 3].std() < 0.5 * noisy[..., 3].std()
