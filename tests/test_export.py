@@ -121,6 +121,7 @@ def mine(tmp_path: Path) -> str:
     return f"{path}:network"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
 def test_a_model_of_ones_own_is_exported_with_all_that_it_wears(mine: str, tmp_path: Path) -> None:
     model = create_model(mine)
