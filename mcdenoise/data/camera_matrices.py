@@ -100,6 +100,28 @@ def read_camera_matrices(path: Path) -> CameraMatrices:
     )
 
 
+def find_camera_matrices(folder: Path, last: int) -> CameraMatrices | None:
+    """Read the ``camera_matrices.h`` of a folder; ``None`` where there is none.
+
+    Args:
+        folder: of the frames.
+        last: number of the last frame that is used.
+
+    Raises:
+        InputError: as :func:`read_camera_matrices`; or there is no matrix for that frame.
+    """
+    path = folder / MATRICES
+    if not os.path.lexists(path):
+        return None
+    cameras = read_camera_matrices(path)
+    if len(cameras) <= last:
+        raise InputError(
+            f"{path}: expected a matrix for frame {last}, found {len(cameras)} (frames 0 to "
+            f"{len(cameras) - 1}); write all matrices, or choose fewer frames"
+        )
+    return cameras
+
+
 def write_camera_matrices(path: Path, cameras: CameraMatrices, comment: str = "") -> None:
     """Write a ``camera_matrices.h``, whole or not at all; numbers keep single precision.
 

@@ -233,8 +233,7 @@ def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], half: bool) ->
     for top in range(0, spec.height, _ROWS):
         pixels = np.ascontiguousarray(image[top : top + _ROWS], dtype=np.float32)
         if half:
-            # Rounding would turn a firefly into infinity, which spreads through every filter downstream; NaN stays NaN.
-            pixels = np.clip(pixels, -LARGEST_HALF, LARGEST_HALF)
+            pixels = within_half(pixels)
         written = written and file.write_scanlines(top, top + len(pixels), 0, pixels)
     reason = pending_error(file)
     if not file.close() or not written:
@@ -247,6 +246,15 @@ def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], half: bool) ->
     reason = pending_error(check)
     check.close()
     return "" if last is not None and not reason else f"incomplete: {reason}"
+
+
+def within_half(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Pixels that a half float can hold; NaN stays NaN.
+
+    Rounding would turn a firefly into infinity, which spreads through every filter downstream.
+    """
+    clipped: NDArray[Any] = np.clip(pixels, -LARGEST_HALF, LARGEST_HALF)
+    return clipped
 
 
 def pending_error(source: Any) -> str:

@@ -131,8 +131,8 @@ def read_channels(path: Path, wanted: Mapping[int, Sequence[str]], rows: slice =
         file.close()
 
 
-def read_picture(path: Path) -> tuple[oiio.ImageSpec, Image]:
-    """Read all channels of the first image of a file, and what says how it is stored.
+def read_picture(path: Path) -> tuple[oiio.ImageSpec, Part, Image]:
+    """Read all channels of the first image of a file, and what says how it is stored, to the library and to us.
 
     Not through ``oiio.ImageBuf``, which reads a PFM upside down.
 
@@ -142,7 +142,8 @@ def read_picture(path: Path) -> tuple[oiio.ImageSpec, Image]:
     file, header = _open(path)
     try:
         file.seek_subimage(0, 0)
-        return file.spec(), _read(path, file, 0, header.parts[0], header.parts[0].channels)
+        part = header.parts[0]
+        return file.spec(), part, _read(path, file, 0, part, part.channels)
     finally:
         file.close()
 

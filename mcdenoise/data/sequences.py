@@ -181,6 +181,9 @@ class Sequence:
         self._check(number)
         if output_layer is not None:
             self.check_output_layer(output_layer)
+        if not isinstance(self._source, RenderedFiles):
+            # There is neither alpha nor a layer.
+            return self._source.write(out, number, image, full_float=full_float)
         return self._source.write(
             out, number, image, alpha=alpha, lights=lights, output_layer=output_layer, full_float=full_float
         )

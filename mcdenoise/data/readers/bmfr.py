@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices, read_camera_matrices
+from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices, find_camera_matrices
 from mcdenoise.data.exr import (
     LARGEST_HALF,
     ExrHeader,
@@ -28,8 +28,8 @@ from mcdenoise.data.exr import (
     write_exr,
 )
 from mcdenoise.data.files import write_text
-from mcdenoise.data.images import FORMATS
 from mcdenoise.data.readers.cameras import convert, read_as
+from mcdenoise.data.readers.names import find_files
 from mcdenoise.data.readers.rewrite import write_like
 from mcdenoise.data.readers.values import (
     MOTION_PAIRS,
@@ -56,6 +56,7 @@ _STEMS = {
     "reference": "reference",
     "color": "color",
 }
+_KNOWN = re.compile(rf"({'|'.join(_STEMS.values())})[0-9]+\.exr")
 # What nobody else calls a buffer.
 _OWN_STEMS = {"shading_normal", "world_position"}
 _CHANNELS = {1: ["Y"], 2: ["X", "Y"], 3: ["R", "G", "B"]}
@@ -159,17 +160,7 @@ class BmfrFolder:
         """Read the reference of one frame that has one."""
         return self._read("reference", self.files["reference"][number])
 
-    def write(
-        self,
-        out: Path,
-        number: int,
-        image: Image,
-        *,
-        alpha: Image | None = None,
-        lights: Mapping[str, Image] | None = None,
-        output_layer: str | None = None,
-        full_float: bool = False,
-    ) -> Path:
+    def write(self, out: Path, number: int, image: Image, *, full_float: bool = False) -> Path:
         """Write ``denoisedN.exr``; see :meth:`mcdenoise.data.Sequence.write`. There is neither alpha nor a layer."""
         source = self.files["color"][number]
         target = out / f"denoised{source.name.removeprefix(_STEMS['color'])}"
@@ -207,13 +198,10 @@ def is_bmfr(path: Path) -> bool:
     with suppress(InputError):
         if len(read_exr_header(first).channels) != BUFFERS["color"].channels:
             return False
-    names = os.listdir(path)
-    if {_DESCRIPTION, MATRICES} & set(names):
+    if {_DESCRIPTION, MATRICES} & set(os.listdir(path)):
         return True
-    known = re.compile(rf"({'|'.join(_STEMS.values())})[0-9]+\.exr")
-    images = [name for name in names if Path(name).suffix.lower() in FORMATS and not name.startswith(".")]
-    stems = {found[1] for name in images if (found := known.fullmatch(name))}
-    return all(map(known.fullmatch, images)) and bool(stems & _OWN_STEMS or stems == {"color"})
+    stems = {_STEMS[name] for name, found in files.items() if found}
+    return not _others(path) and bool(stems & _OWN_STEMS or stems == {"color"})
 
 
 def realisation_folder(folder: Path, realisation: int) -> Path:
@@ -265,12 +253,7 @@ def open_bmfr(
                     f"{missing}: expected buffer '{name}' for every frame, found it for some; "
                     f"render it, or leave out all {_STEMS[name]} files"
                 )
-    cameras = read_camera_matrices(path / MATRICES) if os.path.lexists(path / MATRICES) else None
-    if cameras is not None and len(cameras) <= numbers[-1]:
-        raise InputError(
-            f"{path / MATRICES}: expected a matrix for frame {numbers[-1]}, found {len(cameras)} (frames 0 to "
-            f"{len(cameras) - 1}); write all matrices, or choose fewer frames"
-        )
+    cameras = find_camera_matrices(path, numbers[-1])
     more_colors = _find_realisations(path, numbers, first)
     own = {name: files[name] for name in used}
     stated = _color_has_albedo(path, "albedo" in used) if color_has_albedo is None else color_has_albedo
@@ -335,7 +318,7 @@ def _look(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
         motion=motion,
         table=rows,
         warnings=warnings,
-        unused=_unused(folder),
+        unused=_others(folder.path),
     )
 
 
@@ -354,14 +337,10 @@ def _pairs(folder: BmfrFolder) -> list[Pair]:
     ]
 
 
-def _unused(folder: BmfrFolder) -> list[str]:
-    """Images whose names say that they are buffers, and that the layout calls otherwise: `normal0.exr`."""
-    known = re.compile(rf"({'|'.join(_STEMS.values())})[0-9]+\.exr")
-    images = [name for name in sorted(os.listdir(folder.path)) if Path(name).suffix.lower() in FORMATS]
-    kinds = dict.fromkeys(
-        re.sub("[0-9]+", "#", name) for name in images if not known.fullmatch(name) and name[0] != "."
-    )
-    return list(kinds)
+def _others(path: Path) -> list[str]:
+    """Images that the layout does not know, such as `normal#.exr`, which it calls otherwise."""
+    names = [each.name for each in find_files([path]) if not _KNOWN.fullmatch(each.name)]
+    return list(dict.fromkeys(re.sub("[0-9]+", "#", name) for name in names))
 
 
 def _find_realisations(path: Path, numbers: list[int], first: ExrHeader) -> list[dict[int, Path]]:

@@ -159,23 +159,7 @@ class RenderedFiles:
         output_layer: str | None = None,
         full_float: bool = False,
     ) -> Path:
-        """Write the file of a frame as it was read, with the clean radiance in place of the noisy one.
-
-        Args:
-            out: folder to write to.
-            number: of the frame.
-            image: ``(H, W, 3)`` radiance.
-            alpha: ``(H, W, 1)``; that of the file by default.
-            lights: ``(H, W, 3)`` radiance of each of ``self.lights``.
-            output_layer: adds a layer of this name instead.
-            full_float: store what is replaced as 32-bit floats, whatever it was.
-
-        Returns:
-            The file.
-
-        Raises:
-            InputError: it cannot be written.
-        """
+        """Write the files of a frame as they were read, clean; see :meth:`mcdenoise.data.Sequence.write`."""
         layer = self.choice.written[0]
         files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
         added: dict[str, Image] = {}
@@ -220,7 +204,7 @@ class RenderedFiles:
         if color.shape[2] > 3:
             images.setdefault("alpha", np.clip(color[..., 3:4], 0, 1))
         images["color"] = _without_lossy_black(color[..., :3])
-        seen = ~nothing_hit(images["depth"]) if "depth" in images else None
+        seen = seen_of(images)
         if "albedo" in images:
             images["albedo"] = np.clip(np.nan_to_num(images["albedo"], nan=0, posinf=1, neginf=0), 0, 1)
             if not self.color_has_albedo:
@@ -322,6 +306,11 @@ def _without_lossy_black(radiance: Image) -> Image:
     """Radiance without what rounding and lossy compression leave below 0 where it was black."""
     clean: Image = np.where((radiance < 0) & (radiance > -_LOSSY), 0, radiance)
     return clean
+
+
+def seen_of(images: Mapping[str, Image]) -> Mask | None:
+    """``(H, W, 1)`` where the depth says that something was hit; ``None`` without one."""
+    return ~nothing_hit(images["depth"]) if "depth" in images else None
 
 
 def hit(images: Mapping[str, Image], seen: Mask | None) -> Mask:

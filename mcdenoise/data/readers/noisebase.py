@@ -153,17 +153,7 @@ class NoisebaseFiles:
             buffers["variance"] = _tensor(variance)
         return Frame(color=_tensor(color), **buffers)
 
-    def write(
-        self,
-        out: Path,
-        number: int,
-        image: Image,
-        *,
-        alpha: Image | None = None,
-        lights: Mapping[str, Image] | None = None,
-        output_layer: str | None = None,
-        full_float: bool = False,
-    ) -> Path:
+    def write(self, out: Path, number: int, image: Image, *, full_float: bool = False) -> Path:
         """Write an EXR of the name of the zip with R, G, B: the arrays are of samples, and no place for an image.
 
         Where one zip holds all frames, the number of the frame stands behind its name. See

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -12,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices, read_camera_matrices
-from mcdenoise.data.exr import Image, Metadata
+from mcdenoise.data.camera_matrices import MATRICES, Array, find_camera_matrices
+from mcdenoise.data.exr import Image, Mask, Metadata
 from mcdenoise.data.images import ImageHeader, Part, read_channels, read_image_header
-from mcdenoise.data.readers.cameras import fit_camera, motion_to, read_as
+from mcdenoise.data.readers.cameras import FittedCamera, fit_camera, motion_to, read_as
 from mcdenoise.data.readers.choice import choose
-from mcdenoise.data.readers.files import RenderedFiles, hit, world_to_camera
+from mcdenoise.data.readers.files import RenderedFiles, hit, seen_of, world_to_camera
 from mcdenoise.data.readers.layers import Layer, layers_of
 from mcdenoise.data.readers.lights import find_lights
 from mcdenoise.data.readers.names import FileGroup, pattern_of
@@ -80,7 +79,8 @@ def open_files(
     shot = RenderedFiles(groups, [header.parts for header in headers], numbers, choice, {})
     _check(shot)
     found = find_lights(where, layers, color, lights)
-    shot = replace(shot, lights=found, cameras=_cameras(shot))
+    folder = shot.file(color, numbers[0]).parent
+    shot = replace(shot, lights=found, cameras=find_camera_matrices(folder, numbers[-1]))
     _look(shot, color_has_albedo)
     return shot
 
@@ -175,19 +175,6 @@ def _window(part: Part) -> str:
     return f"{width} x {height} pixels" + (f" at {left}, {top}" if (top, left) != (0, 0) else "")
 
 
-def _cameras(shot: RenderedFiles) -> CameraMatrices | None:
-    path = shot.file(shot.choice.layers["color"], shot.numbers[0]).parent / MATRICES
-    if not os.path.lexists(path):
-        return None
-    cameras = read_camera_matrices(path)
-    if len(cameras) <= shot.numbers[-1]:
-        raise InputError(
-            f"{path}: expected a matrix for frame {shot.numbers[-1]}, found {len(cameras)} (frames 0 to "
-            f"{len(cameras) - 1}); write all matrices, or choose fewer frames"
-        )
-    return cameras
-
-
 def _look(shot: RenderedFiles, color_has_albedo: bool | None) -> None:
     """Read the first frame, and the next ones where there is motion, and decide what their values mean."""
     number, chosen = shot.numbers[0], dict(shot.choice.layers)
@@ -250,7 +237,7 @@ def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
 
 def _look_at_positions(shot: RenderedFiles, images: dict[str, Image], readings: dict[str, list[str]]) -> None:
     position = images["position"]
-    known = hit(images, ~nothing_hit(images["depth"]) if "depth" in images else None)
+    known = hit(images, seen_of(images))
     words = readings.setdefault("view_projection", [])
     if shot.cameras is not None:
         stated = shot.cameras.view_projection(shot.numbers[0], shot.size)
@@ -273,7 +260,7 @@ def _look_at_positions(shot: RenderedFiles, images: dict[str, Image], readings: 
         readings["position"].append("not used without a camera")
         readings.pop("view_projection")
         shot.drops_positions = True
-    elif not shot.positions_of_camera and _is_in_camera_space(shot, images) and _is_in_camera_space(shot, _last(shot)):
+    elif not shot.positions_of_camera and _is_origin(found, position, known) and _ends_at_origin(shot):
         if world_to_camera(shot.metadata(shot.numbers[0])) is not None:
             shot.positions_of_camera = True
             images["position"] = shot.in_world(shot.numbers[0], images["position"])
@@ -289,19 +276,19 @@ def _look_at_positions(shot: RenderedFiles, images: dict[str, Image], readings: 
         words.append(f"found from the positions, which it sees {found.error:.2g} pixels from their own")
 
 
-def _last(shot: RenderedFiles) -> dict[str, Image]:
-    """Positions and depth of the last frame."""
-    return shot.read(
-        shot.numbers[-1], {n: each for n, each in shot.choice.layers.items() if n in ("position", "depth")}
-    )
+def _is_origin(camera: FittedCamera, position: Image, known: Mask) -> bool:
+    """Whether a camera is the origin of the positions that it sees."""
+    distance = np.linalg.norm(position[known], axis=-1)
+    return bool(np.linalg.norm(camera.eye) < _ORIGIN * np.median(distance))
 
 
-def _is_in_camera_space(shot: RenderedFiles, images: Mapping[str, Image]) -> bool:
-    """Whether the camera that sees the positions of a frame is their origin."""
-    known = hit(images, ~nothing_hit(images["depth"]) if "depth" in images else None)
+def _ends_at_origin(shot: RenderedFiles) -> bool:
+    """Whether the camera of the last frame is: one that moves in the world may have begun there."""
+    layers = {name: each for name, each in shot.choice.layers.items() if name in ("position", "depth")}
+    images = shot.read(shot.numbers[-1], layers)
+    known = hit(images, seen_of(images))
     found = fit_camera(images["position"], known)
-    distance = np.linalg.norm(images["position"][known], axis=-1)
-    return found is not None and bool(np.linalg.norm(found.eye) < _ORIGIN * np.median(distance))
+    return found is not None and _is_origin(found, images["position"], known)
 
 
 def _motion(shot: RenderedFiles, first: Mapping[str, Image]) -> tuple[Convention, str]:
@@ -350,8 +337,7 @@ def _seen_elsewhere(
     """Pixels from each point of a frame to where the camera of the one before sees it, where these are known."""
     if not shot.has_camera:
         return None
-    seens = [~nothing_hit(images["depth"]) if "depth" in images else None for _, images in (before, now)]
-    matrix, known = shot.camera(*before, seens[0]), hit(now[1], seens[1])
+    matrix, known = shot.camera(*before, seen_of(before[1])), hit(now[1], seen_of(now[1]))
     if matrix is None or not known.any():
         return None
     return motion_to(matrix, now[1]["position"], known)

@@ -10,15 +10,12 @@ import numpy as np
 import OpenEXR
 import OpenImageIO as oiio
 
-from mcdenoise.data.exr import LARGEST_HALF, Image, pending_error
+from mcdenoise.data.exr import Image, pending_error, within_half
 from mcdenoise.data.files import atomic_path
 from mcdenoise.data.images import FORMATS, Part, read_image_header, read_picture
 from mcdenoise.data.readers.attributes import put_back, readable
 from mcdenoise.data.readers.transfer import encode
 from mcdenoise.errors import InputError
-
-# The name and the checksum of the empty chunk with which every PNG ends.
-_PNG_END = b"IEND\xaeB`\x82"
 
 _LIBRARY_ERRORS = (RuntimeError, ValueError, TypeError, OSError, InputError)
 
@@ -116,21 +113,16 @@ def _is_whole(found: Any, part: Part) -> bool:
 
 
 def _stored(image: Image, kind: Any) -> Any:
-    if kind == np.float16:
-        # Rounding would turn a firefly into infinity, which spreads through every filter downstream.
-        image = np.clip(image, -LARGEST_HALF, LARGEST_HALF)
-    return np.ascontiguousarray(image, dtype=kind)
+    return np.ascontiguousarray(within_half(image) if kind == np.float16 else image, dtype=kind)
 
 
 def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image]) -> str:
     """A file of one picture: its other channels, and what kind of numbers it has, stay."""
-    spec, pixels = read_picture(source)
-    names = list(spec.channelnames)
-    light = np.stack([replaced[name] for name in names[:3]], -1)
-    display = read_image_header(source).parts[0].display_referred
-    pixels[..., :3] = encode(light) if display else light
-    if len(names) > 3 and names[3] in replaced:
-        pixels[..., 3] = replaced[names[3]]
+    spec, part, pixels = read_picture(source)
+    light = np.stack([replaced[name] for name in part.channels[:3]], -1)
+    pixels[..., :3] = encode(light) if part.display_referred else light
+    if len(part.channels) > 3 and part.channels[3] in replaced:
+        pixels[..., 3] = replaced[part.channels[3]]
     output = oiio.ImageOutput.create(str(target))
     if output is None or not output.open(str(target), spec):
         return pending_error(output or oiio) or "writing failed"
@@ -142,6 +134,4 @@ def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image]) ->
         read_picture(target)
     except InputError as error:
         return f"incomplete: {error}"
-    if target.suffix.lower() == ".png" and not target.read_bytes().endswith(_PNG_END):
-        return "incomplete"
     return ""
