@@ -109,6 +109,7 @@ class Accumulated(Wrapper):
         specular_length: the longest history of what is seen in mirrors and through glass while the image moves, in
             frames, at least 0; infinity treats them as everything else.
         lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test for changes of light.
+        clamp_current: whether fireflies are clamped in what the method sees as ``current``, too.
 
     Raises:
         InputError: a setting is out of its range.
@@ -125,6 +126,7 @@ class Accumulated(Wrapper):
         firefly_limit: float | None = None,
         specular_length: float = SPECULAR_LENGTH,
         lag_threshold: float = THRESHOLD,
+        clamp_current: bool = True,
     ) -> None:
         super().__init__(inner)
         if not 0 < alpha_min <= 1:
@@ -134,6 +136,7 @@ class Accumulated(Wrapper):
         self.alpha_min, self.rule, self.firefly_limit = alpha_min, rule, firefly_limit
         self.position_limit, self.normal_limit = position_limit, normal_limit
         self.specular_length, self.lag_threshold = specular_length, lag_threshold
+        self.clamp_current = clamp_current
 
     @property
     def needs(self) -> Needs:
@@ -209,8 +212,9 @@ class Accumulated(Wrapper):
             surface = Surface(frame.position, frame.normal, frame.depth, label)
             after = History(color, length, surface, frame.view_projection, limit, carried)
         hints = frame.hints._replace(still=not compiling and bool(still))
+        current = entering[:, COLOR] if self.clamp_current else frame.color.to(color.dtype)
         # What was found of another image is not handed on.
-        seen_inside = {"color": color[:, COLOR], "current": entering[:, COLOR], "length": length, "statistics": {}}
+        seen_inside = {"color": color[:, COLOR], "current": current, "length": length, "statistics": {}}
         return _with_carried(frame.replace(**seen_inside, hints=hints), carried), after, inner
 
     def _blend_carried(

@@ -43,6 +43,7 @@ Normalize = Literal["softmax", "none"]
 
 # The published limits of the BMFR scene "classroom", squared, in scene units (its world is in metres).
 POSITION_LIMIT, NORMAL_LIMIT = 0.01, 1.0
+LEVELS = 4  # of the U-Net
 
 
 class _Network(nn.Module):
@@ -50,18 +51,18 @@ class _Network(nn.Module):
 
     def __init__(self, width: int, channels: int, radius: int) -> None:
         super().__init__()
-        self.unet = UNet(10, width)  # color 3, albedo 3, normal 3, depth 1
-        self.heads = nn.ModuleList(Head(self.unet, scale, channels) for scale in range(UNet.scales))
+        self.unet = UNet(10, [width] * LEVELS)  # color 3, albedo 3, normal 3, depth 1
+        self.heads = nn.ModuleList(Head(self.unet, scale, channels) for scale in range(self.unet.scales))
         self.fusions: Sequence[FusionModule] = nn.ModuleList(  # type: ignore[assignment]
-            FusionModule() for _ in range(UNet.scales - 1)
+            FusionModule() for _ in range(self.unet.scales - 1)
         )
         self._radius = radius
 
     @property
     def needs(self) -> Needs:
         """A pixel for each head and fusion and the radius of each filter, at their scales, behind the U-Net."""
-        ways = (self.unet.reach(scale) + ((1 + self._radius) << scale) for scale in range(UNet.scales))
-        reach = max(ways) + sum(1 << scale for scale in range(UNet.scales - 1))
+        ways = (self.unet.reach(scale) + ((1 + self._radius) << scale) for scale in range(self.unet.scales))
+        reach = max(ways) + sum(1 << scale for scale in range(self.unet.scales - 1))
         return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:

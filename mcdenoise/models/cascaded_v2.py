@@ -48,18 +48,18 @@ class _Network(nn.Module):
     def __init__(self, unet: UNet, channels: int, radius: int) -> None:
         super().__init__()
         self.unet = unet
-        self.heads = nn.ModuleList(Head(unet, scale, channels) for scale in range(UNet.scales))
+        self.heads = nn.ModuleList(Head(unet, scale, channels) for scale in range(self.unet.scales))
         self.fusions: Sequence[LogFusion] = nn.ModuleList(  # type: ignore[assignment]
-            LogFusion() for _ in range(UNet.scales - 1)
+            LogFusion() for _ in range(self.unet.scales - 1)
         )
         self._radius = radius
 
     @property
     def needs(self) -> Needs:
         """A pixel for each head and fusion and the radius of each filter, at their scales, behind the U-Net."""
-        heads = (max(1 << scale, self.unet.stride) for scale in range(UNet.scales))
+        heads = (max(1 << scale, self.unet.stride) for scale in range(self.unet.scales))
         ways = (self.unet.reach(scale) + head + (self._radius << scale) for scale, head in enumerate(heads))
-        reach = max(ways) + sum(1 << scale for scale in range(UNet.scales - 1))
+        reach = max(ways) + sum(1 << scale for scale in range(self.unet.scales - 1))
         return Needs(uses=_USES, reach=reach, stride=self.unet.multiple)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
@@ -166,8 +166,8 @@ class KernelNetwork(_Network):
 
 def _unet(width: int, half: bool, coarse_channels: int = 0) -> UNet:
     if not half:
-        return UNet(3 + FEATURES, width, coarse_channels=coarse_channels)
-    return UNet(3 + FEATURES, width, 3, coarse_channels, coarse_width=2 * width, half=True)
+        return UNet(3 + FEATURES, [width] * 4, coarse_channels=coarse_channels)
+    return UNet(3 + FEATURES, [width, 2 * width, 2 * width], coarse_channels=coarse_channels, half=True)
 
 
 def _at_least_float32(tensor: Tensor) -> Tensor:

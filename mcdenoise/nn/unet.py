@@ -18,7 +18,7 @@ _LIVE_WIDTHS, _LIVE_IMAGES = 4.5, 54
 
 
 class UNet(nn.Module):
-    """A U-Net that hands out features of an image at full, half and quarter resolution: its last decoder levels.
+    """A U-Net that hands out features of an image at several resolutions: full, half, quarter and so on.
 
     Each level is two 3x3 convolutions with ReLU; 2x2 max-pooling goes down, a 2x2 transposed convolution goes up, and
     the encoder's features of the same scale are concatenated before the decoder's convolutions (Ronneberger et al.
@@ -31,35 +31,25 @@ class UNet(nn.Module):
 
     Args:
         in_channels: channels of the input.
-        width: feature channels of every convolution (the paper's 40).
-        levels: number of scales, at least 4, with ``half`` at least 3; 4 in the paper.
+        widths: feature channels of the convolutions of each level, finest first (the paper's 40, 40, 40, 40).
+        scales: how many resolutions it hands out, the finest first; 3 in the paper.
         coarse_channels: channels that the encoder is given at each scale but the finest, beside its own features.
-        coarse_width: feature channels of all levels but the finest; ``width`` by default.
         half: whether the finest level is that of half the resolution.
 
     Raises:
-        ValueError: there are too few levels.
+        ValueError: there are fewer levels than scales.
     """
 
-    scales = 3
-
     def __init__(
-        self,
-        in_channels: int,
-        width: int,
-        levels: int = 4,
-        coarse_channels: int = 0,
-        coarse_width: int | None = None,
-        half: bool = False,
+        self, in_channels: int, widths: Sequence[int], scales: int = 3, coarse_channels: int = 0, half: bool = False
     ) -> None:
         super().__init__()
-        self.levels, self.width = levels, width
+        self.widths, self.levels, self.scales = list(widths), len(widths), scales
         self.stride = 2 if half else 1
-        # The coarsest level is the encoder's alone.
-        if levels <= self.level(self.scales - 1) + 1:
-            raise ValueError(f"levels: expected at least {self.level(self.scales - 1) + 2}, found {levels}")
+        if self.levels <= self.level(scales - 1):
+            raise ValueError(f"widths: expected at least {self.level(scales - 1) + 1} levels, found {self.levels}")
+        levels = self.levels
         self.multiple: int = self.stride * 2 ** (levels - 1)
-        self.widths = [width] + [coarse_width or width] * (levels - 1)
         entering = [in_channels] + [finer + coarse_channels for finer in self.widths[:-1]]
         strides = [self.stride] + [1] * (levels - 1)
         self.encoder = nn.ModuleList(_block(*each) for each in zip(entering, self.widths, strides, strict=True))
@@ -86,10 +76,10 @@ class UNet(nn.Module):
         Args:
             bfloat16: whether convolutions are in bfloat16, else in float32.
         """
-        return _LIVE_WIDTHS * self.width * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
+        return _LIVE_WIDTHS * self.widths[0] * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
 
     def forward(self, x: Tensor, coarse: Sequence[Tensor] = ()) -> list[Tensor]:
-        """Features at full, half and quarter resolution.
+        """Features at each of the scales.
 
         Args:
             x: ``(B, in_channels, H, W)``.
@@ -97,8 +87,8 @@ class UNet(nn.Module):
                 4, ..., with ``half`` from 4 on: one for each level but the finest, or none.
 
         Returns:
-            Three tensors ``(B, width, ceil(H / s), ceil(W / s))`` for ``s`` = 1, 2, 4; with ``half`` 2, 2, 4, and what
-            is coarser than the finest level has its width.
+            Tensors ``(B, width, ceil(H / s), ceil(W / s))`` for ``s`` = 1, 2, 4, ..., with ``half`` 2, 2, 4, ..., each
+            with the width of its level.
         """
         height, width = x.shape[-2:]
         # Whole multiples, whose halves are simple expressions in a graph for images of any size, as a remainder is not.
@@ -112,8 +102,7 @@ class UNet(nn.Module):
                 x = torch.cat([x, _padded(given, x.shape[-2:])], 1)
             x = block(x)
             skips.append(x)
-        skips.pop()
-        features: list[Tensor] = []
+        features = [skips.pop()]
         for up, block in zip(self.up, self.decoder, strict=True):
             x = block(torch.cat([up(x), skips.pop()], 1))
             features.append(x)

@@ -44,7 +44,7 @@ def demodulate(color: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         True
     """
     check_shapes(color=(color, "B C H W"), albedo=(albedo, "B C H W"))
-    return (color.to(accumulator_dtype(color.dtype)) / _modulation(albedo, floor)).to(color.dtype)
+    return (color.to(accumulator_dtype(color.dtype)) / modulation(albedo, floor)).to(color.dtype)
 
 
 def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor:
@@ -74,14 +74,15 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
         True
     """
     check_shapes(image=(image, "B C H W"), albedo=(albedo, "B C H W"))
-    return (image.to(accumulator_dtype(image.dtype)) * _modulation(albedo, floor)).to(image.dtype)
+    return (image.to(accumulator_dtype(image.dtype)) * modulation(albedo, floor)).to(image.dtype)
 
 
 Demodulate = module_of("Demodulate", demodulate)
 Remodulate = module_of("Remodulate", remodulate)
 
 
-def _modulation(albedo: Tensor, floor: float) -> Tensor:
+def modulation(albedo: Tensor, floor: float = FLOOR) -> Tensor:
+    """What :func:`demodulate` divides by."""
     if not floor > 0:
         raise ValueError(f"floor: expected a positive number, found {floor}")
     albedo = albedo.to(accumulator_dtype(albedo.dtype))

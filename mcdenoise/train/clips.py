@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, Hints
+from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.ops import NO_ALBEDO, demodulate
 from mcdenoise.train.cache import Array, Shot
 
@@ -92,6 +93,8 @@ class ClipSampler:
         crop: side of the square crop in pixels.
         lamps: chance that a clip gets rectangles of constant radiance, without noise, up to 30 times as bright as its
             mean: emitters seen directly, of which few training scenes have any.
+        key: the typical radiance that each clip is brought to first, see :func:`mcdenoise.nn.inputs.auto_exposure`; 0
+            leaves it as it is.
         exposure: all light of a clip is scaled by up to so many stops, up or down.
         tint: each colour channel of the light is scaled by up to so many stops, up or down.
         gloss: chance that what has no albedo in a clip (mirrors, glass, black gloss, and lamps) is darker, by up to six
@@ -108,13 +111,14 @@ class ClipSampler:
         crop: int,
         *,
         lamps: float = 0.0,
+        key: float = 0.0,
         exposure: float = 0.0,
         tint: float = 0.0,
         gloss: float = 0.0,
     ) -> None:
         self.shots = [shot for shot in shots if len(shot) >= frames]
         self.frames, self.crop = frames, crop
-        self.lamps, self.exposure, self.tint, self.gloss = lamps, exposure, tint, gloss
+        self.lamps, self.key, self.exposure, self.tint, self.gloss = lamps, key, exposure, tint, gloss
         check_sizes([(len(shot), shot.size) for shot in self.shots], frames, crop)
         self.chances = torch.tensor([float(len(shot)) for shot in self.shots])
         self.flips_and_turns = nn.Sequential(
@@ -160,7 +164,10 @@ class ClipSampler:
             view[..., :2] = turn.vectors(view[..., :2].mT).mT
             clip["view_projection"] = view
         stops = self.exposure * (2 * torch.rand(1) - 1) + self.tint * (2 * torch.rand(3) - 1)
-        _light(clip, torch.exp2(stops).reshape(3, 1, 1))
+        factor = torch.exp2(stops).reshape(3, 1, 1)
+        if self.key:
+            factor = factor * auto_exposure(clip["reference"][:1], self.key)[0]
+        _light(clip, factor)
         if self.gloss and float(torch.rand(())) < self.gloss:
             # Less is reflected or sent out towards the camera; what that would take from other surfaces is left out.
             glossy = clip["albedo"].amax(1, keepdim=True) < NO_ALBEDO

@@ -37,6 +37,9 @@ class TrainConfig:
         learning_rate: of Adam, at its highest.
         schedule: constant, or cosine down to 0 after a warm-up of 200 steps.
         temporal_weight: of the temporal loss.
+        display_weight: of the error on a display, see :func:`mcdenoise.train.losses.display_error`.
+        key: each clip is brought to this typical radiance, a middle gray such as 0.2, before its light is scaled; 0
+            leaves it as it was rendered.
         gradient_norm: largest norm of a step's gradient; 0 does not limit it.
         ema: decay of an exponential moving average of the weights, such as 0.999, below it in the first steps; the
             average is what is validated and what the run ends with. 0 takes the weights themselves.
@@ -67,6 +70,8 @@ class TrainConfig:
     learning_rate: float = 1e-4
     schedule: Schedule = "constant"
     temporal_weight: float = 0.1
+    display_weight: float = 0.0
+    key: float = 0.0
     gradient_norm: float = 0.0
     ema: float = 0.0
     draw_resolutions: bool = True
@@ -124,6 +129,8 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
         # A lamp is two pixels wide and has room to hang in more than one place.
         "crop": 3 if config.lamps else 1,
         "temporal_weight": 0,
+        "display_weight": 0,
+        "key": 0,
         "gradient_norm": 0,
         "start_every": 1,
         "keep_fireflies": 0,

@@ -124,6 +124,7 @@ class DataFolders:
             config.frames,
             config.crop,
             lamps=config.lamps,
+            key=config.key,
             exposure=config.exposure,
             tint=config.tint,
             gloss=config.gloss,

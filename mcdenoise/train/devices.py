@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
@@ -30,11 +30,19 @@ def open_fabric(accelerator: str, precision: Precision, batch: int) -> Fabric:
     """
     try:
         from lightning_fabric import Fabric
+        from lightning_fabric.plugins import MixedPrecision
     except ImportError as error:
         raise InputError(
             f"training: expected the optional packages of mcdenoise[train], found no '{error.name}'; "
             "install them with pip install 'mcdenoise[train]'"
         ) from error
+
+    class Autocast(MixedPrecision):
+        """Convolutions in bfloat16 of radiance that keeps all its digits: Fabric would round every input, too."""
+
+        def convert_input(self, data: Any) -> Any:
+            return data
+
     processes, here = (int(os.environ[name]) if _launched() else 1 for name in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
     if batch % processes:
         raise InputError(f"batch: expected a multiple of the {processes} processes, found {batch}")
@@ -44,7 +52,7 @@ def open_fabric(accelerator: str, precision: Precision, batch: int) -> Fabric:
             devices=here,
             num_nodes=processes // here,
             strategy="ddp" if processes > 1 else "auto",
-            precision="bf16-mixed" if precision == "bfloat16" else "32-true",
+            plugins=Autocast("bf16-mixed", accelerator) if precision == "bfloat16" else None,
         )
         fabric.launch()
     except (RuntimeError, ValueError, ImportError) as error:

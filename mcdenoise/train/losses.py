@@ -11,21 +11,28 @@ from mcdenoise.metrics import smape_linear, temporal_smape_linear
 from mcdenoise.models import Output
 
 RESULT = "image"
+_DARK = 1e-3
 
 
 def stage_loss(
-    output: Output, reference: Tensor, weights: Mapping[str, float], *, temporal_weight: float = 0.1
+    output: Output,
+    reference: Tensor,
+    weights: Mapping[str, float],
+    *,
+    temporal_weight: float = 0.1,
+    display_weight: float = 0.0,
 ) -> Tensor:
-    """The total loss: spatial and temporal SMAPE of the image, and of stages on the way to it.
+    """The total loss: spatial and temporal SMAPE of the image, its error on a display, and those of stages before it.
 
-    ``L = sum_s w_s (L_s(R_s, Y) + w_t L_t(dR_s, dY))``; with weights of 1 for the result and the stage ``initial``,
+    ``L = sum_s w_s (L_s(R_s, Y) + w_t L_t(dR_s, dY) + w_d L_d(R_s, Y))``; with weights of 1 for the result and the stage ``initial``,
     that is the paper's.
 
     Args:
         output: of a clip: images ``(B, T, 3, H, W)``, scene-linear radiance with its albedo.
         reference: Y of the same shape.
         weights: of the result, ``"image"``, and of stages by name; those without one do not count.
-        temporal_weight: ``w_c = w_d`` of the paper, 0.1; 0 leaves the temporal loss out.
+        temporal_weight: ``w_t``, the paper's ``w_c = w_d``, 0.1; 0 leaves the temporal loss out.
+        display_weight: ``w_d`` of :func:`display_error`; 0, as in the paper, leaves it out.
 
     Returns:
         A scalar, the mean over the batch.
@@ -50,7 +57,26 @@ def stage_loss(
         if temporal_weight:
             flicker = temporal_smape_linear(images[stage], reference).mean()
             loss = loss + weight * temporal_weight * flicker
+        if display_weight:
+            loss = loss + weight * display_weight * display_error(images[stage], reference).mean()
     return loss
+
+
+def display_error(image: Tensor, reference: Tensor) -> Tensor:
+    """Root mean square error of each frame as a display shows it, which is what PSNR is the logarithm of.
+
+    ``sqrt(mean((g(x) - g(y))^2))`` with ``g(x) = (clamp(x, 0, 1) + c)^(1 / 2.2)``. SMAPE alone is content with a median:
+    a highlight of which most samples know nothing is left out.
+
+    Args:
+        image: ``(..., 3, H, W)`` scene-linear radiance, 1 is the brightest that a display shows.
+        reference: of the same shape.
+
+    Returns:
+        ``(...)``, one number a frame, differentiable also where both are equal, or black: ``c = 0.001``.
+    """
+    shown, wanted = (each.clamp(0, 1).add(_DARK).pow(1 / 2.2) for each in (image, reference))
+    return ((shown - wanted).square().mean((-3, -2, -1)) + _DARK**2).sqrt()
 
 
 def stage_weights(asked: Mapping[str, float], output: Output) -> dict[str, float]:

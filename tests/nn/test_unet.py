@@ -28,7 +28,7 @@ def whole_numbers(parameter: Tensor, generator: torch.Generator) -> Tensor:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
 def test_shortcuts_of_inference_change_no_feature(dtype: torch.dtype) -> None:
     """Bit by bit, of a network whose sums have no rounding in whichever order a library takes them."""
-    net, generator = UNet(4, WIDTH), torch.Generator().manual_seed(0)
+    net, generator = UNet(4, [WIDTH] * 4), torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.copy_(whole_numbers(parameter, generator))
@@ -52,7 +52,7 @@ def test_shortcuts_of_inference_change_no_convolution_by_more_than_rounding(dtyp
     the second one multiplies by its weights. A result in bfloat16 is rounded once more, by up to its ``u``.
     """
     torch.manual_seed(0)
-    net = UNet(4, WIDTH).to(dtype=dtype, memory_format=torch.channels_last)
+    net = UNet(4, [WIDTH] * 4).to(dtype=dtype, memory_format=torch.channels_last)
     entering: list[tuple[nn.Module, Tensor]] = []
     blocks = [*net.encoder, *net.decoder]
     for block in blocks:
@@ -81,7 +81,7 @@ def test_shortcuts_of_inference_change_no_convolution_by_more_than_rounding(dtyp
 
 def test_shortcuts_of_training_change_no_derivative(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
-    net = UNet(4, WIDTH).to(dtype=torch.bfloat16, memory_format=torch.channels_last)
+    net = UNet(4, [WIDTH] * 4).to(dtype=torch.bfloat16, memory_format=torch.channels_last)
     image = torch.randn(1, 4, 21, 34).bfloat16()
 
     def derivatives() -> tuple[list[Tensor], list[Tensor]]:
@@ -108,7 +108,7 @@ def test_shortcuts_of_training_change_no_derivative(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize(("levels", "half"), [(4, False), (5, False), (3, True), (4, True)])
 def test_unet_gives_three_scales_of_any_size(levels: int, half: bool) -> None:
-    unet = UNet(5, 4, levels, coarse_width=6, half=half)
+    unet = UNet(5, [4, *[6] * (levels - 1)], half=half)
     for height, width in ((1, 1), (7, 9), (16, 32)):
         features = unet(torch.rand(2, 5, height, width))
         sizes = [(-(-height // s), -(-width // s)) for s in ((2, 2, 4) if half else (1, 2, 4))]
@@ -120,7 +120,7 @@ def test_unet_gives_three_scales_of_any_size(levels: int, half: bool) -> None:
 
 
 def test_a_head_predicts_the_pixels_that_a_feature_of_half_the_resolution_stands_for() -> None:
-    unet = UNet(1, 2, 3, half=True)
+    unet = UNet(1, [2] * 3, half=True)
     head = Head(unet, 0, 1)
     with torch.no_grad():
         for parameter in head.parameters():
@@ -133,7 +133,7 @@ def test_a_head_predicts_the_pixels_that_a_feature_of_half_the_resolution_stands
 
 def test_unet_sees_what_it_is_given_at_coarser_scales() -> None:
     torch.manual_seed(0)
-    unet = UNet(5, 4, coarse_channels=2)
+    unet = UNet(5, [4] * 4, coarse_channels=2)
     image = torch.rand(1, 5, 13, 22)
     coarse = [torch.rand(1, 2, *size, requires_grad=True) for size in ((7, 11), (4, 6), (2, 3))]
     features = unet(image, coarse)
@@ -142,16 +142,16 @@ def test_unet_sees_what_it_is_given_at_coarser_scales() -> None:
         assert gradient.abs().sum() > 0
 
 
-@pytest.mark.parametrize(("levels", "half", "lowest"), [(0, False, 4), (2, False, 4), (3, False, 4), (2, True, 3)])
-def test_unet_needs_a_decoder_level_for_each_scale(levels: int, half: bool, lowest: int) -> None:
-    with pytest.raises(ValueError, match=f"levels: expected at least {lowest}, found {levels}"):
-        UNet(5, 4, levels, half=half)
+@pytest.mark.parametrize(("levels", "half", "lowest"), [(0, False, 3), (2, False, 3), (1, True, 2)])
+def test_unet_needs_a_level_for_each_scale(levels: int, half: bool, lowest: int) -> None:
+    with pytest.raises(ValueError, match=f"widths: expected at least {lowest} levels, found {levels}"):
+        UNet(5, [4] * levels, half=half)
 
 
 # Of torch's own making, when its rules for forward mode are loaded.
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 def test_a_network_that_does_not_learn_has_its_derivative_forward() -> None:
-    unet = UNet(3, 4).double().requires_grad_(False)
+    unet = UNet(3, [4] * 4).double().requires_grad_(False)
     image, direction = (torch.randn(1, 3, 16, 24, dtype=torch.float64) for _ in range(2))
     _, forward = torch.func.jvp(lambda x: unet(x)[0], (image,), (direction,))
     leaf = image.clone().requires_grad_()

@@ -1,0 +1,240 @@
+"""The family ``pyramid``: one U-Net that weighs, splits and filters the noisy pixels themselves, scale by scale.
+
+Every pixel of the result is a weighted mean of noisy pixels, times a bounded factor. One network predicts all weights,
+and so decides what rules decide elsewhere:
+
+- how far the history is to be trusted against the frame alone, pixel by pixel: highlights and reflections do not move
+  with the surface whose history they are in;
+- how much of the light is matt: the filtered quantity is ``color / e`` with the effective albedo
+  ``e = m + t (1 - m)`` between the albedo ``m`` (t = 0) and one (t = 1). Where ``color = m D + S``, of matt light and of
+  what a coat reflects, ``t / (1 - t) = S / D`` makes it exactly as smooth as D, and no grain is multiplied into highlights;
+- how much a pixel is worth: a firefly little, a pixel without noise much;
+- on which scale a pixel's light is to be spread: each scale keeps a part of it and hands on the rest (Balint et al. 2023,
+  "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", Eqs. 4-7, with kernels guided by features);
+- how features that have noise themselves (anti-aliased, out of focus, blurred by motion) are filtered before they are
+  multiplied back or guide anything.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.skipping import TOLERANCE, Skipping
+from mcdenoise.models.tiled import Tiled
+from mcdenoise.nn.inputs import FEATURES, features_of, guides_of, image_statistics, input_of
+from mcdenoise.nn.unet import Head, UNet
+from mcdenoise.ops import cross_bilateral_filter, downsample, kernel_conv, upsample
+from mcdenoise.ops._backend import one_backend
+from mcdenoise.ops._steps.network import softplus
+from mcdenoise.ops.demodulation import modulation
+from mcdenoise.ops.lag import THRESHOLD
+
+SCALE_UNITS = (10.0, 1000.0, 1.0)  # of the falloffs with normal, depth and distance
+_USES = frozenset({"albedo", "normal", "depth", "current", "length"})
+_COARSE_CHANNELS = 4  # the logarithm of the mean, and how much the pixels of a block differ
+_FEATURE_TAPS = 9  # of the kernel for features
+_PARTS = {"importance": 1, "history": 1, "matt": 1, "gain": 3, "features": _FEATURE_TAPS}
+# What they are before anything was learnt: the history is trusted, light is matt, features are exact.
+_AT_REST = {"history": 2.0, "matt": -2.0}
+_LEAST = 1e-3  # of the light of a pixel that a scale keeps or hands on, and that a pixel is worth
+_MOST_GAIN = 1.0  # of the logarithm of the factor
+
+
+class PyramidNetwork(nn.Module):
+    """Predicts all weights of the pyramid, and filters the image with them.
+
+    It sees demodulated radiance, and turns it into what it filters by itself.
+
+    Args:
+        widths: feature channels of each level of the U-Net, finest first.
+        kernel_size: side of the kernels at every scale.
+        half: whether the U-Net begins at half the resolution.
+    """
+
+    def __init__(self, widths: Sequence[int], kernel_size: int = 5, half: bool = False) -> None:
+        super().__init__()
+        scales = len(widths) + half
+        self.unet = UNet(6 + FEATURES, widths, scales, _COARSE_CHANNELS, half)
+        self.taps = kernel_size**2
+        # Kernel, its three falloffs, what a scale keeps, and what it takes of the coarser one.
+        self.channels = [self.taps + 5] * (scales - 1) + [self.taps + 3]
+        extra = [sum(_PARTS.values())] + [0] * (scales - 1)
+        self.heads = nn.ModuleList(
+            Head(self.unet, scale, own + more)
+            for scale, (own, more) in enumerate(zip(self.channels, extra, strict=True))
+        )
+        for head in self.heads:
+            nn.init.normal_(head.weight, std=0.01)  # type: ignore[arg-type]
+            nn.init.zeros_(head.bias)  # type: ignore[arg-type]
+        rest = torch.cat([torch.full((count,), _AT_REST.get(name, 0.0)) for name, count in _PARTS.items()])
+        rest[-_FEATURE_TAPS // 2] = 4.0
+        with torch.no_grad():
+            # A head of half the resolution predicts each channel for two by two pixels.
+            self.heads[0].bias[self.channels[0] * self.heads[0].side ** 2 :] = rest.repeat_interleave(  # type: ignore
+                self.heads[0].side ** 2  # type: ignore
+            )
+
+    @property
+    def needs(self) -> Needs:
+        """What the U-Net sees, and the radius of each filter at its scale behind it."""
+        radius = math.isqrt(self.taps) // 2
+        behind = sum((radius + 1) << scale for scale in range(self.unet.scales))
+        ways = (self.unet.reach(scale) + max(1 << scale, self.unet.stride) for scale in range(self.unet.scales))
+        return Needs(uses=_USES, reach=max(ways) + behind, stride=self.unet.multiple)
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """Exposure and depth scale of the whole image."""
+        return image_statistics(frame)
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`."""
+        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
+        exposure = frame.statistics["exposure"]
+        image = frame.color * exposure
+        albedo = modulation(features_of(frame)[0]) if frame.albedo is not None else torch.ones_like(image)
+        seen = torch.cat([input_of(frame, image), torch.log1p(image * albedo)], 1)
+        levels = self.unet(seen, self._coarse(frame, exposure))
+        sizes = _sizes(frame.size, len(levels))
+        predicted = [
+            head(level, size).to(torch.promote_types(image.dtype, torch.float32))
+            for head, level, size in zip(self.heads, levels, sizes, strict=True)
+        ]
+        parts = dict(zip(_PARTS, predicted[0][:, self.channels[0] :].split(list(_PARTS.values()), 1), strict=True))
+        predicted[0] = predicted[0][:, : self.channels[0]]
+
+        # Features of the pixel, which may be of one sample, and what the samples around it say.
+        features = torch.cat([albedo, *guides_of(frame)], 1)
+        smooth = kernel_conv(features, torch.softmax(parts["features"], 1))
+        matt = 1 - torch.sigmoid(parts["matt"])
+        alone = image if frame.current is None else frame.current * exposure
+        color = torch.lerp(alone, image, torch.sigmoid(parts["history"]))
+        others, ratio = carried(frame), _ratio(albedo, albedo, matt)
+        if others is not None:
+            others = torch.cat(
+                [others[:, : 3 * (count := len(frame.layers))] * ratio.repeat(1, count, 1, 1), others[:, 3 * count :]],
+                1,
+            )
+        light = [color * ratio, *([] if others is None else [others])]
+        # Of the weights alone, in the last channel, the mean is what it is divided by.
+        worth = _inside(parts["importance"])
+        weighted = torch.cat([*light, torch.ones_like(worth)], 1) * worth
+        filtered = self._filtered(weighted, predicted, smooth[:, 3:])
+        mean = filtered[:, :-1] / filtered[:, -1:]
+        gain = torch.exp(_MOST_GAIN * torch.tanh(parts["gain"]))
+        result = mean[:, :3] * gain / _ratio(albedo, smooth[:, :3], matt) / exposure
+        return answered(frame, result, None if others is None else mean[:, 3:]), None
+
+    def _coarse(self, frame: Frame, exposure: Tensor) -> list[Tensor]:
+        """At each coarser scale the logarithm of the mean radiance, and how much single pixels of the frame differ."""
+        color = frame.color * exposure
+        single = (color if frame.current is None else frame.current * exposure).mean(1, keepdim=True)
+        moments = torch.cat([color, single, single.square()], 1)
+        found: list[Tensor] = []
+        for level in range(1, self.unet.levels * self.unet.stride):
+            if (1 << level) > self.unet.multiple:
+                break
+            moments = downsample(moments)
+            mean, square = moments[:, 3:4], moments[:, 4:5]
+            spread = (square - mean.square()).clamp_min(1e-12).sqrt() / (mean + 0.01)
+            found.append(torch.log1p(torch.cat([moments[:, :3], spread], 1)))
+        return found[self.unet.stride - 1 :]
+
+    def _filtered(self, light: Tensor, predicted: list[Tensor], guides: Tensor) -> Tensor:
+        """Down: each scale keeps a part. Up: it is filtered together with what comes from the coarser scales."""
+        kept: list[Tensor] = []
+        for prediction in predicted[:-1]:
+            keep = _inside(prediction[:, -2:-1])
+            kept.append(keep * light)
+            light = downsample(light - kept[-1])
+        guiding = [guides]
+        for _ in kept:
+            guiding.append(downsample(guiding[-1]))
+        # One for all scales: a tile of an image must not be filtered otherwise than the whole.
+        with one_backend(light):
+            for scale in reversed(range(len(predicted))):
+                prediction, guide = predicted[scale], guiding[scale]
+                if scale < len(kept):
+                    size = (guide.shape[-2], guide.shape[-1])
+                    light = kept[scale] + torch.sigmoid(prediction[:, -1:]) * upsample(light, size)
+                falloffs = softplus(prediction[:, self.taps : self.taps + 3], SCALE_UNITS)
+                light = cross_bilateral_filter(
+                    light,
+                    prediction[:, : self.taps],
+                    [guide[:, :3], guide[:, 3:]],
+                    [falloffs[:, :1], falloffs[:, 1:2]],
+                    falloffs[:, 2:],
+                    border="renormalize",
+                )
+        return light
+
+
+def _ratio(albedo: Tensor, smooth: Tensor, matt: Tensor) -> Tensor:
+    """Albedo over the effective albedo of what is smooth: from demodulated radiance to what is filtered."""
+    return albedo / torch.lerp(torch.ones_like(smooth), smooth, matt)
+
+
+def _inside(logit: Tensor) -> Tensor:
+    """In [_LEAST, 1 - _LEAST]: nothing is ever lost altogether, and no mean is 0 / 0."""
+    return _LEAST + (1 - 2 * _LEAST) * torch.sigmoid(logit)
+
+
+def _sizes(size: tuple[int, int], scales: int) -> list[tuple[int, int]]:
+    return [(-(-size[0] // side), -(-size[1] // side)) for side in (1 << scale for scale in range(scales))]
+
+
+def _pyramid(
+    widths: Sequence[int] = (32, 48, 64, 96, 128),
+    kernel_size: int = 5,
+    half: bool = False,
+    *,
+    alpha_min: float = 0.1,
+    anti_lag: bool = True,
+    tolerance: float = TOLERANCE,
+) -> Model:
+    """The pyramid with all that it wears.
+
+    Args:
+        widths: feature channels of each level.
+        kernel_size: side of the kernels.
+        half: whether the U-Net begins at half the resolution.
+        alpha_min: see :class:`mcdenoise.models.Accumulated`.
+        anti_lag: likewise.
+        tolerance: see :class:`mcdenoise.models.Skipping`.
+    """
+    network = Tiled(PyramidNetwork(tuple(widths), kernel_size, half))
+    return Demodulated(
+        Accumulated(
+            Skipping(network, tolerance, alpha_min),
+            alpha_min=alpha_min,
+            lag_threshold=THRESHOLD if anti_lag else math.inf,
+            clamp_current=False,
+        )
+    )
+
+
+for _name, _about, _settings in (
+    ("pyramid", "widths 32 to 128", {}),
+    ("pyramid_small", "widths 16 to 96", {"widths": (16, 32, 48, 64, 96)}),
+    (
+        "pyramid_tiny",
+        "widths 24 to 64, half the resolution, 3x3 kernels",
+        {"widths": (24, 32, 48, 64), "kernel_size": 3, "half": True},
+    ),
+):
+    register_model(
+        _name, f"one network weighs, splits and filters the noisy pixels at all scales: {_about}", **_settings
+    )(_pyramid)
