@@ -4,11 +4,12 @@ OIDN denoises every frame by itself, in the state of the art for a still, and fl
 Behind it are two histories, of its images and of the noisy ones, and a small network that decides for every pixel
 
 - how far the history of OIDN's images is to be trusted against its image of this frame;
-- how much of what the samples say otherwise is put back: the difference of the noisy radiance and OIDN's, filtered with
-  predicted kernels at several scales. Where there is hardly any noise (many samples, lamps, mirrors) that is the pixel
+- how much of what the samples say otherwise is put back: the difference of the noisy radiance and OIDN's, filtered
+  with predicted kernels at several scales. Where there is hardly any noise (many samples, lamps, mirrors) that is the pixel
   itself, elsewhere the mean over a neighbourhood, in which noise cancels out and a bias of OIDN's does not. It is a
   combiner of Back et al. 2020, "Deep Combiner for Independent and Correlated Pixel Estimates", with the partition of
-  light into scales of Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", Eqs. 4-7;
+  light into scales of Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings",
+  Eqs. 4-7;
 - a bounded factor.
 
 Untrained it gives OIDN's images, accumulated half and half with their history.
@@ -43,13 +44,13 @@ NOISY, NOISY_CURRENT = "noisy", "noisy_current"
 _USES = frozenset({"albedo", "normal", "depth", "current", "length", NOISY, NOISY_CURRENT})
 _TAPS = 9
 _COARSE_CHANNELS = 4  # how the noisy means differ from OIDN's, and how much single pixels do
-_PARTS = {"importance": 1, "history": 1, "noisy history": 1, "repair": 1, "gain": 3}
+_PARTS = {"importance": 1, "history": 1, "noisy history": 1, "repair": 1, "gain": 1}
 # Before anything was learnt: half and half, and hardly anything is put back.
 _AT_REST = {"importance": 2.0, "noisy history": 2.0, "repair": -4.0}
 # Squared length of a normal that is no mean of others, and the fraction of pixels that may have shorter ones.
 _UNIT, _MOST_MEANS = 0.98, 0.002
 _LEAST = 1e-3  # of the light of a pixel that a scale keeps or hands on, and that a pixel is worth
-_MOST_GAIN = 0.5  # of the logarithm of the factor
+_MOST_GAIN = 0.25  # of the logarithm of the factor
 
 
 class AfterOidn(Wrapper):
@@ -63,8 +64,8 @@ class AfterOidn(Wrapper):
     Args:
         inner: any method.
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
-        auxiliary: likewise; by default the features of a frame are taken as clean if all of its normals have unit length,
-            which a mean of several does not, and as noisy if not, see :func:`has_exact_normals`.
+        auxiliary: likewise; by default the features of a frame are taken as clean if all of its normals have unit
+            length, which a mean of several has not, and as noisy if not, see :func:`has_exact_normals`.
         threads: likewise.
 
     Raises:
