@@ -49,6 +49,8 @@ _PARTS = {"importance": 1, "history": 1, "noisy history": 1, "repair": 1, "gain"
 _AT_REST = {"importance": 2.0, "noisy history": 2.0, "repair": -4.0}
 # Squared length of a normal that is no mean of others, and the fraction of pixels that may have shorter ones.
 _UNIT, _MOST_MEANS = 0.98, 0.002
+# Relative difference of inverse depths at two pixels' distance that is no rounding of half floats.
+_LEAST_SLOPE, _EVEN = 4e-3, 0.1
 _LEAST = 1e-3  # of the light of a pixel that a scale keeps or hands on, and that a pixel is worth
 _MOST_GAIN = 0.25  # of the logarithm of the factor
 
@@ -64,8 +66,8 @@ class AfterOidn(Wrapper):
     Args:
         inner: any method.
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
-        auxiliary: likewise; by default the features of a frame are taken as clean if all of its normals have unit
-            length, which a mean of several has not, and as noisy if not, see :func:`has_exact_normals`.
+        auxiliary: likewise; by default the features of a frame are taken as clean where :func:`has_exact_features`
+            says so, and as noisy elsewhere.
         threads: likewise.
 
     Raises:
@@ -109,7 +111,7 @@ class AfterOidn(Wrapper):
     def before(self, frame: Frame) -> Frame:
         """The frame as the method inside sees it."""
         if self.auxiliary is None:
-            self._oidn.auxiliary = "clean" if has_exact_normals(frame) else "noisy"
+            self._oidn.auxiliary = "clean" if has_exact_features(frame) else "noisy"
         output = completed(frame, self._oidn(frame)[0])
         with timed("accumulate", frame.color.device):
             light = frame.color if frame.albedo is None else by_rows(demodulate, frame.color, frame.albedo)
@@ -117,17 +119,32 @@ class AfterOidn(Wrapper):
         return frame.replace(color=output.image, layers=output.layers, extra=extra, skip=None)
 
 
-def has_exact_normals(frame: Frame) -> bool:
-    """Whether hardly any normal is shorter than one, as means of several normals are: features of one ray a pixel.
+def has_exact_features(frame: Frame) -> bool:
+    """Whether features are those of one ray through the center of each pixel, and so have no noise.
+
+    The normals of hardly any pixel are shorter than one, as means of several are. And depth goes on evenly from pixel
+    to pixel: along a plane its inverse is linear in the image, along what is curved nearly so, but not where rays go
+    through a point of each pixel, or of a lens, that was drawn. Three neighbours in a row or a column
+    have ``|a - 2 b + c| < |a - c| / 10`` in one of six cases or less then, and in half of them or more elsewhere; one
+    of four decides. (Measured on random scenes of both renderers.)
 
     Args:
-        frame: one without normals has none that are means.
+        frame: any; without a normal or a depth nothing tells that, and the answer is no.
     """
-    if frame.normal is None:
-        return True
+    if frame.normal is None or frame.depth is None:
+        return False
     squares = frame.normal.square().sum(1)
     # Nothing was hit: no normal.
-    return bool(((squares < _UNIT) & (squares > 0)).float().mean() < _MOST_MEANS)
+    if float(((squares < _UNIT) & (squares > 0)).float().mean()) > _MOST_MEANS:
+        return False
+    even = told = 0
+    for inverse in ((near := frame.depth.detach().reciprocal()), near.mT):
+        a, b, c = inverse[..., :-2], inverse[..., 1:-1], inverse[..., 2:]
+        slope = (a - c).abs()
+        known = (slope > _LEAST_SLOPE * b) & (torch.minimum(a, c) > 0)
+        told += int(known.sum())
+        even += int((known & ((a - 2 * b + c).abs() < _EVEN * slope)).sum())
+    return even > told / 4
 
 
 class RepairNetwork(nn.Module):
