@@ -207,7 +207,7 @@ def open_cached(
     if cached is not None:
         return cached
     try:
-        with _locked(place):
+        with locked(place):
             # While this waited for the lock, somebody else may have done the work.
             if (cached := _load(finished, plan)) is None:
                 _fill(finished, plan)
@@ -252,7 +252,7 @@ def _code() -> bytes:
 
 
 @contextmanager
-def _locked(place: Path) -> Iterator[None]:
+def locked(place: Path) -> Iterator[None]:
     """Have a folder for oneself; the lock ends with the process, however that ends."""
     place.mkdir(parents=True, exist_ok=True)
     with (place / "lock").open("w") as file:
