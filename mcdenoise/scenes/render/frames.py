@@ -120,7 +120,9 @@ def render_frame(job: FrameJob, tracer: Tracer, number: int, advance: Callable[[
     tracer.place(number)
     wanted = number in job.references and not job.has_reference(number)
     if job.film is not None:
-        return _render_filtered(job, FilmRenderer(tracer, job.film, job.size, job.reach), tracer, number, advance, wanted)
+        return _render_filtered(
+            job, FilmRenderer(tracer, job.film, job.size, job.reach), tracer, number, advance, wanted
+        )
     rays = pixel_rays(job.cameras[number], width, height)
     if not job.has_features(number):
         for name, values in _features(job, tracer, number, rays).items():
