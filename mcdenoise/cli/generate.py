@@ -12,10 +12,13 @@ from mcdenoise.cli._output import progress_bar
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.errors import InputError
-from mcdenoise.scenes.random import random_scene
+from mcdenoise.scenes.random.takes import Sampling, random_takes
 from mcdenoise.scenes.render import render_sequence
 
 _FOR_TRAINING = RenderOptions(realisations=3, reference_spp=64, size="160x160")
+_WILD_STILLS = 0.5
+# Samples of a reference for each one of the noisy color.
+_CLEANER = 4
 
 
 def generate(
@@ -25,6 +28,9 @@ def generate(
     frames: int = 12,
     zoom: float = 1.0,
     noise_seed: int | None = None,
+    wild: bool = False,
+    sampling: Sampling | None = None,
+    stills: float | None = None,
 ) -> None:
     """Render random rooms, courts and still lifes to sequences to train on: OUT/random0000, OUT/random0001, ...
 
@@ -37,30 +43,52 @@ def generate(
         frames: frames of each sequence.
         zoom: render the middle of an image that is so many times as wide and high.
         noise_seed: of the noise of all scenes; by default each has the noise of its own seed.
+        wild: frames as renderers' users have them: coats, mirrors, glass and metal in every scene, --sampling mixed,
+            --stills 0.5, and for each sequence its own number of samples, from 1 to 64 instead of --spp.
+        sampling: every sample at the pixel centre, with features without noise (centre, the default); or as Mitsuba
+            takes them, through a pixel filter and at times a lens, with features of the same samples (filtered); or
+            for each sequence one of both (mixed).
+        stills: fraction of the scenes of which half as many stills are rendered as a clip has frames, each a sequence
+            of its own, OUT/random0000_0, OUT/random0000_1, ...
     """
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
     if not 0 < zoom < math.inf:
         raise InputError(f"--zoom: expected a positive number, found {zoom:g}")
+    if stills is not None and not 0 <= stills <= 1:
+        raise InputError(f"--stills: expected a fraction from 0 to 1, found {stills:g}")
     chosen, arguments = parse_frames(seeds, name="--seeds"), rendering.arguments()
     with progress_bar() as progress:
         whole = progress.add_task("scenes", total=len(chosen))
         for seed in chosen:
-            made = random_scene(seed, frames, zoom)
-            task = progress.add_task(f"random{seed:04d}", total=None)
-
-            def show(done: int, total: int, task: TaskID = task) -> None:
-                progress.update(task, completed=done, total=total)
-
-            written = render_sequence(
-                made.scene,
-                made.cameras,
-                out / f"random{seed:04d}",
-                seed=seed if noise_seed is None else noise_seed,
-                moves=made.moves,
-                progress=show,
-                **arguments,
+            takes = random_takes(
+                seed,
+                frames,
+                zoom,
+                sampling=sampling or ("mixed" if wild else "centre"),
+                spp=None if wild else rendering.spp,
+                stills=(_WILD_STILLS if wild else 0) if stills is None else stills,
+                shiny=wild,
+                width=arguments["size"][0],
             )
-            progress.remove_task(task)
+            for take in takes:
+                task = progress.add_task(take.name, total=None)
+
+                def show(done: int, total: int, task: TaskID = task) -> None:
+                    progress.update(task, completed=done, total=total)
+
+                # Hardly less noisy than the color, a reference would teach nothing.
+                reference_spp = max(arguments["reference_spp"], _CLEANER * take.spp if wild else 0)
+                written = render_sequence(
+                    take.made.scene,
+                    take.made.cameras,
+                    out / take.name,
+                    seed=seed if noise_seed is None else noise_seed,
+                    moves=take.made.moves,
+                    film=take.film,
+                    progress=show,
+                    **{**arguments, "spp": take.spp, "reference_spp": reference_spp},
+                )
+                progress.remove_task(task)
+                print(written, flush=True)
             progress.advance(whole)
-            print(written, flush=True)
