@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Literal
 
 import tyro
 from rich.progress import TaskID
@@ -12,6 +15,7 @@ from mcdenoise.cli._output import progress_bar
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.errors import InputError
+from mcdenoise.scenes.cycles import Blender, render_cycles
 from mcdenoise.scenes.random.takes import Sampling, random_takes
 from mcdenoise.scenes.render import render_sequence
 
@@ -31,6 +35,10 @@ def generate(
     wild: bool = False,
     sampling: Sampling | None = None,
     stills: float | None = None,
+    renderer: Literal["mitsuba", "cycles"] = "mitsuba",
+    cycles_spp: int | None = None,
+    blender_python: Path | None = None,
+    threads: int = 0,
 ) -> None:
     """Render random rooms, courts and still lifes to sequences to train on: OUT/random0000, OUT/random0001, ...
 
@@ -50,6 +58,11 @@ def generate(
             for each sequence one of both (mixed).
         stills: fraction of the scenes of which half as many stills are rendered as a clip has frames, each a sequence
             of its own, OUT/random0000_0, OUT/random0000_1, ...
+        renderer: with cycles, by Blender, each noisy color has features of its own; pixel filter, depth of field and
+            motion blur are drawn from the seed.
+        cycles_spp: samples a pixel of Cycles' noisy colors; by default drawn from the seed, 1 for half of the scenes.
+        blender_python: a Python that has Blender's module bpy; this one by default.
+        threads: of Cycles; all processors by default.
     """
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
@@ -58,7 +71,9 @@ def generate(
     if stills is not None and not 0 <= stills <= 1:
         raise InputError(f"--stills: expected a fraction from 0 to 1, found {stills:g}")
     chosen, arguments = parse_frames(seeds, name="--seeds"), rendering.arguments()
-    with progress_bar() as progress:
+    with ExitStack() as stack:
+        blender = stack.enter_context(Blender(blender_python)) if renderer == "cycles" else None
+        progress = stack.enter_context(progress_bar())
         whole = progress.add_task("scenes", total=len(chosen))
         for seed in chosen:
             takes = random_takes(
@@ -77,18 +92,33 @@ def generate(
                 def show(done: int, total: int, task: TaskID = task) -> None:
                     progress.update(task, completed=done, total=total)
 
-                # Hardly less noisy than the color, a reference would teach nothing.
-                reference_spp = max(arguments["reference_spp"], _CLEANER * take.spp if wild else 0)
-                written = render_sequence(
-                    take.made.scene,
-                    take.made.cameras,
-                    out / take.name,
-                    seed=seed if noise_seed is None else noise_seed,
-                    moves=take.made.moves,
-                    film=take.film,
-                    progress=show,
-                    **{**arguments, "spp": take.spp, "reference_spp": reference_spp},
-                )
+                folder, noise = out / take.name, seed if noise_seed is None else noise_seed
+                if blender is not None:
+                    written = render_cycles(
+                        take.made,
+                        folder,
+                        blender,
+                        size=arguments["size"],
+                        seed=noise,
+                        samples=cycles_spp,
+                        realisations=rendering.realisations,
+                        reference_samples=rendering.reference_spp,
+                        threads=threads,
+                        progress=show,
+                    )
+                else:
+                    # Hardly less noisy than the color, a reference would teach nothing.
+                    reference_spp = max(arguments["reference_spp"], _CLEANER * take.spp if wild else 0)
+                    written = render_sequence(
+                        take.made.scene,
+                        take.made.cameras,
+                        folder,
+                        seed=noise,
+                        moves=take.made.moves,
+                        film=take.film,
+                        progress=show,
+                        **{**arguments, "spp": take.spp, "reference_spp": reference_spp},
+                    )
                 progress.remove_task(task)
                 print(written, flush=True)
             progress.advance(whole)
