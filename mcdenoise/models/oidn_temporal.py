@@ -5,10 +5,10 @@ Behind it are two histories, of its images and of the noisy ones, and a small ne
 
 - how far the history of OIDN's images is to be trusted against its image of this frame;
 - how much of what the samples say otherwise is put back: the difference of the noisy radiance and OIDN's, filtered
-  with predicted kernels at several scales. Where there is hardly any noise (many samples, lamps, mirrors) that is the pixel
-  itself, elsewhere the mean over a neighbourhood, in which noise cancels out and a bias of OIDN's does not. It is a
-  combiner of Back et al. 2020, "Deep Combiner for Independent and Correlated Pixel Estimates", with the partition of
-  light into scales of Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings",
+  with predicted kernels at several scales. Where there is hardly any noise (many samples, lamps, mirrors) that is the
+  pixel itself, elsewhere the mean over a neighbourhood, in which noise cancels out and a bias of OIDN's does not. It
+  is a combiner of Back et al. 2020, "Deep Combiner for Independent and Correlated Pixel Estimates", with the partition
+  of light into scales of Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings",
   Eqs. 4-7;
 - a bounded factor.
 
