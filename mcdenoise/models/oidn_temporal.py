@@ -7,9 +7,8 @@ Behind it are two histories, of its images and of the noisy ones, and a small ne
 - how much of what the samples say otherwise is put back: the difference of the noisy radiance and OIDN's, filtered
   with predicted kernels at several scales. Where there is hardly any noise (many samples, lamps, mirrors) that is the
   pixel itself, elsewhere the mean over a neighbourhood, in which noise cancels out and a bias of OIDN's does not. It
-  is a combiner of Back et al. 2020, "Deep Combiner for Independent and Correlated Pixel Estimates", with the partition
-  of light into scales of Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings",
-  Eqs. 4-7;
+  combines as Back et al. 2020, "Deep Combiner for Independent and Correlated Pixel Estimates", do, with light split
+  into scales as in Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", Sec. 4;
 - a bounded factor.
 
 Untrained it gives OIDN's images, accumulated half and half with their history.
@@ -49,6 +48,9 @@ _PARTS = {"importance": 1, "history": 1, "noisy history": 1, "repair": 1, "gain"
 _AT_REST = {"importance": 2.0, "noisy history": 2.0, "repair": -4.0}
 # Squared length of a normal that is no mean of others, and the fraction of pixels that may have shorter ones.
 _UNIT, _MOST_MEANS = 0.98, 0.002
+# Relative difference of inverse depths at two pixels' distance that is no rounding of half floats.
+_LEAST_SLOPE, _EVEN = 4e-3, 0.1
+_THIRDS = (3, 4, 6, 8)  # of the width, at each level
 _LEAST = 1e-3  # of the light of a pixel that a scale keeps or hands on, and that a pixel is worth
 _MOST_GAIN = 0.25  # of the logarithm of the factor
 
@@ -64,8 +66,8 @@ class AfterOidn(Wrapper):
     Args:
         inner: any method.
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
-        auxiliary: likewise; by default the features of a frame are taken as clean if all of its normals have unit
-            length, which a mean of several has not, and as noisy if not, see :func:`has_exact_normals`.
+        auxiliary: likewise; by default the features of a frame are taken as clean where :func:`has_exact_features`
+            says so, and as noisy elsewhere.
         threads: likewise.
 
     Raises:
@@ -109,7 +111,7 @@ class AfterOidn(Wrapper):
     def before(self, frame: Frame) -> Frame:
         """The frame as the method inside sees it."""
         if self.auxiliary is None:
-            self._oidn.auxiliary = "clean" if has_exact_normals(frame) else "noisy"
+            self._oidn.auxiliary = "clean" if has_exact_features(frame) else "noisy"
         output = completed(frame, self._oidn(frame)[0])
         with timed("accumulate", frame.color.device):
             light = frame.color if frame.albedo is None else by_rows(demodulate, frame.color, frame.albedo)
@@ -117,17 +119,31 @@ class AfterOidn(Wrapper):
         return frame.replace(color=output.image, layers=output.layers, extra=extra, skip=None)
 
 
-def has_exact_normals(frame: Frame) -> bool:
-    """Whether hardly any normal is shorter than one, as means of several normals are: features of one ray a pixel.
+def has_exact_features(frame: Frame) -> bool:
+    """Whether features are those of one ray through the center of each pixel, and so have no noise.
+
+    The normals of hardly any pixel are shorter than one, as means of several are. And depth goes on evenly from pixel
+    to pixel: along a plane its inverse is linear in the image, along what is curved nearly so, but not where rays go
+    through a point of each pixel, or of a lens, that was drawn. Where one of four triples of
+    neighbours in a row or a column or more have ``|a - 2 b + c| < |a - c| / 10``, rays went through the centers.
 
     Args:
-        frame: one without normals has none that are means.
+        frame: any; without a normal or a depth nothing tells that, and the answer is no.
     """
-    if frame.normal is None:
-        return True
+    if frame.normal is None or frame.depth is None:
+        return False
     squares = frame.normal.square().sum(1)
     # Nothing was hit: no normal.
-    return bool(((squares < _UNIT) & (squares > 0)).float().mean() < _MOST_MEANS)
+    if float(((squares < _UNIT) & (squares > 0)).float().mean()) > _MOST_MEANS:
+        return False
+    even = told = 0
+    for inverse in ((near := frame.depth.detach().reciprocal()), near.mT):
+        a, b, c = inverse[..., :-2], inverse[..., 1:-1], inverse[..., 2:]
+        slope = (a - c).abs()
+        known = (slope > _LEAST_SLOPE * b) & (torch.minimum(a, c) > 0)
+        told += int(known.sum())
+        even += int((known & ((a - 2 * b + c).abs() < _EVEN * slope)).sum())
+    return even > told / 4
 
 
 class RepairNetwork(nn.Module):
@@ -149,13 +165,13 @@ class RepairNetwork(nn.Module):
             for scale, (own, more) in enumerate(zip(self.channels, extra, strict=True))
         )
         for head in self.heads:
-            nn.init.normal_(head.weight, std=0.01)  # type: ignore[arg-type]
+            nn.init.zeros_(head.weight)  # type: ignore[arg-type]
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
         rest = torch.cat([torch.full((count,), _AT_REST.get(name, 0.0)) for name, count in _PARTS.items()])
         pixels = self.unet.stride**2
         with torch.no_grad():
             # The finest head predicts each channel for two by two pixels.
-            self.heads[0].bias[self.channels[0] * pixels :] = rest.repeat_interleave(pixels)  # type: ignore[index]
+            self.heads[0].bias[self.channels[0] * pixels :] = rest.repeat_interleave(pixels)  # type: ignore[operator]
 
     @property
     def needs(self) -> Needs:
@@ -197,10 +213,9 @@ class RepairNetwork(nn.Module):
         weighted = [image * worth for image in (lacking, *([] if others is None else [others]))] + [worth]
         filtered = _filtered(torch.cat(weighted, 1), predicted)
         mean = filtered[:, :-1] / filtered[:, -1:]
-        repair = torch.sigmoid(parts["repair"])
         gain = torch.exp(_MOST_GAIN * torch.tanh(parts["gain"]))
-        image = (base + repair * mean[:, :3]).clamp_min(0) * gain / exposure
-        return answered(frame, image, None if others is None else torch.lerp(others, mean[:, 3:], repair)), None
+        image = (base + torch.sigmoid(parts["repair"]) * mean[:, :3]).clamp_min(0) * gain / exposure
+        return answered(frame, image, None if others is None else mean[:, 3:]), None
 
     def _coarse(self, noisy_before: Tensor, noisy_now: Tensor, now: Tensor) -> list[Tensor]:
         """At each coarser scale how far the noisy mean is from OIDN's, relatively, and how much single pixels are."""
@@ -245,7 +260,7 @@ def _size(size: tuple[int, int], scale: int) -> tuple[int, int]:
 
 @register_model("oidn_temporal")
 def oidn_temporal(
-    widths: Sequence[int] = (24, 32, 48, 64),
+    width: int = 24,
     *,
     quality: Quality = "high",
     auxiliary: Auxiliary | None = None,
@@ -255,7 +270,7 @@ def oidn_temporal(
     """Open Image Denoise (optional package pyoidn), a history behind it, and a network that repairs both.
 
     Args:
-        widths: feature channels of each level of the network.
+        width: feature channels of the finest level of the network, a multiple of 3.
         quality: see :class:`AfterOidn`.
         auxiliary: likewise.
         threads: likewise.
@@ -266,7 +281,7 @@ def oidn_temporal(
     """
     # What OIDN has made has no fireflies and no noise to tell a change of light from: the network sees both images.
     history = Accumulated(
-        Tiled(RepairNetwork(tuple(widths))),
+        Tiled(RepairNetwork([width * thirds // 3 for thirds in _THIRDS])),
         alpha_min=alpha_min,
         firefly_limit=math.inf,
         lag_threshold=math.inf,
