@@ -22,7 +22,7 @@ from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, v
 from mcdenoise.data.exr import Image
 from mcdenoise.data.files import write_text
 from mcdenoise.data.images import read_channels, read_image_header
-from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer
+from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.layers import layers_of
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
@@ -129,10 +129,10 @@ def render_cycles(
             description.save(Path(place))
             blender.ask("scene", folder=place, settings=_for_blender(made, moves, movers, chosen, size, threads))
 
-        def shot(number: int, samples: int, stream: int, passes: bool) -> dict[str, Image]:
+        def shot(number: int, samples: int, stream: int) -> dict[str, Image]:
             noise = int(np.random.SeedSequence((seed, number, stream)).generate_state(1)[0] % 2**31)
-            blender.ask("render", frame=number, samples=samples, seed=noise, passes=passes, out=str(file))
-            images = _read(file, passes)
+            blender.ask("render", frame=number, samples=samples, seed=noise, out=str(file))
+            images = _read(file)
             file.unlink()
             advance(samples)
             return images
@@ -142,12 +142,14 @@ def render_cycles(
         for number, realisation in noisy:
             back = {index + 1: _back(moves[name], number) for index, name in enumerate(movers)}
             view = _View(made.cameras[number], size, back)
-            images = shot(number, chosen.samples, 1 + realisation if realisation else 0, passes=True)
+            images = shot(number, chosen.samples, 1 + realisation if realisation else 0)
             folder.write(number, realisation, view.buffers(images))
         for number in clean:
-            image = shot(number, reference_samples, _REFERENCE_STREAM, passes=False)["Combined"]
+            images = shot(number, reference_samples, _REFERENCE_STREAM)
+            clean = _View(made.cameras[number], size, {}).buffers(images)
+            write_clean_features(folder.path, number, _tensor(clean["albedo"]), _tensor(clean["normal"]))
             state = ReferenceState(reference_samples, 1, None)
-            write_reference(folder.path, number, _tensor(image[..., :3]), state)
+            write_reference(folder.path, number, _tensor(clean["color"]), state)
     return folder.path
 
 
@@ -309,12 +311,12 @@ def _prolonged(poses: Array) -> Array:
     return np.concatenate([first[None], poses, last[None]])
 
 
-def _read(path: Path, passes: bool) -> dict[str, Image]:
+def _read(path: Path) -> dict[str, Image]:
     parts = read_image_header(path).parts
     layers = {layer.title: layer for layer in layers_of(0, "", parts)}
     found: dict[str, Image] = {}
-    for name in _PASSES if passes else ("Combined",):
-        layer = next((layers[each] for each in _PASSES[name] if each in layers), None)
+    for name, names in _PASSES.items():
+        layer = next((layers[each] for each in names if each in layers), None)
         if layer is None and len(layers) == 1:
             (layer,) = layers.values()
         if layer is None:
