@@ -146,10 +146,10 @@ def render_cycles(
             folder.write(number, realisation, view.buffers(images))
         for number in clean:
             images = shot(number, reference_samples, _REFERENCE_STREAM)
-            clean = _View(made.cameras[number], size, {}).buffers(images)
-            write_clean_features(folder.path, number, _tensor(clean["albedo"]), _tensor(clean["normal"]))
+            seen = _View(made.cameras[number], size, {}).buffers(images)
+            write_clean_features(folder.path, number, _tensor(seen["albedo"]), _tensor(seen["normal"]))
             state = ReferenceState(reference_samples, 1, None)
-            write_reference(folder.path, number, _tensor(clean["color"]), state)
+            write_reference(folder.path, number, _tensor(seen["color"]), state)
     return folder.path
 
 
