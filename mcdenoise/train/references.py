@@ -19,8 +19,8 @@ def clean_references(source: Path, out: Path) -> Path:
     A network that is trained with an error of relative differences learns the median of noisy references, which is
     darker than their mean, and few samples a pixel leave much noise where light is hard to find. Open Image Denoise at
     high quality, told that albedo and normal are clean, removes nearly all of it: at 50 samples a pixel that is a far
-    easier problem than at one. Those of an anti-aliased reference were rendered with it. For training only: what is measured is measured against references as they were
-    rendered.
+    easier problem than at one. Those of an anti-aliased reference were rendered with it. For training only: what is
+    measured is measured against references as they were rendered.
 
     Args:
         source: folder of the sequence. The noise of its features, if they have any, comes back in the references.
