@@ -35,7 +35,7 @@ class BufferSpec:
         high: largest legal value.
         meaning: unit and convention, for messages and documentation.
         infinite: whether infinity is legal, within the range (nothing was hit, or there is no previous position).
-        slack: how far values may overshoot ``high`` before they are refused, or warned of; up to there they are clamped.
+        slack: how far values may overshoot ``high`` before they are refused; up to there they are clamped.
         forgiven: whether those of less than half of a buffer are clamped beyond it, too, with a warning.
     """
 
@@ -590,8 +590,8 @@ def _check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]
     forgiven = high > limit and spec.forgiven and bool((value > limit).double().mean() < 0.5)
     if forgiven:
         warnings.warn(
-            f"buffer '{name}': expected values up to {spec.high:g} ({spec.meaning}), found some up to {high:.4g}, which "
-            f"count as {spec.high:g}; leave the buffer out if it is another one",
+            f"buffer '{name}': expected values up to {spec.high:g} ({spec.meaning}), found some up to {high:.4g}, "
+            f"which count as {spec.high:g}; leave the buffer out if it is another one",
             stacklevel=2,
         )
     if low < spec.low - _ROUNDING or (high > limit and not forgiven):

@@ -115,8 +115,8 @@ def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
     shots |= {"nothing but color": [Frame(color=frame.color) for frame in frames]}
     # Features that contradict one another, or come and go.
     shots |= {"albedo 93 in some rows": with_value("albedo", 93.0, some)}
-    shots |= {"hit distance 0": [frame.replace(hit_distance=torch.zeros_like(frame.depth)) for frame in frames]}
-    shots |= {"normals against all depths": [frame.replace(normal=-frame.normal) for frame in frames]}
+    shots |= {"hit distance 0": [frame.replace(hit_distance=0 * frame.color[:, :1]) for frame in frames]}
+    shots |= {"normal -1": with_value("normal", -1.0)}
     shots |= {"albedo without normal": [frame.replace(normal=None) for frame in frames]}
     shots |= {"normal without albedo": [frame.replace(albedo=None) for frame in frames]}
     lacking = [frame.replace(albedo=None, depth=None, position=None) for frame in frames]
