@@ -85,7 +85,7 @@ def generate(
                 spp=None if wild else rendering.spp,
                 stills=(_WILD_STILLS if wild else 0) if stills is None else stills,
                 shiny=wild,
-                width=arguments["size"][0],
+                width=max(arguments["size"][0], 1),
             )
             for take in takes:
                 task = progress.add_task(take.name, total=None)
