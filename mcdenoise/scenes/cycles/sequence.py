@@ -220,7 +220,8 @@ class _Folder:
     def _check(self, described: Path, content: Mapping[str, Any]) -> None:
         try:
             before = json.loads(described.read_text(encoding="utf-8"))
-            changed = [key for key in _IDENTITY if before[key] != content[key]]
+            # What was rendered before there were several views is the first one.
+            changed = [key for key in _IDENTITY if {"view": 0, **before}[key] != content[key]]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(
                 f"{described}: cannot be read, so the run cannot be resumed; choose another output folder"
