@@ -63,11 +63,11 @@ def build(folder: str, settings: dict[str, Any]) -> None:
     scene = bpy.context.scene
     images = {name: _image(name, pixels) for name, pixels in arrays.items() if name.startswith(("texture", "sky"))}
     materials = [_material(number, entry, images) for number, entry in enumerate(content["materials"])]
-    for number, entry in enumerate(content["objects"]):
+    for entry in content["objects"]:
         thing = _object(entry, arrays, materials)
         scene.collection.objects.link(thing)
         if entry["moves"]:
-            thing.pass_index = number
+            thing.pass_index = entry["index"]
             _animate(thing, settings["moves"][entry["id"]])
     for number, light in enumerate(content["lights"]):
         scene.collection.objects.link(_light(number, light))

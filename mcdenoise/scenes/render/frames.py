@@ -171,7 +171,7 @@ def _render_filtered(
 
 
 # Samples of the features that belong to a reference, and where their noise differs from that of its passes.
-_CLEAN_PATHS, _CLEAN_STREAM = 32, 2**20
+_CLEAN_PATHS, _CLEAN_STREAM = 16, 2**20
 
 
 def _stream(realisation: int) -> int:
