@@ -61,7 +61,8 @@ def generate(
         renderer: with cycles, by Blender, each noisy color has features of its own; pixel filter, depth of field and
             motion blur are drawn from the seed.
         cycles_spp: samples a pixel of Cycles' noisy colors; by default drawn from the seed, 1 for half of the scenes.
-        blender_python: a Python that has Blender's module bpy; this one by default.
+        blender_python: a Python that has Blender's module bpy; by default that of the environment variable
+            MCDENOISE_BLENDER_PYTHON, or else this one.
         threads: of Cycles; all processors by default.
     """
     if frames < 1:
@@ -84,7 +85,7 @@ def generate(
                 spp=None if wild else rendering.spp,
                 stills=(_WILD_STILLS if wild else 0) if stills is None else stills,
                 shiny=wild,
-                width=arguments["size"][0],
+                width=max(arguments["size"][0], 1),
             )
             for take in takes:
                 task = progress.add_task(take.name, total=None)

@@ -27,6 +27,7 @@ from mcdenoise.train.references import clean_references
 
 _TABLES = ("train", "data", "validation", "expected")
 _CLEAN = "clean_references"
+_NO_PIXELS = ("workers", "threads", "blender_python")
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,8 @@ class Rendering:
     @property
     def sha256(self) -> str:
         """Of all that decides what is rendered."""
-        # Several processes render the same pixels as one.
-        return _digest({key: value for key, value in self.options.items() if key != "workers"})
+        # The pixels are the same whoever renders them.
+        return _digest({key: value for key, value in self.options.items() if key not in _NO_PIXELS})
 
     def make(self, data: Path, generate: Callable[[], object]) -> list[Path]:
         """Render what is not there yet, and clean the references if that is asked for.

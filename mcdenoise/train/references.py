@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mcdenoise.data import open_sequence, write_exr
 from mcdenoise.data.files import write_text
+from mcdenoise.data.readers.bmfr import read_clean_features
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model
 
@@ -18,8 +19,8 @@ def clean_references(source: Path, out: Path) -> Path:
     A network that is trained with an error of relative differences learns the median of noisy references, which is
     darker than their mean, and few samples a pixel leave much noise where light is hard to find. Open Image Denoise at
     high quality, told that albedo and normal are clean, removes nearly all of it: at 50 samples a pixel that is a far
-    easier problem than at one. For training only: what is measured is measured against references as they were
-    rendered.
+    easier problem than at one. Those of an anti-aliased reference were rendered with it. For training only: what is
+    measured is measured against references as they were rendered.
 
     Args:
         source: folder of the sequence. The noise of its features, if they have any, comes back in the references.
@@ -45,7 +46,8 @@ def clean_references(source: Path, out: Path) -> Path:
         frame, _ = sequence.frame(number).validate()
         if frame.reference is None:
             continue
-        image = oidn(Frame(color=frame.reference, albedo=frame.albedo, normal=frame.normal))[0].image
+        features = read_clean_features(inputs, number) or (frame.albedo, frame.normal)
+        image = oidn(Frame(color=frame.reference, albedo=features[0], normal=features[1]))[0].image
         # The filter may undershoot; radiance may not.
         pixels = image[0].clamp(0, 65504).permute(1, 2, 0).numpy()
         write_exr(copied / f"reference{number}.exr", pixels, ["R", "G", "B"], half=True)

@@ -63,11 +63,11 @@ def build(folder: str, settings: dict[str, Any]) -> None:
     scene = bpy.context.scene
     images = {name: _image(name, pixels) for name, pixels in arrays.items() if name.startswith(("texture", "sky"))}
     materials = [_material(number, entry, images) for number, entry in enumerate(content["materials"])]
-    for number, entry in enumerate(content["objects"]):
+    for entry in content["objects"]:
         thing = _object(entry, arrays, materials)
         scene.collection.objects.link(thing)
         if entry["moves"]:
-            thing.pass_index = number
+            thing.pass_index = entry["index"]
             _animate(thing, settings["moves"][entry["id"]])
     for number, light in enumerate(content["lights"]):
         scene.collection.objects.link(_light(number, light))
@@ -75,21 +75,16 @@ def build(folder: str, settings: dict[str, Any]) -> None:
     _set_up(scene, settings)
 
 
-def render(frame: int, samples: int, seed: int, passes: bool, out: str) -> None:
+def render(frame: int, samples: int, seed: int, out: str) -> None:
     """Render one frame to a multilayer EXR.
 
     Args:
         frame: which.
         samples: a pixel.
         seed: of the noise.
-        passes: whether the features are wanted beside the color.
         out: the file, ending in ``.exr``.
     """
     scene = bpy.context.scene
-    layer = scene.view_layers[0]
-    layer.cycles.denoising_store_passes = passes
-    for name in ("z", "position", "object_index"):
-        setattr(layer, f"use_pass_{name}", passes)
     scene.frame_set(frame)
     scene.cycles.samples, scene.cycles.seed = samples, seed
     scene.render.filepath = out
@@ -104,6 +99,10 @@ def _set_up(scene: Any, settings: dict[str, Any]) -> None:
     scene.render.use_persistent_data = True
     if settings["threads"]:
         scene.render.threads_mode, scene.render.threads = "FIXED", settings["threads"]
+    layer = scene.view_layers[0]
+    layer.cycles.denoising_store_passes = True
+    for name in ("z", "position", "object_index"):
+        setattr(layer, f"use_pass_{name}", True)
     cycles = scene.cycles
     cycles.device = "CPU"
     cycles.use_adaptive_sampling = cycles.use_denoising = False

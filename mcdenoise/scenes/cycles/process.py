@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -12,6 +13,7 @@ from typing import IO, Any
 
 from mcdenoise.errors import InputError
 
+PYTHON_VARIABLE = "MCDENOISE_BLENDER_PYTHON"
 _SCRIPT = Path(__file__).with_name("blender.py")
 _LAST_WORDS = 2000
 
@@ -20,14 +22,15 @@ class Blender:
     """A Blender that builds scenes and renders their frames, started once for many; a context manager.
 
     Args:
-        python: an interpreter that can import ``bpy``; this one by default.
+        python: an interpreter that can import ``bpy``; by default that of the environment variable
+            ``MCDENOISE_BLENDER_PYTHON``, or else this one.
 
     Raises:
         InputError: there is no such interpreter, or it has no ``bpy``.
     """
 
     def __init__(self, python: Path | None = None) -> None:
-        self._python = Path(sys.executable) if python is None else python
+        self._python = python or Path(os.environ.get(PYTHON_VARIABLE, sys.executable))
         self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
         try:
             self._process = subprocess.Popen(

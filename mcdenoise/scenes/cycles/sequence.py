@@ -3,6 +3,9 @@
 Each noisy color has features of its own, from the same samples, as users have them: anti-aliased, and noisy
 through glass, depth of field and motion blur. They hold what :func:`mcdenoise.data.open_sequence` makes of a file of
 Blender, but for normals, which are turned from the camera's space to the world's.
+
+Cycles takes depth and position from the first sample of a pixel alone, and puts that at the pixel centre, whatever the
+filter: these are noisy through a lens and a shutter only, and an image of one sample a pixel is not filtered at all.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, v
 from mcdenoise.data.exr import Image
 from mcdenoise.data.files import write_text
 from mcdenoise.data.images import read_channels, read_image_header
-from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer
+from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.layers import layers_of
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
@@ -45,11 +48,12 @@ _PASSES = {
 # How much farther than everything else the sky is, as the reader has it.
 _SKY = 1000.0
 _REFERENCE_STREAM = 1
+_CLEANER = 4
 _CONVENTIONS: dict[str, Any] = {
     "color_includes_albedo": True,
     "reference_includes_albedo": True,
-    "seeds": "numpy.random.SeedSequence((seed, frame, stream)).generate_state(1) % 2**31; stream 0 for the first "
-    "noisy color, 1 for the reference, 1 + realisation for the others",
+    "seeds": "numpy.random.SeedSequence((seed, frame, stream)).generate_state(1) % 2**31, of a view but the first "
+    "with spawn_key=(view,); stream 0 for the first noisy color, 1 for the reference, 1 + realisation for the others",
     "features": "from the samples of the color beside them: Denoising Albedo clamped to 0..1, Denoising Normal in "
     "world space, Depth, Position",
     "conventions": {
@@ -58,7 +62,7 @@ _CONVENTIONS: dict[str, Any] = {
         "camera_to_world": "column vectors; camera frame +x left, +y up, +z forward (Mitsuba)",
     },
 }
-_IDENTITY = ("scene_sha256", "renderer", "frames", "width", "height", "seed", "camera_to_world", "settings")
+_IDENTITY = ("scene_sha256", "renderer", "frames", "width", "height", "seed", "view", "camera_to_world", "settings")
 
 
 def render_cycles(
@@ -68,6 +72,7 @@ def render_cycles(
     *,
     size: tuple[int, int] = (160, 160),
     seed: int = 0,
+    view: int = 0,
     samples: int | None = None,
     realisations: int = 2,
     reference_samples: int = 128,
@@ -85,10 +90,12 @@ def render_cycles(
         blender: the process that renders.
         size: width and height in pixels.
         seed: of the noise, and of the settings that are drawn.
+        view: another number gives other noise and settings, for another take of the same scene.
         samples: a pixel of the noisy colors; drawn by default, see :func:`draw_settings`.
         realisations: how many noisy colors, with features of their own. Those after the first go to
             ``out/inputs/realisation{1,2,...}``.
-        reference_samples: a pixel of the references; 0 for none.
+        reference_samples: a pixel of the references, but at least four times as many as of the noisy colors; 0 for no
+            references.
         settings: filter, lens and shutter; drawn by default.
         threads: of the processor; all by default. The images do not depend on it.
         progress: called with the finished and the total number of samples a pixel, summed over all frames.
@@ -101,20 +108,23 @@ def render_cycles(
             ``out`` cannot be written or holds a sequence with other settings.
     """
     lowest = {"realisations": (realisations, 1), "reference_samples": (reference_samples, 0), "threads": (threads, 0)}
-    for name, (value, least) in {**lowest, "samples": (1 if samples is None else samples, 1)}.items():
+    lowest |= {"seed": (seed, 0), "view": (view, 0), "samples": (1 if samples is None else samples, 1)}
+    for name, (value, least) in lowest.items():
         if value < least:
             raise InputError(f"{name}: expected at least {least}, found {value}")
     count = len(made.cameras)
-    chosen = settings or draw_settings(seed, samples=samples, moving=count > 1)
+    chosen = settings or draw_settings(seed, view=view, samples=samples, moving=count > 1)
+    # Hardly less noisy than the color, a reference would teach nothing.
+    clean_samples = max(reference_samples, _CLEANER * chosen.samples) if reference_samples else 0
     moves = check_moves(made.moves, count)
     # One after the other, so that an index of Blender's tells which object it is.
     movers = [name for name in made.scene if name in moves]
     description = translate(made.scene, movers, seed=seed)
-    folder = _Folder(out / "inputs", made, size, chosen, seed, blender.version)
+    folder = _Folder(out / "inputs", made, size, chosen, (seed, view), blender.version)
     noisy = [(n, k) for n in range(count) for k in reversed(range(realisations)) if not folder.has_color(n, k)]
-    clean = [n for n in range(count) if reference_samples and not folder.has_reference(n)]
-    total = count * (realisations * chosen.samples + reference_samples)
-    done = total - len(noisy) * chosen.samples - len(clean) * reference_samples
+    clean = [n for n in range(count) if clean_samples and not folder.has_reference(n)]
+    total = count * (realisations * chosen.samples + clean_samples)
+    done = total - len(noisy) * chosen.samples - len(clean) * clean_samples
 
     def advance(spent: int) -> None:
         nonlocal done
@@ -129,10 +139,11 @@ def render_cycles(
             description.save(Path(place))
             blender.ask("scene", folder=place, settings=_for_blender(made, moves, movers, chosen, size, threads))
 
-        def shot(number: int, samples: int, stream: int, passes: bool) -> dict[str, Image]:
-            noise = int(np.random.SeedSequence((seed, number, stream)).generate_state(1)[0] % 2**31)
-            blender.ask("render", frame=number, samples=samples, seed=noise, passes=passes, out=str(file))
-            images = _read(file, passes)
+        def shot(number: int, samples: int, stream: int) -> dict[str, Image]:
+            sequence = np.random.SeedSequence((seed, number, stream), spawn_key=(view,) if view else ())
+            noise = int(sequence.generate_state(1)[0] % 2**31)
+            blender.ask("render", frame=number, samples=samples, seed=noise, out=str(file))
+            images = _read(file)
             file.unlink()
             advance(samples)
             return images
@@ -141,13 +152,15 @@ def render_cycles(
         # samples that it has seen, and the noise of a frame would depend on what was rendered before it.
         for number, realisation in noisy:
             back = {index + 1: _back(moves[name], number) for index, name in enumerate(movers)}
-            view = _View(made.cameras[number], size, back)
-            images = shot(number, chosen.samples, 1 + realisation if realisation else 0, passes=True)
-            folder.write(number, realisation, view.buffers(images))
+            seen = _View(made.cameras[number], size, back)
+            images = shot(number, chosen.samples, 1 + realisation if realisation else 0)
+            folder.write(number, realisation, seen.buffers(images))
         for number in clean:
-            image = shot(number, reference_samples, _REFERENCE_STREAM, passes=False)["Combined"]
-            state = ReferenceState(reference_samples, 1, None)
-            write_reference(folder.path, number, _tensor(image[..., :3]), state)
+            images = shot(number, clean_samples, _REFERENCE_STREAM)
+            buffers = _View(made.cameras[number], size, {}).buffers(images)
+            write_clean_features(folder.path, number, _tensor(buffers["albedo"]), _tensor(buffers["normal"]))
+            state = ReferenceState(clean_samples, 1, None)
+            write_reference(folder.path, number, _tensor(buffers["color"]), state)
     return folder.path
 
 
@@ -155,7 +168,13 @@ class _Folder:
     """``inputs`` of a sequence, with its description."""
 
     def __init__(
-        self, path: Path, made: RandomScene, size: tuple[int, int], chosen: CyclesSettings, seed: int, version: str
+        self,
+        path: Path,
+        made: RandomScene,
+        size: tuple[int, int],
+        chosen: CyclesSettings,
+        seed: tuple[int, int],
+        version: str,
     ) -> None:
         self.path = path
         width, height = size
@@ -172,7 +191,8 @@ class _Folder:
             "width": width,
             "height": height,
             "fov_x_degrees": made.cameras[0].fov_x,
-            "seed": seed,
+            "seed": seed[0],
+            "view": seed[1],
             "noisy_spp": chosen.samples,
             "settings": {**vars(chosen), "focus": list(chosen.focus)},
             "position_limit_squared": (0.005 * scale) ** 2,
@@ -202,7 +222,8 @@ class _Folder:
     def _check(self, described: Path, content: Mapping[str, Any]) -> None:
         try:
             before = json.loads(described.read_text(encoding="utf-8"))
-            changed = [key for key in _IDENTITY if before[key] != content[key]]
+            # What was rendered before there were several views is the first one.
+            changed = [key for key in _IDENTITY if {"view": 0, **before}[key] != content[key]]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(
                 f"{described}: cannot be read, so the run cannot be resumed; choose another output folder"
@@ -309,12 +330,12 @@ def _prolonged(poses: Array) -> Array:
     return np.concatenate([first[None], poses, last[None]])
 
 
-def _read(path: Path, passes: bool) -> dict[str, Image]:
+def _read(path: Path) -> dict[str, Image]:
     parts = read_image_header(path).parts
     layers = {layer.title: layer for layer in layers_of(0, "", parts)}
     found: dict[str, Image] = {}
-    for name in _PASSES if passes else ("Combined",):
-        layer = next((layers[each] for each in _PASSES[name] if each in layers), None)
+    for name, names in _PASSES.items():
+        layer = next((layers[each] for each in names if each in layers), None)
         if layer is None and len(layers) == 1:
             (layer,) = layers.values()
         if layer is None:

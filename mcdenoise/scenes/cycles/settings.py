@@ -15,6 +15,8 @@ _FILTERS_P = (0.5, 0.25, 0.25)
 WIDTHS = {"blackman_harris": 1.5, "box": 1.0, "centre": 0.01}
 _DEFOCUSED, _BLURRED = 0.2, 0.15
 _SHUTTER = 0.5
+# Of the streams of a seed, that of the settings.
+_STREAM = 0x6379636C
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class CyclesSettings:
     shutter: float
 
 
-def draw_settings(seed: int, *, samples: int | None = None, moving: bool = True) -> CyclesSettings:
+def draw_settings(seed: int, *, view: int = 0, samples: int | None = None, moving: bool = True) -> CyclesSettings:
     """The settings of a sequence; the same for the same seed.
 
     Half of all have one sample a pixel, the others up to 32. Half have Blender's default pixel filter, a quarter a box
@@ -44,6 +46,7 @@ def draw_settings(seed: int, *, samples: int | None = None, moving: bool = True)
 
     Args:
         seed: of the scene.
+        view: another number draws other settings for the same scene.
         samples: a pixel, if they are not to be drawn.
         moving: whether there is more than one frame; a still has no motion blur.
 
@@ -51,7 +54,7 @@ def draw_settings(seed: int, *, samples: int | None = None, moving: bool = True)
         >>> draw_settings(3, samples=4).samples
         4
     """
-    rng = np.random.default_rng(np.random.SeedSequence((seed, 0x6379636C)))
+    rng = np.random.default_rng(np.random.SeedSequence((seed, _STREAM), spawn_key=(view,) if view else ()))
     drawn = int(rng.choice(_SAMPLES, p=_SAMPLES_P))
     pixel_filter = str(rng.choice(_FILTERS, p=_FILTERS_P))
     defocused, blurred = (bool(rng.random() < part) for part in (_DEFOCUSED, _BLURRED))

@@ -41,8 +41,8 @@ class Description:
     """A scene for the script that builds it in Blender; all of it is numbers, texts and arrays.
 
     Args:
-        content: ``objects`` (with the ids of those that move, the first one is all that rests), ``materials``,
-            ``lights`` and ``sky``.
+        content: ``objects`` (all that rests is one; those that move have ids and, in the order of the scene, indices
+            from 1), ``materials``, ``lights`` and ``sky``.
         arrays: vertices and triangles of the objects, and textures, by the names that ``content`` gives them.
     """
 
@@ -142,7 +142,7 @@ class _Translator:
             "material": np.concatenate([np.full(len(mesh.triangles), own, np.int32) for mesh, own in parts]),
         }
         self._arrays |= {f"object{number}_{key}": np.ascontiguousarray(array) for key, array in arrays.items()}
-        return {"id": name, "array": f"object{number}", "moves": bool(name)}
+        return {"id": name, "array": f"object{number}", "moves": bool(name), "index": number}
 
     def _bsdf(self, where: str, bsdf: Mapping[str, Any]) -> dict[str, Any]:
         if bsdf["type"] == "ref":
