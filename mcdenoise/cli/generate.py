@@ -101,6 +101,7 @@ def generate(
                         blender,
                         size=arguments["size"],
                         seed=noise,
+                        view=take.view,
                         samples=cycles_spp,
                         realisations=rendering.realisations,
                         reference_samples=rendering.reference_spp,
