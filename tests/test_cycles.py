@@ -24,12 +24,13 @@ from mcdenoise.data.camera_path import Camera, pixel_rays, view_projection
 from mcdenoise.data.exr import read_exr
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.cycles import Blender, CyclesSettings, draw_settings, render_cycles, translate
+from mcdenoise.scenes.cycles.process import PYTHON_VARIABLE
 from mcdenoise.scenes.cycles.sequence import _prolonged, _View
 from mcdenoise.scenes.cycles.shapes import Mesh, tessellate
 from mcdenoise.scenes.random import RandomScene, random_scene
 from mcdenoise.scenes.random.stage import place, rgb, rotate
 
-PYTHON = os.environ.get("BLENDER_PYTHON")
+PYTHON = os.environ.get(PYTHON_VARIABLE)
 GRAY = {"type": "diffuse", "reflectance": rgb((0.5, 0.5, 0.5))}
 CENTRE = CyclesSettings(samples=1, pixel_filter="centre", aperture=0.0, focus=(0.5, 0.5), shutter=0.0)
 CAMERA = Camera.look_at((0, 0, 4), (0, 0, 0), fov_x=40)
@@ -305,7 +306,8 @@ def test_motion_goes_on_before_and_after_the_frames() -> None:
     np.testing.assert_array_equal(_prolonged(np.stack(poses[:1])), np.stack([np.eye(4)] * 3))
 
 
-def test_a_python_without_blender_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_python_without_blender_is_told_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
     if importlib.util.find_spec("bpy") is not None:
         pytest.skip("this Python has bpy")
     with pytest.raises(InputError, match=r"module bpy, found none .*--blender-python$"):

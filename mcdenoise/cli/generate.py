@@ -62,7 +62,7 @@ def generate(
             motion blur are drawn from the seed.
         cycles_spp: samples a pixel of Cycles' noisy colors; by default drawn from the seed, 1 for half of the scenes.
         blender_python: a Python that has Blender's module bpy; by default that of the environment variable
-            MCDENOISE_BLENDER_PYTHON, or else this one.
+            BLENDER_PYTHON, or else this one.
         threads: of Cycles; all processors by default.
     """
     if frames < 1:
@@ -101,6 +101,7 @@ def generate(
                         blender,
                         size=arguments["size"],
                         seed=noise,
+                        view=take.view,
                         samples=cycles_spp,
                         realisations=rendering.realisations,
                         reference_samples=rendering.reference_spp,

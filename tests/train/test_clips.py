@@ -13,7 +13,7 @@ from mcdenoise.ops import motion_from_position, remodulate
 from mcdenoise.train.cache import NOISY, Shot
 from mcdenoise.train.clips import Clip, ClipSampler
 
-PARTS = {**NOISY, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
+PARTS = {**dict(list(NOISY.items())[:3]), "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
 
 
 def shot_of(stack: Tensor, *more_colors: Tensor) -> Shot:

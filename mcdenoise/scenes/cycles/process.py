@@ -13,7 +13,7 @@ from typing import IO, Any
 
 from mcdenoise.errors import InputError
 
-PYTHON_VARIABLE = "MCDENOISE_BLENDER_PYTHON"
+PYTHON_VARIABLE = "BLENDER_PYTHON"
 _SCRIPT = Path(__file__).with_name("blender.py")
 _LAST_WORDS = 2000
 
@@ -23,7 +23,7 @@ class Blender:
 
     Args:
         python: an interpreter that can import ``bpy``; by default that of the environment variable
-            ``MCDENOISE_BLENDER_PYTHON``, or else this one.
+            ``BLENDER_PYTHON``, or else this one.
 
     Raises:
         InputError: there is no such interpreter, or it has no ``bpy``.

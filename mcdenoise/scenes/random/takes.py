@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -37,12 +37,14 @@ class Take:
         made: the scene with the cameras of this take.
         film: filter and lens, ``None`` for samples at the pixel centre.
         spp: samples a pixel of the noisy color.
+        view: which of several takes of one scene.
     """
 
     name: str
     made: RandomScene
     film: Film | None
     spp: int
+    view: int = 0
 
 
 def random_takes(
@@ -80,7 +82,8 @@ def random_takes(
     for view in range(max(1, frames // 2)):
         made = random_scene(seed, 1, zoom, shiny=shiny, view=view)
         still = RandomScene(made.scene, made.cameras, focus=made.focus)
-        takes.append(_take(f"random{seed:04d}_{view}", still, rng, sampling, spp, width))
+        take = _take(f"random{seed:04d}_{view}", still, rng, sampling, spp, width)
+        takes.append(replace(take, view=view))
     return takes
 
 
