@@ -50,6 +50,9 @@ _AT_REST = {"importance": 2.0, "noisy history": 2.0, "repair": -4.0}
 _UNIT, _MOST_MEANS = 0.98, 0.002
 # Relative difference of inverse depths at two pixels' distance that is no rounding of half floats.
 _LEAST_SLOPE, _EVEN = 4e-3, 0.1
+# Largest difference of two normals that is unlike, and the fraction of pixels: measured, of scenes without such
+# materials up to 0.0039, of rough glass and metal in Cycles 0.0069.
+_UNLIKE, _MOST_SPECKS = 0.1, 0.0045
 _THIRDS = (3, 4, 6, 8)  # of the width, at each level
 _LEAST = 1e-3  # of the light of a pixel that a scale keeps or hands on, and that a pixel is worth
 _MOST_GAIN = 0.25  # of the logarithm of the factor
@@ -124,8 +127,10 @@ def has_exact_features(frame: Frame) -> bool:
 
     The normals of hardly any pixel are shorter than one, as means of several are. And depth goes on evenly from pixel
     to pixel: along a plane its inverse is linear in the image, along what is curved nearly so, but not where rays go
-    through a point of each pixel, or of a lens, that was drawn. Where one of four triples of
-    neighbours in a row or a column or more have ``|a - 2 b + c| < |a - c| / 10``, rays went through the centers.
+    through a point of each pixel, or of a lens, that was drawn. Where one of four triples of neighbours in a row or a
+    column or more have ``|a - 2 b + c| < |a - c| / 10``, rays went through the centers. Nor are there many normals
+    unlike all four around them where these are alike: rough metal and glass scatter the rays, and some renderers hand
+    over the features of what such a ray hits.
 
     Args:
         frame: any; without a normal or a depth nothing tells that, and the answer is no.
@@ -143,7 +148,18 @@ def has_exact_features(frame: Frame) -> bool:
         known = (slope > _LEAST_SLOPE * b) & (torch.minimum(a, c) > 0)
         told += int(known.sum())
         even += int((known & ((a - 2 * b + c).abs() < _EVEN * slope)).sum())
-    return even > told / 4
+    return even > told / 4 and _specks(frame.normal) < _MOST_SPECKS
+
+
+def _specks(normal: Tensor) -> float:
+    """Fraction of the pixels that are unlike all of their four neighbours, of which those opposite are alike."""
+    inside = normal.detach()[..., 1:-1, 1:-1]
+    left, right = normal.detach()[..., 1:-1, :-2], normal.detach()[..., 1:-1, 2:]
+    above, below = normal.detach()[..., :-2, 1:-1], normal.detach()[..., 2:, 1:-1]
+    nearest = torch.stack([(inside - other).abs().amax(1) for other in (left, right, above, below)]).amin(0)
+    around = torch.maximum((left - right).abs().amax(1), (above - below).abs().amax(1))
+    count = int(((nearest > _UNLIKE) & (around < nearest / 2)).sum())
+    return count / max(nearest.numel(), 1)
 
 
 class RepairNetwork(nn.Module):

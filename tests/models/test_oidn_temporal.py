@@ -211,6 +211,13 @@ def test_features_are_exact_of_rays_through_the_centers_alone() -> None:
     mixed = exact.normal.clone()
     mixed[..., ::10] *= 0.8
     assert not has_exact_features(exact.replace(normal=mixed))
+    specks = exact.normal.clone()
+    specks[..., 5::10, 5::10] *= -1
+    assert not has_exact_features(exact.replace(normal=specks))
+    # The edges of what is in front are none.
+    edges = exact.normal.clone()
+    edges[..., 10:30, 20:50] *= -1
+    assert has_exact_features(exact.replace(normal=edges))
     assert not has_exact_features(exact.replace(depth=None))
     assert not has_exact_features(exact.replace(normal=None))
 
