@@ -45,6 +45,8 @@ class Sequence:
         reference_numbers: frames that have a reference; possibly only some.
         color_has_albedo: whether the files hold color with the albedo in it. Frames always do.
         realisations: how many noisy colors every frame has: of the same pixels, with independent noise. Mostly 1.
+        noisy: names of the buffers that each realisation has of its own: its color, and the features of its samples
+            where they have noise, too.
         table: what each buffer was taken from.
         warnings: what is probably wrong, a line each.
         unused: files and layers that look like buffers and are not used.
@@ -61,6 +63,7 @@ class Sequence:
     reference_numbers: list[int]
     color_has_albedo: bool
     realisations: int
+    noisy: frozenset[str]
     table: Sequential[Row] = field(repr=False)
     warnings: Sequential[str]
     unused: Sequential[str] = field(repr=False)
@@ -89,7 +92,8 @@ class Sequence:
         Args:
             number: one of ``numbers``.
             reference: whether to read the reference too, where there is one.
-            realisation: which noisy color, from 0 to ``realisations - 1``; the other buffers are the same for all.
+            realisation: which noisy color, from 0 to ``realisations - 1``, and the other buffers that are ``noisy``; the
+                rest is the same for all.
 
         Raises:
             InputError: there is no such frame or realisation, or a file is damaged.
@@ -349,6 +353,7 @@ def _wrap(root: Path, layout: str, source: BmfrFolder | NoisebaseFiles | Rendere
         reference_numbers=source.reference_numbers,
         color_has_albedo=source.color_has_albedo,
         realisations=source.realisations,
+        noisy=source.noisy if isinstance(source, BmfrFolder) else frozenset({"color"}),
         table=source.table,
         warnings=[*gaps, *source.warnings],
         unused=source.unused,

@@ -33,13 +33,13 @@ from mcdenoise.models.accumulated import motion_to_previous
 from mcdenoise.train.front import Front
 
 # What each realisation of the noise and each first frame has of its own, in one array, with the number of channels; the
-# first alone where nothing is accumulated. All of them have the features in common.
+# first alone where nothing is accumulated. All of them have the features in common, unless the features have noise.
 NOISY = {"color": 3, "current": 3, "length": 1}
 _CAMERA = frozenset({"position", "view_projection"})
 # The files that a reader of sequences looks at, and where they are in a sequence's folder.
 _SUFFIXES = {".exr", ".h", ".json"}
 _PLACES = ("*", "realisation*/*", "inputs/*", "inputs/realisation*/*")
-_FORMAT = 3
+_FORMAT = 4
 
 Array: TypeAlias = NDArray[Any]
 # First frame (an index) and realisation of the noise: each has a color of its own.
@@ -55,11 +55,14 @@ class Shot:
             frame alone, and the history length.
         features: ``(T, C, H, W)`` of everything else, by the names of buffers; ``view_projection`` is ``(T, 4, 4)``.
         demodulated: whether the radiance in ``colors`` has no albedo in it.
+        noisy: for each realisation the features that are of its own samples, in the same form; empty where there are
+            none.
     """
 
     colors: tuple[Array, ...]
     features: Mapping[str, Array]
     demodulated: bool = False
+    noisy: tuple[Mapping[str, Array], ...] = ()
 
     def __len__(self) -> int:
         return len(self.colors[0])
@@ -73,7 +76,8 @@ class Shot:
     def cut(self, frames: slice) -> Shot:
         """Some of the frames, with the history that they have."""
         features = {name: feature[frames] for name, feature in self.features.items()}
-        return Shot(tuple(color[frames] for color in self.colors), features, self.demodulated)
+        noisy = tuple({name: feature[frames] for name, feature in own.items()} for own in self.noisy)
+        return Shot(tuple(color[frames] for color in self.colors), features, self.demodulated, noisy)
 
     def read(
         self,
@@ -91,7 +95,7 @@ class Shot:
             frames: which frames.
             rows: which rows.
             columns: which columns.
-            realisation: of the noise.
+            realisation: of the noise, and of the features that have noise.
             channels: of some buffers, which channels, in which order.
             turn: gives another view of ``(T, C, H, W)``, flipped or turned.
         """
@@ -103,7 +107,8 @@ class Shot:
                 sources[name] = color[:, start : start + count]
             start += count
         parts = {}
-        for name, source in {**sources, **self.features}.items():
+        own = self.noisy[realisation] if self.noisy else {}
+        for name, source in {**sources, **self.features, **own}.items():
             if source.ndim == 3:
                 parts[name] = torch.from_numpy(source[frames].astype(np.float32))
                 continue
@@ -140,6 +145,19 @@ class _Plan:
     keep_fireflies: int
 
     @property
+    def own(self) -> tuple[str, ...]:
+        """Features that each realisation has of its own."""
+        noisy = self.sequence.noisy
+        # Depth and motion may be those of the positions.
+        derived = {"motion"} if "position" in noisy and "motion" not in self.sequence.buffers else set()
+        return tuple(name for name in self.features if name in noisy | derived)
+
+    @property
+    def shared(self) -> tuple[str, ...]:
+        """Features that all realisations have in common."""
+        return tuple(name for name in self.features if name not in self.own)
+
+    @property
     def starts(self) -> list[_Start]:
         return [(first, realisation) for first in self.firsts for realisation in range(self.realisations)]
 
@@ -173,7 +191,8 @@ def open_cached(
 ) -> CachedSequence:
     """A sequence as a network sees it, from a cache that is filled where it has to be.
 
-    The features are kept once, the radiance once for each first frame and realisation of the noise: a shot that starts
+    The features are kept once (those with noise once for each realisation), the radiance once for each first frame and
+    realisation of the noise: a shot that starts
     later has shorter histories, so that a network also learns how a shot begins. Features are kept in half precision
     where nothing is lost by it, radiance in single. Pixels of the radiance and of the reference that are none (NaN,
     infinite, negative, or absurdly large) get the mean of their neighbours. Motion is the sequence's own, or else
@@ -278,7 +297,8 @@ def _build(folder: Path, plan: _Plan) -> None:
     """Decode the frames one after the other; only features in the making are held in memory."""
     sequence = plan.sequence
     steps = {start: plan.begin(start[1]) for start in plan.starts}
-    features: dict[str, list[Array]] = {name: [] for name in plan.features}
+    features: dict[str, list[Array]] = {_feature_name(name): [] for name in plan.shared}
+    features |= {_feature_name(name, k): [] for name in plan.own for k in range(plan.realisations)}
     camera: Tensor | None = None
     digest = hashlib.sha256()
     with ExitStack() as stack:
@@ -294,14 +314,16 @@ def _build(folder: Path, plan: _Plan) -> None:
                         seen = dict(steps[first, realisation](frame).items())
                         noisy = torch.cat([seen[name] for name in plan.noisy], 1)
                         files[first, realisation].write(noisy.numpy().tobytes())
-                if realisation == 0:
-                    found = _with_motion(frame, camera) if "motion" in features else frame
-                    for name, values in features.items():
-                        values.append(_smallest(dict(found.items())[name].numpy()))
-                    camera = frame.view_projection
-    for name in list(features):
+                if realisation == 0 or plan.own:
+                    found = dict((_with_motion(frame, camera) if "motion" in plan.features else frame).items())
+                    for name in plan.shared if realisation == 0 else ():
+                        features[_feature_name(name)].append(_smallest(found[name].numpy()))
+                    for name in plan.own:
+                        features[_feature_name(name, realisation)].append(_smallest(found[name].numpy()))
+            camera = frame.view_projection
+    for file in list(features):
         # One frame that half precision cannot hold makes all of them single.
-        np.save(folder / f"{name}.npy", np.concatenate(features.pop(name)), allow_pickle=False)
+        np.save(folder / file, np.concatenate(features.pop(file)), allow_pickle=False)
     (folder / "about.json").write_text(json.dumps({"sha256": digest.hexdigest()}) + "\n")
 
 
@@ -349,24 +371,37 @@ def _color_name(start: _Start) -> str:
     return f"color-{first}-{realisation}.npy"
 
 
+def _feature_name(name: str, realisation: int | None = None) -> str:
+    return f"{name}.npy" if realisation is None else f"{name}-{realisation}.npy"
+
+
 def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
     """Map the arrays; ``None`` where there are none, or not those of this sequence."""
     sequence = plan.sequence
     try:
         about = json.loads((folder / "about.json").read_text())
-        features = {name: _map(folder / f"{name}.npy") for name in plan.features}
-        for name, feature in features.items():
-            _check(name, feature, (len(sequence), *feature.shape[1:-2], *_size(name, sequence)))
+        features = _map_features(folder, plan.shared, None, sequence)
+        noisy = [_map_features(folder, plan.own, k, sequence) for k in range(plan.realisations)] if plan.own else []
         shots = []
         for first in plan.firsts:
             colors = [_map(folder / _color_name((first, k))) for k in range(plan.realisations)]
             for color in colors:
                 _check(f"color of {first}", color, plan.color_shape(first))
             later = {name: feature[first:] for name, feature in features.items()}
-            shots.append(Shot(tuple(colors), later, plan.front.demodulates))
+            own = tuple({name: feature[first:] for name, feature in each.items()} for each in noisy)
+            shots.append(Shot(tuple(colors), later, plan.front.demodulates, own))
         return CachedSequence(shots, str(about["sha256"]))
     except (OSError, EOFError, ValueError, KeyError, TypeError):
         return None
+
+
+def _map_features(
+    folder: Path, names: tuple[str, ...], realisation: int | None, sequence: Sequence
+) -> dict[str, Array]:
+    features = {name: _map(folder / _feature_name(name, realisation)) for name in names}
+    for name, feature in features.items():
+        _check(name, feature, (len(sequence), *feature.shape[1:-2], *_size(name, sequence)))
+    return features
 
 
 def _size(name: str, sequence: Sequence) -> tuple[int, int]:

@@ -68,7 +68,8 @@ _FULL_FLOAT = {"position", "previous_position"}
 class BmfrFolder:
     """A folder in this layout: ``{color,albedo,shading_normal,world_position,...}N.exr`` and ``camera_matrices.h``.
 
-    Further noisy colors of the same frames, with noise of their own, are ``realisation{1,2,...}/colorN.exr``.
+    Further noisy colors of the same frames, with noise of their own, are ``realisation{1,2,...}/colorN.exr``. Other
+    buffers that lie beside them are of the same samples, and have noise of their own too; references are the same.
 
     Args:
         path: the folder that holds the files.
@@ -78,7 +79,7 @@ class BmfrFolder:
         cameras: what ``camera_matrices.h`` says, or ``None`` without it.
         color_has_albedo: whether the color files hold radiance (``camera.json`` says so) or radiance divided by
             albedo (the published data, which has no ``camera.json``). Without albedo files it is always radiance.
-        more_colors: for each realisation of the noise from 1 on, the color file of each frame number.
+        more: for each realisation of the noise from 1 on, the files that it has of its own, as ``files``.
         table: what each buffer was taken from.
         warnings: what is probably wrong.
         unused: files that look like buffers of the layout and are not.
@@ -90,7 +91,7 @@ class BmfrFolder:
     size: tuple[int, int]
     cameras: CameraMatrices | None
     color_has_albedo: bool
-    more_colors: Sequence[Mapping[int, Path]] = ()
+    more: Sequence[Mapping[str, Mapping[int, Path]]] = ()
     encoded_normals: bool = False
     camera_convention: str = ""
     motion: Convention | None = USUAL_MOTION
@@ -106,7 +107,14 @@ class BmfrFolder:
     @property
     def realisations(self) -> int:
         """How many noisy colors every frame in use has."""
-        return 1 + len(self.more_colors)
+        return 1 + len(self.more)
+
+    @property
+    def noisy(self) -> frozenset[str]:
+        """Names of the buffers that are of each realisation's own samples, as :meth:`frame` gives them."""
+        own = {name for files in self.more for name in files} | {"color"}
+        derived = {"depth"} if "position" in own and self.cameras is not None and not self.files.get("depth") else set()
+        return frozenset(own | derived)
 
     @property
     def buffers(self) -> frozenset[str]:
@@ -130,7 +138,7 @@ class BmfrFolder:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
         sources: dict[str, Mapping[int, Path]] = dict(self.files)
         if realisation:
-            sources["color"] = self.more_colors[realisation - 1]
+            sources |= self.more[realisation - 1]
         buffers: dict[str, Any] = {
             name: self._read(name, files[number])
             for name, files in sources.items()
@@ -254,10 +262,10 @@ def open_bmfr(
                     f"render it, or leave out all {_STEMS[name]} files"
                 )
     cameras = find_camera_matrices(path, numbers[-1])
-    more_colors = _find_realisations(path, numbers, first)
+    more = _find_realisations(path, numbers, first, used - {"reference"})
     own = {name: files[name] for name in used}
     stated = _color_has_albedo(path, "albedo" in used) if color_has_albedo is None else color_has_albedo
-    folder = BmfrFolder(path, own, numbers, size, cameras, stated is not False, more_colors)
+    folder = BmfrFolder(path, own, numbers, size, cameras, stated is not False, more)
     return _look(folder, stated)
 
 
@@ -343,16 +351,25 @@ def _others(path: Path) -> list[str]:
     return list(dict.fromkeys(re.sub("[0-9]+", "#", name) for name in names))
 
 
-def _find_realisations(path: Path, numbers: list[int], first: ExrHeader) -> list[dict[int, Path]]:
-    """Color files of the realisations 1, 2, ... up to the first that some frame lacks: it is still being rendered."""
-    found: list[dict[int, Path]] = []
+def _find_realisations(
+    path: Path, numbers: list[int], first: ExrHeader, used: set[str]
+) -> list[dict[str, dict[int, Path]]]:
+    """Files of the realisations 1, 2, ... up to the first whose color some frame lacks: it is still being rendered."""
+    found: list[dict[str, dict[int, Path]]] = []
     while os.path.isdir(folder := realisation_folder(path, 1 + len(found))):
-        colors = _list_files(folder, {"color": "color"})["color"]
-        if not all(number in colors for number in numbers):
+        files = _list_files(folder, {name: _STEMS[name] for name in used})
+        if not all(number in files["color"] for number in numbers):
             break
-        for number in numbers:
-            _check_header("color", colors[number], first)
-        found.append(colors)
+        own = {name: paths for name, paths in files.items() if any(number in paths for number in numbers)}
+        for name, paths in own.items():
+            for number in numbers:
+                if number not in paths:
+                    raise InputError(
+                        f"{folder / f'{_STEMS[name]}{number}.exr'}: expected buffer '{name}' for every frame, found it "
+                        "for some; render it, or remove them all"
+                    )
+                _check_header(name, paths[number], first)
+        found.append(own)
     return found
 
 

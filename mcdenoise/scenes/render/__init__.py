@@ -1,7 +1,8 @@
 """Mitsuba 3: a scene and a camera path in, a noisy sequence with features and references out, in the BMFR layout."""
 
 from mcdenoise.data.camera_path import Camera, Shot, load_shot, view_projection
+from mcdenoise.scenes.render.film import FILTERS, Film
 from mcdenoise.scenes.render.sequence import render_sequence
 from mcdenoise.scenes.render.tracer import VARIANTS, Scene
 
-__all__ = ["VARIANTS", "Camera", "Scene", "Shot", "load_shot", "render_sequence", "view_projection"]
+__all__ = ["FILTERS", "VARIANTS", "Camera", "Film", "Scene", "Shot", "load_shot", "render_sequence", "view_projection"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,14 @@ _CONVENTIONS: dict[str, Any] = {
         "transform that the scene gives it",
     },
 }
+# What differs on a film; see :mod:`mcdenoise.scenes.render.film`.
+_ON_A_FILM: dict[str, Any] = {
+    "pixel_sampling": "jittered samples through the pixel filter and the lens of 'film'; features are means over the "
+    "samples of their color, and each folder realisation{1,2,...} has its own",
+    "albedo": "Mitsuba's aov, clamped to [0, 1]",
+    "alpha_masks": "features are of the first surface, be it see-through",
+    "shading_normal": "world space, turned to the side the camera sees, averaged and not normalised",
+}
 # Frames rendered with different values of these do not belong into one folder.
 _IDENTITY = (
     "scene",
@@ -54,6 +63,7 @@ _IDENTITY = (
     "near",
     "far",
     "noisy_spp",
+    "film",
     "max_depth",
     "rr_depth",
     "seed",
@@ -100,7 +110,7 @@ class SequenceFolder:
             ) from error
         self._description = self.path / "camera.json"
         before = self._read(settings) if self._description.is_file() else {}
-        self._settings = {**_merged(before, settings), **_CONVENTIONS}
+        self._settings = {**_merged(before, settings), **_CONVENTIONS, **(_ON_A_FILM if settings["film"] else {})}
         self.references = self._find_references(before.get("reference_spp", {}))
         self._write()
         matrices = CameraMatrices(
@@ -199,18 +209,25 @@ def read_reference(folder: Path, number: int) -> np.ndarray[Any, np.dtype[np.flo
     return read_exr(folder / f"reference{number}.exr")[0].astype(np.float64).reshape(-1, 3)
 
 
-def write_realisation(folder: Path, number: int, realisation: int, color: Tensor) -> None:
-    """Write one noisy color, ``(1, 3, H, W)``, of a frame.
+def write_realisation(folder: Path, number: int, realisation: int, buffers: Mapping[str, Tensor]) -> None:
+    """Write what one realisation of the noise has of its own: its noisy color, and perhaps features.
+
+    Args:
+        folder: ``inputs`` of a sequence.
+        number: frame number.
+        realisation: of the noise.
+        buffers: ``(1, C, H, W)`` by name, in the order of writing.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: a file cannot be written.
     """
     place = realisation_folder(folder, realisation)
     try:
         place.mkdir(exist_ok=True)
     except OSError as error:
         raise InputError(f"{place}: cannot be created ({error.strerror}); choose another output folder") from error
-    write_buffer(place, number, "color", color)
+    for name, buffer in buffers.items():
+        write_buffer(place, number, name, buffer)
 
 
 def _merged(before: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import torch
 
 from mcdenoise.data.camera_path import Array, Camera, PixelRays, pixel_rays
 from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer
+from mcdenoise.scenes.render.film import Film, FilmRenderer
 from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write_realisation, write_reference
 from mcdenoise.scenes.render.halves import ReferenceHalves
 from mcdenoise.scenes.render.tracer import STRATIFIED_PATHS, Tracer
@@ -20,6 +23,8 @@ from mcdenoise.scenes.render.tracer import STRATIFIED_PATHS, Tracer
 _FEWEST_PATHS_IN_A_HALF = 16
 _SMALLEST_HALF = 1 / 8
 _SECONDS_BETWEEN_SAVES = 60.0
+
+Seed: TypeAlias = tuple[int, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +44,7 @@ class FrameJob:
         references: frames that get a reference.
         started: how far the references on disk have come.
         seed: of the noise.
+        film: filter and lens of jittered samples; ``None`` for samples at the pixel centre.
     """
 
     folder: Path
@@ -53,20 +59,24 @@ class FrameJob:
     references: frozenset[int]
     started: dict[int, ReferenceState] = field(default_factory=dict)
     seed: int
+    film: Film | None = None
 
     def is_finished(self, number: int) -> bool:
         """Whether a frame has everything."""
         colors = all(self.has_color(number, realisation) for realisation in range(self.realisations))
-        return colors and self.has_features(number) and (number not in self.references or self.has_reference(number))
+        folders = {0, *(range(self.realisations) if self.film is not None else ())}
+        features = all(self.has_features(number, realisation) for realisation in folders)
+        return colors and features and (number not in self.references or self.has_reference(number))
 
     def has_color(self, number: int, realisation: int) -> bool:
         """Whether a frame has one of its noisy colours."""
         return (realisation_folder(self.folder, realisation) / f"color{number}.exr").is_file()
 
-    def has_features(self, number: int) -> bool:
-        """Whether a frame has everything but colours and reference."""
+    def has_features(self, number: int, realisation: int = 0) -> bool:
+        """Whether a frame has everything but colours and reference, in the folder of a realisation."""
+        folder = realisation_folder(self.folder, realisation)
         names = ["albedo", "shading_normal", "world_position", "depth", *(["previous_position"] if self.moves else [])]
-        return all((self.folder / f"{name}{number}.exr").is_file() for name in names)
+        return all((folder / f"{name}{number}.exr").is_file() for name in names)
 
     def has_reference(self, number: int) -> bool:
         """Whether a frame has a reference that is good enough."""
@@ -107,21 +117,58 @@ def render_frame(job: FrameJob, tracer: Tracer, number: int, advance: Callable[[
         InputError: a file cannot be written, or what there is of a reference is damaged.
     """
     width, height = job.size
-    rays = pixel_rays(job.cameras[number], width, height)
     tracer.place(number)
+    wanted = number in job.references and not job.has_reference(number)
+    if job.film is not None:
+        return _render_filtered(job, FilmRenderer(tracer, job.film, job.size, job.reach), tracer, number, advance, wanted)
+    rays = pixel_rays(job.cameras[number], width, height)
     if not job.has_features(number):
         for name, values in _features(job, tracer, number, rays).items():
             write_buffer(job.folder, number, name, _image(values, job.size))
     state = None
-    if number in job.references and not job.has_reference(number):
-        state = _refine_reference(job, tracer, number, rays, advance)
+    if wanted:
+        trace = partial(tracer.radiance, rays)
+        state = _refine_reference(job, lambda n, seed, even: trace(n, seed, stratified=even), number, advance)
     for realisation in reversed(range(job.realisations)):
         if not job.has_color(number, realisation):
-            # The stream 1 belongs to the reference.
-            stream = 1 + realisation if realisation else 0
-            color = _color(tracer, rays, job.spp, (job.seed, number, stream), advance)
-            write_realisation(job.folder, number, realisation, _image(color, job.size))
+            color = _color(tracer, rays, job.spp, (job.seed, number, _stream(realisation)), advance)
+            write_realisation(job.folder, number, realisation, {"color": _image(color, job.size)})
     return state
+
+
+def _render_filtered(
+    job: FrameJob,
+    film: FilmRenderer,
+    tracer: Tracer,
+    number: int,
+    advance: Callable[[int], None],
+    wanted: bool,
+) -> ReferenceState | None:
+    """As :func:`render_frame`, on a film: every realisation of the noise has the features of its own samples."""
+    camera = job.cameras[number]
+    state = None
+    if wanted:
+        state = _refine_reference(job, lambda n, seed, _: film.radiance(camera, n, seed), number, advance)
+    back = {name: matrix for name, matrix in _moved_back(job, number).items() if name in tracer.movers}
+    for realisation in reversed(range(job.realisations)):
+        if job.has_color(number, realisation) and job.has_features(number, realisation):
+            continue
+        total: dict[str, Array] = {}
+        per_pass = film.paths_per_pass()
+        for index, start in enumerate(range(0, job.spp, per_pass)):
+            paths = min(per_pass, job.spp - start)
+            seed = (job.seed, number, _stream(realisation), index)
+            for name, values in film.frame(camera, back, paths, seed).items():
+                total[name] = total.get(name, 0) + values * (paths / job.spp)
+            advance(paths)
+        images = {name: _image(total[name], job.size) for name in (*sorted({*total} - {"color"}), "color")}
+        write_realisation(job.folder, number, realisation, images)
+    return state
+
+
+def _stream(realisation: int) -> int:
+    # The stream 1 belongs to the reference.
+    return 1 + realisation if realisation else 0
 
 
 def _features(job: FrameJob, tracer: Tracer, number: int, rays: PixelRays) -> dict[str, Array]:
@@ -130,17 +177,23 @@ def _features(job: FrameJob, tracer: Tracer, number: int, rays: PixelRays) -> di
     depth = (position - rays.origin) @ job.cameras[number].to_world[:3, 2]
     features = {"albedo": hits.albedo, "normal": hits.normal, "position": position, "depth": depth}
     if job.moves:
-        # The first frame has no frame before it; a look back at itself leaves everything where it is.
-        earlier = max(number - 1, 0)
-        before = position.copy()
+        before, back = position.copy(), _moved_back(job, number)
         for index, identity in enumerate(tracer.movers):
-            moved = job.moves[identity]
-            if not np.array_equal(moved[earlier], moved[number]):
-                back = moved[earlier] @ np.linalg.inv(moved[number])
-                hit = hits.mover == index
-                before[hit] = position[hit] @ back[:3, :3].T + back[:3, 3]
+            hit = hits.mover == index
+            before[hit] = position[hit] @ back[identity][:3, :3].T + back[identity][:3, 3]
         features["previous_position"] = before
     return features
+
+
+def _moved_back(job: FrameJob, number: int) -> dict[str, Array]:
+    """For each object that moves ``(4, 4)``: from where a point of it is to where it was in the frame before."""
+    # The first frame has no frame before it; a look back at itself leaves everything where it is.
+    earlier = max(number - 1, 0)
+    still = {name: np.array_equal(moved[earlier], moved[number]) for name, moved in job.moves.items()}
+    return {
+        name: np.eye(4) if still[name] else moved[earlier] @ np.linalg.inv(moved[number])
+        for name, moved in job.moves.items()
+    }
 
 
 def _color(
@@ -156,16 +209,19 @@ def _color(
 
 
 def _refine_reference(
-    job: FrameJob, tracer: Tracer, number: int, rays: PixelRays, advance: Callable[[int], None]
+    job: FrameJob, trace: Callable[[int, Seed, bool], Array], number: int, advance: Callable[[int], None]
 ) -> ReferenceState:
-    """Add passes to what there is of a reference until it is good, and write it."""
+    """Add passes to what there is of a reference until it is good, and write it.
+
+    ``trace`` gives the mean radiance of so many paths a pixel, with a seed, drawn evenly or each for itself.
+    """
     unfinished = job.folder / f"reference{number}.partial.npz"
     before = job.started.get(number, ReferenceState(0, 0, None))
     if unfinished.is_file():
         halves = ReferenceHalves.load(unfinished)
         advance(halves.spp - before.spp)
     else:
-        mean = read_reference(job.folder, number) if before.spp else np.zeros_like(rays.directions)
+        mean = read_reference(job.folder, number) if before.spp else np.zeros((job.size[0] * job.size[1], 3))
         halves = ReferenceHalves.start(mean, before.spp, before.passes)
     saved = time.monotonic()
     while not job.is_good(halves.spp, _reliable_noise(halves)):
@@ -175,14 +231,14 @@ def _refine_reference(
         rest = missing if halves.passes else (missing + 1) // 2
         paths = STRATIFIED_PATHS if stratified else rest
         seed = (job.seed, number, 1, halves.passes)
-        halves.add(tracer.radiance(rays, paths, seed, stratified=stratified), paths)
+        halves.add(trace(paths, seed, stratified), paths)
         advance(paths)
         if time.monotonic() - saved > _SECONDS_BETWEEN_SAVES:
             halves.save(unfinished)
             saved = time.monotonic()
     advance(max(0, job.reference_spp - halves.spp))
     state = ReferenceState(halves.spp, halves.passes, halves.noise())
-    write_reference(job.folder, number, _image(halves.mean(), job.size), state)
+    write_reference(job.folder, number, _image(np.maximum(halves.mean(), 0), job.size), state)
     unfinished.unlink(missing_ok=True)
     return state
 

@@ -1,12 +1,14 @@
 """Render a sequence: what is asked for, what is there already, and who renders which frame.
 
 Everything is sampled at the pixel centre: features, noisy colour and reference, so that the expectation of the colour
-is the reference, and dividing by the albedo is consistent.
+is the reference, and dividing by the albedo is consistent. Or everything is sampled as Mitsuba does it, see
+:class:`mcdenoise.scenes.render.film.Film`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, view_projection
 from mcdenoise.errors import InputError
+from mcdenoise.scenes.render.film import Film
 from mcdenoise.scenes.render.folder import SequenceFolder
 from mcdenoise.scenes.render.frames import FrameJob, render_frame
 from mcdenoise.scenes.render.processes import TracerSource, render_in_processes
@@ -46,6 +49,7 @@ def render_sequence(
     max_depth: int = 8,
     workers: int = 1,
     variant: str | None = None,
+    film: Film | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Render a sequence in the BMFR layout.
@@ -79,6 +83,9 @@ def render_sequence(
             than one must protect its main part by ``if __name__ == "__main__":``.
         variant: one of ``VARIANTS``; by default the one Mitsuba is already set to, else ``cuda_ad_rgb`` or
             ``llvm_ad_rgb`` where they work, else ``scalar_rgb``.
+        film: filter and lens of jittered samples, as Mitsuba's own renderer takes them: noisy colours then come with
+            noisy features of the same samples, those of realisation k in its folder, and so does the reference. With
+            several threads its sums differ by rounding from run to run. By default all samples are at the pixel centre.
         progress: called with the finished and the total number of paths per pixel, summed over all frames. A reference
             that reaches the noise level early counts as complete.
 
@@ -125,6 +132,7 @@ def render_sequence(
         "near": near,
         "far": far,
         "noisy_spp": spp,
+        "film": None if film is None else asdict(film),
         "realisations": realisations,
         "max_depth": max_depth,
         "rr_depth": RR_DEPTH,
@@ -154,6 +162,7 @@ def render_sequence(
         references=references,
         started=dict(folder.references),
         seed=seed,
+        film=film,
     )
 
     done, total = 0, count * realisations * spp + len(references) * reference_spp

@@ -1,7 +1,7 @@
 """Mitsuba 3 behind a small interface: given rays in, what they hit and the light that comes back out.
 
-Mitsuba's own renderer always jitters inside the pixel; therefore the rays are built here, and Mitsuba traces them. It
-is optional and imported on first use.
+Mitsuba's own renderer always jitters inside the pixel; therefore the rays are built here, and Mitsuba traces them; what
+its own renderer gives is :mod:`mcdenoise.scenes.render.film`. Mitsuba is optional and imported on first use.
 """
 
 from __future__ import annotations
@@ -57,13 +57,16 @@ class Tracer:
         max_depth: longest path, in segments.
         moves: see :class:`mcdenoise.data.camera_path.Shot`.
 
+    ``mitsuba`` is its module, ``scene`` and ``path`` are its scene and integrator, ``moving`` the shapes that move by
+    their ids, which ``movers`` lists.
+
     Raises:
         InputError: Mitsuba is missing, the variant does not run here, the scene cannot be loaded, or an object that
             is to move is not there.
     """
 
     def __init__(self, scene: Scene, variant: str, max_depth: int, moves: Mapping[str, Array] | None = None) -> None:
-        self._mi = mi = _import_mitsuba()
+        self.mitsuba = mi = _import_mitsuba()
         try:
             mi.set_variant(variant)
         except ImportError as error:
@@ -74,19 +77,19 @@ class Tracer:
         self._scalar = variant.startswith("scalar")
         self.name = f"mitsuba {mi.__version__} ({variant}, drjit {self._dr.__version__}), path integrator"
         # Merged meshes could no longer move each for itself.
-        self._scene = _load_scene(mi, scene, merge=not moves)
-        self._integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": RR_DEPTH})
+        self.scene = _load_scene(mi, scene, merge=not moves)
+        self.path = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": RR_DEPTH})
         self._independent = mi.load_dict({"type": "independent"})
         self._stratified = mi.load_dict({"type": "multijitter", "sample_count": STRATIFIED_PATHS})
         self._context = mi.BSDFContext()
         self._last_rays: tuple[PixelRays, list[Any]] | None = None
         self._moves = dict(moves or {})
-        self._parameters: Any = mi.traverse(self._scene) if moves else {}
-        shapes = {shape.id(): shape for shape in self._scene.shapes()}
+        self._parameters: Any = mi.traverse(self.scene) if moves else {}
+        shapes = {shape.id(): shape for shape in self.scene.shapes()}
         self._at_rest = {identity: self._placement(identity, shapes) for identity in self._moves}
-        self._moving = {identity: shapes[identity] for identity in self._moves if identity in shapes}
-        self.movers = list(self._moving)
-        self._boxes = {identity: _box(shape) for identity, shape in self._moving.items()}
+        self.moving = {identity: shapes[identity] for identity in self._moves if identity in shapes}
+        self.movers = list(self.moving)
+        self._boxes = {identity: _box(shape) for identity, shape in self.moving.items()}
 
     def place(self, frame: int) -> None:
         """Put every object that moves where it is in a frame.
@@ -106,7 +109,7 @@ class Tracer:
 
     def reach(self, cameras: Sequence[Camera]) -> float:
         """A distance that lies behind everything in the scene, from each camera: where the background is put."""
-        box = self._scene.bbox()
+        box = self.scene.bbox()
         if not box.valid():
             return 1.0
         corners = [np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)]
@@ -159,10 +162,10 @@ class Tracer:
         wavefront = self._wavefront(rays, copies, interleaved=not stratified)
         if stratified:
             sampler.set_samples_per_wavefront(copies)
-        sampler.seed(self._dr.opaque(self._mi.UInt32, state), count * copies)
+        sampler.seed(self._dr.opaque(self.mitsuba.UInt32, state), count * copies)
         total = np.zeros((count, 3))
         for _ in range(paths // copies):
-            radiance = self._integrator.sample(self._scene, sampler, wavefront)[0]
+            radiance = self.path.sample(self.scene, sampler, wavefront)[0]
             # All channels at once: each by itself would trace the paths again. With them where the sampler has come to:
             # the next pass would otherwise trace these paths again to find out.
             sampler.schedule_state()
@@ -175,7 +178,7 @@ class Tracer:
 
     def _placement(self, identity: str, shapes: Mapping[str, Any]) -> dict[str, tuple[Any, Array]]:
         """What has to change when an object moves: for each of its parameters its type and its value at rest."""
-        emitters = {emitter.id() for emitter in self._scene.emitters()}
+        emitters = {emitter.id() for emitter in self.scene.emitters()}
         present = [
             key for key in ("to_world", "vertex_positions", "position") if f"{identity}.{key}" in self._parameters
         ]
@@ -209,14 +212,14 @@ class Tracer:
         return self._last_rays[1]
 
     def _make_scalar_rays(self, rays: PixelRays) -> list[Any]:
-        origin = self._mi.Point3f(*rays.origin.tolist())
+        origin = self.mitsuba.Point3f(*rays.origin.tolist())
         return [
-            self._mi.RayDifferential3f(self._mi.Ray3f(origin, self._mi.Vector3f(*direction)))
+            self.mitsuba.RayDifferential3f(self.mitsuba.Ray3f(origin, self.mitsuba.Vector3f(*direction)))
             for direction in rays.directions.tolist()
         ]
 
     def _scalar_radiance(self, rays: list[Any], paths: int, sampler: Any, state: int, stratified: bool) -> Array:
-        sample, scene = self._integrator.sample, self._scene
+        sample, scene = self.path.sample, self.scene
         values: list[float] = []
         if stratified:
             for index, ray in enumerate(rays):
@@ -234,7 +237,7 @@ class Tracer:
         return np.asarray(_finite(samples).sum(axis=0, dtype=np.float64) / paths)
 
     def _wavefront(self, rays: PixelRays, copies: int, interleaved: bool = True) -> Any:
-        mi = self._mi
+        mi = self.mitsuba
         directions = rays.directions.astype(np.float32)
         columns = (np.tile(directions, (copies, 1)) if interleaved else np.repeat(directions, copies, axis=0)).T
         direction = mi.Vector3f(*(mi.Float(_aligned(column)) for column in columns))
@@ -244,8 +247,8 @@ class Tracer:
 
     def _hit(self, ray: Any) -> tuple[Any, Any, Any, Any]:
         """Distance, normal, albedo and mover of the first surface that is not see-through, the same in all variants."""
-        mi, dr = self._mi, self._dr
-        hit = self._scene.ray_intersect(ray)
+        mi, dr = self.mitsuba, self._dr
+        hit = self.scene.ray_intersect(ray)
         for _ in range(_SEE_THROUGH_LAYERS):
             if not dr.any(hit.is_valid()):
                 break
@@ -253,7 +256,7 @@ class Tracer:
             through = hit.is_valid() & (sum(transmission) > 1.5)  # opacity below a half, on average over RGB
             if not dr.any(through):
                 break
-            behind = self._scene.ray_intersect(hit.spawn_ray(ray.d), through)
+            behind = self.scene.ray_intersect(hit.spawn_ray(ray.d), through)
             hit = dr.select(through, behind, hit)
         valid = hit.is_valid()
         black = mi.Color3f(0)
@@ -269,14 +272,14 @@ class Tracer:
         if dr.any(glossy):
             albedo = dr.select(glossy, self._directional_albedo(bsdf, hit, glossy), albedo)
         mover = mi.Float(-1)
-        for index, shape in enumerate(self._moving.values()):
+        for index, shape in enumerate(self.moving.values()):
             found = valid & ((hit.shape == shape) | (hit.instance == shape))
             mover = dr.select(found, mi.Float(index), mover)
         return dr.select(valid, dr.dot(hit.p - ray.o, ray.d), dr.inf), normal, albedo, mover
 
     def _directional_albedo(self, bsdf: Any, hit: Any, active: Any) -> Any:
         """What a rough metal reflects of a white world towards the viewer: a fixed 4x4 grid of samples, so no noise."""
-        mi, dr = self._mi, self._dr
+        mi, dr = self.mitsuba, self._dr
         # Known from here on: each of the samples would otherwise trace the rays again.
         dr.eval(hit, active)
         total = mi.Color3f(0)
