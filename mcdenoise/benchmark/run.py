@@ -277,7 +277,8 @@ class _SceneRun:
 
     def _frames(self, *, reference: bool) -> Iterator[_Read]:
         for timed in self._made.denoisers.values():
-            timed.denoiser.reset(frames=len(self._sequence))
+            # A still has neither a history nor a frame that it would be one of.
+            timed.denoiser.reset(frames=1 if len(self._sequence) == 1 else None)
         for number in self._sequence.numbers:
             start = self._watch.mark()
             frame = self._sequence.frame(number, reference=reference).to(self._settings.device)

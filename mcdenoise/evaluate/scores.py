@@ -33,9 +33,9 @@ METRICS: dict[str, Metric] = {
     "tSMAPE": Metric(temporal_smape_linear, temporal=True),
     "tRMSE": Metric(temporal_rmse_srgb, temporal=True),
     # For comparison with tables of others: not computed unless it is asked for.
-    "PSNR 1/2.2": Metric(psnr_gamma, higher_is_better=True),
+    "PSNR 2.2": Metric(psnr_gamma, higher_is_better=True),
 }
-USUAL = tuple(name for name in METRICS if name != "PSNR 1/2.2")
+USUAL = tuple(name for name in METRICS if name != "PSNR 2.2")
 
 
 def measure(
