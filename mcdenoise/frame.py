@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -35,6 +36,7 @@ class BufferSpec:
         meaning: unit and convention, for messages and documentation.
         infinite: whether infinity is legal, within the range (nothing was hit, or there is no previous position).
         slack: how far values may overshoot ``high`` before they are refused; up to there they are clamped.
+        forgiven: whether those of less than half of a buffer are clamped beyond it, too, with a warning.
     """
 
     channels: int
@@ -43,13 +45,16 @@ class BufferSpec:
     meaning: str
     infinite: bool = False
     slack: float = _ROUNDING
+    forgiven: bool = False
 
 
 _UNBOUNDED = float("inf")
 
 BUFFERS: dict[str, BufferSpec] = {
     "color": BufferSpec(3, 0.0, _UNBOUNDED, "noisy radiance, scene-linear RGB, not clamped"),
-    "albedo": BufferSpec(3, 0.0, 1.0, "diffuse reflectance, linear RGB; 0 where there is none", slack=1.0),
+    "albedo": BufferSpec(
+        3, 0.0, 1.0, "diffuse reflectance, linear RGB; 0 where there is none", slack=1.0, forgiven=True
+    ),
     "normal": BufferSpec(3, -1.0, 1.0, "shading normal, world space, unit length; 0 where nothing was hit"),
     "depth": BufferSpec(
         1, 0.0, _UNBOUNDED, "distance along the view axis, scene units; inf where nothing was hit", infinite=True
@@ -63,7 +68,7 @@ BUFFERS: dict[str, BufferSpec] = {
     ),
     "diffuse": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance by diffuse reflection, with albedo"),
     "specular": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance by specular reflection"),
-    "specular_albedo": BufferSpec(3, 0.0, 1.0, "specular reflectance, linear RGB", slack=1.0),
+    "specular_albedo": BufferSpec(3, 0.0, 1.0, "specular reflectance, linear RGB", slack=1.0, forgiven=True),
     "roughness": BufferSpec(1, 0.0, 1.0, "perceptual roughness: 0 is a mirror"),
     "hit_distance": BufferSpec(
         1, 0.0, _UNBOUNDED, "length of the first bounce, scene units; inf where it hit nothing", infinite=True
@@ -354,7 +359,8 @@ class Frame:
         neighbours (0 if there is none), so that they never spread. A pixel that has such a value in a layer counts as
         one of them, and all layers are replaced where ``color`` is, in the same way: what added up still does.
         Values of ``albedo`` and ``normal`` that overshoot their range by rounding are clamped, and so are albedos up to
-        2 (rough conductors evaluated at the normal).
+        2 (rough conductors evaluated at the normal). What is brighter is no reflectance; where that is less
+        than half of the buffer, it is clamped, too, with a warning.
 
         Returns:
             The clean frame, and the number of pixels of ``color`` that were replaced.
@@ -579,7 +585,16 @@ def _check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]
     if (spec.high == _UNBOUNDED and spec.low == -_UNBOUNDED) or (low >= spec.low and high <= spec.high):
         return value, (low, high)
     # The largest radiance itself is rounded.
-    if low < spec.low - _ROUNDING or high > spec.high + max(spec.slack, 1e-6 * spec.high):
+    limit = spec.high + max(spec.slack, 1e-6 * spec.high)
+    # A lamp's radiance among reflectances is a pixel's fault; all of them are another unit, or another buffer.
+    forgiven = high > limit and spec.forgiven and bool((value > limit).double().mean() < 0.5)
+    if forgiven:
+        warnings.warn(
+            f"buffer '{name}': expected values up to {spec.high:g} ({spec.meaning}), found some up to {high:.4g}, "
+            f"which count as {spec.high:g}; leave the buffer out if it is another one",
+            stacklevel=2,
+        )
+    if low < spec.low - _ROUNDING or (high > limit and not forgiven):
         raise InputError(
             f"buffer '{name}': expected values in [{spec.low:g}, {spec.high:g}] ({spec.meaning}), "
             f"found [{low:.4g}, {high:.4g}]"

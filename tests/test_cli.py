@@ -634,6 +634,29 @@ def test_generate(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")} == times
 
 
+def test_generate_wild(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
+    """One clip and two stills, by their sampling; what a second call finds it does not render again."""
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    command = ["generate", "-o", out, "--frames", "4", "--size", "8x8", "--variant", "scalar_rgb", "--wild"]
+    command += ["--realisations", "2", "--reference-spp", "1", "--sampling", "filtered", "--seeds"]
+    for stills, names in (("0", ["random0011"]), ("1", ["random0011_0", "random0011_1"])):
+        status, text, errors = run(*command, "11", "--stills", stills)
+        assert (status, errors) == (0, "")
+        assert text.split() == [str(out / name / "inputs") for name in names]
+        for name in names:
+            found = open_sequence(out / name)
+            about = json.loads((out / name / "inputs" / "camera.json").read_text())
+            assert len(found) == (1 if "_" in name else 4)
+            assert found.noisy >= {"color", "albedo", "normal", "position", "depth"}
+            assert about["film"]["filter"] in ("box", "gaussian", "tent", "mitchell")
+            assert about["reference_spp"]["0"] == 4 * about["noisy_spp"]
+            for number in found.numbers:
+                found.frame(number, realisation=1).validate()
+    times = {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")}
+    assert run(*command, "11", "--stills", "0")[0] == 0
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")} == times
+
+
 @pytest.mark.parametrize(
     ("option", "value", "expected"),
     [
@@ -644,6 +667,8 @@ def test_generate(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
         ("--size", "160", "--size: expected WIDTHxHEIGHT such as 1280x720, found '160'"),
         ("--size", "0x8", "expected width and height between 1 and 16384 pixels, found 0x8"),
         ("--realisations", "0", "realisations: expected at least 1, found 0"),
+        ("--stills", "1.5", "--stills: expected a fraction from 0 to 1, found 1.5"),
+        ("--sampling", "left", "centre"),
     ],
 )
 def test_generate_with_bad_options(

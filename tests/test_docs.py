@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from mcdenoise.cli import COMMANDS
+from mcdenoise.models import pretrained_models
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = ("bring-your-own-model.md", "bring-your-own-op.md")
@@ -35,9 +37,19 @@ def test_code_of_a_page_runs(page: str, tmp_path: Path, monkeypatch: pytest.Monk
     sys.modules.pop(name, None)
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.skipif("oidn_temporal" not in pretrained_models(), reason="there are no weights yet")
+def test_code_for_those_who_come_from_oidn_runs() -> None:
+    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[oidn]")
+    found: dict[str, Any] = {"__name__": "page"}
+    (block,) = blocks("from-oidn.md", "python")
+    exec(compile(block, "from-oidn.md", "exec"), found)
+    assert found["clean"].shape == found["image"].shape == (72, 128, 3)
+
+
+@pytest.mark.parametrize("page", [*PAGES, "from-oidn.md"])
 def test_commands_of_a_page_exist(page: str) -> None:
-    commands = [line.split()[1] for block in blocks(page, "sh") for line in block.splitlines() if line.strip()]
+    lines = [line for block in blocks(page, "sh") for line in block.splitlines() if line.strip()]
+    commands = [line.split()[1] for line in lines if not line.startswith("pip ")]
     assert commands
     assert set(commands) <= set(COMMANDS)
 

@@ -235,6 +235,16 @@ def test_values_far_outside_their_range_are_refused(name: str, value: float) -> 
     assert message.endswith(f"found [{value:g}, {value:g}]")
 
 
+def test_a_lamp_among_reflectances_is_clamped_with_a_warning() -> None:
+    albedo = plane(3, 0.5)
+    albedo[..., 0] = 93
+    with pytest.warns(UserWarning, match="'albedo': expected values up to 1 .* found some up to 93, which count as 1"):
+        clean, _ = Frame(color=plane(3), albedo=albedo).validate()
+    assert clean.albedo is not None
+    assert (clean.albedo[..., 0] == 1).all()
+    assert (clean.albedo[..., 1:] == 0.5).all()
+
+
 @pytest.mark.parametrize("name", ["position", "motion"])
 def test_unbounded_buffers_take_any_finite_value(name: str) -> None:
     frame = Frame(color=plane(3), **{name: plane(BUFFERS[name].channels, -1e30)})

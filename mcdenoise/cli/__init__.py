@@ -61,7 +61,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"mcdenoise: unknown command '{name}'; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(2)
     try:
-        status = _parse(load_command(name), rest, f"mcdenoise {name}")()
+        status = parse(name, rest)()
     except InputError as error:
         print(f"mcdenoise {name}: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
@@ -81,8 +81,17 @@ def load_command(name: str) -> Command:
     return command
 
 
-def _parse(command: Command, arguments: list[str], prog: str) -> Callable[[], int | None]:
-    """A command with its arguments, ready to be called."""
+def parse(name: str, arguments: list[str]) -> Callable[[], int | None]:
+    """A command with its arguments, ready to be called.
+
+    Args:
+        name: one of :data:`COMMANDS`.
+        arguments: as on the command line.
+
+    Raises:
+        InputError: the command does not take them.
+    """
+    command, prog = load_command(name), f"mcdenoise {name}"
 
     @functools.wraps(command)
     def bind(*args: Any, **kwargs: Any) -> Callable[[], int | None]:

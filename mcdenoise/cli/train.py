@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import math
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import get_type_hints
 
 import tyro
 from rich.console import Console
 
+from mcdenoise.cli import load_command, parse
 from mcdenoise.cli._options import Out
+from mcdenoise.cli._output import warn
+from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
-from mcdenoise.train import Progress, TrainConfig, is_first_process
+from mcdenoise.train import Progress, Recipe, Rendering, RunFolder, TrainConfig, is_first_process
 from mcdenoise.train import train as run
 
 
@@ -17,6 +26,8 @@ def train(
     sequences: tyro.conf.Positional[list[Path]],
     out: Out,
     config: tyro.conf.OmitArgPrefixes[TrainConfig],
+    recipe: Path | None = None,
+    data: Path | None = None,
     validation: list[Path] = [],  # noqa: B006 - tyro reads it
     cache: Path | None = None,
     initial_weights: Path | None = None,
@@ -30,6 +41,8 @@ def train(
         sequences: folders of sequences with references, and with the buffers that the model is better with.
         out: folder of the run: checkpoint, log, TensorBoard events, and at the end the weights.
         config: what to train.
+        recipe: TOML file that says all this, and how the sequences are generated, which are rendered first.
+        data: folder of what a recipe renders, which several may share; OUT/data by default.
         validation: folders of sequences that are used for nothing but validation.
         cache: folder of the decoded sequences, which several runs may share; OUT/cache by default.
         initial_weights: safetensors file of weights to start from.
@@ -38,7 +51,21 @@ def train(
         credits: authors and licences of the training scenes, stored with the weights.
     """
     keep_heap()
-    console = Console(stderr=True)
+    console, followed = Console(stderr=True), None
+    if recipe is not None:
+        changed = [each.name for each in dataclasses.fields(config) if getattr(config, each.name) != each.default]
+        others: dict[str, object] = {"SEQUENCES": sequences, "--validation": validation, "--credits": credits}
+        others["--initial-weights"] = initial_weights
+        given = [name for name, value in others.items() if value]
+        for name in [*given, *(f"--{name.replace('_', '-')}" for name in changed)]:
+            raise InputError(f"{name}: expected none beside --recipe, which says what is trained, found one")
+        followed = Recipe.read(recipe, options_of("generate"))
+        config, credits = followed.config, followed.credits
+        # Before anything is rendered for a run that the folder is not of.
+        RunFolder(out).check(config=dataclasses.asdict(config))
+        sequences, validation = _make_data(followed, data or out / "data")
+    elif data is not None:
+        raise InputError("--data: expected a --recipe that says what is rendered to it, found none")
 
     def report(progress: Progress) -> None:
         scores = "".join(f"  validation {name} {value:.4f}" for name, value in progress.validation.items())
@@ -55,7 +82,70 @@ def train(
         accelerator=accelerator,
         checkpoint_every=checkpoint_every,
         credits=credits,
+        recipe=followed.sha256 if followed else "",
         report=report,
     )
     if is_first_process():
+        if followed:
+            _print_errors(RunFolder(out).errors(), followed.expected)
         print(weights)
+
+
+def options_of(command: str) -> set[str]:
+    """Names of a command's options but for its output, with those of the data classes among its arguments."""
+    hints = get_type_hints(load_command(command))
+    grouped = {name: kind for name, kind in hints.items() if dataclasses.is_dataclass(kind)}
+    inner = {field.name for kind in grouped.values() for field in dataclasses.fields(kind)}
+    return (inner | hints.keys()) - grouped.keys() - {"out", "return"}
+
+
+def _make_data(recipe: Recipe, data: Path) -> tuple[list[Path], list[Path]]:
+    """Folders to train on and to validate on, rendered where they are not there yet."""
+    # All are parsed before the first is rendered.
+    ready = [(each, _generator(each, data)) for each in (*recipe.data, *recipe.validation)]
+    made = [each.make(data, generate) for each, generate in ready]
+    training, validation = made[: len(recipe.data)], made[len(recipe.data) :]
+    return [path for each in training for path in each], [path for each in validation for path in each]
+
+
+def _generator(rendering: Rendering, data: Path) -> Callable[[], None]:
+    """`mcdenoise generate` with the options of a table, ready to be called."""
+    arguments = ["--out", str(rendering.folder(data))]
+    for key, value in rendering.options.items():
+        name = key.replace("_", "-")
+        if isinstance(value, bool):
+            arguments.append(f"--{name}" if value else f"--no-{name}")
+        else:
+            arguments += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
+    with _naming(rendering.where):
+        command = parse("generate", arguments)
+
+    def generate() -> None:
+        # What is printed is what this command makes.
+        with _naming(rendering.where), contextlib.redirect_stdout(sys.stderr):
+            command()
+
+    return generate
+
+
+@contextlib.contextmanager
+def _naming(where: str) -> Iterator[None]:
+    """Say where in a recipe it is that something is wrong."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def _print_errors(errors: Mapping[str, float], expected: tuple[float, float] | None) -> None:
+    """Print how good the weights are, and whether that is what the recipe says."""
+    scores = "".join(f"  {name} {value:.4f}" for name, value in errors.items())
+    print(f"validation{scores or ': no frames to validate on'}")
+    if expected is None:
+        return
+    found, (smape, tolerance) = errors.get("smape", math.nan), expected
+    line = f"expected a smape of at most {smape:g} + {tolerance:g}, found {found:.4f}"
+    if found <= smape + tolerance:
+        print(f"{line}: met")
+    else:
+        warn([f"{line}: missed"])

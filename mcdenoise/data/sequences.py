@@ -92,8 +92,8 @@ class Sequence:
         Args:
             number: one of ``numbers``.
             reference: whether to read the reference too, where there is one.
-            realisation: which noisy color, from 0 to ``realisations - 1``, and the other buffers that are ``noisy``; the
-                rest is the same for all.
+            realisation: which noisy color, from 0 to ``realisations - 1``, with its other ``noisy`` buffers; the
+                others are the same for all.
 
         Raises:
             InputError: there is no such frame or realisation, or a file is damaged.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -59,7 +59,8 @@ class History(NamedTuple):
         surface: what was seen.
         view_projection: ``(B, 4, 4)`` by which camera.
         limit: ``(B, 1, 1, 1)`` of the fireflies of this shot, see :func:`mcdenoise.ops.clamp_fireflies`.
-        carried: of each layer, and then of the alpha, the channels of ``color`` that are no compressed radiance.
+        carried: of each layer, then of the alpha, then of each buffer that is accumulated as well, the channels of
+            ``color`` that are no compressed radiance.
     """
 
     color: Tensor
@@ -110,6 +111,8 @@ class Accumulated(Wrapper):
             frames, at least 0; infinity treats them as everything else.
         lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test for changes of light.
         clamp_current: whether fireflies are clamped in what the method sees as ``current``, too.
+        also: names of buffers ``(B, 3, H, W)`` of ``frame.extra`` that are accumulated as the color is, where a frame
+            has them: with its weights, and with what they have of fireflies.
 
     Raises:
         InputError: a setting is out of its range.
@@ -127,6 +130,7 @@ class Accumulated(Wrapper):
         specular_length: float = SPECULAR_LENGTH,
         lag_threshold: float = THRESHOLD,
         clamp_current: bool = True,
+        also: Sequence[str] = (),
     ) -> None:
         super().__init__(inner)
         if not 0 < alpha_min <= 1:
@@ -136,7 +140,7 @@ class Accumulated(Wrapper):
         self.alpha_min, self.rule, self.firefly_limit = alpha_min, rule, firefly_limit
         self.position_limit, self.normal_limit = position_limit, normal_limit
         self.specular_length, self.lag_threshold = specular_length, lag_threshold
-        self.clamp_current = clamp_current
+        self.clamp_current, self.also = clamp_current, tuple(also)
 
     @property
     def needs(self) -> Needs:
@@ -202,7 +206,9 @@ class Accumulated(Wrapper):
                     limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
         if reset:
             color, length = without_history(entering), torch.ones_like(entering[:, :1])
-            carried = tuple(torch.cat([part, part], 1) if compared else part for part in _entering(frame, entering))
+            carried = tuple(
+                torch.cat([part, part], 1) if compared else part for part in self._entering(frame, entering)
+            )
             inner, still = None, False
         if (found := journal()) is not None:
             self._report(found, frame, reset, still=bool(still), can_move=can_move, keeps=keeps)
@@ -215,18 +221,18 @@ class Accumulated(Wrapper):
         current = entering[:, COLOR] if self.clamp_current else frame.color.to(color.dtype)
         # What was found of another image is not handed on.
         seen_inside = {"color": color[:, COLOR], "current": current, "length": length, "statistics": {}}
-        return _with_carried(frame.replace(**seen_inside, hints=hints), carried), after, inner
+        return self._with_carried(frame.replace(**seen_inside, hints=hints), carried), after, inner
 
     def _blend_carried(
         self, frame: Frame, entering: Tensor, seen: Tensor | None, history: History, still: bool | Tensor
     ) -> tuple[Tensor, ...]:
-        """Layers and alpha of the frame with their histories.
+        """Layers and alpha of the frame, and what is accumulated as well, with their histories.
 
         Each goes through the blend in the place of the color, which decides nothing: its compressed radiance does.
         """
         decisive = entering[:, COLOR.stop :]
         blended = []
-        for part, before in zip(_entering(frame, entering), history.carried, strict=True):
+        for part, before in zip(self._entering(frame, entering), history.carried, strict=True):
             previous = [before[:, COLOR], history.color[:, MEAN.start : SQUARE.stop], before[:, COLOR.stop :]]
             previous = [*previous, history.color[:, RECENT_MEAN]] if decisive.shape[1] else previous
             together = torch.cat([part, decisive], 1), torch.cat(previous, 1)
@@ -266,6 +272,31 @@ class Accumulated(Wrapper):
             lag_threshold=self.lag_threshold,
         )
 
+    def _entering(self, frame: Frame, entering: Tensor) -> list[Tensor]:
+        """What has a history beside the color, ``(B, 3, H, W)`` each, as it enters it: layers without fireflies."""
+        parts = list(frame.layers.values())
+        if parts:
+            lit = frame.color > 0
+            scale = torch.where(lit, entering[:, COLOR] / torch.where(lit, frame.color, 1), 1)
+            parts = [part * scale for part in parts]
+        if (alpha := alpha_of(frame)) is not None:
+            parts.append(alpha.expand(-1, COLOR.stop, -1, -1))
+        parts += [frame.extra[name] for name in self._found(frame)]
+        return [part.to(entering.dtype) for part in parts]
+
+    def _with_carried(self, frame: Frame, carried: tuple[Tensor, ...]) -> Frame:
+        """The frame with the layers, the alpha and the buffers of its history."""
+        if not carried:
+            return frame
+        parts = iter(carried)
+        layers = {name: next(parts)[:, COLOR] for name in frame.layers}
+        alpha = frame.alpha if alpha_of(frame) is None else next(parts)[:, :1]
+        extra = {**frame.extra, **{name: next(parts)[:, COLOR] for name in self._found(frame)}}
+        return frame.replace(layers=layers, alpha=alpha, extra=extra)
+
+    def _found(self, frame: Frame) -> list[str]:
+        return [name for name in self.also if name in frame.extra]
+
     def _chosen(self, color: Tensor) -> Tensor:
         """The limit of the fireflies of each image of a shot that begins with this frame."""
         if self.firefly_limit is not None:
@@ -281,28 +312,6 @@ class Accumulated(Wrapper):
         why = alone or ("nothing moves in the image" if still and not frame.hints.keep_all else "")
         note("reproject", why or source, float(why != ""))
         note("remember", "for the next frame" if keeps else alone or "last frame", float(not keeps))
-
-
-def _entering(frame: Frame, entering: Tensor) -> list[Tensor]:
-    """Layers and alpha of a frame, ``(B, 3, H, W)`` each, as its color enters the history: without fireflies."""
-    parts = list(frame.layers.values())
-    if parts:
-        lit = frame.color > 0
-        scale = torch.where(lit, entering[:, COLOR] / torch.where(lit, frame.color, 1), 1)
-        parts = [part * scale for part in parts]
-    alpha = alpha_of(frame)
-    return [part.to(entering.dtype) for part in parts] + (
-        [] if alpha is None else [alpha.to(entering.dtype).expand(-1, COLOR.stop, -1, -1)]
-    )
-
-
-def _with_carried(frame: Frame, carried: tuple[Tensor, ...]) -> Frame:
-    """The frame with the layers and the alpha of its history."""
-    if not carried:
-        return frame
-    layers = {name: part[:, COLOR] for name, part in zip(frame.layers, carried, strict=False)}
-    alpha = frame.alpha if alpha_of(frame) is None else carried[-1][:, :1]
-    return frame.replace(layers=layers, alpha=alpha)
 
 
 def surface_before(frame: Frame) -> Surface:

@@ -1,6 +1,6 @@
 """Intel Open Image Denoise through its own package, in each of its settings: the denoiser to compare with.
 
-https://www.openimagedenoise.org, Apache License 2.0; optional, ``pip install 'mcdenoise[peers]'``.
+https://www.openimagedenoise.org, Apache License 2.0; optional, ``pip install 'mcdenoise[oidn]'``.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Oidn:
         if threads is not None and threads < 1:
             raise InputError(f"threads: expected at least 1, found {threads}")
         self._oidn = _import_oidn()
-        self.quality, self.auxiliary = quality, auxiliary
+        self.quality, self.auxiliary, self.threads = quality, auxiliary, threads
         self._device = self._oidn.Device()
         if threads is not None:
             self._device.set_int("numThreads", threads)
@@ -61,6 +61,10 @@ class Oidn:
         self._buffers: dict[str, Tensor] = {}
         # Filters go before their device, and both before the library does.
         weakref.finalize(self, _release, self._filters, self._device)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Oidn:
+        """One of the same settings: a device of the library cannot be copied."""
+        return Oidn(self.quality, self.auxiliary, threads=self.threads)
 
     @property
     def needs(self) -> Needs:
@@ -169,7 +173,7 @@ def _import_oidn() -> Any:
         return importlib.import_module("pyoidn")
     except ImportError as error:
         raise InputError(
-            "Open Image Denoise needs pyoidn, which is not installed; pip install 'mcdenoise[peers]'"
+            "Open Image Denoise needs pyoidn, which is not installed; pip install 'mcdenoise[oidn]'"
         ) from error
 
 

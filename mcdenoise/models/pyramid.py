@@ -5,12 +5,12 @@ and so decides what rules decide elsewhere:
 
 - how far the history is to be trusted against the frame alone, pixel by pixel: highlights and reflections do not move
   with the surface whose history they are in;
-- how much of the light is matt: the filtered quantity is ``color / e`` with the effective albedo
-  ``e = m + t (1 - m)`` between the albedo ``m`` (t = 0) and one (t = 1). Where ``color = m D + S``, of matt light and of
-  what a coat reflects, ``t / (1 - t) = S / D`` makes it exactly as smooth as D, and no grain is multiplied into highlights;
+- how much of the light is matt: what is filtered is ``color / e`` with the effective albedo ``e = m + t (1 - m)``
+  between the albedo ``m`` (t = 0) and one (t = 1). Where ``color = m D + S``, of matt light and of what a coat
+  reflects, ``t / (1 - t) = S / D`` makes it as smooth as D and S are, and no grain is multiplied into highlights;
 - how much a pixel is worth: a firefly little, a pixel without noise much;
-- on which scale a pixel's light is to be spread: each scale keeps a part of it and hands on the rest (Balint et al. 2023,
-  "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", Eqs. 4-7, with kernels guided by features);
+- on which scale a pixel's light is to be spread: each scale keeps a part of it and hands on the rest, as in Balint et
+  al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", Sec. 4;
 - how features that have noise themselves (anti-aliased, out of focus, blurred by motion) are filtered before they are
   multiplied back or guide anything.
 """
@@ -46,6 +46,7 @@ _FEATURE_TAPS = 9  # of the kernel for features
 _PARTS = {"importance": 1, "history": 1, "matt": 1, "gain": 3, "features": _FEATURE_TAPS}
 # What they are before anything was learnt: the history is trusted, light is matt, features are exact.
 _AT_REST = {"history": 2.0, "matt": -2.0}
+_QUARTERS = (4, 6, 8, 12, 16)  # of the width, at each level
 _LEAST = 1e-3  # of the light of a pixel that a scale keeps or hands on, and that a pixel is worth
 _MOST_GAIN = 1.0  # of the logarithm of the factor
 
@@ -197,7 +198,7 @@ def _sizes(size: tuple[int, int], scales: int) -> list[tuple[int, int]]:
 
 
 def _pyramid(
-    widths: Sequence[int] = (32, 48, 64, 96, 128),
+    width: int = 32,
     kernel_size: int = 5,
     half: bool = False,
     *,
@@ -208,17 +209,17 @@ def _pyramid(
     """The pyramid with all that it wears.
 
     Args:
-        widths: feature channels of each level.
+        width: feature channels of the finest level, a multiple of 4.
         kernel_size: side of the kernels.
-        half: whether the U-Net begins at half the resolution.
+        half: whether the U-Net begins at half the resolution; it has one level less then.
         alpha_min: see :class:`mcdenoise.models.Accumulated`.
         anti_lag: likewise.
         tolerance: see :class:`mcdenoise.models.Skipping`.
     """
-    network = Tiled(PyramidNetwork(tuple(widths), kernel_size, half))
+    widths = [width * quarters // 4 for quarters in _QUARTERS[: len(_QUARTERS) - half]]
     return Demodulated(
         Accumulated(
-            Skipping(network, tolerance, alpha_min),
+            Skipping(Tiled(PyramidNetwork(widths, kernel_size, half)), tolerance, alpha_min),
             alpha_min=alpha_min,
             lag_threshold=THRESHOLD if anti_lag else math.inf,
             clamp_current=False,
@@ -226,15 +227,10 @@ def _pyramid(
     )
 
 
+_ABOUT = "one network weighs, splits and filters the noisy pixels at all scales"
 for _name, _about, _settings in (
-    ("pyramid", "widths 32 to 128", {}),
-    ("pyramid_small", "widths 16 to 96", {"widths": (16, 32, 48, 64, 96)}),
-    (
-        "pyramid_tiny",
-        "widths 24 to 64, half the resolution, 3x3 kernels",
-        {"widths": (24, 32, 48, 64), "kernel_size": 3, "half": True},
-    ),
+    ("pyramid", "width 32, 5x5 kernels", {}),
+    ("pyramid_small", "width 16, 5x5 kernels", {"width": 16}),
+    ("pyramid_tiny", "width 24, 3x3 kernels, half the resolution", {"width": 24, "kernel_size": 3, "half": True}),
 ):
-    register_model(
-        _name, f"one network weighs, splits and filters the noisy pixels at all scales: {_about}", **_settings
-    )(_pyramid)
+    register_model(_name, f"{_ABOUT}: {_about}", **_settings)(_pyramid)

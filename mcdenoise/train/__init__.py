@@ -3,6 +3,20 @@
 from mcdenoise.train.config import Schedule, TrainConfig
 from mcdenoise.train.devices import is_first_process
 from mcdenoise.train.loop import Progress, train
+from mcdenoise.train.recipe import Recipe, Rendering
+from mcdenoise.train.references import clean_references
+from mcdenoise.train.run_folder import RunFolder
 from mcdenoise.train.unroll import unroll
 
-__all__ = ["Progress", "Schedule", "TrainConfig", "is_first_process", "train", "unroll"]
+__all__ = [
+    "Progress",
+    "Recipe",
+    "Rendering",
+    "RunFolder",
+    "Schedule",
+    "TrainConfig",
+    "clean_references",
+    "is_first_process",
+    "train",
+    "unroll",
+]

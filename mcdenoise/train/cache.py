@@ -30,11 +30,13 @@ from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, replace_invalid
 from mcdenoise.models.accumulated import motion_to_previous
+from mcdenoise.models.oidn_temporal import NOISY as RAW
+from mcdenoise.models.oidn_temporal import NOISY_CURRENT as RAW_CURRENT
 from mcdenoise.train.front import Front
 
-# What each realisation of the noise and each first frame has of its own, in one array, with the number of channels; the
-# first alone where nothing is accumulated. All of them have the features in common, unless the features have noise.
-NOISY = {"color": 3, "current": 3, "length": 1}
+# What each realisation of the noise and each first frame has of its own, in one array, with the number of channels: as
+# many of the first as Front.radiance says. All of them have the features in common, unless the features have noise.
+NOISY = {"color": 3, "current": 3, "length": 1, RAW: 3, RAW_CURRENT: 3}
 _CAMERA = frozenset({"position", "view_projection"})
 # The files that a reader of sequences looks at, and where they are in a sequence's folder.
 _SUFFIXES = {".exr", ".h", ".json"}
@@ -52,7 +54,8 @@ class Shot:
 
     Args:
         colors: for each realisation ``(T, 3, H, W)``: radiance; or ``(T, 7, H, W)``: accumulated radiance, that of each
-            frame alone, and the history length.
+            frame alone, and the history length; or ``(T, 13, H, W)``: also the noisy radiance, accumulated and that of
+            each frame alone, where a denoiser has come before.
         features: ``(T, C, H, W)`` of everything else, by the names of buffers; ``view_projection`` is ``(T, 4, 4)``.
         demodulated: whether the radiance in ``colors`` has no albedo in it.
         noisy: for each realisation the features that are of its own samples, in the same form; empty where there are
@@ -163,7 +166,7 @@ class _Plan:
 
     @property
     def noisy(self) -> list[str]:
-        return list(NOISY)[: None if self.front.accumulates else 1]
+        return list(self.front.radiance)
 
     def begin(self, realisation: int) -> Callable[[Frame], Frame]:
         kept = self.keep_fireflies > 0 and (realisation + 1) % self.keep_fireflies == 0
@@ -226,7 +229,7 @@ def open_cached(
     if cached is not None:
         return cached
     try:
-        with _locked(place):
+        with locked(place):
             # While this waited for the lock, somebody else may have done the work.
             if (cached := _load(finished, plan)) is None:
                 _fill(finished, plan)
@@ -271,7 +274,7 @@ def _code() -> bytes:
 
 
 @contextmanager
-def _locked(place: Path) -> Iterator[None]:
+def locked(place: Path) -> Iterator[None]:
     """Have a folder for oneself; the lock ends with the process, however that ends."""
     place.mkdir(parents=True, exist_ok=True)
     with (place / "lock").open("w") as file:
@@ -297,6 +300,7 @@ def _build(folder: Path, plan: _Plan) -> None:
     """Decode the frames one after the other; only features in the making are held in memory."""
     sequence = plan.sequence
     steps = {start: plan.begin(start[1]) for start in plan.starts}
+    prepare = plan.front.prepare()
     features: dict[str, list[Array]] = {_feature_name(name): [] for name in plan.shared}
     features |= {_feature_name(name, k): [] for name in plan.own for k in range(plan.realisations)}
     camera: Tensor | None = None
@@ -309,9 +313,10 @@ def _build(folder: Path, plan: _Plan) -> None:
         for i, number in enumerate(sequence.numbers):
             for realisation in range(plan.realisations):
                 frame = _read(sequence, number, realisation, digest)
+                prepared = prepare(frame)
                 for first in plan.firsts:
                     if first <= i:
-                        seen = dict(steps[first, realisation](frame).items())
+                        seen = dict(steps[first, realisation](prepared).items())
                         noisy = torch.cat([seen[name] for name in plan.noisy], 1)
                         files[first, realisation].write(noisy.numpy().tobytes())
                 if realisation == 0 or plan.own:

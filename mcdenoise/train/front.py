@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Skipping, State, Wrapper
 from mcdenoise.models.accumulated import CAUSTICS
+from mcdenoise.models.oidn_temporal import NOISY, NOISY_CURRENT, AfterOidn
 from mcdenoise.ops import remodulate
 
 
@@ -35,12 +36,28 @@ class Front:
         return any(kind is Demodulated for kind, _ in self.wrappers)
 
     @property
+    def keeps_noisy(self) -> bool:
+        """Whether frames come out with the noisy radiance beside what was made of it."""
+        return any(kind is AfterOidn for kind, _ in self.wrappers)
+
+    @property
+    def radiance(self) -> dict[str, int]:
+        """Names of the buffers of radiance that frames come out with, and of their history's length; with channels."""
+        accumulated = {"current": 3, "length": 1} if self.accumulates else {}
+        return {"color": 3, **accumulated, **({NOISY: 3, NOISY_CURRENT: 3} if self.keeps_noisy else {})}
+
+    @property
     def settings(self) -> list[Any]:
         """Everything that the frames depend on, as JSON knows it."""
         return [[kind.__name__, settings] for kind, settings in self.wrappers]
 
+    def prepare(self) -> Callable[[Frame], Frame]:
+        """What is made of each frame whatever shot it is in: Open Image Denoise is slow, and has no history."""
+        denoisers = [AfterOidn(_Seen(), **settings) for kind, settings in self.wrappers if kind is AfterOidn]
+        return denoisers[0].before if denoisers else lambda frame: frame
+
     def begin(self, *, keep_fireflies: bool = False) -> Callable[[Frame], Frame]:
-        """What makes of each frame of one shot what the rest of the model sees.
+        """What makes of each prepared frame of one shot what the rest of the model sees.
 
         Args:
             keep_fireflies: whatever the shot looks like, take its fireflies for caustics.
@@ -48,6 +65,8 @@ class Front:
         seen = _Seen()
         model: Model = seen
         for kind, settings in reversed(self.wrappers):
+            if kind is AfterOidn:
+                continue
             caustics = {"firefly_limit": CAUSTICS} if keep_fireflies and kind is Accumulated else {}
             model = kind(model, **{**settings, **caustics})
         state: State = None
@@ -102,7 +121,7 @@ def split(model: Model) -> tuple[Front, Model]:
     wrappers: list[tuple[type[Wrapper], dict[str, Any]]] = []
     found, rest = 0, model
     # Not those that are derived from them, which may do anything.
-    while isinstance(model, Wrapper) and type(model) in (Demodulated, Accumulated):
+    while isinstance(model, Wrapper) and type(model) in (AfterOidn, Demodulated, Accumulated):
         wrappers.append((type(model), _settings(model)))
         model = model.inner
         if wrappers[-1][0] is Accumulated:

@@ -68,6 +68,7 @@ def train(
     accelerator: str = "cpu",
     checkpoint_every: int = 500,
     credits: str = "",
+    recipe: str = "",
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> Path:
     """Train a model, from the start or from where an earlier run of the same config in ``out`` stopped.
@@ -91,6 +92,7 @@ def train(
         accelerator: ``"cpu"`` or ``"cuda"``.
         checkpoint_every: steps between checkpoints and validations.
         credits: authors and licences of the training scenes, stored with the weights.
+        recipe: checksum of the recipe that the run follows, stored likewise.
         report: called with the progress every 50 steps, in the first process only.
 
     Returns:
@@ -116,6 +118,7 @@ def train(
     with fabric.rank_zero_first():
         data = folders.load(cache or out / "cache")
     identity = {"credits": credits, "initial_weights": start["sha256"], **data.description}
+    identity |= {"recipe": recipe} if recipe else {}
     first_clip = data.sampler.draw([config.seed])
     network.eval()
     output, state = _tried(config.model, rest, first_clip, fabric)

@@ -24,8 +24,8 @@ def stage_loss(
 ) -> Tensor:
     """The total loss: spatial and temporal SMAPE of the image, its error on a display, and those of stages before it.
 
-    ``L = sum_s w_s (L_s(R_s, Y) + w_t L_t(dR_s, dY) + w_d L_d(R_s, Y))``; with weights of 1 for the result and the stage ``initial``,
-    that is the paper's.
+    ``L = sum_s w_s (L_s(R_s, Y) + w_t L_t(dR_s, dY) + w_d L_d(R_s, Y))``; with weights of 1 for the result and the
+    stage ``initial``, and without ``w_d``, that is the paper's.
 
     Args:
         output: of a clip: images ``(B, T, 3, H, W)``, scene-linear radiance with its albedo.
@@ -65,8 +65,8 @@ def stage_loss(
 def display_error(image: Tensor, reference: Tensor) -> Tensor:
     """Root mean square error of each frame as a display shows it, which is what PSNR is the logarithm of.
 
-    ``sqrt(mean((g(x) - g(y))^2))`` with ``g(x) = (clamp(x, 0, 1) + c)^(1 / 2.2)``. SMAPE alone is content with a median:
-    a highlight of which most samples know nothing is left out.
+    ``sqrt(mean((g(x) - g(y))^2))`` with ``g(x) = (clamp(x, 0, 1) + c)^(1 / 2.2)``. SMAPE alone is content with a
+    median: a highlight of which most samples know nothing is left out.
 
     Args:
         image: ``(..., 3, H, W)`` scene-linear radiance, 1 is the brightest that a display shows.

@@ -103,6 +103,20 @@ class RunFolder:
         with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
 
+    def errors(self) -> dict[str, float]:
+        """The errors of the last validation; none without one.
+
+        Raises:
+            InputError: the log cannot be read.
+        """
+        path = self.out / "log.jsonl"
+        try:
+            entries = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+            measured = [entry["validation"] for entry in entries if entry.get("validation")]
+            return dict(measured[-1]) if measured else {}
+        except (OSError, ValueError, AttributeError, TypeError) as error:
+            raise InputError(f"{path}: expected the log of this run, found none that can be read") from error
+
     def rewind(self, step: int) -> None:
         """Drop from ``log.jsonl`` what will be computed again: steps after ``step``, and a line cut off in writing.
 
@@ -147,6 +161,7 @@ def about_weights(
         "config": json.dumps(config),
         "data": json.dumps(identity["sequences"]),
         "credits": identity["credits"],
+        **({"recipe": identity["recipe"]} if "recipe" in identity else {}),
         "initial_weights": identity["initial_weights"],
         "steps": str(steps),
         "commits": json.dumps(provenance),

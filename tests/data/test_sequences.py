@@ -212,6 +212,43 @@ def test_a_realisation_of_another_size_is_refused(small_sequence: Path) -> None:
     assert f"{path}: expected 24 x 20 pixels" in refused(lambda: open_sequence(small_sequence))
 
 
+def test_features_of_a_realisation_are_read_where_it_has_them(small_sequence: Path) -> None:
+    inputs = small_sequence / "inputs"
+    _add_realisation(inputs, 1, range(4))
+    assert open_sequence(small_sequence).noisy == {"color"}
+    for number in range(4):
+        for stem in ("albedo", "world_position"):
+            image = read_exr(inputs / f"{stem}{number}.exr")[0] + 0.25
+            write_exr(inputs / "realisation1" / f"{stem}{number}.exr", image, ["R", "G", "B"])
+    (inputs / "depth3.exr").unlink()
+    for number in range(3):
+        (inputs / f"depth{number}.exr").unlink()
+    sequence = open_sequence(small_sequence)
+    # Depth is that of the positions where it has no file.
+    assert sequence.noisy == {"color", "albedo", "position", "depth"}
+    first, second = (sequence.frame(2, realisation=k) for k in range(2))
+    assert first.albedo is not None
+    assert second.albedo is not None
+    assert first.position is not None
+    assert second.position is not None
+    torch.testing.assert_close(second.albedo, first.albedo + 0.25, atol=2**-11, rtol=0)
+    torch.testing.assert_close(second.position, first.position + 0.25, atol=1e-2, rtol=2**-11)
+    assert not torch.equal(second.depth, first.depth)  # type: ignore[arg-type]
+    for name in ("normal", "reference", "view_projection"):
+        assert torch.equal(dict(first.items())[name], dict(second.items())[name])
+
+
+def test_a_realisation_with_features_of_some_frames_is_refused(small_sequence: Path) -> None:
+    inputs = small_sequence / "inputs"
+    _add_realisation(inputs, 1, range(4))
+    shutil.copyfile(inputs / "albedo2.exr", inputs / "realisation1" / "albedo2.exr")
+    message = refused(lambda: open_sequence(small_sequence))
+    missing = inputs / "realisation1" / "albedo0.exr"
+    assert message.startswith(f"{missing}: expected buffer 'albedo' for every frame, found it for some")
+    write_exr(missing, np.zeros((4, 4, 3)), ["R", "G", "B"])
+    assert "albedo0.exr: expected 24 x 20 pixels" in refused(lambda: open_sequence(small_sequence, "0"))
+
+
 def test_chosen_frames(small_sequence: Path) -> None:
     assert open_sequence(small_sequence, "1,3").numbers == [1, 3]
     (small_sequence / "inputs" / "albedo3.exr").unlink()

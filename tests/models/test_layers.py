@@ -19,17 +19,18 @@ from mcdenoise.models._layers import REST, closed, fractions, split
 from mcdenoise.models.joint_bilateral import JointBilateral
 from mcdenoise.models.noisy import Noisy
 
+OIDN = ("oidn", "oidn_temporal")
 MODELS = [
     pytest.param(
         name,
         marks=pytest.mark.skipif(
-            name == "oidn" and importlib.util.find_spec("pyoidn") is None, reason="it is in the extra mcdenoise[peers]"
+            name in OIDN and importlib.util.find_spec("pyoidn") is None, reason="it is in the extra mcdenoise[oidn]"
         ),
     )
     for name in list_models()
 ]
 # Of others the library decides, or there are none.
-DIFFERENTIABLE = [each for each in MODELS if each.values[0] != "oidn"]
+DIFFERENTIABLE = [each for each in MODELS if each.values[0] not in OIDN]
 NAMES = ("diffuse", "glossy", "emission")
 SIZE = (24, 40)
 

@@ -42,7 +42,7 @@ def denoised(given: Frame, color: Tensor | None = None, *, quality: str = "high"
 
 @pytest.fixture(scope="module")
 def pyoidn() -> Any:
-    return pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    return pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[oidn]")
 
 
 @pytest.mark.parametrize("auxiliary", ["noisy", "clean"])
@@ -145,6 +145,6 @@ def test_refuses_what_is_no_setting() -> None:
 
 def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyoidn", None)
-    with pytest.raises(InputError, match=r"needs pyoidn, .*pip install 'mcdenoise\[peers\]'") as caught:
+    with pytest.raises(InputError, match=r"needs pyoidn, .*pip install 'mcdenoise\[oidn\]'") as caught:
         create_model("oidn")
     assert "\n" not in str(caught.value)

@@ -38,9 +38,11 @@ def test_a_model_without_its_package_is_listed_with_the_reason(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     models(tmp_path / "models.json")
-    last = json.loads((tmp_path / "models.json").read_text())[-1]
-    assert (last["name"], last["group"]) == ("oidn", "not available")
-    assert "pip install 'mcdenoise[peers]'" in last["reason"]
+    absent = json.loads((tmp_path / "models.json").read_text())[-2:]
+    assert [(entry["name"], entry["group"]) for entry in absent] == [
+        (name, "not available") for name in ("oidn", "oidn_temporal")
+    ]
+    assert all("pip install 'mcdenoise[oidn]'" in entry["reason"] for entry in absent)
     printed = capsys.readouterr().out
     assert all(name in printed for name in list_models())
     assert "not available" in printed

@@ -49,6 +49,20 @@ def noisy(small_sequence: Path) -> Path:
 
 
 @pytest.fixture
+def noisy_features(noisy: Path) -> Path:
+    """The same, with albedo and position of each realisation's own samples; normals are the same for all."""
+    inputs, positions = noisy / "inputs", [open_sequence(noisy).frame(number).position for number in range(4)]
+    for realisation in (1, 2):
+        for number, position in enumerate(positions):
+            torch.manual_seed(100 * realisation + number)
+            folder = inputs / f"realisation{realisation}"
+            write_buffer(folder, number, "albedo", 0.2 + 0.7 * torch.rand(1, 3, 20, 24))
+            assert position is not None
+            write_buffer(folder, number, "position", position + 0.01 * torch.rand(1, 3, 20, 24))
+    return noisy
+
+
+@pytest.fixture
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """Frame number and realisation of every frame that is decoded."""
     read, seen = Sequence.frame, []
@@ -209,6 +223,36 @@ def test_what_is_cached_is_not_decoded_again(noisy: Path, tmp_path: Path, reads:
     assert torch.equal(again.shots[1].read(realisation=2)["color"], first.shots[1].read(realisation=2)["color"])
 
 
+def test_features_with_noise_are_those_of_the_realisation(noisy_features: Path, tmp_path: Path) -> None:
+    names = ("albedo", "normal", "depth", "motion")
+    cached, sequence = opened(noisy_features, tmp_path / "cache", features=names), open_sequence(noisy_features)
+    assert sequence.noisy >= {"color", "albedo", "position"}
+    assert not sequence.noisy & {"normal", "reference", "view_projection"}
+    whole = cached.shots[0]
+    assert {name for own in whole.noisy for name in own} >= {"albedo", "motion"}
+    assert {"normal", "reference"} <= set(whole.features)
+    for shot, first in ((whole, 0), (cached.shots[1], 2), (whole.cut(slice(1, 3)), 1)):
+        for realisation in range(3):
+            clip = shot.read(realisation=realisation)
+            for i in range(len(shot)):
+                frame = sequence.frame(first + i, realisation=realisation).validate()[0].with_depth()
+                for name in ("albedo", "normal", "depth"):
+                    assert torch.equal(clip[name][i], dict(frame.items())[name][0])
+                if first + i > 0:
+                    camera = sequence.frame(first + i - 1).view_projection
+                    assert frame.position is not None
+                    assert camera is not None
+                    moved = motion_from_position(frame.position, camera)
+                    assert torch.equal(clip["motion"][i], moved[0])
+    differ = [not torch.equal(whole.read()[name], whole.read(realisation=1)[name]) for name in names]
+    assert differ[0]
+    assert not differ[1]
+    assert differ[3]
+    files = entries(tmp_path / "cache")
+    assert sum("normal" in name for name in files) == 1
+    assert sum("albedo" in name for name in files) == 3
+
+
 def test_fewer_realisations(noisy: Path, tmp_path: Path, reads: list[tuple[int, int]]) -> None:
     assert len(opened(noisy, tmp_path / "cache", realisations=1).shots[0].colors) == 1
     assert {realisation for _, realisation in reads} == {0}
@@ -281,7 +325,7 @@ def test_every_nth_realisation_keeps_its_fireflies(noisy: Path, tmp_path: Path) 
         bright = np.ones((20, 24, 3), np.float32)
         bright[10, 10] = 1e4
         write_exr(folder / "color0.exr", bright, ["R", "G", "B"])
-        write_exr(folder / "albedo0.exr", np.ones((20, 24, 3), np.float32), ["R", "G", "B"])
+    write_exr(noisy / "inputs" / "albedo0.exr", np.ones((20, 24, 3), np.float32), ["R", "G", "B"])
     brightest = [
         opened(noisy, tmp_path / "cache", keep_fireflies=n).shots[0].read(realisation=k)[name][0].amax((1, 2)).tolist()
         for n in (0, 2)

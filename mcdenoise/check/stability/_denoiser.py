@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -112,6 +113,14 @@ def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
     shots |= {f"position {value:g} in some rows": with_value("position", value, some) for value in (0.0, 1e10)}
     shots |= {f"{h}x{w}": [_frame(seed, dtype, (h, w)) for seed in range(FRAMES)] for h, w in ((1, 1), (1, 9), (9, 1))}
     shots |= {"nothing but color": [Frame(color=frame.color) for frame in frames]}
+    # Features that contradict one another, or come and go.
+    shots |= {"albedo 93 in some rows": with_value("albedo", 93.0, some)}
+    shots |= {"hit distance 0": [frame.replace(hit_distance=0 * frame.color[:, :1]) for frame in frames]}
+    shots |= {"normal -1": with_value("normal", -1.0)}
+    shots |= {"albedo without normal": [frame.replace(normal=None) for frame in frames]}
+    shots |= {"normal without albedo": [frame.replace(albedo=None) for frame in frames]}
+    lacking = [frame.replace(albedo=None, depth=None, position=None) for frame in frames]
+    shots |= {"half the features in every second frame": [*frames[:1], lacking[1], *frames[2:]]}
     return shots
 
 
@@ -120,7 +129,9 @@ def _valid(denoiser: Denoiser, name: str, frames: list[Frame], dtype: torch.dtyp
     denoiser.reset()
     message = ""
     for number, frame in enumerate(frames):
-        image = denoiser(frame)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            image = denoiser(frame)
         if not torch.isfinite(image).all() or not (image >= 0).all():
             message = message or f"frame {number}: NaN, infinite or negative pixels"
     return _found(name, dtype, "finite", message)

@@ -429,6 +429,43 @@ def write_buffer(
     write_exr(path, image, _CHANNELS[image.shape[2]], half=half, metadata=metadata)
 
 
+CLEAN = "clean"
+
+
+def write_clean_features(folder: Path, number: int, albedo: Tensor, normal: Tensor) -> None:
+    """Write the features that belong to a reference, of many samples: ``clean/albedoN.exr`` and so on.
+
+    Args:
+        folder: ``inputs`` of a sequence.
+        number: frame number.
+        albedo: ``(1, 3, H, W)`` in [0, 1].
+        normal: ``(1, 3, H, W)`` in [-1, 1].
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    place = folder / CLEAN
+    try:
+        place.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{place}: cannot be created ({error.strerror}); choose another output folder") from error
+    write_buffer(place, number, "albedo", albedo)
+    write_buffer(place, number, "normal", normal)
+
+
+def read_clean_features(folder: Path, number: int) -> tuple[Tensor, Tensor] | None:
+    """Albedo and normal of :func:`write_clean_features`, ``(1, 3, H, W)`` each; ``None`` where there are none.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    paths = [folder / CLEAN / f"{_STEMS[name]}{number}.exr" for name in ("albedo", "normal")]
+    if not all(path.is_file() for path in paths):
+        return None
+    albedo, normal = (torch.from_numpy(read_exr(path)[0]).permute(2, 0, 1)[None] for path in paths)
+    return albedo, normal
+
+
 def _check_header(name: str, path: Path, first: ExrHeader) -> None:
     """A file has the channels of its buffer, and the same pixels as the first color."""
     header = read_exr_header(path)

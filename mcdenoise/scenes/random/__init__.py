@@ -16,11 +16,15 @@ import numpy as np
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.scenes.random.cameras import shoot
 from mcdenoise.scenes.random.rooms import build
+from mcdenoise.scenes.random.shiny import shine
 from mcdenoise.scenes.random.stage import Stage, bounds, rotate
 
 __all__ = ["RandomScene", "random_scene"]
 
 _MOVING_SHARE = 0.15
+# Of the streams of a seed, the one of further views.
+_VIEWS = 100
+_NEAREST_FOCUS = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +36,16 @@ class RandomScene:
         cameras: one per frame.
         moves: id of an object in ``scene`` to ``(T, 4, 4)`` transforms in world space, one per frame, applied to the
             object where the scene places it. Empty for most seeds.
+        focus: distance along the viewing axis of the first camera to what it looks at.
     """
 
     scene: dict[str, Any]
     cameras: list[Camera]
     moves: dict[str, Array] = field(default_factory=dict)
+    focus: float = 2.0
 
 
-def random_scene(seed: int, frames: int = 8, zoom: float = 1.0) -> RandomScene:
+def random_scene(seed: int, frames: int = 8, zoom: float = 1.0, *, shiny: bool = False, view: int = 0) -> RandomScene:
     """A random scene; the same for the same seed, and a longer shot begins like a shorter one.
 
     Args:
@@ -47,22 +53,39 @@ def random_scene(seed: int, frames: int = 8, zoom: float = 1.0) -> RandomScene:
         frames: number of cameras.
         zoom: the cameras see the middle of the image only, this many times as large: what a crop of a larger image
             shows, with its wide even surfaces and fast motion, for the price of a small one.
+        shiny: the same place, with coats, mirrors, glass and metal in it, and cameras that look at them.
+        view: another number gives other cameras in the same place.
 
     Example:
         >>> made = random_scene(3, frames=2)
         >>> made.scene["type"], len(made.cameras)
         ('scene', 2)
     """
-    place_rng, camera_rng, move_rng, level_rng = (
-        np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(4)
+    place_rng, camera_rng, move_rng, level_rng, shine_rng = (
+        np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(5)
     )
+    if view:
+        camera_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_VIEWS, view)))
     stage = build(place_rng)
+    if shiny:
+        shine(stage, shine_rng)
     cameras = shoot(stage, camera_rng, frames)
     moves = _movements(stage, move_rng, frames, cameras[0]) if move_rng.random() < _MOVING_SHARE else {}
     if zoom != 1:
         cameras = [replace(camera, fov_x=_narrowed(camera.fov_x, zoom)) for camera in cameras]
     scene = _exposed(stage.scene(), 10 ** float(level_rng.uniform(-1.5, 1.5)))
-    return RandomScene(scene, cameras, moves)
+    return RandomScene(scene, cameras, moves, _distance(stage, cameras[0]))
+
+
+def _distance(stage: Stage, camera: Camera) -> float:
+    """How far away along the viewing axis the point is that a camera looks at."""
+    origin, forward = camera.to_world[:3, 3], camera.to_world[:3, 2]
+    ways = np.array([point - origin for point in stage.points]).reshape(-1, 3)
+    depth = ways @ forward
+    ways, depth = ways[depth > _NEAREST_FOCUS], depth[depth > _NEAREST_FOCUS]
+    if len(depth) == 0:
+        return 2.0
+    return float(depth[np.argmax(depth / np.linalg.norm(ways, axis=1))])
 
 
 def _narrowed(fov: float, zoom: float) -> float:

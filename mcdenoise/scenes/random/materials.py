@@ -27,6 +27,11 @@ def plastic(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1)) ->
     return _two_sided({"type": "plastic", "diffuse_reflectance": _bitmap(reflectance, repeat)})
 
 
+def lacquer(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1), nonlinear: bool = True) -> Bsdf:
+    """A matt surface under a smooth clear coat, whose color deepens with every reflection inside if ``nonlinear``."""
+    return _two_sided({"type": "plastic", "diffuse_reflectance": _bitmap(reflectance, repeat), "nonlinear": nonlinear})
+
+
 def rough_plastic(reflectance: Color | Array, alpha: float, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
     """A matt surface under a rough coat."""
     return _two_sided({"type": "roughplastic", "diffuse_reflectance": _bitmap(reflectance, repeat), "alpha": alpha})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -67,6 +67,18 @@ class Stage:
         name = f"material_{len(self._materials)}"
         self._materials[name] = bsdf
         return {"type": "ref", "id": name}
+
+    def areas(self) -> dict[str, float]:
+        """For each material the largest side of a box around a shape that has it, square metres."""
+        areas: dict[str, float] = {}
+        for shape, (low, high) in zip(self._objects.values(), self._bounds, strict=True):
+            name, size = shape["bsdf"]["id"], np.sort(high - low)
+            areas[name] = max(areas.get(name, 0.0), float(size[1] * size[2]))
+        return areas
+
+    def change_materials(self, change: Callable[[str, Bsdf], Bsdf]) -> None:
+        """Give every material another look: called with its id and its description."""
+        self._materials = {name: change(name, bsdf) for name, bsdf in self._materials.items()}
 
     def add(self, parts: Iterable[Part], to_world: Array | None = None, movable: bool = False) -> list[str]:
         """Put a group of parts into the world; returns the ids of its shapes."""

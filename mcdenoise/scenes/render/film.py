@@ -136,9 +136,7 @@ class FilmRenderer:
             lens = {"aperture_radius": self._film.aperture, "focus_distance": self._film.focus}
             sensor |= {"type": "thinlens", **lens}
         state = int(np.random.SeedSequence(seed).generate_state(1)[0])
-        image = mi.render(
-            self._tracer.scene, sensor=mi.load_dict(sensor), integrator=integrator, spp=paths, seed=state
-        )
+        image = mi.render(self._tracer.scene, sensor=mi.load_dict(sensor), integrator=integrator, spp=paths, seed=state)
         table = np.array(image, dtype=np.float64).reshape(width * height, -1)
         # A pixel whose weights cancel has no mean.
         return np.where(np.isfinite(table), table, 0)

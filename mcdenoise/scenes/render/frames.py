@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from mcdenoise.data.camera_path import Array, Camera, PixelRays, pixel_rays
-from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer
+from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer, write_clean_features
 from mcdenoise.scenes.render.film import Film, FilmRenderer
 from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write_realisation, write_reference
 from mcdenoise.scenes.render.halves import ReferenceHalves
@@ -120,7 +120,9 @@ def render_frame(job: FrameJob, tracer: Tracer, number: int, advance: Callable[[
     tracer.place(number)
     wanted = number in job.references and not job.has_reference(number)
     if job.film is not None:
-        return _render_filtered(job, FilmRenderer(tracer, job.film, job.size, job.reach), tracer, number, advance, wanted)
+        return _render_filtered(
+            job, FilmRenderer(tracer, job.film, job.size, job.reach), tracer, number, advance, wanted
+        )
     rays = pixel_rays(job.cameras[number], width, height)
     if not job.has_features(number):
         for name, values in _features(job, tracer, number, rays).items():
@@ -149,6 +151,8 @@ def _render_filtered(
     state = None
     if wanted:
         state = _refine_reference(job, lambda n, seed, _: film.radiance(camera, n, seed), number, advance)
+        clean = film.frame(camera, {}, _CLEAN_PATHS, (job.seed, number, 1, _CLEAN_STREAM))
+        write_clean_features(job.folder, number, *(_image(clean[name], job.size) for name in ("albedo", "normal")))
     back = {name: matrix for name, matrix in _moved_back(job, number).items() if name in tracer.movers}
     for realisation in reversed(range(job.realisations)):
         if job.has_color(number, realisation) and job.has_features(number, realisation):
@@ -164,6 +168,10 @@ def _render_filtered(
         images = {name: _image(total[name], job.size) for name in (*sorted({*total} - {"color"}), "color")}
         write_realisation(job.folder, number, realisation, images)
     return state
+
+
+# Samples of the features that belong to a reference, and where their noise differs from that of its passes.
+_CLEAN_PATHS, _CLEAN_STREAM = 16, 2**20
 
 
 def _stream(realisation: int) -> int:

@@ -1,0 +1,337 @@
+"""Runs in Blender's Python: builds the scenes that it is told of, renders their frames, and answers in lines of JSON.
+
+This script stands alone: it needs ``bpy`` and numpy, which comes with it, and nothing of mcdenoise. It reads one
+command a line from its input, such as ``{"do": "render", "frame": 0, ...}``, and answers each with one line,
+``{"ok": ...}`` or ``{"error": ...}``. Whatever Blender itself says goes to the standard error.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+bpy: Any
+Matrix: Any
+try:
+    bpy = importlib.import_module("bpy")
+    Matrix = importlib.import_module("mathutils").Matrix
+except ImportError:  # mcdenoise's own Python need not have it.
+    bpy = Matrix = None
+
+# Mitsuba's cameras look along +z with +x to the left, Blender's along -z with +x to the right.
+_CAMERA = np.diag((-1.0, 1.0, -1.0, 1.0))
+
+
+def main() -> None:
+    """Serve until the input ends."""
+    # What is printed by Blender's own code must not be taken for an answer.
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    if bpy is None:
+        print(json.dumps({"error": "there is no module 'bpy'"}), file=answers, flush=True)
+        return
+    print(json.dumps({"ok": bpy.app.version_string}), file=answers, flush=True)
+    commands: dict[str, Any] = {"scene": build, "render": render}
+    for line in sys.stdin:
+        command = json.loads(line)
+        try:
+            answer = {"ok": commands[command.pop("do")](**command)}
+        except Exception as error:  # Whatever it is, the one who asked is told.
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), file=answers, flush=True)
+
+
+def build(folder: str, settings: dict[str, Any]) -> None:
+    """Build the scene that ``scene.json`` and ``scene.npz`` of a folder describe.
+
+    Args:
+        folder: where they are.
+        settings: ``size``, ``threads``, ``filter_width``, ``box``, ``cameras`` and ``fov_x`` and ``moves`` of every
+            frame, from one before the first to one after the last, ``aperture`` and ``focus``, ``shutter``.
+    """
+    content = json.loads((Path(folder) / "scene.json").read_text(encoding="utf-8"))
+    with np.load(Path(folder) / "scene.npz", allow_pickle=False) as file:
+        arrays = dict(file)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    images = {name: _image(name, pixels) for name, pixels in arrays.items() if name.startswith(("texture", "sky"))}
+    materials = [_material(number, entry, images) for number, entry in enumerate(content["materials"])]
+    for entry in content["objects"]:
+        thing = _object(entry, arrays, materials)
+        scene.collection.objects.link(thing)
+        if entry["moves"]:
+            thing.pass_index = entry["index"]
+            _animate(thing, settings["moves"][entry["id"]])
+    for number, light in enumerate(content["lights"]):
+        scene.collection.objects.link(_light(number, light))
+    scene.world = _world(content["sky"], images)
+    _set_up(scene, settings)
+
+
+def render(frame: int, samples: int, seed: int, out: str) -> None:
+    """Render one frame to a multilayer EXR.
+
+    Args:
+        frame: which.
+        samples: a pixel.
+        seed: of the noise.
+        out: the file, ending in ``.exr``.
+    """
+    scene = bpy.context.scene
+    scene.frame_set(frame)
+    scene.cycles.samples, scene.cycles.seed = samples, seed
+    scene.render.filepath = out
+    bpy.ops.render.render(write_still=True)
+
+
+def _set_up(scene: Any, settings: dict[str, Any]) -> None:
+    scene.render.engine = "CYCLES"
+    scene.render.resolution_x, scene.render.resolution_y = settings["size"]
+    scene.render.resolution_percentage = 100
+    # The scene stays in Cycles between renderings: to bring it there takes longer than a sample a pixel.
+    scene.render.use_persistent_data = True
+    if settings["threads"]:
+        scene.render.threads_mode, scene.render.threads = "FIXED", settings["threads"]
+    layer = scene.view_layers[0]
+    layer.cycles.denoising_store_passes = True
+    for name in ("z", "position", "object_index"):
+        setattr(layer, f"use_pass_{name}", True)
+    cycles = scene.cycles
+    cycles.device = "CPU"
+    cycles.use_adaptive_sampling = cycles.use_denoising = False
+    cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0
+    # A threshold of brightness would make the result depend on the unit of radiance.
+    cycles.light_sampling_threshold = 0
+    # Cycles takes a box filter as one pixel wide whatever the width says, so the narrow one is the default kind.
+    cycles.pixel_filter_type = "BOX" if settings["box"] else "BLACKMAN_HARRIS"
+    cycles.filter_width = settings["filter_width"]
+    image = scene.render.image_settings
+    if bpy.app.version >= (5, 0):
+        image.media_type = "MULTI_LAYER_IMAGE"
+        image.use_exr_interleave = True
+    image.file_format = "OPEN_EXR_MULTILAYER"
+    image.color_depth, image.exr_codec = "32", "NONE"
+    scene.render.use_motion_blur = settings["shutter"] > 0
+    if settings["shutter"]:
+        scene.render.motion_blur_shutter = settings["shutter"]
+    poses = [np.array(pose) @ _CAMERA for pose in settings["cameras"]]
+    data = bpy.data.cameras.new("Camera")
+    camera = bpy.data.objects.new("Camera", data)
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    data.sensor_fit = "HORIZONTAL"
+    data.clip_start, data.clip_end = 1e-3, 1e6
+    # Before and after the frames there are places too, for motion blur.
+    for index, fov in enumerate(settings["fov_x"]):
+        data.angle = math.radians(fov)
+        data.keyframe_insert("lens", frame=index - 1)
+    scene.frame_start, scene.frame_end = 0, len(poses) - 3
+    _animate(camera, poses)
+    scene.frame_set(0)
+    if settings["aperture"]:
+        _defocus(scene, data, poses[1], settings)
+
+
+def _defocus(scene: Any, data: Any, pose: Any, settings: dict[str, Any]) -> None:
+    """Focus on what a pixel sees, and open the lens until what is infinitely far is blurred over so many pixels."""
+    extent = math.tan(math.radians(settings["fov_x"][1]) / 2)
+    width, height = settings["size"]
+    x, y = settings["focus"]
+    ray = pose[:3, :3] @ ((2 * x - 1) * extent, (1 - 2 * y) * extent * height / width, -1.0)
+    length = float(np.linalg.norm(ray))
+    graph = bpy.context.evaluated_depsgraph_get()
+    hit, place, *_ = scene.ray_cast(graph, pose[:3, 3].tolist(), (ray / length).tolist())
+    # Along the axis of view, where it is focused.
+    distance = float((np.array(place) - pose[:3, 3]) @ -pose[:3, 2]) if hit else 3.0
+    data.dof.use_dof = True
+    data.dof.focus_distance = distance
+    opening = settings["aperture"] / width * 2 * extent * distance
+    data.dof.aperture_fstop = data.lens * 1e-3 / opening
+
+
+def _animate(thing: Any, poses: Any) -> None:
+    """Keyframes of an object, one before the first frame, and one after the last."""
+    bpy.context.preferences.edit.keyframe_new_interpolation_type = "LINEAR"
+    thing.rotation_mode = "QUATERNION"
+    before = None
+    for index, pose in enumerate(poses):
+        location, rotation, scale = Matrix(np.array(pose).tolist()).decompose()
+        if before is not None:
+            # A rotation has two quaternions; between those of both signs the object would turn around.
+            rotation.make_compatible(before)
+        before = rotation
+        thing.location, thing.rotation_quaternion, thing.scale = location, rotation, scale
+        for path in ("location", "rotation_quaternion", "scale"):
+            thing.keyframe_insert(path, frame=index - 1)
+
+
+def _object(entry: dict[str, Any], arrays: dict[str, Any], materials: list[Any]) -> Any:
+    vertices, triangles, uv, smooth, used = (
+        arrays[f"{entry['array']}_{key}"] for key in ("vertices", "triangles", "uv", "smooth", "material")
+    )
+    name = entry["id"] or "rest"
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(vertices))
+    mesh.vertices.foreach_set("co", vertices.ravel())
+    mesh.loops.add(triangles.size)
+    mesh.loops.foreach_set("vertex_index", triangles.ravel())
+    mesh.polygons.add(len(triangles))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, triangles.size, 3, dtype=np.int32))
+    slots, numbers = np.unique(used, return_inverse=True)
+    for slot in slots:
+        mesh.materials.append(materials[slot])
+    mesh.polygons.foreach_set("material_index", numbers.ravel().astype(np.int32))
+    mesh.polygons.foreach_set("use_smooth", smooth)
+    mesh.uv_layers.new(name="UVMap").data.foreach_set("uv", uv.ravel())
+    mesh.update(calc_edges=True)
+    return bpy.data.objects.new(name, mesh)
+
+
+def _image(name: str, pixels: Any) -> Any:
+    """An image of linear numbers; its first row is where v is 0, as in Mitsuba, but for the sky's."""
+    height, width, _ = pixels.shape
+    image = bpy.data.images.new(name, width, height, alpha=False, float_buffer=True, is_data=True)
+    rows = pixels[::-1] if name == "sky" else pixels
+    image.pixels.foreach_set(np.concatenate([rows, np.ones((height, width, 1), np.float32)], -1).ravel())
+    image.update()
+    return image
+
+
+def _material(number: int, entry: dict[str, Any], images: dict[str, Any]) -> Any:
+    material = bpy.data.materials.new(f"material{number}")
+    material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    shader = (_pane if entry["type"] == "pane" else _principled)(tree, entry, images)
+    if "radiance" in entry:
+        strength = max(entry["radiance"])
+        lamp = tree.nodes.new("ShaderNodeEmission")
+        lamp.inputs["Color"].default_value = (*(channel / strength for channel in entry["radiance"]), 1)
+        lamp.inputs["Strength"].default_value = strength
+        if entry["one_sided"]:
+            front = _math(tree, "MULTIPLY_ADD", tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"])
+            front.inputs[1].default_value, front.inputs[2].default_value = -strength, strength
+            tree.links.new(front.outputs[0], lamp.inputs["Strength"])
+            material.cycles.emission_sampling = "FRONT"
+        both = tree.nodes.new("ShaderNodeAddShader")
+        tree.links.new(shader, both.inputs[0])
+        tree.links.new(lamp.outputs[0], both.inputs[1])
+        shader = both.outputs[0]
+    tree.links.new(shader, tree.nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+    return material
+
+
+_INPUTS = {
+    "base": "Base Color",
+    "roughness": "Roughness",
+    "metallic": "Metallic",
+    "specular": "Specular IOR Level",
+    "ior": "IOR",
+    "transmission": "Transmission Weight",
+    "coat": "Coat Weight",
+    "coat_roughness": "Coat Roughness",
+    "coat_ior": "Coat IOR",
+    "alpha": "Alpha",
+}
+
+
+def _principled(tree: Any, entry: dict[str, Any], images: dict[str, Any]) -> Any:
+    node = tree.nodes.new("ShaderNodeBsdfPrincipled")
+    for key, name in _INPUTS.items():
+        if key not in entry:
+            continue
+        socket, value = node.inputs[name], entry[key]
+        if "texture" in value:
+            texture = tree.nodes.new("ShaderNodeTexImage")
+            texture.image, texture.interpolation, texture.extension = images[value["texture"]], "Linear", "REPEAT"
+            scaled = tree.nodes.new("ShaderNodeMapping")
+            scaled.inputs["Scale"].default_value = (*value["scale"], 1)
+            tree.links.new(tree.nodes.new("ShaderNodeTexCoord").outputs["UV"], scaled.inputs["Vector"])
+            tree.links.new(scaled.outputs[0], texture.inputs["Vector"])
+            tree.links.new(texture.outputs["Color"], socket)
+        elif socket.type == "RGBA":
+            socket.default_value = (*value["value"], 1)
+        else:
+            number = value["value"]
+            socket.default_value = number[0] if isinstance(number, list) else number
+    return node.outputs[0]
+
+
+def _pane(tree: Any, entry: dict[str, Any], images: dict[str, Any]) -> Any:
+    """Glass that does not bend light: it mirrors 2 F / (1 + F) of it and lets the rest through."""
+    # The node takes the inverse index where a surface is seen from behind, and a pane has no behind.
+    behind = tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"]
+    exponent = _math(tree, "MULTIPLY_ADD", behind)
+    exponent.inputs[1].default_value, exponent.inputs[2].default_value = -2.0, 1.0
+    index = _math(tree, "POWER", None)
+    index.inputs[0].default_value = entry["ior"]
+    tree.links.new(exponent.outputs[0], index.inputs[1])
+    fresnel = tree.nodes.new("ShaderNodeFresnel")
+    tree.links.new(index.outputs[0], fresnel.inputs["IOR"])
+    one_more, doubled = _math(tree, "ADD", fresnel.outputs[0]), _math(tree, "MULTIPLY", fresnel.outputs[0])
+    one_more.inputs[1].default_value, doubled.inputs[1].default_value = 1.0, 2.0
+    mirrored = _math(tree, "DIVIDE", doubled.outputs[0])
+    tree.links.new(one_more.outputs[0], mirrored.inputs[1])
+    glossy = tree.nodes.new("ShaderNodeBsdfGlossy")
+    glossy.inputs["Roughness"].default_value = 0
+    glossy.inputs["Color"].default_value = (1, 1, 1, 1)
+    mix = tree.nodes.new("ShaderNodeMixShader")
+    tree.links.new(mirrored.outputs[0], mix.inputs[0])
+    tree.links.new(tree.nodes.new("ShaderNodeBsdfTransparent").outputs[0], mix.inputs[1])
+    tree.links.new(glossy.outputs[0], mix.inputs[2])
+    return mix.outputs[0]
+
+
+def _math(tree: Any, operation: str, first: Any) -> Any:
+    node = tree.nodes.new("ShaderNodeMath")
+    node.operation = operation
+    if first is not None:
+        tree.links.new(first, node.inputs[0])
+    return node
+
+
+def _light(number: int, light: dict[str, Any]) -> Any:
+    data = bpy.data.lights.new(f"light{number}", light["type"].upper())
+    strength = max(light["intensity"])
+    data.color = [channel / strength for channel in light["intensity"]]
+    # Watts in all directions, from watts per steradian.
+    data.energy = 4 * math.pi * strength
+    data.shadow_soft_size = 0.0
+    thing = bpy.data.objects.new(data.name, data)
+    if light["type"] == "spot":
+        thing.matrix_world = Matrix((np.array(light["to_world"]) @ _CAMERA).tolist())
+        data.spot_size = 2 * math.radians(light["cutoff"])
+        data.spot_blend = 1 - light["beam"] / light["cutoff"]
+    else:
+        thing.location = light["position"]
+    return thing
+
+
+def _world(sky: dict[str, Any] | None, images: dict[str, Any]) -> Any:
+    world = bpy.data.worlds.new("World")
+    world.use_nodes = True
+    tree = world.node_tree
+    background = tree.nodes["Background"]
+    background.inputs["Color"].default_value = (*(sky or {}).get("value", (0, 0, 0)), 1)
+    if sky is not None and "texture" in sky:
+        texture = tree.nodes.new("ShaderNodeTexEnvironment")
+        texture.image, texture.interpolation = images[sky["texture"]], "Linear"
+        # Blender's images are around z and begin at -x, Mitsuba's around y and at -z: (z, x, y) instead of (x, y, z).
+        parts, turned = tree.nodes.new("ShaderNodeSeparateXYZ"), tree.nodes.new("ShaderNodeCombineXYZ")
+        tree.links.new(tree.nodes.new("ShaderNodeTexCoord").outputs["Generated"], parts.inputs[0])
+        for old, new in ((2, 0), (0, 1), (1, 2)):
+            tree.links.new(parts.outputs[old], turned.inputs[new])
+        tree.links.new(turned.outputs[0], texture.inputs["Vector"])
+        tree.links.new(texture.outputs["Color"], background.inputs["Color"])
+    return world
+
+
+if __name__ == "__main__":
+    main()

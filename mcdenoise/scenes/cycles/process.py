@@ -1,0 +1,108 @@
+"""Blender in a process of its own: it is under another license, large, and wants a Python of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+from mcdenoise.errors import InputError
+
+PYTHON_VARIABLE = "MCDENOISE_BLENDER_PYTHON"
+_SCRIPT = Path(__file__).with_name("blender.py")
+_LAST_WORDS = 2000
+
+
+class Blender:
+    """A Blender that builds scenes and renders their frames, started once for many; a context manager.
+
+    Args:
+        python: an interpreter that can import ``bpy``; by default that of the environment variable
+            ``MCDENOISE_BLENDER_PYTHON``, or else this one.
+
+    Raises:
+        InputError: there is no such interpreter, or it has no ``bpy``.
+    """
+
+    def __init__(self, python: Path | None = None) -> None:
+        self._python = python or Path(os.environ.get(PYTHON_VARIABLE, sys.executable))
+        self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
+        try:
+            self._process = subprocess.Popen(
+                # -P: the modules beside the script are none of Blender's.
+                [str(self._python), "-P", str(_SCRIPT)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._said,
+                encoding="utf-8",
+            )
+        except OSError as error:
+            self._said.close()
+            raise InputError(
+                f"{self._python}: expected a Python that has Blender's module bpy, found nothing that runs "
+                f"({error.strerror}); name one with --blender-python"
+            ) from error
+        answer = self._answer()
+        if "ok" not in answer:
+            self.close()
+            raise InputError(
+                f"{self._python}: expected a Python that has Blender's module bpy, found none "
+                f"({answer['error']}); pip install bpy==4.5.15 into a Python 3.11 and name it with --blender-python"
+            )
+        self.version: str = answer["ok"]
+
+    def __enter__(self) -> Blender:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def ask(self, do: str, **arguments: Any) -> None:
+        """Give a command of ``blender.py`` and wait until it is done.
+
+        Raises:
+            InputError: Blender could not do it, or died.
+        """
+        try:
+            assert self._process.stdin is not None
+            self._process.stdin.write(json.dumps({"do": do, **arguments}) + "\n")
+            self._process.stdin.flush()
+            answer = self._answer()
+        except BrokenPipeError:
+            answer = {"error": self._last_words()}
+        if "ok" not in answer:
+            raise InputError(f"Blender could not do '{do}': {answer['error']}")
+
+    def close(self) -> None:
+        """End the process."""
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                stream.close()
+        try:
+            self._process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._said.close()
+
+    def _answer(self) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            self._process.wait()
+            return {"error": self._last_words()}
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def _last_words(self) -> str:
+        size = self._said.seek(0, 2)
+        self._said.seek(max(size - _LAST_WORDS, 0))
+        lines = [line for line in self._said.read().decode(errors="replace").splitlines() if line.strip()]
+        return lines[-1].strip() if lines else "it ended without a word"

@@ -1,0 +1,359 @@
+"""Render a random scene with Cycles to a sequence to train on, in the BMFR layout.
+
+Each noisy color has features of its own, from the same samples, as users have them: anti-aliased, and noisy
+through glass, depth of field and motion blur. They hold what :func:`mcdenoise.data.open_sequence` makes of a file of
+Blender, but for normals, which are turned from the camera's space to the world's.
+
+Cycles takes depth and position from the first sample of a pixel alone, and puts that at the pixel centre, whatever the
+filter: these are noisy through a lens and a shutter only, and an image of one sample a pixel is not filtered at all.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
+from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, view_projection
+from mcdenoise.data.exr import Image
+from mcdenoise.data.files import write_text
+from mcdenoise.data.images import read_channels, read_image_header
+from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer, write_clean_features
+from mcdenoise.data.readers.layers import layers_of
+from mcdenoise.data.readers.values import nothing_hit
+from mcdenoise.errors import InputError
+from mcdenoise.scenes.cycles.process import Blender
+from mcdenoise.scenes.cycles.settings import WIDTHS, CyclesSettings, draw_settings
+from mcdenoise.scenes.cycles.translate import translate
+from mcdenoise.scenes.random import RandomScene
+from mcdenoise.scenes.render.folder import ReferenceState, write_reference
+from mcdenoise.scenes.render.tracer import scene_digest
+
+# Names of Blender 4.5 and, behind them, of 5.0.
+_PASSES = {
+    "Combined": ("Combined",),
+    "Denoising Albedo": ("Denoising Albedo",),
+    "Denoising Normal": ("Denoising Normal",),
+    "Depth": ("Depth",),
+    "Position": ("Position",),
+    "IndexOB": ("IndexOB", "Object Index"),
+}
+# How much farther than everything else the sky is, as the reader has it.
+_SKY = 1000.0
+_REFERENCE_STREAM = 1
+_CLEANER = 4
+_CONVENTIONS: dict[str, Any] = {
+    "color_includes_albedo": True,
+    "reference_includes_albedo": True,
+    "seeds": "numpy.random.SeedSequence((seed, frame, stream)).generate_state(1) % 2**31, of a view but the first "
+    "with spawn_key=(view,); stream 0 for the first noisy color, 1 for the reference, 1 + realisation for the others",
+    "features": "from the samples of the color beside them: Denoising Albedo clamped to 0..1, Denoising Normal in "
+    "world space, Depth, Position",
+    "conventions": {
+        "camera_matrices": "clip = [x,y,z,1] @ M (row vectors; M is the transpose of world_to_clip); "
+        "u=(clip.x/clip.w+1)/2 left to right, v=(clip.y/clip.w+1)/2 top to bottom; clip.z/clip.w in [0,1]",
+        "camera_to_world": "column vectors; camera frame +x left, +y up, +z forward (Mitsuba)",
+    },
+}
+_IDENTITY = ("scene_sha256", "renderer", "frames", "width", "height", "seed", "view", "camera_to_world", "settings")
+
+
+def render_cycles(
+    made: RandomScene,
+    out: Path,
+    blender: Blender,
+    *,
+    size: tuple[int, int] = (160, 160),
+    seed: int = 0,
+    view: int = 0,
+    samples: int | None = None,
+    realisations: int = 2,
+    reference_samples: int = 128,
+    settings: CyclesSettings | None = None,
+    threads: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Render a random scene by Cycles on the processor.
+
+    Frames that are there are kept, so a stopped run can be resumed.
+
+    Args:
+        made: the scene, its cameras and what moves in it.
+        out: folder of the sequence; the files go to ``out/inputs``.
+        blender: the process that renders.
+        size: width and height in pixels.
+        seed: of the noise, and of the settings that are drawn.
+        view: another number gives other noise and settings, for another take of the same scene.
+        samples: a pixel of the noisy colors; drawn by default, see :func:`draw_settings`.
+        realisations: how many noisy colors, with features of their own. Those after the first go to
+            ``out/inputs/realisation{1,2,...}``.
+        reference_samples: a pixel of the references, but at least four times as many as of the noisy colors; 0 for no
+            references.
+        settings: filter, lens and shutter; drawn by default.
+        threads: of the processor; all by default. The images do not depend on it.
+        progress: called with the finished and the total number of samples a pixel, summed over all frames.
+
+    Returns:
+        The folder with the files, ``out/inputs``.
+
+    Raises:
+        InputError: a setting is unusable, the scene has something that Cycles cannot be given, Blender failed, or
+            ``out`` cannot be written or holds a sequence with other settings.
+    """
+    lowest = {"realisations": (realisations, 1), "reference_samples": (reference_samples, 0), "threads": (threads, 0)}
+    lowest |= {"seed": (seed, 0), "view": (view, 0), "samples": (1 if samples is None else samples, 1)}
+    for name, (value, least) in lowest.items():
+        if value < least:
+            raise InputError(f"{name}: expected at least {least}, found {value}")
+    count = len(made.cameras)
+    chosen = settings or draw_settings(seed, view=view, samples=samples, moving=count > 1)
+    # Hardly less noisy than the color, a reference would teach nothing.
+    clean_samples = max(reference_samples, _CLEANER * chosen.samples) if reference_samples else 0
+    moves = check_moves(made.moves, count)
+    # One after the other, so that an index of Blender's tells which object it is.
+    movers = [name for name in made.scene if name in moves]
+    description = translate(made.scene, movers, seed=seed)
+    folder = _Folder(out / "inputs", made, size, chosen, (seed, view), blender.version)
+    noisy = [(n, k) for n in range(count) for k in reversed(range(realisations)) if not folder.has_color(n, k)]
+    clean = [n for n in range(count) if clean_samples and not folder.has_reference(n)]
+    total = count * (realisations * chosen.samples + clean_samples)
+    done = total - len(noisy) * chosen.samples - len(clean) * clean_samples
+
+    def advance(spent: int) -> None:
+        nonlocal done
+        done += spent
+        if progress is not None:
+            progress(done, total)
+
+    advance(0)
+    with tempfile.TemporaryDirectory() as place:
+        file = Path(place) / "shot.exr"
+        if noisy or clean:
+            description.save(Path(place))
+            blender.ask("scene", folder=place, settings=_for_blender(made, moves, movers, chosen, size, threads))
+
+        def shot(number: int, samples: int, stream: int) -> dict[str, Image]:
+            sequence = np.random.SeedSequence((seed, number, stream), spawn_key=(view,) if view else ())
+            noise = int(sequence.generate_state(1)[0] % 2**31)
+            blender.ask("render", frame=number, samples=samples, seed=noise, out=str(file))
+            images = _read(file)
+            file.unlink()
+            advance(samples)
+            return images
+
+        # What has few samples comes before what has many: a scene that stays in Cycles keeps the pattern of the most
+        # samples that it has seen, and the noise of a frame would depend on what was rendered before it.
+        for number, realisation in noisy:
+            back = {index + 1: _back(moves[name], number) for index, name in enumerate(movers)}
+            seen = _View(made.cameras[number], size, back)
+            images = shot(number, chosen.samples, 1 + realisation if realisation else 0)
+            folder.write(number, realisation, seen.buffers(images))
+        for number in clean:
+            images = shot(number, clean_samples, _REFERENCE_STREAM)
+            buffers = _View(made.cameras[number], size, {}).buffers(images)
+            write_clean_features(folder.path, number, _tensor(buffers["albedo"]), _tensor(buffers["normal"]))
+            state = ReferenceState(clean_samples, 1, None)
+            write_reference(folder.path, number, _tensor(buffers["color"]), state)
+    return folder.path
+
+
+class _Folder:
+    """``inputs`` of a sequence, with its description."""
+
+    def __init__(
+        self,
+        path: Path,
+        made: RandomScene,
+        size: tuple[int, int],
+        chosen: CyclesSettings,
+        seed: tuple[int, int],
+        version: str,
+    ) -> None:
+        self.path = path
+        width, height = size
+        scale = _extent(made)
+        matrices = np.stack(
+            [view_projection(each, width, height, 1e-3 * scale, 2 * _SKY * scale) for each in made.cameras]
+        )
+        content: dict[str, Any] = {
+            **_CONVENTIONS,
+            "scene": "in memory",
+            "scene_sha256": scene_digest(made.scene),
+            "renderer": f"Blender {version}, Cycles",
+            "frames": len(made.cameras),
+            "width": width,
+            "height": height,
+            "fov_x_degrees": made.cameras[0].fov_x,
+            "seed": seed[0],
+            "view": seed[1],
+            "noisy_spp": chosen.samples,
+            "settings": {**vars(chosen), "focus": list(chosen.focus)},
+            "position_limit_squared": (0.005 * scale) ** 2,
+            "normal_limit_squared": 1.0,
+            "pixel_offsets": [[0.5, 0.5]] * len(made.cameras),
+            "camera_matrices": matrices.tolist(),
+            "camera_to_world": [camera.to_world.tolist() for camera in made.cameras],
+            "moves": {name: np.asarray(path).tolist() for name, path in made.moves.items()},
+        }
+        described = path / "camera.json"
+        if described.is_file():
+            self._check(described, content)
+            return
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be created ({error.strerror}); choose another output folder") from error
+        cameras = CameraMatrices(
+            matrices,
+            np.array(content["pixel_offsets"]),
+            content["position_limit_squared"],
+            content["normal_limit_squared"],
+        )
+        write_camera_matrices(path / "camera_matrices.h", cameras, _CONVENTIONS["conventions"]["camera_matrices"])
+        write_text(described, json.dumps(content, indent=1) + "\n")
+
+    def _check(self, described: Path, content: Mapping[str, Any]) -> None:
+        try:
+            before = json.loads(described.read_text(encoding="utf-8"))
+            # What was rendered before there were several views is the first one.
+            changed = [key for key in _IDENTITY if {"view": 0, **before}[key] != content[key]]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                f"{described}: cannot be read, so the run cannot be resumed; choose another output folder"
+            ) from error
+        if changed:
+            raise InputError(
+                f"{described}: rendered with another '{changed[0]}'; choose another output folder, or delete this one"
+            )
+
+    def has_color(self, number: int, realisation: int) -> bool:
+        """Whether a frame has one of its noisy colors, which is written behind its features."""
+        return (realisation_folder(self.path, realisation) / f"color{number}.exr").is_file()
+
+    def has_reference(self, number: int) -> bool:
+        """Whether a frame has its reference."""
+        return (self.path / f"reference{number}.exr").is_file()
+
+    def write(self, number: int, realisation: int, buffers: Mapping[str, Image]) -> None:
+        """Write one noisy color and its features, the color last."""
+        place = realisation_folder(self.path, realisation)
+        try:
+            place.mkdir(exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{place}: cannot be created ({error.strerror}); choose another output folder") from error
+        for name, image in buffers.items():
+            write_buffer(place, number, name, _tensor(image))
+
+
+class _View:
+    """What the passes of one frame mean.
+
+    Args:
+        camera: of the frame.
+        size: width and height in pixels.
+        back: for each index of an object the transform of its points to the frame before.
+    """
+
+    def __init__(self, camera: Camera, size: tuple[int, int], back: Mapping[int, Array]) -> None:
+        self._camera, self._size, self._back = camera, size, back
+
+    def buffers(self, images: Mapping[str, Image]) -> dict[str, Image]:
+        """Buffers of the BMFR layout, the color last."""
+        width, height = self._size
+        pose, position, depth = self._camera.to_world, images["Position"], images["Depth"]
+        known = (~nothing_hit(depth)) & np.isfinite(position).all(-1, keepdims=True)
+        # As the reader does to a user's file: the sky is put far behind everything, so that it can be followed.
+        rays = pixel_rays(self._camera, width, height)
+        axis = (rays.directions @ pose[:3, 2]).reshape(height, width, 1)
+        far = _SKY * float(depth[known].max(initial=1))
+        sky = rays.origin + far / axis * rays.directions.reshape(height, width, 3)
+        position = np.where(known, position, sky)
+        # x is to the right in Blender's Denoising Normal, y up, and z into the scene.
+        normal = np.nan_to_num(images["Denoising Normal"], nan=0, posinf=0, neginf=0) * (-1, 1, 1)
+        buffers: dict[str, Any] = {
+            "albedo": np.clip(np.nan_to_num(images["Denoising Albedo"], nan=0, posinf=1, neginf=0), 0, 1),
+            "normal": np.clip(normal @ pose[:3, :3].T, -1, 1),
+            "position": position,
+            "depth": np.where(known, depth, np.inf),
+        }
+        if self._back:
+            before = position.copy()
+            index = np.rint(images["IndexOB"][..., 0])
+            for number, back in self._back.items():
+                own = (index == number) & known[..., 0]
+                before[own] = position[own] @ back[:3, :3].T + back[:3, 3]
+            buffers["previous_position"] = before
+        return {**buffers, "color": images["Combined"][..., :3]}
+
+
+def _back(move: Array, number: int) -> Array:
+    """From where an object is in a frame to where it was in the one before; the first frame has none before it."""
+    return np.asarray(move[max(number - 1, 0)] @ np.linalg.inv(move[number]))
+
+
+def _for_blender(
+    made: RandomScene,
+    moves: Mapping[str, Array],
+    movers: list[str],
+    chosen: CyclesSettings,
+    size: tuple[int, int],
+    threads: int,
+) -> dict[str, Any]:
+    fovs = [camera.fov_x for camera in made.cameras]
+    return {
+        "size": list(size),
+        "threads": threads,
+        "box": chosen.pixel_filter == "box",
+        "filter_width": WIDTHS[chosen.pixel_filter],
+        "aperture": chosen.aperture,
+        "focus": list(chosen.focus),
+        "shutter": chosen.shutter,
+        "cameras": _prolonged(np.stack([camera.to_world for camera in made.cameras])).tolist(),
+        "fov_x": [fovs[0], *fovs, fovs[-1]],
+        "moves": {name: _prolonged(moves[name]).tolist() for name in movers},
+    }
+
+
+def _prolonged(poses: Array) -> Array:
+    """Rigid transforms with one before the first and one after the last, as if the motion went on."""
+    if len(poses) == 1:
+        return np.repeat(poses, 3, 0)
+    first = poses[0] @ np.linalg.inv(poses[1]) @ poses[0]
+    last = poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1]
+    return np.concatenate([first[None], poses, last[None]])
+
+
+def _read(path: Path) -> dict[str, Image]:
+    parts = read_image_header(path).parts
+    layers = {layer.title: layer for layer in layers_of(0, "", parts)}
+    found: dict[str, Image] = {}
+    for name, names in _PASSES.items():
+        layer = next((layers[each] for each in names if each in layers), None)
+        if layer is None and len(layers) == 1:
+            (layer,) = layers.values()
+        if layer is None:
+            raise InputError(
+                f"Blender's pass '{name}': expected it in the frame just rendered, found {', '.join(layers)}"
+            )
+        pixels = read_channels(path, {layer.part: layer.channels})[layer.part]
+        found[name] = pixels if pixels.shape[-1] < 3 else pixels[..., :3]
+    return found
+
+
+def _extent(made: RandomScene) -> float:
+    """About how far apart things are, metres."""
+    eye = made.cameras[0].to_world[:3, 3]
+    shapes = [entry for entry in made.scene.values() if isinstance(entry, Mapping) and "to_world" in entry]
+    away = [float(np.linalg.norm(np.asarray(shape["to_world"])[:3, 3] - eye)) for shape in shapes]
+    return float(np.median(away or [1.0]))
+
+
+def _tensor(image: Image | Array) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None]

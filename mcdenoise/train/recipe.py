@@ -1,0 +1,184 @@
+"""A recipe: a TOML file that says all that decides what weights become, from the seeds of the data on.
+
+::
+
+    [train]             # fields of TrainConfig; credits = "authors and licences"
+    [[data]]            # options of `mcdenoise generate`; clean_references = true if they are to be cleaned
+    [[validation]]      # likewise
+    [expected]          # smape and tolerance: the error on the validation frames, and how far above it a run may end
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from mcdenoise.data.files import write_text
+from mcdenoise.errors import InputError
+from mcdenoise.models import create_model
+from mcdenoise.train.cache import locked
+from mcdenoise.train.config import TrainConfig, check_config
+from mcdenoise.train.references import clean_references
+
+_TABLES = ("train", "data", "validation", "expected")
+_CLEAN = "clean_references"
+_NO_PIXELS = ("workers", "threads", "blender_python")
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Sequences that one run of ``mcdenoise generate`` makes.
+
+    Args:
+        where: the file and the table of the recipe, for messages.
+        options: of the command, with underscores.
+        clean: whether what noise is left in the references is removed, see :func:`clean_references`.
+    """
+
+    where: str
+    options: Mapping[str, Any]
+    clean: bool
+
+    def folder(self, data: Path) -> Path:
+        """Where they are rendered: the same options have the same place, in whichever recipe."""
+        return data / self.sha256[:16]
+
+    @property
+    def sha256(self) -> str:
+        """Of all that decides what is rendered."""
+        # The pixels are the same whoever renders them.
+        return _digest({key: value for key, value in self.options.items() if key not in _NO_PIXELS})
+
+    def make(self, data: Path, generate: Callable[[], object]) -> list[Path]:
+        """Render what is not there yet, and clean the references if that is asked for.
+
+        Args:
+            data: folder of the sequences of all recipes.
+            generate: renders to :meth:`folder`; keeps what is finished there.
+
+        Returns:
+            Folders of the sequences.
+
+        Raises:
+            InputError: it cannot be rendered, cleaned or written.
+        """
+        place = self.folder(data)
+        finished = place / "finished.json"
+        try:
+            with locked(place):
+                if not finished.exists():
+                    generate()
+                    write_text(finished, json.dumps(dict(self.options), indent=2) + "\n")
+                sequences = sorted(path for path in place.iterdir() if path.is_dir())
+                if self.clean:
+                    out = place.with_name(f"{place.name}-clean")
+                    sequences = [clean_references(sequence, out) for sequence in sequences]
+        except OSError as error:
+            reason = error.strerror or type(error).__name__
+            raise InputError(f"{place}: cannot be rendered to ({reason}); check permissions and free space") from error
+        return sequences
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a recipe says.
+
+    Args:
+        config: what is trained.
+        data: what it is trained on.
+        validation: what is used for nothing but validation.
+        credits: authors and licences of the training scenes.
+        expected: SMAPE at the end, and how far above it a run may end; ``None`` if the recipe does not say.
+        sha256: of all that decides what is computed.
+    """
+
+    config: TrainConfig
+    data: list[Rendering]
+    validation: list[Rendering]
+    credits: str
+    expected: tuple[float, float] | None
+    sha256: str
+
+    @staticmethod
+    def read(path: Path, options: Collection[str]) -> Recipe:
+        """Read a recipe, and see that what it names exists.
+
+        Args:
+            path: of the file.
+            options: names that a table of data may have.
+
+        Raises:
+            InputError: it cannot be read, a key is unknown, or a value is none that can be trained with.
+        """
+        content = _parse(path)
+        kinds = {field.name: type(field.default) for field in fields(TrainConfig)} | {"credits": str}
+        settings = _checked(f"{path}: [train]", content.get("train", {}), kinds)
+        credits = settings.pop("credits", "")
+        made = {name: _renderings(path, name, content.get(name, []), options) for name in ("data", "validation")}
+        bound = {"smape": float, "tolerance": float}
+        expected = _checked(f"{path}: [expected]", content.get("expected", {}), bound)
+        if expected and expected.keys() != bound.keys():
+            raise InputError(f"{path}: [expected]: expected smape and tolerance, found {', '.join(expected)} alone")
+        if not made["data"]:
+            raise InputError(f"{path}: expected at least one table [[data]] to render and train on, found none")
+        config = TrainConfig(**settings)
+        try:
+            # What would fail after hours of rendering.
+            check_config(config, 1)
+            create_model(config.model, **config.model_settings)
+            if any(rendering.clean for each in made.values() for rendering in each):
+                create_model("oidn")
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        computed = [content.get("train"), *([(r.sha256, r.clean) for r in each] for each in made.values())]
+        bounds = (float(expected["smape"]), float(expected["tolerance"])) if expected else None
+        return Recipe(config, made["data"], made["validation"], credits, bounds, _digest(computed))
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: expected a recipe, found no file that can be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: expected a recipe in TOML, found: {error}") from error
+    _check_keys(str(path), content, _TABLES)
+    return content
+
+
+def _renderings(path: Path, name: str, tables: Any, options: Collection[str]) -> list[Rendering]:
+    if not isinstance(tables, list):
+        raise InputError(f"{path}: expected tables [[{name}]], found [{name}]")
+    made = []
+    for number, table in enumerate(tables, start=1):
+        where = f"{path}: [[{name}]] {number}"
+        _check_keys(where, table, [*options, _CLEAN])
+        clean = _checked(where, {_CLEAN: table.get(_CLEAN, False)}, {_CLEAN: bool})[_CLEAN]
+        made.append(Rendering(where, {key: value for key, value in table.items() if key != _CLEAN}, clean))
+    return made
+
+
+def _checked(where: str, table: Any, kinds: Mapping[str, type]) -> dict[str, Any]:
+    """A table, whose keys are known and whose values are of their kind."""
+    _check_keys(where, table, kinds)
+    for key, value in table.items():
+        if type(value) is not kinds[key] and (type(value), kinds[key]) != (int, float):
+            raise InputError(f"{where}: {key}: expected a value of type {kinds[key].__name__}, found {value!r}")
+    return dict(table)
+
+
+def _check_keys(where: str, table: Any, known: Collection[str]) -> None:
+    if not isinstance(table, dict):
+        raise InputError(f"{where}: expected a table, found {table!r}")
+    for key in table:
+        if key not in known:
+            raise InputError(f"{where}: unknown key '{key}'; known are {', '.join(sorted(known))}")
+
+
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()

@@ -1,0 +1,59 @@
+"""References with less noise than they were rendered with, to train on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+from mcdenoise.data import open_sequence, write_exr
+from mcdenoise.data.files import write_text
+from mcdenoise.data.readers.bmfr import read_clean_features
+from mcdenoise.frame import Frame
+from mcdenoise.models import create_model
+
+
+def clean_references(source: Path, out: Path) -> Path:
+    """Copy a sequence in the BMFR layout with the remaining noise of its references removed by Open Image Denoise.
+
+    A network that is trained with an error of relative differences learns the median of noisy references, which is
+    darker than their mean, and few samples a pixel leave much noise where light is hard to find. Open Image Denoise at
+    high quality, told that albedo and normal are clean, removes nearly all of it: at 50 samples a pixel that is a far
+    easier problem than at one. Those of an anti-aliased reference were rendered with it. For training only: what is
+    measured is measured against references as they were rendered.
+
+    Args:
+        source: folder of the sequence. The noise of its features, if they have any, comes back in the references.
+        out: folder for the copy. One that is finished is kept.
+
+    Returns:
+        Folder of the copy, ``out/NAME``.
+
+    Raises:
+        InputError: the optional package pyoidn is missing, a file is damaged, or the copy cannot be written.
+    """
+    oidn = create_model("oidn", quality="high", auxiliary="clean")
+    sequence = open_sequence(source)
+    inputs = source / "inputs" if (source / "inputs").is_dir() else source
+    copied = out / sequence.name / "inputs"
+    # Written last: it says that the copy is finished.
+    description = copied / "camera.json"
+    if description.exists():
+        return copied.parent
+    ignored = shutil.ignore_patterns("reference*.exr", description.name, ".*")
+    shutil.copytree(inputs, copied, ignore=ignored, dirs_exist_ok=True)
+    for number in sequence.reference_numbers:
+        frame, _ = sequence.frame(number).validate()
+        if frame.reference is None:
+            continue
+        features = read_clean_features(inputs, number) or (frame.albedo, frame.normal)
+        image = oidn(Frame(color=frame.reference, albedo=features[0], normal=features[1]))[0].image
+        # The filter may undershoot; radiance may not.
+        pixels = image[0].clamp(0, 65504).permute(1, 2, 0).numpy()
+        write_exr(copied / f"reference{number}.exr", pixels, ["R", "G", "B"], half=True)
+    rendered = inputs / description.name
+    about = json.loads(rendered.read_text()) if rendered.exists() else {}
+    # What was said of the references no longer holds, and without it no renderer takes them for means of so many paths.
+    about = {key: value for key, value in about.items() if key not in ("reference_spp", "reference_noise")}
+    write_text(description, json.dumps({**about, "reference_filter": "Open Image Denoise, high, clean aux"}) + "\n")
+    return copied.parent

@@ -1,0 +1,208 @@
+"""Rendering as Mitsuba's own renderer samples: filter, lens, and features with noise."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mcdenoise.data.exr import read_exr
+from mcdenoise.data.sequences import open_sequence
+from mcdenoise.errors import InputError
+from mcdenoise.scenes.demo import demo_cameras, demo_scene
+from mcdenoise.scenes.render import FILTERS, Camera, Film, render_sequence
+from mcdenoise.scenes.render import frames as render_frames
+
+WIDTH, HEIGHT = 24, 16
+SCALAR: dict[str, Any] = {"size": (WIDTH, HEIGHT), "variant": "scalar_rgb"}
+FEATURES = ("albedo", "shading_normal", "world_position", "depth")
+# Half floats of 11 bits.
+ROUNDING = 2**-11
+
+
+@pytest.fixture(autouse=True)
+def _mitsuba() -> None:
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+
+
+def read(folder: Path, name: str) -> np.ndarray[Any, Any]:
+    return read_exr(folder / f"{name}.exr")[0].astype(np.float64)
+
+
+def wall() -> dict[str, Any]:
+    """A checked wall at z = 0 in an even white light."""
+    squares = np.indices((8, 8)).sum(axis=0) % 2 * 0.6 + 0.2
+    texture = {
+        "type": "bitmap",
+        "bitmap": np.repeat(squares[..., None], 3, axis=2),
+        "raw": True,
+        "filter_type": "nearest",
+    }
+    return {
+        "type": "scene",
+        "wall": {"type": "rectangle", "to_world": np.eye(4), "bsdf": {"type": "diffuse", "reflectance": texture}},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}},
+    }
+
+
+AT_WALL = [Camera.look_at((0.1, 0.2, 3), (0, 0, 0), fov_x=30)]
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two frames with two realisations on a film with a Gaussian filter and a lens."""
+    pytest.importorskip("mitsuba")
+    out = tmp_path_factory.mktemp("film")
+    film = Film("gaussian", aperture=0.05, focus=3)
+    return render_sequence(demo_scene(), demo_cameras(2), out, realisations=2, reference_spp=2, film=film, **SCALAR)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_the_mean_of_noisy_colors_and_features_is_that_of_many_samples(tmp_path: Path, name: str) -> None:
+    """Albedo and color of a wall in even light are one and the same image, filtered by the same filter.
+
+    Each noisy color is a mean of 4 samples; 30 of them give the standard error. Filters wider than a pixel divide by
+    the weight of the samples that were drawn: a quotient of random numbers, whose bias at 4 samples is below 0.02 here.
+    """
+    runs = 30
+    folder = render_sequence(
+        wall(), AT_WALL, tmp_path, spp=4, realisations=runs, reference_spp=512, film=Film(name), max_depth=2, **SCALAR
+    )
+    places = [folder, *(folder / f"realisation{k}" for k in range(1, runs))]
+    colors = np.array([read(place, "color0") for place in places])
+    albedos = np.array([read(place, "albedo0") for place in places])
+    reference = read(folder, "reference0")
+    error = colors.std(axis=0, ddof=1) / np.sqrt(runs) + reference * ROUNDING + 1e-3
+    away = (colors.mean(axis=0) - reference) / error
+    if name == "box":
+        # Of independent errors of 384 pixels none is beyond six deviations.
+        assert np.abs(away).max() < 6
+        assert abs(away.mean()) < 4 / np.sqrt(away[..., 0].size)
+    else:
+        assert np.abs(colors.mean(axis=0) - reference).max() < 0.02 + 6 * error.max()
+    inside = reference < 0.99
+    np.testing.assert_allclose(albedos.mean(axis=0)[inside], colors.mean(axis=0)[inside], atol=2 * error.max())
+
+
+def test_every_realisation_has_features_of_its_own_samples(sequence: Path) -> None:
+    for name in (*FEATURES, "color"):
+        first, second = read(sequence, f"{name}1"), read(sequence / "realisation1", f"{name}1")
+        assert (first != second).any(axis=-1).mean() > 0.5, name
+        assert np.isfinite(first).all()
+    assert not (sequence / "realisation1" / "reference0.exr").exists()
+    assert read(sequence, "albedo0").min() >= 0
+    assert read(sequence, "albedo0").max() <= 1
+    assert np.linalg.norm(read(sequence, "shading_normal0"), axis=-1).max() < 1.001
+
+
+def test_the_reader_gives_each_realisation_its_own(sequence: Path) -> None:
+    found = open_sequence(sequence.parent)
+    assert found.realisations == 2
+    assert found.noisy == {"color", "albedo", "normal", "position", "depth"}
+    first, second = (found.frame(1, realisation=k).validate()[0] for k in range(2))
+    for name, file in (("albedo", "albedo1"), ("color", "color1"), ("position", "world_position1")):
+        for k, frame in enumerate((first, second)):
+            stored = read(sequence / f"realisation{k}" if k else sequence, file)
+            given = dict(frame.items())[name][0].permute(1, 2, 0).double().numpy()
+            np.testing.assert_array_equal(given, stored)
+    assert torch.equal(first.reference, second.reference)  # type: ignore[arg-type]
+    assert torch.equal(first.view_projection, second.view_projection)  # type: ignore[arg-type]
+
+
+def test_positions_are_seen_within_the_filter_of_their_pixels(tmp_path: Path) -> None:
+    """Box and wall: the sample of a pixel lies in that pixel, and its depth is the distance along the axis."""
+    folder = render_sequence(wall(), AT_WALL, tmp_path, reference_spp=1, film=Film("box"), **SCALAR)
+    matrix = np.array(json.loads((folder / "camera.json").read_text())["camera_matrices"][0])
+    position = read(folder, "world_position0")
+    clip = np.concatenate((position, np.ones((HEIGHT, WIDTH, 1))), axis=-1) @ matrix
+    column = (clip[..., 0] / clip[..., 3] + 1) / 2 * WIDTH - np.arange(WIDTH)
+    row = (clip[..., 1] / clip[..., 3] + 1) / 2 * HEIGHT - np.arange(HEIGHT)[:, None]
+    for offset in (column, row):
+        assert offset.min() > -1e-3
+        assert offset.max() < 1 + 1e-3
+        assert 0.2 < offset.std() < 0.4  # that of even numbers is 0.29
+    np.testing.assert_allclose(read(folder, "depth0")[..., 0], clip[..., 3], rtol=ROUNDING)
+
+
+def test_normals_of_a_back_side_are_turned_to_the_viewer(tmp_path: Path) -> None:
+    behind = [Camera.look_at((0, 0, -3), (0, 0, 0), fov_x=20)]
+    folder = render_sequence(wall(), behind, tmp_path, reference_spp=1, film=Film(), **SCALAR)
+    np.testing.assert_allclose(read(folder, "shading_normal0")[HEIGHT // 2, WIDTH // 2], (0, 0, -1), atol=1e-3)
+
+
+def test_a_lens_blurs_what_it_is_not_focused_on(tmp_path: Path) -> None:
+    """Three lenses: a pinhole, one that is focused on the wall, one on half the way."""
+
+    def contrast(film: Film, name: str) -> float:
+        folder = render_sequence(wall(), AT_WALL, tmp_path / name, reference_spp=256, film=film, max_depth=2, **SCALAR)
+        return float(read(folder, "reference0")[4:-4, 6:-6].std())
+
+    sharp, focused = contrast(Film(), "pinhole"), contrast(Film(aperture=0.15, focus=3.0), "focused")
+    blurred = contrast(Film(aperture=0.15, focus=1.5), "blurred")
+    assert focused > 0.8 * sharp
+    assert blurred < 0.5 * sharp
+
+
+def test_the_same_seed_gives_the_same_pixels_and_a_stopped_run_is_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def render(name: str, **settings: Any) -> Path:
+        changed = {"seed": 5, "film": Film("box"), "realisations": 2, "reference_spp": 2} | settings
+        return render_sequence(demo_scene(), demo_cameras(2), tmp_path / name, **changed, **SCALAR)
+
+    whole, other = render("a"), render("c", seed=6)
+    render("b", frames=1)
+    (tmp_path / "b" / "inputs" / "realisation1" / "albedo0.exr").unlink()
+    again = render("b")
+    for path in whole.rglob("*.exr"):
+        same = path.relative_to(whole)
+        np.testing.assert_array_equal(read_exr(path)[0], read_exr(again / same)[0])
+        assert not np.array_equal(read_exr(path)[0], read_exr(other / same)[0])
+
+    def fail(*_: Any) -> None:
+        raise AssertionError("nothing is missing")
+
+    for name in ("write_buffer", "write_realisation", "write_reference"):
+        monkeypatch.setattr(render_frames, name, fail)
+    render("a")
+    with pytest.raises(InputError, match=r"rendered with film .*'box'.*, now None; choose another output folder"):
+        render("a", film=None)
+
+
+def test_previous_positions_of_what_moves(tmp_path: Path) -> None:
+    """Of a ball that moves along x, where it is seen for sure; and of the wall, that stands still."""
+    ball = np.diag((0.4, 0.4, 0.4, 1.0))
+    ball[2, 3] = 0.6
+    scene = wall() | {"ball": {"type": "sphere", "to_world": ball, "bsdf": {"type": "diffuse"}}}
+    moved = np.tile(np.eye(4), (2, 1, 1))
+    moved[1, 0, 3] = 0.1
+    folder = render_sequence(
+        scene, AT_WALL * 2, tmp_path, moves={"ball": moved}, reference_spp=1, film=Film("box"), **SCALAR
+    )
+    position, before = read(folder, "world_position1"), read(folder, "previous_position1")
+    on_ball, on_wall = position[..., 2] > 0.7, np.abs(position[..., 2]) < 1e-4
+    assert on_ball.sum() > 5
+    assert on_wall.sum() > 50
+    np.testing.assert_allclose((position - before)[on_ball], np.tile((0.1, 0, 0), (on_ball.sum(), 1)), atol=1e-5)
+    np.testing.assert_allclose(before[on_wall], position[on_wall], atol=1e-5)
+    first = read(folder, "previous_position0")
+    np.testing.assert_allclose(first, read(folder, "world_position0"), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"filter": "lanczos"}, "pixel filter: expected one of box, gaussian, tent, mitchell, found 'lanczos'"),
+        ({"aperture": -1.0}, "aperture: expected a radius of at least 0, found -1"),
+        ({"aperture": float("nan")}, "aperture: expected a radius of at least 0, found nan"),
+        ({"focus": 0.0}, "focus: expected a distance above 0, found 0"),
+    ],
+)
+def test_bad_films(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Film(**settings)
+    assert str(caught.value) == message

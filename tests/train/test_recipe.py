@@ -1,0 +1,252 @@
+"""Recipes: from nothing to weights by one command, also when it is stopped, and recipes that are refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from mcdenoise.cli import main
+from mcdenoise.cli.train import options_of
+from mcdenoise.data import open_sequence
+from mcdenoise.errors import InputError
+from mcdenoise.models import describe_weights
+from mcdenoise.train import Recipe, Rendering, clean_references
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+TINY = RECIPES / "tiny.toml"
+WEIGHTS = "cascaded_v2_micro.safetensors"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    """The same weights again, and networks this small are several times slower on several threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of the tiny recipe."""
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
+    pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
+    out = tmp_path_factory.mktemp("recipe") / "run"
+    assert follow(TINY, out) == 0
+    return out
+
+
+def follow(recipe: Path, out: Path, *arguments: object) -> object:
+    """Exit status of the command that a person gives."""
+    with pytest.raises(SystemExit) as stop:
+        main(["train", "--recipe", str(recipe), "-o", str(out), *map(str, arguments)])
+    return stop.value.code
+
+
+def changed(tmp_path: Path, old: str, new: str) -> Path:
+    """The tiny recipe with something else in it."""
+    text = TINY.read_text()
+    assert old in text
+    path = tmp_path / "changed.toml"
+    path.write_text(text.replace(old, new))
+    return path
+
+
+def renderings(data: Path) -> dict[Path, int]:
+    return {path.relative_to(data): path.stat().st_mtime_ns for path in data.rglob("*.exr")}
+
+
+def test_from_nothing_to_weights(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folders = [json.loads(path.read_text())["seeds"] for path in (trained / "data").glob("*/finished.json")]
+    assert sorted(folders) == ["0-1", "2"]
+    said = json.loads((trained / "data.json").read_text())
+    assert [each["name"] for each in said["sequences"]] == ["random0000", "random0001"]
+    assert [each["realisations"] for each in said["sequences"]] == [2, 2]
+    assert [each["name"] for each in said["validation_sequences"]] == ["random0002"]
+    assert describe_weights(trained / WEIGHTS)["recipe"] == said["recipe"]
+
+    before = renderings(trained / "data"), (trained / WEIGHTS).stat().st_mtime_ns
+    assert follow(TINY, trained) == 0
+    assert (renderings(trained / "data"), (trained / WEIGHTS).stat().st_mtime_ns) == before
+    errors, expected, weights = capsys.readouterr().out.splitlines()
+    scores = json.loads((trained / "log.jsonl").read_text().splitlines()[-1])["validation"]
+    assert errors.startswith(f"validation  smape {scores['smape']:.4f}  psnr {scores['psnr']:.4f}")
+    assert expected == f"expected a smape of at most 0.094 + 0.01, found {scores['smape']:.4f}: met"
+    assert weights == str(trained / WEIGHTS)
+
+
+def test_an_error_above_the_bound_is_said(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = renderings(trained / "data")
+    recipe = changed(tmp_path, "smape = 0.094\ntolerance = 0.01", "smape = 0\ntolerance = 1e-9")
+    assert follow(recipe, tmp_path / "run", "--data", trained / "data") == 0
+    printed = capsys.readouterr()
+    assert printed.err.splitlines()[-1].startswith("warning: expected a smape of at most 0 + 1e-09, found 0.")
+    assert printed.err.endswith(": missed\n")
+    # What another run has rendered is used, and what is expected of weights does not change them.
+    assert renderings(trained / "data") == before
+    assert not (tmp_path / "run" / "data").exists()
+    both = [describe_weights(run / WEIGHTS) for run in (trained, tmp_path / "run")]
+    assert len({about["sha256"] for about in both}) == len({about["recipe"] for about in both}) == 1
+
+
+def test_a_run_that_is_killed_while_it_renders_goes_on(trained: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    command = [sys.executable, "-m", "mcdenoise", "train", "--recipe", str(TINY), "-o", str(run)]
+    process = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stderr=subprocess.DEVNULL)
+    while not list(run.glob("data/*/random0000/inputs/color0.exr")):
+        assert process.poll() is None
+        time.sleep(0.005)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert not list(run.glob("data/*/finished.json"))
+    assert follow(TINY, run) == 0
+    assert (run / "data.json").read_bytes() == (trained / "data.json").read_bytes()
+    assert describe_weights(run / WEIGHTS)["sha256"] == describe_weights(trained / WEIGHTS)["sha256"]
+
+
+def test_another_recipe_does_not_go_on_with_a_run(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = renderings(trained / "data")
+    recipe = changed(tmp_path, "steps = 12", "steps = 13")
+    assert follow(recipe, trained) == 2
+    assert "config.json: expected the same as in this run, found another" in capsys.readouterr().err
+    # Other data for the same training.
+    recipe = changed(tmp_path, 'seeds = "0-1"', 'seeds = "1"')
+    assert follow(recipe, trained, "--data", tmp_path / "data") == 2
+    assert "data.json: expected the same as in this run, found another" in capsys.readouterr().err
+    assert renderings(trained / "data") == before
+
+
+@pytest.mark.parametrize("recipe", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
+def test_the_recipes_can_be_read(recipe: Path) -> None:
+    found = Recipe.read(recipe, options_of("generate"))
+    assert found.data
+    assert found.expected is not None
+    assert found.validation
+
+
+def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
+    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    (block,) = re.findall(r"```toml\n(.*?)```", (RECIPES.parent / "training" / "README.md").read_text(), re.DOTALL)
+    path = tmp_path / "explained.toml"
+    path.write_text(block)
+    found = Recipe.read(path, options_of("generate"))
+    assert [rendering.clean for rendering in (*found.data, *found.validation)] == [True, False, False]
+    assert (found.config.steps, found.expected, found.credits) == (5000, (0.093, 0.005), "random*: CC0")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[train]", "[train", "expected a recipe in TOML, found: "),
+        ("[train]", "[training]", "unknown key 'training'; known are data, expected, train, validation"),
+        ("[train]", "[train]\nseeds = 1", "[train]: unknown key 'seeds'; known are batch, credits, crop, "),
+        ("steps = 12", 'steps = "12"', "[train]: steps: expected a value of type int, found '12'"),
+        ("steps = 12", "steps = true", "[train]: steps: expected a value of type int, found True"),
+        ("steps = 12", "steps = 0", "steps: expected at least 1, found 0"),
+        ('"cascaded_v2_micro"', '"cascade"', "cascade"),
+        ("[[data]]", "[data]", "expected tables [[data]], found [data]"),
+        ('[[data]]\nseeds = "0-1"', '[[data]]\nseed = "0-1"', "[[data]] 1: unknown key 'seed'; known are clean_ref"),
+        ("frames = 3", "frames = 2.5", "[[data]] 1: "),
+        ("frames = 3", "frames = 0", "[[data]] 1: --frames: expected at least 1, found 0"),
+        ("frames = 3", "clean_references = 1", "[[data]] 1: clean_references: expected a value of type bool, found 1"),
+        ('size = "48x48"\nrealisations = 2', "size = 48", "[[data]] 1: --size: expected WIDTHxHEIGHT"),
+        ("tolerance = 0.01", "", "[expected]: expected smape and tolerance, found smape alone"),
+        ("tolerance = 0.01", "psnr = 30", "[expected]: unknown key 'psnr'; known are smape, tolerance"),
+    ],
+)
+def test_bad_recipes(tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, message: str) -> None:
+    recipe = changed(tmp_path, old, new)
+    # Whatever is wrong, nothing is rendered first.
+    assert follow(recipe, tmp_path / "run", "--data", tmp_path / "data") == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"mcdenoise train: {recipe}: ")
+    assert message in said
+    assert said.count("\n") == 1
+    assert not list(tmp_path.rglob("*.exr"))
+
+
+def test_a_recipe_without_data(tmp_path: Path) -> None:
+    path = tmp_path / "empty.toml"
+    with pytest.raises(InputError, match=r"empty\.toml: expected a recipe, found no file that can be read"):
+        Recipe.read(path, options_of("generate"))
+    path.write_text("")
+    with pytest.raises(InputError, match=r"empty\.toml: expected at least one table \[\[data\]\]"):
+        Recipe.read(path, options_of("generate"))
+
+
+@pytest.mark.parametrize(
+    "others", [["somewhere"], ["--steps", "3"], ["--validation", "somewhere"], ["--initial-weights", "file"]]
+)
+def test_nothing_beside_a_recipe_says_what_is_trained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], others: list[str]
+) -> None:
+    assert follow(TINY, tmp_path / "run", *others) == 2
+    assert "expected none beside --recipe, which says what is trained, found one" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_place_of_data_needs_a_recipe(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", "somewhere", "-o", "out", "--data", "data"])
+    assert "--data: expected a --recipe" in capsys.readouterr().err
+
+
+def test_the_same_options_have_the_same_place(tmp_path: Path) -> None:
+    def place(**options: object) -> Path:
+        return Rendering("a recipe", options, clean=False).folder(tmp_path)
+
+    assert place(seeds="1", frames=2) == place(frames=2, seeds="1", workers=2)
+    assert len({place(seeds="1"), place(seeds="2"), place(seeds="1", frames=2)}) == 3
+
+
+@pytest.mark.parametrize("place", [".", "inputs"])
+def test_cleaned_references(small_sequence: Path, tmp_path: Path, place: str) -> None:
+    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    description = small_sequence / "inputs" / "camera.json"
+    about = json.loads(description.read_text())
+    description.write_text(json.dumps({**about, "reference_spp": {"0": 64}, "reference_noise": {"0": 0.1}}))
+    copied = clean_references(small_sequence / place, tmp_path / "out")
+    assert copied == tmp_path / "out" / "plane"
+    source, cleaned = open_sequence(small_sequence), open_sequence(copied)
+    assert cleaned.reference_numbers == source.reference_numbers
+    before, after = (dict(sequence.frame(1).items()) for sequence in (source, cleaned))
+    assert {name for name in before if not torch.equal(before[name], after[name])} == {"reference"}
+    # What was known of the references is not said of what the filter made of them.
+    said = json.loads((copied / "inputs" / "camera.json").read_text())
+    assert said == {**about, "reference_filter": "Open Image Denoise, high, clean aux"}
+
+
+def test_cleaned_references_of_a_recipe(small_sequence: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    rendering = Rendering("a recipe", {"seeds": "0"}, clean=True)
+
+    def generate() -> None:
+        shutil.copytree(small_sequence, rendering.folder(tmp_path) / "plane")
+
+    (cleaned,) = rendering.make(tmp_path, generate)
+    assert cleaned.parent == tmp_path / f"{rendering.folder(tmp_path).name}-clean"
+    times = renderings(tmp_path)
+    # Neither rendered nor cleaned again.
+    assert rendering.make(tmp_path, generate) == [cleaned]
+    assert renderings(tmp_path) == times
+
+
+def test_clean_references_need_their_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    recipe = changed(tmp_path, "frames = 3", "frames = 3\nclean_references = true")
+    with pytest.raises(InputError, match=r"changed\.toml: .* pip install 'mcdenoise\[peers\]'"):
+        Recipe.read(recipe, options_of("generate"))
