@@ -17,6 +17,7 @@ from mcdenoise.data import Sequence, open_sequence, read_exr, write_exr
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.data.files import atomic_path, write_text
 from mcdenoise.errors import InputError
+from mcdenoise.scenes.cycles import Blender
 from mcdenoise.scenes.parlour import parlour_cameras, parlour_moves, parlour_scene
 from mcdenoise.scenes.random import random_scene
 from mcdenoise.scenes.render import Film, render_sequence
@@ -61,7 +62,8 @@ def render_suite(
     Args:
         shots: in this order. Their references get a quarter of their samples first, and then all.
         data: the folder; a shot's files go to ``data/NAME``.
-        blender_python: an interpreter that can import ``bpy``, for the shots of Cycles.
+        blender_python: an interpreter that can import ``bpy``, for the shots of Cycles; by default as
+            :class:`mcdenoise.scenes.cycles.Blender` has it.
         threads: of Cycles; all processors by default.
         on_stage: called before each step.
 
@@ -69,12 +71,10 @@ def render_suite(
         InputError: a renderer is missing or failed, or the folder cannot be written or holds something else.
     """
     shots = list(shots)
-    cycles = [shot.name for shot in shots if shot.renderer == "cycles"]
-    if cycles and blender_python is None and any(not _is_whole(shot, data) for shot in shots if shot.name in cycles):
-        raise InputError(
-            f"--blender-python: expected a Python that has Blender's module bpy, to render {cycles[0]}, found none; "
-            "pip install bpy==4.5.15 into a Python 3.11 and name it, or choose others with --rows 'mitsuba-*'"
-        )
+    if any(shot.renderer == "cycles" and not _is_whole(shot, data) for shot in shots):
+        # Before the hours that Mitsuba takes.
+        with Blender(blender_python) as blender:
+            blender_python = blender.python
     try:
         data.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -84,7 +84,7 @@ def render_suite(
         on_stage(Stage(shot.name, fraction, number, len(steps)))
         if shot.renderer == "mitsuba":
             _render_mitsuba(shot, data, fraction)
-        elif blender_python is not None:
+        else:
             _render_cycles(shot, data, fraction, blender_python, threads)
 
 
@@ -142,8 +142,8 @@ def _render_mitsuba(shot: Shot, data: Path, fraction: float) -> None:
 
 def _mitsuba_scene(shot: Shot) -> tuple[dict[str, Any], list[Camera], dict[str, Array]]:
     kind, _, seed = shot.scene.partition(" ")
-    if kind == "room":
-        made = random_scene(int(seed), shot.frames)
+    if seed:
+        made = random_scene(int(seed), shot.frames, shiny=kind == "shiny")
         return made.scene, made.cameras, made.moves
     return parlour_scene(), parlour_cameras(shot.frames), parlour_moves(shot.frames)
 
@@ -162,7 +162,7 @@ def _take_references(shot: Shot, data: Path) -> None:
                 shutil.copyfile(source, unfinished)
 
 
-def _render_cycles(shot: Shot, data: Path, fraction: float, python: Path, threads: int) -> None:
+def _render_cycles(shot: Shot, data: Path, fraction: float, python: Path | None, threads: int) -> None:
     folder, parts = data / shot.name, _parts_of(shot, data)
     for each in (folder, parts):
         each.mkdir(parents=True, exist_ok=True)
@@ -174,7 +174,7 @@ def _render_cycles(shot: Shot, data: Path, fraction: float, python: Path, thread
             seed = _REFERENCE_SEED + 1000 * part + n
             images.append(_image(n, samples, seed, _part(parts, part, n), passes=False))
     missing = [image for image in images if not Path(image["out"]).is_file()]
-    if missing:
+    if missing and python is not None:
         _run_blender(shot, missing, python, threads)
     noise = {}
     for n in shot.references:
@@ -201,13 +201,9 @@ def _run_blender(shot: Shot, images: list[dict[str, Any]], python: Path, threads
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "job.json"
         path.write_text(json.dumps(job))
-        try:
-            # -P: the modules beside the script are none of Blender's.
-            done = subprocess.run(
-                [str(python), "-P", str(_SCRIPT), str(path)], capture_output=True, text=True, check=False
-            )
-        except OSError as error:
-            raise InputError(f"--blender-python: {python} does not run ({error.strerror}); check the path") from error
+        # -P: the modules beside the script are none of Blender's.
+        command = [str(python), "-P", str(_SCRIPT), str(path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode or not all(Path(image["out"]).is_file() for image in images):
         said = [line for line in done.stderr.splitlines() if line.strip()] or ["it ended without a word"]
         raise InputError(f"{shot.name}: Blender could not render it: {said[-1].strip()}")

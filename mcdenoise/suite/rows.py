@@ -20,7 +20,8 @@ class Shot:
     Args:
         name: also of its folder.
         renderer: who renders it.
-        scene: ``parlour`` or ``room`` and a seed for Mitsuba; a name in ``blender_scenes.py`` for Cycles.
+        scene: ``parlour``, or ``room`` or ``shiny`` and the seed of a random scene, for Mitsuba; a name in
+            ``blender_scenes.py`` for Cycles.
         samples: a pixel.
         filter: of the pixels.
         frames: how many; a still has one.
@@ -131,8 +132,8 @@ SHOTS: tuple[Shot, ...] = (
     Shot("mitsuba-parlour-gaussian-16", "mitsuba", "parlour", 16, "gaussian"),
     Shot("cycles-gallery-1", "cycles", "gallery", 1, "default"),
     Shot("cycles-gallery-16", "cycles", "gallery", 16, "default"),
-    Shot("mitsuba-room-90001-box-1", "mitsuba", "room 90001", 1, "box"),
-    Shot("mitsuba-room-90002-gaussian-4", "mitsuba", "room 90002", 4, "gaussian", frames=1),
+    Shot("mitsuba-shiny-90001-box-1", "mitsuba", "shiny 90001", 1, "box"),
+    Shot("mitsuba-shiny-90002-gaussian-4", "mitsuba", "shiny 90002", 4, "gaussian", frames=1),
     Shot("mitsuba-room-90003-box-16", "mitsuba", "room 90003", 16, "box", frames=1),
     Shot("cycles-gallery-centre-1", "cycles", "gallery", 1, "centre"),
     Shot("cycles-garden-4", "cycles", "garden", 4, "default"),
