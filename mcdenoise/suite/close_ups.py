@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -21,7 +22,7 @@ PARTS: dict[str, dict[str, tuple[float, float, float, float]]] = {
         "books": (0.68, 0.08, 0.94, 0.43),
         "print": (0.46, 0.05, 0.68, 0.35),
         "rods": (0.36, 0.0, 0.54, 0.5),
-        "contact": (0.16, 0.62, 0.36, 0.8),
+        "contact": (0.55, 0.62, 0.85, 0.84),
         "disocclusion": (0.0, 0.2, 0.3, 0.7),
     },
     "gallery": {
@@ -92,6 +93,8 @@ def _panel(title: str, image: Image, reference: Image, crop: Crop) -> tuple[list
     own, truth = np.ascontiguousarray(crop.of(image)), np.ascontiguousarray(crop.of(reference))
     factor = max(1, -(-_LEAST_WIDTH // own.shape[1]))
     pixels = to_srgb(own).repeat(factor, 0).repeat(factor, 1)
+    # Of settings the values are enough: their names would not fit.
+    title = re.sub(r"\w+=", "", title)
     if image is reference:
         return [title, ""], pixels
     psnr, smape = crop_errors(own, truth)
