@@ -21,6 +21,7 @@ from mcdenoise.cli.train import options_of
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.models import describe_weights
+from mcdenoise.models._weights import pretrained_models
 from mcdenoise.train import Recipe, Rendering, clean_references
 
 RECIPES = Path(__file__).parents[2] / "recipes"
@@ -134,8 +135,9 @@ def test_another_recipe_does_not_go_on_with_a_run(
 def test_the_recipes_can_be_read(recipe: Path) -> None:
     found = Recipe.read(recipe, options_of("generate"))
     assert found.data
-    assert found.expected is not None
     assert found.validation
+    # Of what is shipped it is known.
+    assert found.expected is not None or found.config.model not in pretrained_models()
 
 
 def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
