@@ -43,9 +43,10 @@ SCALE_UNITS = (10.0, 1000.0, 1.0)  # of the falloffs with normal, depth and dist
 _USES = frozenset({"albedo", "normal", "depth", "current", "length", ALBEDO_HISTORY})
 _COARSE_CHANNELS = 4  # the logarithm of the mean, and how much the pixels of a block differ
 _FEATURE_TAPS = 9  # of the kernel for features
-_PARTS = {"importance": 1, "history": 1, "albedo": 1, "matt": 1, "gain": 3, "features": _FEATURE_TAPS}
+# "albedo" weighs that of the 3x3 pixels around, that of the history, and that which the pyramid makes of it.
+_PARTS = {"importance": 1, "history": 1, "albedo": 3, "matt": 1, "gain": 3, "features": _FEATURE_TAPS}
 # What they are before anything was learnt: the history is trusted, light is matt, features are exact.
-_AT_REST = {"history": 2.0, "albedo": -2.0, "matt": -2.0}
+_AT_REST = {"history": 2.0, "matt": -1.0}
 _QUARTERS = (4, 6, 8, 12, 16)  # of the width, at each level
 _LEAST = 1e-3  # of the light of a pixel that a scale keeps or hands on, and that a pixel is worth
 _MOST_GAIN = 1.0  # of the logarithm of the factor
@@ -79,6 +80,7 @@ class PyramidNetwork(nn.Module):
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
         rest = torch.cat([torch.full((count,), _AT_REST.get(name, 0.0)) for name, count in _PARTS.items()])
         rest[-_FEATURE_TAPS // 2] = 4.0
+        rest[2] = 1.0  # the albedo of the pixels around
         with torch.no_grad():
             # A head of half the resolution predicts each channel for two by two pixels.
             self.heads[0].bias[self.channels[0] * self.heads[0].side ** 2 :] = rest.repeat_interleave(  # type: ignore
@@ -121,7 +123,6 @@ class PyramidNetwork(nn.Module):
         # Features of the pixel, which may be of one sample, and what the samples around it say.
         features = torch.cat([albedo, *guides_of(frame)], 1)
         smooth, guides = kernel_conv(features, torch.softmax(parts["features"], 1)).split([3, 4], 1)
-        smooth = torch.lerp(smooth, before, torch.sigmoid(parts["albedo"]))
         matt = 1 - torch.sigmoid(parts["matt"])
         alone = image if frame.current is None else frame.current * exposure
         color = torch.lerp(alone, image, torch.sigmoid(parts["history"]))
@@ -131,15 +132,17 @@ class PyramidNetwork(nn.Module):
                 [others[:, : 3 * (count := len(frame.layers))] * ratio.repeat(1, count, 1, 1), others[:, 3 * count :]],
                 1,
             )
-        light = [color * ratio, *([] if others is None else [others])]
+        light = [color * ratio, albedo, *([] if others is None else [others])]
         # Of the weights alone, in the last channel, the mean is what it is divided by.
         worth = _inside(parts["importance"])
         weighted = torch.cat([*light, torch.ones_like(worth)], 1) * worth
         filtered = self._filtered(weighted, predicted, guides)
         mean = filtered[:, :-1] / filtered[:, -1:]
+        near, past, wide = torch.softmax(parts["albedo"], 1).split(1, 1)
+        smooth = near * smooth + past * before + wide * mean[:, 3:6]
         gain = torch.exp(_MOST_GAIN * torch.tanh(parts["gain"]))
         result = mean[:, :3] * gain / _ratio(albedo, smooth, matt) / exposure
-        return answered(frame, result, None if others is None else mean[:, 3:]), None
+        return answered(frame, result, None if others is None else mean[:, 6:]), None
 
     def _coarse(self, frame: Frame, exposure: Tensor) -> list[Tensor]:
         """At each coarser scale the logarithm of the mean radiance, and how much single pixels of the frame differ."""

@@ -129,8 +129,9 @@ def test_the_albedo_of_what_is_multiplied_back_may_be_that_of_the_history() -> N
     with torch.no_grad():
         for head in net.heads:
             head.weight.zero_()  # type: ignore[operator]
-        for name, logit in (("albedo", 1000.0), ("matt", -1000.0)):
-            net.heads[0].bias[net.channels[0] + list(_PARTS).index(name)] = logit  # type: ignore[index,operator]
+        # Of the history, the second of three, and of what is not matt.
+        for place, logit in ((3, 1000.0), (sum(list(_PARTS.values())[:3]), -1000.0)):
+            net.heads[0].bias[net.channels[0] + place] = logit  # type: ignore[index,operator]
     noisy, history = (torch.rand(1, 3, *SIZE, dtype=torch.float64) * 0.9 + 0.05 for _ in range(2))
     light = torch.ones_like(noisy)
     frame = frame_of(light, albedo=noisy).replace(extra={ALBEDO_HISTORY: history})
