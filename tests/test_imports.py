@@ -30,7 +30,7 @@ LIBRARY = SIGNAL | {
     "denoiser",
 }
 REPORTS = {"benchmark", "check", "evaluate", "folder", "methods", "report"}
-TOOLS = REPORTS | {"budget", "demo", "export", "preview", "train"}
+TOOLS = REPORTS | {"budget", "demo", "export", "preview", "suite", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),

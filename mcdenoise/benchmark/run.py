@@ -24,7 +24,7 @@ from mcdenoise.data import Sequence, open_sequence, write_exr
 from mcdenoise.data.files import new_folder
 from mcdenoise.data.sequences import with_unique_names
 from mcdenoise.errors import InputError
-from mcdenoise.evaluate import METRICS, check_references, reference_noise
+from mcdenoise.evaluate import USUAL, check_references, reference_noise
 from mcdenoise.frame import Frame
 from mcdenoise.models import Output, Stage, summarize
 from mcdenoise.results import IMAGES, STAGES, Cell, Method, Results, Scene, Spread
@@ -50,6 +50,7 @@ class Settings:
         metrics: names in :data:`mcdenoise.evaluate.METRICS`.
         flip_every: FLIP is slow: compute it for the first of so many frames with a reference.
         on_the_way: whether to compare the images on the way to a result, too, such as ``initial``.
+        memory: whether to measure what memory each method takes, in processes of their own.
         command: the command line, to be stored with the results.
 
     Raises:
@@ -61,9 +62,10 @@ class Settings:
     device: str = "cpu"
     sizes: tuple[Size, ...] = ()
     pictures: int = 4
-    metrics: tuple[str, ...] = tuple(METRICS)
+    metrics: tuple[str, ...] = USUAL
     flip_every: int = 1
     on_the_way: bool = False
+    memory: bool = True
     command: str = ""
 
     def __post_init__(self) -> None:
@@ -275,7 +277,8 @@ class _SceneRun:
 
     def _frames(self, *, reference: bool) -> Iterator[_Read]:
         for timed in self._made.denoisers.values():
-            timed.denoiser.reset()
+            # A still has neither a history nor a frame that it would be one of.
+            timed.denoiser.reset(frames=1 if len(self._sequence) == 1 else None)
         for number in self._sequence.numbers:
             start = self._watch.mark()
             frame = self._sequence.frame(number, reference=reference).to(self._settings.device)
@@ -329,7 +332,7 @@ class _SceneRun:
             cell,
             whole=times[_WHOLE],
             stages={stage: times[stage] for stage in STAGES if stage in times},
-            memory=self._made.peaks.of(method, self._sequence.size, frames),
+            memory=self._made.peaks.of(method, self._sequence.size, frames) if self._settings.memory else None,
             computing=times[_COMPUTING],
         )
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mcdenoise.evaluate import METRICS, measure
+from mcdenoise.evaluate import METRICS, USUAL, measure
 from mcdenoise.results import Spread
 
 
@@ -31,7 +31,7 @@ class Errors:
             not installed.
     """
 
-    def __init__(self, metrics: Collection[str] = tuple(METRICS), flip_every: int = 1) -> None:
+    def __init__(self, metrics: Collection[str] = USUAL, flip_every: int = 1) -> None:
         self.skipped: dict[str, str] = {}
         self._metrics = {name: METRICS[name] for name in METRICS if name in metrics}
         self._flip_every = flip_every

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 import tyro
@@ -15,6 +15,7 @@ from mcdenoise.benchmark.sizes import SIZES
 from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows, skipped_rows
 from mcdenoise.cli._options import Json, check_threads, parse_size
 from mcdenoise.cli._output import print_rows, progress_bar, write_json
+from mcdenoise.cli._suite import SHOWN, score_suite
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
@@ -35,6 +36,11 @@ def benchmark(
     keep_all: bool = False,
     ops: bool = False,
     size: str = "1280x720",
+    suite: Literal["wild"] | None = None,
+    data: Path | None = None,
+    rows: str | None = None,
+    blender_python: Path | None = None,
+    render: bool = True,
     json: Json = None,
 ) -> int:
     """Measure error against run time: any methods and doing nothing, on the same frames, taking turns.
@@ -42,6 +48,10 @@ def benchmark(
     Writes OUT/index.html, the report, with its plots, results.json, results.csv and images; OUT must not exist.
     Exit status 1 if a method failed on a scene. With --ops, measures the operators instead: time, error, and how
     near they come to a copy.
+
+    With --suite wild, renders frames that no training uses, by Mitsuba and by Blender's Cycles, to the folder of --data
+    where they are missing, and compares --models with OIDN's best setting of each: OUT/suite.md, suite.json and
+    close-ups. Without --out it only renders. Rendering everything takes hours; it can be stopped and goes on.
 
     Args:
         sequences: folders of sequences with references.
@@ -60,11 +70,33 @@ def benchmark(
         keep_all: measure each method that skips anything a second time, skipping nothing, to see what that saves.
         ops: measure the operators.
         size: of the images with --ops, WIDTHxHEIGHT.
+        suite: render and score the suite of this name.
+        data: folder of the suite's frames.
+        rows: which of the suite, such as "cycles-*,mitsuba-parlour-box-4"; all by default.
+        blender_python: a Python that has Blender's module bpy, to render the suite's rows of Cycles; by default that
+            of the environment variable MCDENOISE_BLENDER_PYTHON, or else this one.
+        render: --no-render scores the rows that are in the folder of --data and renders nothing.
         json: write what is in results.json, or ops.json, to this file too.
     """
     keep_heap()
     threads = torch.get_num_threads() if threads is None else threads
     check_threads(threads)
+    if suite is not None:
+        if ops or sequences:
+            raise InputError("--suite: expected neither folders of sequences nor --ops beside it, found one")
+        if data is None:
+            raise InputError("--data: expected the folder of the suite's frames, found none; give one")
+        command = _command_line("benchmark", suite=suite, data=data, rows=rows, models=models, threads=threads, out=out)
+        settings = Settings(
+            rounds=1 if rounds is None else rounds,
+            threads=threads,
+            device=device,
+            pictures=1,
+            metrics=SHOWN,
+            memory=False,
+            command=command,
+        )
+        return score_suite(data, out, settings, rows, models, blender_python, render=render, json=json)
     if ops == bool(sequences):
         raise InputError("expected the folders of sequences, or --ops, and not both; see `mcdenoise benchmark --help`")
     rounds = rounds if rounds is not None else 5 if ops else 3

@@ -2,11 +2,12 @@
 
 from mcdenoise.evaluate.folder import Evaluation, Table, evaluate_folder, evaluate_method, find_images
 from mcdenoise.evaluate.noise import noise_floor, reference_noise
-from mcdenoise.evaluate.scores import METRICS, check_references, measure
+from mcdenoise.evaluate.scores import METRICS, USUAL, check_references, measure
 from mcdenoise.metrics import Metric
 
 __all__ = [
     "METRICS",
+    "USUAL",
     "Evaluation",
     "Metric",
     "Table",

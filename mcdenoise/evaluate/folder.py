@@ -20,7 +20,7 @@ from mcdenoise.data.readers.opening import open_result
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate.noise import noise_floor, reference_noise
-from mcdenoise.evaluate.scores import METRICS, check_references, measure
+from mcdenoise.evaluate.scores import METRICS, USUAL, check_references, measure
 from mcdenoise.folder import denoised_frames
 from mcdenoise.frame import Frame
 from mcdenoise.metrics import (
@@ -38,7 +38,7 @@ from mcdenoise.ops import Surface
 
 STRICT: ProtocolName = "strict"
 WARPED, FLICKER = "wRMSE", "flicker"
-_METRICS = {**METRICS, "HDR-FLIP": Metric(flip_hdr)}
+_METRICS = {**{name: METRICS[name] for name in USUAL}, "HDR-FLIP": Metric(flip_hdr)}
 _OURS = re.compile(r"denoised(\d+)")
 # The largest motion, in pixels, of a shot in which nothing moves.
 _STILL = 0.05
@@ -281,7 +281,7 @@ def _evaluate(
         else:
             reason = f"{protocol} skips the first {chosen.skipped_frames} frames; this sequence has no reference later"
             tables[protocol].skipped |= dict.fromkeys(chosen.metrics, reason)
-    floor = noise_floor(sequence, metrics=[name for name in METRICS if name not in ("RMSE", "FLIP")])
+    floor = noise_floor(sequence, metrics=[name for name in USUAL if name not in ("RMSE", "FLIP")])
     return Evaluation(sequence.name, source, tables, pairs.warping_error, reference_noise(sequence), floor)
 
 

@@ -13,6 +13,7 @@ from mcdenoise.metrics import (
     Metric,
     UncomputableError,
     flip_srgb,
+    psnr_gamma,
     psnr_srgb,
     relmse_linear,
     rmse_linear,
@@ -31,7 +32,10 @@ METRICS: dict[str, Metric] = {
     "FLIP": Metric(flip_srgb),
     "tSMAPE": Metric(temporal_smape_linear, temporal=True),
     "tRMSE": Metric(temporal_rmse_srgb, temporal=True),
+    # For comparison with tables of others: not computed unless it is asked for.
+    "PSNR 2.2": Metric(psnr_gamma, higher_is_better=True),
 }
+USUAL = tuple(name for name in METRICS if name != "PSNR 2.2")
 
 
 def measure(

@@ -4,7 +4,7 @@ Images are ``(..., 3, H, W)`` scene-linear radiance; whatever stands before the 
 """
 
 from mcdenoise.metrics._check import UncomputableError
-from mcdenoise.metrics.display import display_codes, displayed, flip_hdr, flip_srgb, psnr_srgb, ssim_srgb
+from mcdenoise.metrics.display import display_codes, displayed, flip_hdr, flip_srgb, psnr_gamma, psnr_srgb, ssim_srgb
 from mcdenoise.metrics.linear import relmse_linear, rmse_linear, smape_linear
 from mcdenoise.metrics.metric import Metric
 from mcdenoise.metrics.protocols import PROTOCOLS, Protocol, aces_displayed, gamma_displayed
@@ -30,6 +30,7 @@ __all__ = [
     "flip_hdr",
     "flip_srgb",
     "gamma_displayed",
+    "psnr_gamma",
     "psnr_srgb",
     "relmse_linear",
     "rmse_linear",

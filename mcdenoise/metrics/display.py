@@ -66,6 +66,30 @@ def psnr_srgb(image: Tensor, reference: Tensor) -> Tensor:
     return -10 * torch.log10(difference.square().mean((-3, -2, -1)))
 
 
+def psnr_gamma(image: Tensor, reference: Tensor, *, gamma: float = 2.2) -> Tensor:
+    """Peak signal-to-noise ratio of values clamped to [0, 1] on a plain power curve, peak 1.
+
+    Args:
+        image: ``(..., 3, H, W)`` scene-linear radiance.
+        reference: of the same shape.
+        gamma: the values are raised to ``1 / gamma``.
+
+    Returns:
+        ``(...)`` decibels, higher is better; infinite for equal images.
+
+    Raises:
+        ValueError: the shapes differ.
+
+    Example:
+        >>> white = torch.ones(3, 2, 2)
+        >>> round(psnr_gamma(white * 0.25, white, gamma=2).item(), 4)  # 0.5 against 1
+        6.0206
+    """
+    check_images(image, reference)
+    shown, expected = (x.clamp(0, 1).pow(1 / gamma) for x in (image, reference))
+    return -10 * torch.log10((shown - expected).square().mean((-3, -2, -1)))
+
+
 def ssim_srgb(image: Tensor, reference: Tensor) -> Tensor:
     """Structural similarity as displayed: clamped to [0, 1], sRGB curve, data range 1.
 

@@ -44,6 +44,7 @@ _LOST, CAUSTICS = 0.1, 120.0
 _BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
 # A light has hardly varied over the history: its compressed radiance by less than this fraction.
 _STEADY = 0.1
+ALBEDO_HISTORY = "albedo_history"
 _NO_WAY = "no motion, and no position with a previous camera"
 
 
@@ -112,7 +113,8 @@ class Accumulated(Wrapper):
         lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test for changes of light.
         clamp_current: whether fireflies are clamped in what the method sees as ``current``, too.
         also: names of buffers ``(B, 3, H, W)`` of ``frame.extra`` that are accumulated as the color is, where a frame
-            has them: with its weights, and with what they have of fireflies.
+            has them: with its weights, and with what they have of fireflies. With ``"albedo"``, the method finds the
+            history of the albedo, anti-aliased by all its frames, as ``albedo_history`` in ``frame.extra``.
 
     Raises:
         InputError: a setting is out of its range.
@@ -281,7 +283,7 @@ class Accumulated(Wrapper):
             parts = [part * scale for part in parts]
         if (alpha := alpha_of(frame)) is not None:
             parts.append(alpha.expand(-1, COLOR.stop, -1, -1))
-        parts += [frame.extra[name] for name in self._found(frame)]
+        parts += [buffer for name in self._found(frame) if (buffer := frame.buffer(name)) is not None]
         return [part.to(entering.dtype) for part in parts]
 
     def _with_carried(self, frame: Frame, carried: tuple[Tensor, ...]) -> Frame:
@@ -291,11 +293,12 @@ class Accumulated(Wrapper):
         parts = iter(carried)
         layers = {name: next(parts)[:, COLOR] for name in frame.layers}
         alpha = frame.alpha if alpha_of(frame) is None else next(parts)[:, :1]
-        extra = {**frame.extra, **{name: next(parts)[:, COLOR] for name in self._found(frame)}}
+        also = {ALBEDO_HISTORY if name == "albedo" else name: next(parts)[:, COLOR] for name in self._found(frame)}
+        extra = {**frame.extra, **also}
         return frame.replace(layers=layers, alpha=alpha, extra=extra)
 
     def _found(self, frame: Frame) -> list[str]:
-        return [name for name in self.also if name in frame.extra]
+        return [name for name in self.also if frame.buffer(name) is not None]
 
     def _chosen(self, color: Tensor) -> Tensor:
         """The limit of the fireflies of each image of a shot that begins with this frame."""

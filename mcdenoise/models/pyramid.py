@@ -12,7 +12,7 @@ and so decides what rules decide elsewhere:
 - on which scale a pixel's light is to be spread: each scale keeps a part of it and hands on the rest, as in Balint et
   al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", Sec. 4;
 - how features that have noise themselves (anti-aliased, out of focus, blurred by motion) are filtered before they are
-  multiplied back or guide anything.
+  multiplied back or guide anything, and how far the history of the albedo is to be trusted.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.accumulated import ALBEDO_HISTORY, Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Tiled
@@ -40,12 +40,13 @@ from mcdenoise.ops.demodulation import modulation
 from mcdenoise.ops.lag import THRESHOLD
 
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of the falloffs with normal, depth and distance
-_USES = frozenset({"albedo", "normal", "depth", "current", "length"})
+_USES = frozenset({"albedo", "normal", "depth", "current", "length", ALBEDO_HISTORY})
 _COARSE_CHANNELS = 4  # the logarithm of the mean, and how much the pixels of a block differ
 _FEATURE_TAPS = 9  # of the kernel for features
-_PARTS = {"importance": 1, "history": 1, "matt": 1, "gain": 3, "features": _FEATURE_TAPS}
+# "albedo" weighs that of the 3x3 pixels around, that of the history, and that which the pyramid makes of it.
+_PARTS = {"importance": 1, "history": 1, "albedo": 3, "matt": 1, "gain": 3, "features": _FEATURE_TAPS}
 # What they are before anything was learnt: the history is trusted, light is matt, features are exact.
-_AT_REST = {"history": 2.0, "matt": -2.0}
+_AT_REST = {"history": 2.0, "matt": -1.0}
 _QUARTERS = (4, 6, 8, 12, 16)  # of the width, at each level
 _LEAST = 1e-3  # of the light of a pixel that a scale keeps or hands on, and that a pixel is worth
 _MOST_GAIN = 1.0  # of the logarithm of the factor
@@ -65,7 +66,7 @@ class PyramidNetwork(nn.Module):
     def __init__(self, widths: Sequence[int], kernel_size: int = 5, half: bool = False) -> None:
         super().__init__()
         scales = len(widths) + half
-        self.unet = UNet(6 + FEATURES, widths, scales, _COARSE_CHANNELS, half)
+        self.unet = UNet(9 + FEATURES, widths, scales, _COARSE_CHANNELS, half)
         self.taps = kernel_size**2
         # Kernel, its three falloffs, what a scale keeps, and what it takes of the coarser one.
         self.channels = [self.taps + 5] * (scales - 1) + [self.taps + 3]
@@ -79,6 +80,7 @@ class PyramidNetwork(nn.Module):
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
         rest = torch.cat([torch.full((count,), _AT_REST.get(name, 0.0)) for name, count in _PARTS.items()])
         rest[-_FEATURE_TAPS // 2] = 4.0
+        rest[2] = 1.0  # the albedo of the pixels around
         with torch.no_grad():
             # A head of half the resolution predicts each channel for two by two pixels.
             self.heads[0].bias[self.channels[0] * self.heads[0].side ** 2 :] = rest.repeat_interleave(  # type: ignore
@@ -107,7 +109,8 @@ class PyramidNetwork(nn.Module):
         exposure = frame.statistics["exposure"]
         image = frame.color * exposure
         albedo = modulation(features_of(frame)[0]) if frame.albedo is not None else torch.ones_like(image)
-        seen = torch.cat([input_of(frame, image), torch.log1p(image * albedo)], 1)
+        before = modulation(frame.extra[ALBEDO_HISTORY]) if ALBEDO_HISTORY in frame.extra else albedo
+        seen = torch.cat([input_of(frame, image), torch.log1p(image * albedo), before], 1)
         levels = self.unet(seen, self._coarse(frame, exposure))
         sizes = _sizes(frame.size, len(levels))
         predicted = [
@@ -119,7 +122,7 @@ class PyramidNetwork(nn.Module):
 
         # Features of the pixel, which may be of one sample, and what the samples around it say.
         features = torch.cat([albedo, *guides_of(frame)], 1)
-        smooth = kernel_conv(features, torch.softmax(parts["features"], 1))
+        smooth, guides = kernel_conv(features, torch.softmax(parts["features"], 1)).split([3, 4], 1)
         matt = 1 - torch.sigmoid(parts["matt"])
         alone = image if frame.current is None else frame.current * exposure
         color = torch.lerp(alone, image, torch.sigmoid(parts["history"]))
@@ -129,15 +132,17 @@ class PyramidNetwork(nn.Module):
                 [others[:, : 3 * (count := len(frame.layers))] * ratio.repeat(1, count, 1, 1), others[:, 3 * count :]],
                 1,
             )
-        light = [color * ratio, *([] if others is None else [others])]
+        light = [color * ratio, albedo, *([] if others is None else [others])]
         # Of the weights alone, in the last channel, the mean is what it is divided by.
         worth = _inside(parts["importance"])
         weighted = torch.cat([*light, torch.ones_like(worth)], 1) * worth
-        filtered = self._filtered(weighted, predicted, smooth[:, 3:])
+        filtered = self._filtered(weighted, predicted, guides)
         mean = filtered[:, :-1] / filtered[:, -1:]
+        near, past, wide = torch.softmax(parts["albedo"], 1).split(1, 1)
+        smooth = near * smooth + past * before + wide * mean[:, 3:6]
         gain = torch.exp(_MOST_GAIN * torch.tanh(parts["gain"]))
-        result = mean[:, :3] * gain / _ratio(albedo, smooth[:, :3], matt) / exposure
-        return answered(frame, result, None if others is None else mean[:, 3:]), None
+        result = mean[:, :3] * gain / _ratio(albedo, smooth, matt) / exposure
+        return answered(frame, result, None if others is None else mean[:, 6:]), None
 
     def _coarse(self, frame: Frame, exposure: Tensor) -> list[Tensor]:
         """At each coarser scale the logarithm of the mean radiance, and how much single pixels of the frame differ."""
@@ -223,6 +228,7 @@ def _pyramid(
             alpha_min=alpha_min,
             lag_threshold=THRESHOLD if anti_lag else math.inf,
             clamp_current=False,
+            also=("albedo",),
         )
     )
 

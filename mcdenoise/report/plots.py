@@ -208,6 +208,32 @@ def cost_over_pixels(results: Results, colors: dict[str, str], layout: Layout = 
     return figure
 
 
+def error_over_samples(curves: dict[str, list[tuple[int, float]]], title: str, layout: Layout = "wide") -> Figure:
+    """Error over samples a pixel; a curve each, the name at its end.
+
+    Args:
+        curves: by name, samples and error, at least one point each; the input is the one called ``input``.
+        title: what the error is.
+        layout: of the figure.
+    """
+    figure, axes = _figure(layout)
+    axes.set_xlabel("samples a pixel")
+    axes.set_title(title, loc="left", fontsize=9.5, color=_INK)
+    everything = [point for own in curves.values() for point in own]
+    if not everything:
+        return _empty(axes)
+    _log_axis(axes, "x", [Range(*[float(samples)] * 3) for samples, _ in everything])
+    low, high = axes.get_xlim()
+    axes.set_xlim(low, high * (high / low) ** 0.3)
+    _log_axis(axes, "y", [Range(*[value] * 3) for _, value in everything])
+    colors = iter(_COLORS * (1 + len(curves) // len(_COLORS)))
+    for name, own in curves.items():
+        color = _BASELINE if name == "input" else next(colors)
+        axes.plot(*zip(*own, strict=True), color=color, linewidth=1.4, marker="o", markersize=4)
+    _label(axes, [own[-1] for own in curves.values()], list(curves), right=True)
+    return figure
+
+
 def write_figure(figure: Figure, path: Path) -> None:
     """Write a figure on white, for papers, as its ending says.
 

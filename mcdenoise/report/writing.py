@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
@@ -101,6 +101,29 @@ def write_error_plot(results: Results, metric: str, path: Path) -> list[Row]:
         figure = plots.error_over_time(shown, metric, plots.model_colors(results.methods))
         plots.write_figure(figure, path)
     return shown.rows
+
+
+def write_sample_plots(curves: Mapping[str, dict[str, list[tuple[int, float]]]], folder: Path) -> list[Path]:
+    """Draw SMAPE over samples, ``plots/NAME-over-samples.svg``.
+
+    Args:
+        curves: by name of the figure, and of the curve: samples and SMAPE.
+        folder: of the benchmark.
+
+    Raises:
+        InputError: a package is not installed, or a file cannot be written.
+    """
+    check_packages()
+    from mcdenoise.report import plots
+
+    written = []
+    for name, own in curves.items():
+        path = folder / PLOTS / f"{name}-over-samples.svg"
+        path.parent.mkdir(exist_ok=True)
+        with plots.plot_style():
+            plots.write_figure(plots.error_over_samples(own, f"SMAPE, {name} (lower is better)"), path)
+        written.append(path)
+    return written
 
 
 def check_packages() -> None:

@@ -14,8 +14,21 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
-
-Color = tuple[float, float, float]
+from mcdenoise.scenes.parts import (
+    box,
+    cylinder,
+    diffuse,
+    metal,
+    place,
+    plastic,
+    rectangle,
+    rotate_x,
+    rotate_y,
+    sphere,
+    textured,
+    tint,
+    varnish,
+)
 
 
 def demo_scene() -> dict[str, Any]:
@@ -48,47 +61,47 @@ def demo_cameras(frames: int = 16) -> list[Camera]:
 
 
 def _room() -> dict[str, Any]:
-    plaster = _diffuse((0.72, 0.69, 0.63))
+    plaster = diffuse((0.72, 0.69, 0.63))
     return {
-        "floor": _rectangle((0, 0, 0.5), (3, 3.5), _rotate_x(-90), _varnish(_planks())),
-        "ceiling": _rectangle((0, 2.7, 0.5), (3, 3.5), _rotate_x(90), _diffuse((0.8, 0.8, 0.78))),
-        "wall_back": _rectangle((0, 1.35, -3), (3, 1.35), np.eye(4), _textured(_wallpaper())),
-        "wall_left": _rectangle((-3, 1.35, 0.5), (3.5, 1.35), _rotate_y(90), plaster),
-        "wall_right": _rectangle((3, 1.35, 0.5), (3.5, 1.35), _rotate_y(-90), _diffuse((0.62, 0.16, 0.1))),
-        "wall_front": _rectangle((0, 1.35, 4), (3, 1.35), _rotate_y(180), plaster),
-        "skirting": _box((0, 0.06, -2.98), (6, 0.12, 0.04), _diffuse((0.75, 0.74, 0.7))),
+        "floor": rectangle((0, 0, 0.5), (3, 3.5), rotate_x(-90), varnish(_planks())),
+        "ceiling": rectangle((0, 2.7, 0.5), (3, 3.5), rotate_x(90), diffuse((0.8, 0.8, 0.78))),
+        "wall_back": rectangle((0, 1.35, -3), (3, 1.35), np.eye(4), textured(_wallpaper())),
+        "wall_left": rectangle((-3, 1.35, 0.5), (3.5, 1.35), rotate_y(90), plaster),
+        "wall_right": rectangle((3, 1.35, 0.5), (3.5, 1.35), rotate_y(-90), diffuse((0.62, 0.16, 0.1))),
+        "wall_front": rectangle((0, 1.35, 4), (3, 1.35), rotate_y(180), plaster),
+        "skirting": box((0, 0.06, -2.98), (6, 0.12, 0.04), diffuse((0.75, 0.74, 0.7))),
     }
 
 
 def _lights() -> dict[str, Any]:
     window = {
         "type": "rectangle",
-        "to_world": _place((-2.96, 1.6, -0.9), (1.1, 0.8, 1), _rotate_y(90)),
-        "bsdf": _diffuse((0, 0, 0)),
+        "to_world": place((-2.96, 1.6, -0.9), (1.1, 0.8, 1), rotate_y(90)),
+        "bsdf": diffuse((0, 0, 0)),
         "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [10.5, 11.5, 13.0]}},
     }
     bulb = {
         "type": "sphere",
-        "to_world": _place((2.05, 1.62, -2.2), (0.17, 0.17, 0.17)),
-        "bsdf": _diffuse((0, 0, 0)),
+        "to_world": place((2.05, 1.62, -2.2), (0.17, 0.17, 0.17)),
+        "bsdf": diffuse((0, 0, 0)),
         "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [21.0, 13.0, 6.5]}},
     }
-    frame = _diffuse((0.7, 0.7, 0.68))
+    frame = diffuse((0.7, 0.7, 0.68))
     return {
         "window": window,
-        "window_post": _box((-2.93, 1.6, -0.9), (0.05, 1.7, 0.06), frame),
-        "window_bar": _box((-2.93, 1.6, -0.9), (0.05, 0.06, 2.3), frame),
-        "window_sill": _box((-2.9, 0.77, -0.9), (0.2, 0.05, 2.4), frame),
+        "window_post": box((-2.93, 1.6, -0.9), (0.05, 1.7, 0.06), frame),
+        "window_bar": box((-2.93, 1.6, -0.9), (0.05, 0.06, 2.3), frame),
+        "window_sill": box((-2.9, 0.77, -0.9), (0.2, 0.05, 2.4), frame),
         "lamp_bulb": bulb,
-        "lamp_stand": _cylinder((2.05, 0, -2.2), 1.46, 0.025, _metal("Al", 0.15)),
-        "lamp_foot": _box((2.05, 0.02, -2.2), (0.3, 0.04, 0.3), _metal("Al", 0.15)),
+        "lamp_stand": cylinder((2.05, 0, -2.2), 1.46, 0.025, metal("Al", 0.15)),
+        "lamp_foot": box((2.05, 0.02, -2.2), (0.3, 0.04, 0.3), metal("Al", 0.15)),
     }
 
 
 def _shelf() -> dict[str, Any]:
     """Two boards of books and a painting on the back wall: fine detail for the filter to keep."""
     rng = np.random.default_rng(7)
-    wood = _diffuse((0.33, 0.2, 0.11))
+    wood = diffuse((0.33, 0.2, 0.11))
     parts: dict[str, Any] = {}
     palette = [
         (0.6, 0.12, 0.08),
@@ -99,17 +112,17 @@ def _shelf() -> dict[str, Any]:
         (0.3, 0.12, 0.3),
     ]
     for level, base in enumerate((1.1, 1.65)):
-        parts[f"board_{level}"] = _box((-1.35, base - 0.02, -2.83), (1.8, 0.04, 0.3), wood)
+        parts[f"board_{level}"] = box((-1.35, base - 0.02, -2.83), (1.8, 0.04, 0.3), wood)
         left = -2.2
         for book in range(16):
             width, height = rng.uniform(0.05, 0.1), rng.uniform(0.26, 0.42)
             color = palette[int(rng.integers(len(palette)))]
-            parts[f"book_{level}_{book}"] = _box(
-                (left + width / 2, base + height / 2, -2.84), (0.94 * width, height, 0.2), _plastic(color, 0.25)
+            parts[f"book_{level}_{book}"] = box(
+                (left + width / 2, base + height / 2, -2.84), (0.94 * width, height, 0.2), plastic(color, 0.25)
             )
             left += width
-    parts["picture_frame"] = _box((0.75, 1.6, -2.97), (1.3, 0.95, 0.05), wood)
-    parts["picture"] = _rectangle((0.75, 1.6, -2.94), (0.6, 0.425), np.eye(4), _textured(_painting()))
+    parts["picture_frame"] = box((0.75, 1.6, -2.97), (1.3, 0.95, 0.05), wood)
+    parts["picture"] = rectangle((0.75, 1.6, -2.94), (0.6, 0.425), np.eye(4), textured(_painting()))
     return parts
 
 
@@ -117,30 +130,30 @@ def _still_life() -> dict[str, Any]:
     return {
         "rug": {
             "type": "disk",
-            "to_world": _place((0.1, 0.012, -0.7), (1.5, 1.5, 1), _rotate_x(-90)),
-            "bsdf": _textured(_rings()),
+            "to_world": place((0.1, 0.012, -0.7), (1.5, 1.5, 1), rotate_x(-90)),
+            "bsdf": textured(_rings()),
         },
-        "plinth": _box((0.75, 0.3, -1.25), (0.6, 0.6, 0.6), _textured(_tiles()), turn=25),
-        "glass_ball": _sphere((0.75, 0.8, -1.25), 0.2, {"type": "dielectric", "int_ior": 1.5}),
-        "copper_ball": _sphere((-0.3, 0.47, -0.95), 0.46, _metal("Cu", 0.18)),
-        "blue_ball": _sphere((0.42, 0.235, -0.2), 0.22, _plastic((0.04, 0.16, 0.5), 0.05)),
-        "green_ball": _sphere((-0.95, 0.185, -0.3), 0.17, _plastic((0.1, 0.42, 0.12), 0.3)),
-        "mirror_ball": _sphere((-0.08, 0.143, -0.1), 0.13, {"type": "conductor", "material": "Ag"}),
-        "yellow_cube": _box((-1.5, 0.2, -1.3), (0.4, 0.4, 0.4), _plastic((0.75, 0.45, 0.05), 0.2), turn=35),
-        "bench": _box((-1.5, 0.42, -2.5), (1.7, 0.06, 0.5), _diffuse((0.5, 0.33, 0.18))),
-        "bench_leg_0": _box((-2.2, 0.2, -2.5), (0.08, 0.4, 0.4), _diffuse((0.5, 0.33, 0.18))),
-        "bench_leg_1": _box((-0.8, 0.2, -2.5), (0.08, 0.4, 0.4), _diffuse((0.5, 0.33, 0.18))),
-        "cushion": _sphere((-2.0, 0.65, -2.5), 0.2, _diffuse((0.1, 0.4, 0.42))),
+        "plinth": box((0.75, 0.3, -1.25), (0.6, 0.6, 0.6), textured(_tiles()), turn=25),
+        "glass_ball": sphere((0.75, 0.8, -1.25), 0.2, {"type": "dielectric", "int_ior": 1.5}),
+        "copper_ball": sphere((-0.3, 0.47, -0.95), 0.46, metal("Cu", 0.18)),
+        "blue_ball": sphere((0.42, 0.235, -0.2), 0.22, plastic((0.04, 0.16, 0.5), 0.05)),
+        "green_ball": sphere((-0.95, 0.185, -0.3), 0.17, plastic((0.1, 0.42, 0.12), 0.3)),
+        "mirror_ball": sphere((-0.08, 0.143, -0.1), 0.13, {"type": "conductor", "material": "Ag"}),
+        "yellow_cube": box((-1.5, 0.2, -1.3), (0.4, 0.4, 0.4), plastic((0.75, 0.45, 0.05), 0.2), turn=35),
+        "bench": box((-1.5, 0.42, -2.5), (1.7, 0.06, 0.5), diffuse((0.5, 0.33, 0.18))),
+        "bench_leg_0": box((-2.2, 0.2, -2.5), (0.08, 0.4, 0.4), diffuse((0.5, 0.33, 0.18))),
+        "bench_leg_1": box((-0.8, 0.2, -2.5), (0.08, 0.4, 0.4), diffuse((0.5, 0.33, 0.18))),
+        "cushion": sphere((-2.0, 0.65, -2.5), 0.2, diffuse((0.1, 0.4, 0.42))),
     }
 
 
 def _foreground() -> dict[str, Any]:
     """A folding screen that shades a corner, and a slim column that the camera walks past."""
-    paper = _textured(_lattice())
+    paper = textured(_lattice())
     return {
-        "screen_0": _box((1.62, 0.7, -0.75), (0.6, 1.4, 0.03), paper, turn=55),
-        "screen_1": _box((1.96, 0.7, -0.75), (0.6, 1.4, 0.03), paper, turn=-55),
-        "column": _cylinder((-0.72, 0, 1.1), 2.7, 0.055, _plastic((0.55, 0.28, 0.12), 0.15)),
+        "screen_0": box((1.62, 0.7, -0.75), (0.6, 1.4, 0.03), paper, turn=55),
+        "screen_1": box((1.96, 0.7, -0.75), (0.6, 1.4, 0.03), paper, turn=-55),
+        "column": cylinder((-0.72, 0, 1.1), 2.7, 0.055, plastic((0.55, 0.28, 0.12), 0.15)),
     }
 
 
@@ -155,14 +168,14 @@ def _planks() -> Array:
     grain = 1 + 0.12 * np.sin(0.9 * x + 3 * np.sin(0.02 * (y + 40 * board)) + 9 * tone)
     gap = (x % (columns / boards) < 1.3) | (((y + shift) % rows) % (rows / 3) < 1.5)
     brightness = tone * grain * np.where(gap, 0.35, 1)
-    return _tint(brightness, (0.42, 0.25, 0.13))
+    return tint(brightness, (0.42, 0.25, 0.13))
 
 
 def _wallpaper() -> Array:
     y, x = np.mgrid[0:270, 0:600] / 100
     stripe = 0.93 + 0.07 * np.sign(np.sin(2 * math.pi * x / 0.3))
     leaf = np.sin(2 * math.pi * x / 0.3) * np.sin(2 * math.pi * y / 0.3) > 0.55
-    return _tint(stripe * np.where(leaf, 1.12, 1), (0.36, 0.5, 0.47))
+    return tint(stripe * np.where(leaf, 1.12, 1), (0.36, 0.5, 0.47))
 
 
 def _painting() -> Array:
@@ -198,70 +211,3 @@ def _lattice() -> Array:
     y, x = np.mgrid[0:320, 0:150]
     bar = (x % 50 < 8) | (y % 80 < 8) | (x > 142) | (y > 312)
     return np.where(bar[..., None], (0.1, 0.05, 0.03), (0.75, 0.7, 0.58))
-
-
-def _tint(brightness: Array, color: Color) -> Array:
-    return np.asarray(np.clip(brightness[..., None] * np.array(color), 0, 0.9))
-
-
-def _textured(texture: Array) -> dict[str, Any]:
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _bitmap(texture)}}
-
-
-def _varnish(texture: Array) -> dict[str, Any]:
-    return {
-        "type": "twosided",
-        "bsdf": {"type": "roughplastic", "diffuse_reflectance": _bitmap(texture), "alpha": 0.15},
-    }
-
-
-def _bitmap(texture: Array) -> dict[str, Any]:
-    # raw: the numbers are reflectances already, and no sRGB values to be decoded.
-    return {"type": "bitmap", "bitmap": texture, "raw": True}
-
-
-def _diffuse(color: Color) -> dict[str, Any]:
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(color)}}}
-
-
-def _plastic(color: Color, alpha: float) -> dict[str, Any]:
-    reflectance = {"type": "rgb", "value": list(color)}
-    return {"type": "twosided", "bsdf": {"type": "roughplastic", "diffuse_reflectance": reflectance, "alpha": alpha}}
-
-
-def _metal(material: str, alpha: float) -> dict[str, Any]:
-    return {"type": "twosided", "bsdf": {"type": "roughconductor", "material": material, "alpha": alpha}}
-
-
-def _rectangle(center: Color, half_size: tuple[float, float], rotation: Array, bsdf: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "rectangle", "to_world": _place(center, (*half_size, 1), rotation), "bsdf": bsdf}
-
-
-def _box(center: Color, size: Color, bsdf: dict[str, Any], turn: float = 0) -> dict[str, Any]:
-    half = (size[0] / 2, size[1] / 2, size[2] / 2)
-    return {"type": "cube", "to_world": _place(center, half, _rotate_y(turn)), "bsdf": bsdf}
-
-
-def _sphere(center: Color, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "sphere", "center": list(center), "radius": radius, "bsdf": bsdf}
-
-
-def _cylinder(foot: Color, height: float, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
-    top = [foot[0], foot[1] + height, foot[2]]
-    return {"type": "cylinder", "p0": list(foot), "p1": top, "radius": radius, "bsdf": bsdf}
-
-
-def _place(position: Color, scale: Color, rotation: Array | None = None) -> Array:
-    matrix = np.diag((*scale, 1.0)) if rotation is None else rotation @ np.diag((*scale, 1.0))
-    matrix[:3, 3] = position
-    return np.asarray(matrix)
-
-
-def _rotate_x(degrees: float) -> Array:
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    return np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]])
-
-
-def _rotate_y(degrees: float) -> Array:
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    return np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]])

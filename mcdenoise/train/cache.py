@@ -17,7 +17,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
@@ -30,13 +30,8 @@ from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, replace_invalid
 from mcdenoise.models.accumulated import motion_to_previous
-from mcdenoise.models.oidn_temporal import NOISY as RAW
-from mcdenoise.models.oidn_temporal import NOISY_CURRENT as RAW_CURRENT
-from mcdenoise.train.front import Front
+from mcdenoise.train.front import ACCUMULATED, Front
 
-# What each realisation of the noise and each first frame has of its own, in one array, with the number of channels: as
-# many of the first as Front.radiance says. All of them have the features in common, unless the features have noise.
-NOISY = {"color": 3, "current": 3, "length": 1, RAW: 3, RAW_CURRENT: 3}
 _CAMERA = frozenset({"position", "view_projection"})
 # The files that a reader of sequences looks at, and where they are in a sequence's folder.
 _SUFFIXES = {".exr", ".h", ".json"}
@@ -53,19 +48,20 @@ class Shot:
     """Successive frames as a network sees them, with one or more realisations of their noise.
 
     Args:
-        colors: for each realisation ``(T, 3, H, W)``: radiance; or ``(T, 7, H, W)``: accumulated radiance, that of each
-            frame alone, and the history length; or ``(T, 13, H, W)``: also the noisy radiance, accumulated and that of
-            each frame alone, where a denoiser has come before.
+        colors: for each realisation ``(T, C, H, W)``: what it has of its own, as ``parts`` says.
         features: ``(T, C, H, W)`` of everything else, by the names of buffers; ``view_projection`` is ``(T, 4, 4)``.
         demodulated: whether the radiance in ``colors`` has no albedo in it.
         noisy: for each realisation the features that are of its own samples, in the same form; empty where there are
             none.
+        parts: names of the buffers in ``colors`` with their channels, as many of the first as there are channels; by
+            default accumulated radiance, that of each frame alone, and the history length.
     """
 
     colors: tuple[Array, ...]
     features: Mapping[str, Array]
     demodulated: bool = False
     noisy: tuple[Mapping[str, Array], ...] = ()
+    parts: Mapping[str, int] = field(default_factory=lambda: ACCUMULATED)
 
     def __len__(self) -> int:
         return len(self.colors[0])
@@ -80,7 +76,7 @@ class Shot:
         """Some of the frames, with the history that they have."""
         features = {name: feature[frames] for name, feature in self.features.items()}
         noisy = tuple({name: feature[frames] for name, feature in own.items()} for own in self.noisy)
-        return Shot(tuple(color[frames] for color in self.colors), features, self.demodulated, noisy)
+        return Shot(tuple(color[frames] for color in self.colors), features, self.demodulated, noisy, self.parts)
 
     def read(
         self,
@@ -105,7 +101,7 @@ class Shot:
         color = self.colors[realisation]
         sources: dict[str, Array] = {}
         start = 0
-        for name, count in NOISY.items():
+        for name, count in self.parts.items():
             if start < color.shape[1]:
                 sources[name] = color[:, start : start + count]
             start += count
@@ -164,16 +160,12 @@ class _Plan:
     def starts(self) -> list[_Start]:
         return [(first, realisation) for first in self.firsts for realisation in range(self.realisations)]
 
-    @property
-    def noisy(self) -> list[str]:
-        return list(self.front.radiance)
-
     def begin(self, realisation: int) -> Callable[[Frame], Frame]:
         kept = self.keep_fireflies > 0 and (realisation + 1) % self.keep_fireflies == 0
         return self.front.begin(keep_fireflies=kept)
 
     def color_shape(self, first: int) -> tuple[int, ...]:
-        return (len(self.sequence) - first, sum(NOISY[name] for name in self.noisy), *self.sequence.size)
+        return (len(self.sequence) - first, sum(self.front.parts.values()), *self.sequence.size)
 
 
 def features_of(sequence: Sequence) -> frozenset[str]:
@@ -317,7 +309,7 @@ def _build(folder: Path, plan: _Plan) -> None:
                 for first in plan.firsts:
                     if first <= i:
                         seen = dict(steps[first, realisation](prepared).items())
-                        noisy = torch.cat([seen[name] for name in plan.noisy], 1)
+                        noisy = torch.cat([seen[name] for name in plan.front.parts], 1)
                         files[first, realisation].write(noisy.numpy().tobytes())
                 if realisation == 0 or plan.own:
                     found = dict((_with_motion(frame, camera) if "motion" in plan.features else frame).items())
@@ -394,7 +386,7 @@ def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
                 _check(f"color of {first}", color, plan.color_shape(first))
             later = {name: feature[first:] for name, feature in features.items()}
             own = tuple({name: feature[first:] for name, feature in each.items()} for each in noisy)
-            shots.append(Shot(tuple(colors), later, plan.front.demodulates, own))
+            shots.append(Shot(tuple(colors), later, plan.front.demodulates, own, plan.front.parts))
         return CachedSequence(shots, str(about["sha256"]))
     except (OSError, EOFError, ValueError, KeyError, TypeError):
         return None

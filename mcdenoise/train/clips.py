@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, Hints
+from mcdenoise.models.accumulated import ALBEDO_HISTORY
 from mcdenoise.models.oidn_temporal import NOISY, NOISY_CURRENT
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.ops import NO_ALBEDO, demodulate
@@ -24,7 +25,7 @@ _KNOWN = frozenset(field.name for field in fields(Frame))
 
 # What holds radiance, colours, and vectors of the world: all else has no channels that could be shuffled.
 LIGHT = frozenset({"color", "current", NOISY, NOISY_CURRENT, "reference", "diffuse", "specular", "emission"})
-_COLORED = LIGHT | {"albedo", "specular_albedo", "variance"}
+_COLORED = LIGHT | {"albedo", ALBEDO_HISTORY, "specular_albedo", "variance"}
 _WORLD = frozenset({"normal", "position", "previous_position"})
 
 
@@ -200,7 +201,7 @@ class ClipSampler:
         normal = normalize(torch.randn(1, 3, 1, 1), dim=1)
         light = demodulate(radiance, albedo) if demodulated else radiance
         painted = {name: light for name in ("color", "current", NOISY, NOISY_CURRENT)}
-        painted |= {"albedo": albedo, "normal": normal, "reference": radiance}
+        painted |= {"albedo": albedo, ALBEDO_HISTORY: albedo, "normal": normal, "reference": radiance}
         # Depth, motion and history stay: lamps hang on whatever is there. Nor do they reflect, or have noise.
         painted |= {"emission": radiance} | dict.fromkeys(("diffuse", "specular", "variance"), torch.zeros(1, 3, 1, 1))
         for name in painted.keys() & clip.keys():

@@ -11,7 +11,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.models import Needs
-from mcdenoise.train.cache import NOISY, Shot, features_of, open_cached
+from mcdenoise.train.cache import Shot, features_of, open_cached
 from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
 from mcdenoise.train.front import Front
@@ -74,8 +74,8 @@ class DataFolders:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
         opened = [open_sequence(path) for path in (*training, *validation)]
         # What has no albedo is glossy.
-        used = (needs.buffers | needs.uses | ({"albedo"} if config.gloss else set())) - NOISY.keys()
-        wanted = needs.buffers - (NOISY.keys() if front.accumulates else {"color"}) | (used & set(_FEATURES))
+        used = (needs.buffers | needs.uses | ({"albedo"} if config.gloss else set())) - front.parts.keys()
+        wanted = needs.buffers - front.parts.keys() | (used & set(_FEATURES))
         for sequence in opened:
             _check_trainable(sequence, wanted)
         features = used.intersection(*(features_of(sequence) for sequence in opened))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +10,12 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Skipping, State, Wrapper
-from mcdenoise.models.accumulated import CAUSTICS
+from mcdenoise.models.accumulated import ALBEDO_HISTORY, CAUSTICS
 from mcdenoise.models.oidn_temporal import NOISY, NOISY_CURRENT, AfterOidn
 from mcdenoise.ops import remodulate
+
+# What comes of accumulation, with the number of channels.
+ACCUMULATED: Mapping[str, int] = {"color": 3, "current": 3, "length": 1}
 
 
 @dataclass(frozen=True)
@@ -41,10 +44,13 @@ class Front:
         return any(kind is AfterOidn for kind, _ in self.wrappers)
 
     @property
-    def radiance(self) -> dict[str, int]:
-        """Names of the buffers of radiance that frames come out with, and of their history's length; with channels."""
-        accumulated = {"current": 3, "length": 1} if self.accumulates else {}
-        return {"color": 3, **accumulated, **({NOISY: 3, NOISY_CURRENT: 3} if self.keeps_noisy else {})}
+    def parts(self) -> dict[str, int]:
+        """Names of the buffers that each noise of its own changes, with their channels: radiance, and histories."""
+        if not self.accumulates:
+            return {"color": 3}
+        also = {name for _, settings in self.wrappers for name in settings.get("also", ())}
+        history = {ALBEDO_HISTORY: 3} if "albedo" in also else {}
+        return {**ACCUMULATED, **history, **({NOISY: 3, NOISY_CURRENT: 3} if self.keeps_noisy else {})}
 
     @property
     def settings(self) -> list[Any]:

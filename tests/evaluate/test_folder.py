@@ -17,7 +17,7 @@ import torch
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.errors import InputError
-from mcdenoise.evaluate import METRICS, evaluate_folder, find_images, measure, noise_floor
+from mcdenoise.evaluate import METRICS, USUAL, evaluate_folder, find_images, measure, noise_floor
 from mcdenoise.metrics import PROTOCOLS, displayed, flicker_srgb, warped_rmse_srgb, warping_error_srgb
 from mcdenoise.metrics.protocols import ProtocolName
 from mcdenoise.ops import Surface, motion_from_position
@@ -118,7 +118,8 @@ def test_every_value_is_that_of_its_function(small_sequence: Path, images: Path)
         assert 0 < found.pop("HDR-FLIP") < 1
         warped = found.pop("wRMSE", None)
         assert frame.reference is not None
-        assert found == pytest.approx(measure(METRICS, frame.color, frame.reference, past), rel=1e-6)
+        usual = {name: METRICS[name] for name in USUAL}
+        assert found == pytest.approx(measure(usual, frame.color, frame.reference, past), rel=1e-6)
         if number == 0:
             assert warped is None
             continue

@@ -18,6 +18,7 @@ from mcdenoise.metrics import (
     displayed,
     flip_hdr,
     flip_srgb,
+    psnr_gamma,
     psnr_srgb,
     relmse_linear,
     rmse_linear,
@@ -27,7 +28,7 @@ from mcdenoise.metrics import (
     temporal_smape_linear,
 )
 
-IMAGE_METRICS = [smape_linear, relmse_linear, rmse_linear, psnr_srgb, ssim_srgb, flip_srgb, flip_hdr]
+IMAGE_METRICS = [smape_linear, relmse_linear, rmse_linear, psnr_srgb, psnr_gamma, ssim_srgb, flip_srgb, flip_hdr]
 CLIP_METRICS = [temporal_smape_linear, temporal_rmse_srgb]
 
 

@@ -251,7 +251,7 @@ def test_training_sees_what_the_whole_model_sees(small_sequence: Path, tmp_path:
     """OIDN and the histories come from the cache; the rest gives the same images from there."""
     model = small(NAME, threads=1)
     front, rest = split(model)
-    assert list(front.radiance) == ["color", "current", "length", NOISY, NOISY_CURRENT]
+    assert list(front.parts) == ["color", "current", "length", NOISY, NOISY_CURRENT]
     assert not list(parts_of(rest, AfterOidn))
     sequence = open_sequence(small_sequence)
     features = ["albedo", "normal", "depth"]

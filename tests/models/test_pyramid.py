@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.models import create_model
-from mcdenoise.models.pyramid import PyramidNetwork, _inside, _ratio
+from mcdenoise.models import Accumulated, Output, create_model
+from mcdenoise.models.accumulated import ALBEDO_HISTORY
+from mcdenoise.models.pyramid import _PARTS, PyramidNetwork, _inside, _ratio
 
 SIZE = (21, 34)
 
@@ -118,3 +121,40 @@ def test_gradients_are_finite_at_any_level(level: float) -> None:
     assert all(torch.isfinite(parameter.grad).all() for parameter in net.parameters() if parameter.grad is not None)
     assert color.grad is not None
     assert torch.isfinite(color.grad).all()
+
+
+def test_the_albedo_of_what_is_multiplied_back_may_be_that_of_the_history() -> None:
+    """Of a matt surface, with the albedo's logit far up: the texture is that of the history."""
+    net = network()
+    with torch.no_grad():
+        for head in net.heads:
+            head.weight.zero_()  # type: ignore[operator]
+        # Of the history, the second of three, and of what is not matt.
+        for place, logit in ((3, 1000.0), (sum(list(_PARTS.values())[:3]), -1000.0)):
+            net.heads[0].bias[net.channels[0] + place] = logit  # type: ignore[index,operator]
+    noisy, history = (torch.rand(1, 3, *SIZE, dtype=torch.float64) * 0.9 + 0.05 for _ in range(2))
+    light = torch.ones_like(noisy)
+    frame = frame_of(light, albedo=noisy).replace(extra={ALBEDO_HISTORY: history})
+    # The frame's radiance is without albedo; what is done afterwards multiplies that of the frame.
+    torch.testing.assert_close(net(frame)[0].image * noisy, history, rtol=1e-10, atol=0)
+
+
+def test_an_albedo_has_a_history_of_its_own() -> None:
+    """Where nothing moves, the mean of three frames, as the radiance."""
+
+    class Seen:
+        needs = PyramidNetwork((4, 6, 8), 3).needs
+
+        def __call__(self, frame: Frame, state: None = None) -> tuple[Output, None]:
+            self.frame = frame
+            return Output(frame.color), None
+
+    seen, state = Seen(), None
+    model = Accumulated(seen, lag_threshold=math.inf, firefly_limit=math.inf, also=("albedo",))
+    albedos = [torch.rand(1, 3, *SIZE) for _ in range(3)]
+    motion = torch.zeros(1, 2, *SIZE)
+    for albedo in albedos:
+        _, state = model(frame_of(torch.ones(1, 3, *SIZE), albedo=albedo, motion=motion), state)
+    expected = sum(albedos) / 3
+    torch.testing.assert_close(seen.frame.extra[ALBEDO_HISTORY], expected)
+    assert torch.equal(seen.frame.albedo, albedos[-1])  # type: ignore[arg-type]

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.ops import motion_from_position, remodulate
-from mcdenoise.train.cache import NOISY, Shot
+from mcdenoise.train.cache import Shot
 from mcdenoise.train.clips import Clip, ClipSampler
+from mcdenoise.train.front import ACCUMULATED
 
-PARTS = {**dict(list(NOISY.items())[:3]), "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
+PARTS = {**ACCUMULATED, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
 
 
 def shot_of(stack: Tensor, *more_colors: Tensor) -> Shot:

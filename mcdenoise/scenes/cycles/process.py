@@ -25,17 +25,21 @@ class Blender:
         python: an interpreter that can import ``bpy``; by default that of the environment variable
             ``BLENDER_PYTHON``, or else this one.
 
+    Attributes:
+        python: the interpreter.
+        version: of Blender.
+
     Raises:
         InputError: there is no such interpreter, or it has no ``bpy``.
     """
 
     def __init__(self, python: Path | None = None) -> None:
-        self._python = python or Path(os.environ.get(PYTHON_VARIABLE, sys.executable))
+        self.python = python or Path(os.environ.get(PYTHON_VARIABLE, sys.executable))
         self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
         try:
             self._process = subprocess.Popen(
                 # -P: the modules beside the script are none of Blender's.
-                [str(self._python), "-P", str(_SCRIPT)],
+                [str(self.python), "-P", str(_SCRIPT)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._said,
@@ -44,14 +48,14 @@ class Blender:
         except OSError as error:
             self._said.close()
             raise InputError(
-                f"{self._python}: expected a Python that has Blender's module bpy, found nothing that runs "
+                f"{self.python}: expected a Python that has Blender's module bpy, found nothing that runs "
                 f"({error.strerror}); name one with --blender-python"
             ) from error
         answer = self._answer()
         if "ok" not in answer:
             self.close()
             raise InputError(
-                f"{self._python}: expected a Python that has Blender's module bpy, found none "
+                f"{self.python}: expected a Python that has Blender's module bpy, found none "
                 f"({answer['error']}); pip install bpy==4.5.15 into a Python 3.11 and name it with --blender-python"
             )
         self.version: str = answer["ok"]

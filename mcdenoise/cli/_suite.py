@@ -1,0 +1,92 @@
+"""`mcdenoise benchmark --suite`: renders what is missing, scores it, writes the tables."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from mcdenoise.benchmark import Settings, choose_methods, run_benchmark
+from mcdenoise.benchmark.tables import remarks
+from mcdenoise.cli._output import progress_bar, write_json
+from mcdenoise.data.files import write_text
+from mcdenoise.errors import InputError
+from mcdenoise.models import DEFAULT
+from mcdenoise.report import check_packages, write_report, write_sample_plots
+from mcdenoise.suite import (
+    PEERS,
+    SHOWN,
+    Stage,
+    choose_rows,
+    error_lines,
+    markdown,
+    open_row,
+    render_suite,
+    rows_there,
+    sample_curves,
+    suite_lines,
+    write_close_ups,
+)
+
+__all__ = ["SHOWN", "score_suite"]
+
+
+def score_suite(
+    data: Path,
+    out: Path | None,
+    settings: Settings,
+    patterns: str | None,
+    models: str | None,
+    blender_python: Path | None,
+    *,
+    render: bool,
+    json: Path | None,
+) -> int:
+    """See :func:`mcdenoise.cli.benchmark.benchmark`; exit status 1 if a method failed on a row."""
+    rows = choose_rows(patterns)
+    if out is None and not render:
+        raise InputError("--out: expected a folder to write to with --no-render, found none; give one with -o")
+    # What is wrong with the methods is said before hours of rendering.
+    methods = choose_methods(f"{models or DEFAULT},{PEERS}", precisions="float32", baselines=("noisy",))
+    if out is not None:
+        check_packages()
+    with progress_bar() as progress:
+        task = progress.add_task("render", total=None)
+
+        def show(stage: Stage) -> None:
+            described = f"render {stage.shot}, references to {stage.fraction:.0%}"
+            progress.update(task, description=described, completed=stage.done, total=stage.total)
+
+        if render:
+            shots = list(dict.fromkeys(row.shot for row in rows))
+            render_suite(shots, data, blender_python=blender_python, threads=settings.threads, on_stage=show)
+    if out is None:
+        print(data)
+        return 0
+    found = rows_there(rows, data)
+    if not found:
+        raise InputError(f"{data}: expected frames of the suite, found none; leave out --no-render to render them")
+    missing = [row.name for row in rows if row not in found]
+    with progress_bar() as progress:
+        task = progress.add_task("score", total=None)
+        results = run_benchmark(
+            [open_row(row, data) for row in found],
+            methods,
+            out,
+            settings,
+            on_step=lambda done, total: progress.update(task, completed=done, total=total),
+        )
+    lines, curves = suite_lines(results, found), error_lines(results, found)
+    text = markdown(lines, curves)
+    write_text(out / "suite.md", text)
+    content = {"lines": [asdict(line) for line in lines], "curves": [asdict(line) for line in curves]}
+    write_json(out / "suite.json", content)
+    write_json(json, content)
+    write_sample_plots(sample_curves(curves), out)
+    best = {line.best["SMAPE"].setting: None for line in lines if line.best}
+    ours = dict.fromkeys(line.model for line in lines)
+    write_close_ups(out, results, found, ["noisy", *ours, *best])
+    print(text)
+    for line in [*remarks(results), *([f"not rendered: {', '.join(missing)}"] if missing else [])]:
+        print(line)
+    print(f"tables: {out / 'suite.md'}, close-ups: {out / 'close-ups'}, report: {write_report(out)}")
+    return 1 if results.failed else 0

@@ -1,0 +1,249 @@
+"""A parlour of our own to test on, where light is anything but matt: never trained on.
+
+A lacquered table of dark wood with highlights; a mirror that shows a window and a lamp; bottles and glasses before a
+patterned wall; books with thin black gaps between them; a page of text-like marks; rods as thin as hair; shadows where
+things touch; and a pillar that moves and uncovers what was behind it. Plain Python and numpy, in the form that
+:func:`mcdenoise.scenes.render.render_sequence` takes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from mcdenoise.data.camera_path import Array, Camera
+from mcdenoise.scenes.parts import (
+    Color,
+    box,
+    cylinder,
+    diffuse,
+    metal,
+    place,
+    plastic,
+    rectangle,
+    rotate_x,
+    rotate_y,
+    sphere,
+    textured,
+    tint,
+    varnish,
+)
+
+_TABLE = 0.74
+_MIRROR = {"type": "twosided", "bsdf": {"type": "conductor", "material": "Ag"}}
+
+
+def parlour_scene() -> dict[str, Any]:
+    """The room as a Mitsuba dictionary; units are metres, y is up, the floor is y = 0.
+
+    Example:
+        >>> parlour_scene()["type"]
+        'scene'
+    """
+    return {
+        "type": "scene",
+        **_room(),
+        **_lights(),
+        **_table(),
+        **_bottles(),
+        **_shelf(),
+        **_rods(),
+        "pillar": box((-0.8, 1.3, 0.6), (0.16, 2.6, 0.16), plastic((0.5, 0.46, 0.4), 0.3)),
+    }
+
+
+def parlour_cameras(frames: int = 8) -> list[Camera]:
+    """Cameras of a walk to the right, 3 centimetres a frame.
+
+    Example:
+        >>> len(parlour_cameras(3))
+        3
+    """
+    return [
+        Camera.look_at((-0.12 + 0.03 * frame, 1.55 + 0.004 * frame, 2.2 - 0.015 * frame), (0.05, 1.05, -1.6), fov_x=54)
+        for frame in range(frames)
+    ]
+
+
+def parlour_moves(frames: int = 8) -> dict[str, Array]:
+    """The pillar slides to the right, 7 centimetres a frame: as :class:`mcdenoise.data.camera_path.Shot` has it.
+
+    Example:
+        >>> parlour_moves(3)["pillar"].shape
+        (3, 4, 4)
+    """
+    path = np.tile(np.eye(4), (frames, 1, 1))
+    path[:, 0, 3] = 0.07 * np.arange(frames)
+    return {"pillar": path}
+
+
+def _room() -> dict[str, Any]:
+    return {
+        "floor": rectangle((0, 0, 0.4), (3, 3.6), rotate_x(-90), varnish(_parquet(), 0.12)),
+        "ceiling": rectangle((0, 2.7, 0.4), (3, 3.6), rotate_x(90), diffuse((0.78, 0.77, 0.74))),
+        "wall_back": rectangle((0, 1.35, -3), (3, 1.35), np.eye(4), textured(_damask())),
+        "wall_left": rectangle((-3, 1.35, 0.4), (3.6, 1.35), rotate_y(90), diffuse((0.3, 0.38, 0.42))),
+        "wall_right": rectangle((3, 1.35, 0.4), (3.6, 1.35), rotate_y(-90), diffuse((0.66, 0.6, 0.5))),
+        "wall_front": rectangle((0, 1.35, 4), (3, 1.35), rotate_y(180), diffuse((0.7, 0.68, 0.62))),
+        "mirror": rectangle((-1.15, 1.5, -2.95), (0.55, 0.6), np.eye(4), _MIRROR),
+        "mirror_frame": box((-1.15, 1.5, -2.985), (1.22, 1.32, 0.05), metal("Au", 0.2)),
+        "page": rectangle((0.42, 1.6, -2.985), (0.3, 0.4), np.eye(4), textured(_writing())),
+    }
+
+
+def _lights() -> dict[str, Any]:
+    """A window behind the camera, which the mirror and the table show; a lamp there, and one in the picture."""
+    return {
+        "window": {
+            **rectangle((-2.1, 1.65, 3.96), (0.7, 0.75), rotate_y(180), diffuse((0, 0, 0))),
+            "emitter": _area((13.0, 14.5, 16.5)),
+        },
+        "window_post": box((-2.1, 1.65, 3.93), (0.05, 1.5, 0.05), diffuse((0.7, 0.7, 0.68))),
+        "window_bar": box((-2.1, 1.65, 3.93), (1.4, 0.05, 0.05), diffuse((0.7, 0.7, 0.68))),
+        "lamp_behind": {**sphere((-1.3, 1.8, 0.7), 0.1, diffuse((0, 0, 0))), "emitter": _area((26.0, 16.0, 7.5))},
+        "lamp": {**sphere((0.2, 1.28, -2.0), 0.075, diffuse((0, 0, 0))), "emitter": _area((42.0, 27.0, 13.0))},
+        "lamp_stand": cylinder((0.2, _TABLE, -2.0), 0.48, 0.012, metal("Al", 0.1)),
+        "spot": {**sphere((1.5, 2.3, -0.4), 0.05, diffuse((0, 0, 0))), "emitter": _area((75.0, 66.0, 50.0))},
+    }
+
+
+def _table() -> dict[str, Any]:
+    wood = varnish(_dark_wood(), 0.035)
+    legs = {
+        f"leg_{i}": box((x, 0.35, z), (0.07, 0.7, 0.07), diffuse((0.06, 0.03, 0.02)))
+        for i, (x, z) in enumerate(((-1.0, -0.6), (1.2, -0.6), (-1.0, -2.1), (1.2, -2.1)))
+    }
+    return {
+        "table_top": rectangle((0.1, _TABLE, -1.35), (1.25, 0.9), rotate_x(-90), wood),
+        "table_side": box((0.1, _TABLE - 0.03, -1.35), (2.5, 0.055, 1.8), diffuse((0.05, 0.025, 0.015))),
+        **legs,
+        "bowl": sphere((-0.42, _TABLE + 0.15, -1.0), 0.15, metal("Cu", 0.12)),
+        "ball": sphere((-0.08, _TABLE + 0.07, -0.72), 0.07, {"type": "conductor", "material": "Ag"}),
+        "cup": sphere((0.86, _TABLE + 0.09, -0.85), 0.09, plastic((0.65, 0.62, 0.56), 0.05)),
+        # Matt things whose shadows touch them.
+        "die": box((0.3, _TABLE + 0.04, -0.62), (0.08, 0.08, 0.08), diffuse((0.75, 0.7, 0.6)), turn=30),
+        "slab": box((-0.72, _TABLE + 0.012, -0.75), (0.24, 0.024, 0.16), diffuse((0.15, 0.3, 0.24)), turn=-20),
+        "letter": {
+            "type": "rectangle",
+            "to_world": place((0.55, _TABLE + 0.003, -0.66), (0.13, 0.09, 1), rotate_y(-15) @ rotate_x(-90)),
+            "bsdf": textured(_writing()),
+        },
+    }
+
+
+def _bottles() -> dict[str, Any]:
+    """Closed solids of glass, as Mitsuba's dielectric wants them, and thin tumblers."""
+    parts: dict[str, Any] = {}
+    tints: list[Color] = [(0.35, 0.75, 0.4), (0.85, 0.5, 0.15), (0.9, 0.95, 0.95)]
+    for index, (x, z, height) in enumerate(((0.5, -1.85, 0.3), (0.68, -1.7, 0.24), (0.9, -1.9, 0.34))):
+        glass = {
+            "type": "dielectric",
+            "int_ior": 1.5,
+            "specular_transmittance": {"type": "rgb", "value": list(tints[index])},
+        }
+        parts |= _solid(f"bottle_{index}", (x, _TABLE + 0.001, z), height, 0.055, glass)
+        parts |= _solid(f"neck_{index}", (x, _TABLE + 0.002 + height, z), 0.1, 0.018, glass)
+    for index, (x, z) in enumerate(((0.38, -1.35), (0.62, -1.3), (0.5, -1.08))):
+        pane = {"type": "thindielectric", "int_ior": 1.5}
+        parts[f"tumbler_{index}"] = cylinder((x, _TABLE + 0.001, z), 0.13, 0.042, pane)
+    parts["glass_ball"] = sphere((0.15, _TABLE + 0.085, -1.2), 0.084, {"type": "dielectric", "int_ior": 1.5})
+    return parts
+
+
+def _solid(name: str, foot: Color, height: float, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
+    x, y, z = foot
+    return {
+        f"{name}_side": cylinder(foot, height, radius, bsdf),
+        f"{name}_foot": {"type": "disk", "to_world": place(foot, (radius, radius, 1), rotate_x(90)), "bsdf": bsdf},
+        f"{name}_top": {
+            "type": "disk",
+            "to_world": place((x, y + height, z), (radius, radius, 1), rotate_x(-90)),
+            "bsdf": bsdf,
+        },
+    }
+
+
+def _shelf() -> dict[str, Any]:
+    """Two boards of books, a few millimetres apart, before a black back."""
+    rng = np.random.default_rng(12)
+    wood = diffuse((0.22, 0.13, 0.07))
+    parts: dict[str, Any] = {"shelf_back": box((1.65, 1.55, -2.98), (1.3, 1.1, 0.03), diffuse((0.01, 0.01, 0.01)))}
+    for level, base in enumerate((1.05, 1.55)):
+        parts[f"board_{level}"] = box((1.65, base - 0.02, -2.84), (1.3, 0.04, 0.28), wood)
+        left, book = 1.02, 0
+        while left < 2.22:
+            width, height = rng.uniform(0.03, 0.065), rng.uniform(0.28, 0.42)
+            red, green, blue = (0.05 + 0.6 * rng.random(3) ** 1.5).tolist()
+            parts[f"book_{level}_{book}"] = box(
+                (left + width / 2, base + height / 2, -2.83), (width, height, 0.2), plastic((red, green, blue), 0.3)
+            )
+            left, book = left + width + float(rng.choice([0.003, 0.006, 0.012])), book + 1
+    return parts
+
+
+def _rods() -> dict[str, Any]:
+    """Rods of 1 to 4 millimetres that hang from the ceiling, bright and dark, and a leaning one."""
+    rods: dict[str, Any] = {
+        f"rod_{index}": cylinder(
+            (-0.62 + 0.055 * index, 1.25, -1.7 - 0.04 * (index % 3)),
+            1.45,
+            0.0005 * (1 + index % 4),
+            metal("Al", 0.2) if index % 2 else diffuse((0.02, 0.02, 0.02)),
+        )
+        for index in range(10)
+    }
+    rods["rod_leaning"] = {
+        "type": "cylinder",
+        "p0": [-0.35, _TABLE, -0.55],
+        "p1": [1.05, 1.75, -1.9],
+        "radius": 0.0025,
+        "bsdf": diffuse((0.8, 0.78, 0.7)),
+    }
+    return rods
+
+
+def _area(radiance: Color) -> dict[str, Any]:
+    return {"type": "area", "radiance": {"type": "rgb", "value": list(radiance)}}
+
+
+def _dark_wood() -> Array:
+    y, x = np.mgrid[0:512, 0:768] / 512
+    rings = 6 * (x + 0.12 * np.sin(5 * y) + 0.05 * np.sin(17 * y + 3 * x))
+    grain = 0.5 + 0.5 * np.sin(2 * math.pi * 4 * rings) * np.sin(90 * x + 8 * np.sin(9 * y))
+    return tint(0.35 + grain, (0.13, 0.055, 0.025))
+
+
+def _parquet() -> Array:
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[0:480, 0:480]
+    tone = rng.uniform(0.7, 1.25, (12, 12))[y // 40, x // 40]
+    along = np.where((y // 40 + x // 40) % 2, y, x) % 10
+    return tint(tone * np.where(along < 1, 0.5, 1.0), (0.36, 0.22, 0.12))
+
+
+def _damask() -> Array:
+    """Wallpaper: pale leaves on a dark ground, with fine stripes."""
+    y, x = np.mgrid[0:540, 0:1200] / 200
+    leaf = np.sin(2 * math.pi * x / 0.45) * np.sin(2 * math.pi * y / 0.6) + 0.4 * np.sin(2 * math.pi * (x + y) / 0.15)
+    stripe = np.where((x * 200).astype(int) % 6 < 3, 1.0, 0.82)
+    pattern = np.where(leaf > 0.35, 0.72, 0.24) * stripe
+    return np.asarray(pattern[..., None] * np.array((0.85, 1.0, 0.92)))
+
+
+def _writing() -> Array:
+    """Black marks on white in lines of words, as small as print."""
+    rng = np.random.default_rng(8)
+    page = np.full((320, 240), 0.82)
+    for top in range(16, 300, 10):
+        left = 16
+        while left < 220:
+            for _ in range(int(rng.integers(2, 8))):
+                glyph = rng.random((6, 4)) < 0.55
+                if left + 4 > 224:
+                    break
+                page[top : top + 6, left : left + 4][glyph] = 0.03
+                left += 5
+            left += 5
+    return np.repeat(page[..., None], 3, axis=-1)

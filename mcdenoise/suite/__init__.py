@@ -1,0 +1,25 @@
+"""A suite of frames that nothing was trained on, as renderers write them: what it has, its rendering, its tables."""
+
+from mcdenoise.suite.close_ups import write_close_ups
+from mcdenoise.suite.rendering import Stage, open_row, render_suite, rows_there
+from mcdenoise.suite.rows import SHOTS, Row, Shot, choose_rows
+from mcdenoise.suite.tables import PEERS, SHOWN, Line, error_lines, markdown, sample_curves, suite_lines
+
+__all__ = [
+    "PEERS",
+    "SHOTS",
+    "SHOWN",
+    "Line",
+    "Row",
+    "Shot",
+    "Stage",
+    "choose_rows",
+    "error_lines",
+    "markdown",
+    "open_row",
+    "render_suite",
+    "rows_there",
+    "sample_curves",
+    "suite_lines",
+    "write_close_ups",
+]

@@ -1,0 +1,243 @@
+"""Rendering the suite into a folder, which can be stopped at any time and goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mcdenoise.data import Sequence, open_sequence, read_exr, write_exr
+from mcdenoise.data.camera_path import Array, Camera
+from mcdenoise.data.files import atomic_path, write_text
+from mcdenoise.errors import InputError
+from mcdenoise.scenes.cycles import Blender
+from mcdenoise.scenes.parlour import parlour_cameras, parlour_moves, parlour_scene
+from mcdenoise.scenes.random import random_scene
+from mcdenoise.scenes.render import Film, render_sequence
+from mcdenoise.scenes.render.halves import ReferenceHalves
+from mcdenoise.suite.rows import SHOTS, Row, Shot
+
+_SCRIPT = Path(__file__).with_name("blender_scenes.py")
+# References are rendered in so many equal parts, whose halves tell the noise that is left.
+_PARTS = 8
+# All references get a quarter of their samples before any gets more: then the suite can be used.
+_FRACTIONS = (0.25, 1.0)
+_SEED, _REFERENCE_SEED = 77, 1_000_000
+_LENS, _FOCUS = 0.03, 3.4
+
+
+class Stage(NamedTuple):
+    """How far the rendering is.
+
+    Args:
+        shot: what is rendered next.
+        fraction: of the samples of its references.
+        done: shots that are finished, counted once for each fraction.
+        total: all of them.
+    """
+
+    shot: str
+    fraction: float
+    done: int
+    total: int
+
+
+def render_suite(
+    shots: Iterable[Shot],
+    data: Path,
+    *,
+    blender_python: Path | None = None,
+    threads: int = 0,
+    on_stage: Callable[[Stage], None] = lambda stage: None,
+) -> None:
+    """Render what is missing; files have their names only when whole.
+
+    Args:
+        shots: in this order. Their references get a quarter of their samples first, and then all.
+        data: the folder; a shot's files go to ``data/NAME``.
+        blender_python: an interpreter that can import ``bpy``, for the shots of Cycles; by default as
+            :class:`mcdenoise.scenes.cycles.Blender` has it.
+        threads: of Cycles; all processors by default.
+        on_stage: called before each step.
+
+    Raises:
+        InputError: a renderer is missing or failed, or the folder cannot be written or holds something else.
+    """
+    shots = list(shots)
+    if any(shot.renderer == "cycles" and not _is_whole(shot, data) for shot in shots):
+        # Before the hours that Mitsuba takes.
+        with Blender(blender_python) as blender:
+            blender_python = blender.python
+    try:
+        data.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{data}: cannot be created ({error.strerror}); choose another folder with --data") from error
+    steps = [(fraction, shot) for fraction in _FRACTIONS for shot in shots]
+    for number, (fraction, shot) in enumerate(steps):
+        on_stage(Stage(shot.name, fraction, number, len(steps)))
+        if shot.renderer == "mitsuba":
+            _render_mitsuba(shot, data, fraction)
+        else:
+            _render_cycles(shot, data, fraction, blender_python, threads)
+
+
+def rows_there(rows: Iterable[Row], data: Path) -> list[Row]:
+    """Those of the rows that can be opened: their frames and references are there, however noisy these still are."""
+    return [row for row in rows if _is_there(row.shot, data)]
+
+
+def open_row(row: Row, data: Path) -> Sequence:
+    """The frames of a row, under its name.
+
+    Raises:
+        InputError: they are not there, or damaged.
+    """
+    return replace(open_sequence(data / row.shot.name, row.frames), name=row.name)
+
+
+def _is_there(shot: Shot, data: Path) -> bool:
+    frames, references = range(shot.frames), shot.references
+    if shot.renderer == "mitsuba":
+        folder = data / shot.name / "inputs"
+        names = [f"color{n}.exr" for n in frames] + [f"reference{n}.exr" for n in references]
+    else:
+        folder = data / shot.name
+        names = [_shot_file(n) for n in frames] + [_reference_file(n) for n in references]
+    return all((folder / name).is_file() for name in names)
+
+
+def _is_whole(shot: Shot, data: Path) -> bool:
+    """Whether nothing of a shot of Cycles is missing."""
+    parts = _parts_of(shot, data)
+    return _is_there(shot, data) and all(_part(parts, k, n).is_file() for k in range(_PARTS) for n in shot.references)
+
+
+def _render_mitsuba(shot: Shot, data: Path, fraction: float) -> None:
+    scene, cameras, moves = _mitsuba_scene(shot)
+    folder = data / shot.name
+    _take_references(shot, data)
+    film = None
+    if shot.filter != "centre":
+        film = Film(filter=shot.filter, aperture=_LENS if shot.lens else 0.0, focus=_FOCUS if shot.lens else 1.0)
+    render_sequence(
+        scene,
+        cameras,
+        folder,
+        size=shot.size,
+        spp=shot.samples,
+        reference_spp=max(round(shot.reference_samples * fraction), 2),
+        reference_frames=shot.references,
+        moves=moves,
+        seed=_SEED,
+        film=film,
+    )
+
+
+def _mitsuba_scene(shot: Shot) -> tuple[dict[str, Any], list[Camera], dict[str, Array]]:
+    kind, _, seed = shot.scene.partition(" ")
+    if seed:
+        made = random_scene(int(seed), shot.frames, shiny=kind == "shiny")
+        return made.scene, made.cameras, made.moves
+    return parlour_scene(), parlour_cameras(shot.frames), parlour_moves(shot.frames)
+
+
+def _take_references(shot: Shot, data: Path) -> None:
+    """Take the references of the first shot of the same picture: then they need not be rendered twice."""
+    first = next((other for other in SHOTS if other.picture == shot.picture), shot)
+    if first == shot:
+        return
+    for number in shot.references:
+        source = data / first.name / "inputs" / f"reference{number}.exr"
+        if source.is_file():
+            target = data / shot.name / "inputs" / source.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(target) as unfinished:
+                shutil.copyfile(source, unfinished)
+
+
+def _render_cycles(shot: Shot, data: Path, fraction: float, python: Path | None, threads: int) -> None:
+    folder, parts = data / shot.name, _parts_of(shot, data)
+    for each in (folder, parts):
+        each.mkdir(parents=True, exist_ok=True)
+    images = [_image(n, shot.samples, _SEED + n, folder / _shot_file(n), passes=True) for n in range(shot.frames)]
+    samples = max(shot.reference_samples // _PARTS, 1)
+    wanted = range(max(round(_PARTS * fraction), 2))
+    for part in wanted:
+        for n in shot.references:
+            seed = _REFERENCE_SEED + 1000 * part + n
+            images.append(_image(n, samples, seed, _part(parts, part, n), passes=False))
+    missing = [image for image in images if not Path(image["out"]).is_file()]
+    if missing and python is not None:
+        _run_blender(shot, missing, python, threads)
+    noise = {}
+    for n in shot.references:
+        found = [path for k in range(_PARTS) if (path := _part(parts, k, n)).is_file()]
+        noise[str(n)] = _write_reference(folder / _reference_file(n), found, samples)
+    write_text(folder / "camera.json", json.dumps({"reference_noise": noise}) + "\n")
+
+
+def _image(frame: int, samples: int, seed: int, out: Path, *, passes: bool) -> dict[str, Any]:
+    return {"frame": frame, "samples": samples, "seed": seed, "passes": passes, "out": str(out.absolute())}
+
+
+def _run_blender(shot: Shot, images: list[dict[str, Any]], python: Path, threads: int) -> None:
+    job = {
+        "scene": shot.scene,
+        "size": shot.size,
+        "frames": shot.frames,
+        "filter": shot.filter,
+        "lens": shot.lens,
+        "blur": shot.blur,
+        "threads": threads,
+        "images": images,
+    }
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "job.json"
+        path.write_text(json.dumps(job))
+        # -P: the modules beside the script are none of Blender's.
+        command = [str(python), "-P", str(_SCRIPT), str(path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode or not all(Path(image["out"]).is_file() for image in images):
+        said = [line for line in done.stderr.splitlines() if line.strip()] or ["it ended without a word"]
+        raise InputError(f"{shot.name}: Blender could not render it: {said[-1].strip()}")
+
+
+def _write_reference(path: Path, parts: list[Path], samples: int) -> float:
+    """The mean of the parts, and the estimate of its noise."""
+    halves: ReferenceHalves | None = None
+    for part in parts:
+        pixels, channels, _ = read_exr(part)
+        chosen = [index for index, name in enumerate(channels) if name.rpartition(".")[2] in ("R", "G", "B")]
+        color = pixels[..., chosen].astype(np.float64)
+        if halves is None:
+            size = color.shape[:2]
+            halves = ReferenceHalves.start(np.zeros((size[0] * size[1], 3)), 0, 0)
+        halves.add(color.reshape(-1, 3), samples)
+    assert halves is not None, "there are two parts at least"
+    write_exr(path, halves.mean().astype(np.float32).reshape(*size, 3), ["R", "G", "B"])
+    return halves.noise() or 0.0
+
+
+def _parts_of(shot: Shot, data: Path) -> Path:
+    """Where the parts of its references lie: shots of the same picture have them in common."""
+    first = next((other for other in SHOTS if other.picture == shot.picture), shot)
+    return data / ".parts" / first.name
+
+
+def _part(folder: Path, part: int, frame: int) -> Path:
+    return folder / f"part{part}_{frame:04d}.exr"
+
+
+def _shot_file(frame: int) -> str:
+    return f"shot_{frame:04d}.exr"
+
+
+def _reference_file(frame: int) -> str:
+    return f"reference_{frame:04d}.exr"

@@ -1,0 +1,344 @@
+"""The suite: its rows, its rendering at tiny sizes, and its tables; what needs a renderer is skipped without it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mcdenoise.cli import main
+from mcdenoise.data import read_exr, write_exr
+from mcdenoise.errors import InputError
+from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
+from mcdenoise.scenes.parlour import parlour_cameras, parlour_moves, parlour_scene
+from mcdenoise.suite import (
+    SHOTS,
+    Row,
+    Shot,
+    choose_rows,
+    error_lines,
+    markdown,
+    open_row,
+    render_suite,
+    rendering,
+    rows_there,
+    sample_curves,
+    suite_lines,
+)
+from mcdenoise.suite.close_ups import PARTS, write_close_ups
+from mcdenoise.suite.tables import PSNR, SMAPE, TEMPORAL, verdict
+
+BLENDER = os.environ.get("BLENDER_PYTHON")
+TINY: dict[str, Any] = {"frames": 2, "size": (16, 9), "reference_samples": 8}
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """A `mcdenoise benchmark`: exit status, output and messages."""
+
+    def call(*arguments: Any) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as stop:
+            main(["benchmark", *map(str, arguments)])
+        return int(stop.value.code or 0), *capsys.readouterr()
+
+    return call
+
+
+# Rows
+
+
+def test_names_tell_rows_apart_and_each_sequence_is_a_still_too() -> None:
+    rows = choose_rows()
+    assert len({row.name for row in rows}) == len(rows)
+    assert len({shot.name for shot in SHOTS}) == len(SHOTS)
+    sequences = [shot for shot in SHOTS if shot.frames > 1]
+    assert sum(not row.still for row in rows) == len(sequences)
+    assert sum(row.still for row in rows) == len(SHOTS)
+    for row in rows:
+        # The frame that is denoised alone has a reference.
+        assert row.frames is None or int(row.frames) in row.shot.references
+
+
+def test_the_suite_has_what_a_user_tries_first() -> None:
+    shots = [shot for shot in SHOTS if not shot.curve]
+    for renderer in ("mitsuba", "cycles"):
+        own = [shot for shot in shots if shot.renderer == renderer]
+        assert {shot.samples for shot in own} >= {1, 4, 16}
+        assert any(shot.filter == "centre" for shot in own)
+        assert any(shot.lens for shot in own)
+        curve = [shot.samples for shot in SHOTS if shot.curve and shot.renderer == renderer]
+        assert curve == [2**power for power in range(11)]
+    assert any(shot.blur for shot in shots)
+    assert {shot.size for shot in shots} == {(320, 180), (640, 360), (1280, 720)}
+
+
+def test_rows_are_chosen_by_patterns() -> None:
+    names = [row.name for row in choose_rows("cycles-gallery-4*, mitsuba-parlour-lens-4")]
+    assert names == ["cycles-gallery-4", "cycles-gallery-4-still", "mitsuba-parlour-lens-4"]
+    with pytest.raises(InputError, match=r"--rows: expected names of rows .* found 'gallery'"):
+        choose_rows("cycles-*,gallery")
+
+
+def test_scenes_and_named_parts_fit_together() -> None:
+    cycles = Path(rendering.__file__).with_name("blender_scenes.py").read_text()
+    for shot in SHOTS:
+        if shot.renderer == "cycles":
+            assert f"def {shot.scene}(frames: int)" in cycles
+        assert shot.scene in PARTS or shot.scene.partition(" ")[0] in ("room", "shiny")
+    for parts in PARTS.values():
+        for left, top, right, bottom in parts.values():
+            assert 0 <= left < right <= 1
+            assert 0 <= top < bottom <= 1
+
+
+def test_the_parlour_is_the_same_each_time_and_its_pillar_moves() -> None:
+    first, second = parlour_scene(), parlour_scene()
+    assert first.keys() == second.keys()
+    page = [scene["page"]["bsdf"]["bsdf"]["reflectance"]["bitmap"] for scene in (first, second)]
+    np.testing.assert_array_equal(*page)
+    moves = parlour_moves(4)
+    assert set(moves) <= set(first)
+    np.testing.assert_allclose(np.diff(moves["pillar"][:, 0, 3]), 0.07)
+    assert len(parlour_cameras(4)) == 4
+
+
+# Rendering
+
+
+@pytest.fixture
+def two_shots(monkeypatch: pytest.MonkeyPatch) -> list[Shot]:
+    """The same picture with one and with two samples."""
+    shots = [Shot(f"tiny-{n}", "mitsuba", "parlour", n, "box", **TINY) for n in (1, 2)]
+    monkeypatch.setattr(rendering, "SHOTS", tuple(shots))
+    return shots
+
+
+@pytest.mark.slow
+def test_rendering_goes_on_where_it_was_and_shares_references(tmp_path: Path, two_shots: list[Shot]) -> None:
+    mitsuba = pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    # So small an image is rendered sooner than a kernel is compiled.
+    mitsuba.set_variant("scalar_rgb")
+    stages = []
+    render_suite(two_shots, tmp_path, on_stage=stages.append)
+    assert [(stage.shot, stage.fraction) for stage in stages] == [
+        ("tiny-1", 0.25),
+        ("tiny-2", 0.25),
+        ("tiny-1", 1.0),
+        ("tiny-2", 1.0),
+    ]
+    rows = [Row(shot, still) for shot in two_shots for still in (False, True)]
+    assert rows_there(rows, tmp_path) == rows
+    first, still, second, _ = (open_row(row, tmp_path) for row in rows)
+    assert (first.name, first.numbers, first.reference_numbers) == ("tiny-1", [0, 1], [1])
+    assert (still.name, still.numbers) == ("tiny-1-still", [1])
+    assert first.reference(1).equal(second.reference(1))
+    assert not first.frame(1).color.equal(second.frame(1).color)
+    header = read_exr(tmp_path / "tiny-2" / "inputs" / "reference1.exr")[2]
+    assert header["reference_spp"] == 8
+    (tmp_path / "tiny-2" / "inputs" / "color1.exr").unlink()
+    assert rows_there(rows, tmp_path) == rows[:2]
+    kept = (tmp_path / "tiny-1" / "inputs" / "color1.exr").stat().st_mtime_ns
+    render_suite(two_shots, tmp_path)
+    assert rows_there(rows, tmp_path) == rows
+    assert (tmp_path / "tiny-1" / "inputs" / "color1.exr").stat().st_mtime_ns == kept
+
+
+def test_a_picture_with_a_lens_is_another(two_shots: list[Shot]) -> None:
+    first, second = two_shots
+    assert first.picture == second.picture
+    for change in ({"lens": True}, {"filter": "gaussian"}, {"size": (16, 18)}, {"reference_samples": 4}):
+        assert dataclasses.replace(first, **change).picture != first.picture
+
+
+def test_cycles_needs_a_blender(tmp_path: Path) -> None:
+    shot = Shot("tiny", "cycles", "attic", 1, "default", **TINY)
+    with pytest.raises(InputError, match=r"nowhere: expected a Python that has Blender's module bpy"):
+        render_suite([shot], tmp_path / "data", blender_python=tmp_path / "nowhere")
+    assert not (tmp_path / "data").exists()
+    # It has the module, and cannot render.
+    broken = tmp_path / "broken.sh"
+    broken.write_text(
+        "#!/bin/sh\ncase $2 in *blender.py) echo '{\"ok\": \"4.5\"}'; cat;; *) echo 'no light' >&2; exit 1;; esac\n"
+    )
+    broken.chmod(0o755)
+    with pytest.raises(InputError, match="tiny: Blender could not render it: no light"):
+        render_suite([shot], tmp_path / "data", blender_python=broken)
+    assert rows_there([Row(shot, True)], tmp_path / "data") == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BLENDER is None, reason="no BLENDER_PYTHON: an interpreter with bpy")
+@pytest.mark.parametrize("scene", ["gallery", "garden", "attic"])
+def test_cycles_writes_what_the_reader_understands(tmp_path: Path, scene: str) -> None:
+    shot = Shot(f"tiny-{scene}", "cycles", scene, 1, "default", **TINY)
+    render_suite([shot], tmp_path, blender_python=Path(str(BLENDER)), threads=1)
+    sequence = open_row(Row(shot, False), tmp_path)
+    assert sequence.size == (9, 16)
+    assert {"albedo", "normal", "depth", "motion", "reference"} <= sequence.buffers | {"reference"}
+    assert sequence.reference_numbers == [1]
+    assert float(sequence.reference(1).mean()) == pytest.approx(float(sequence.frame(1).color.mean()), rel=0.5)
+
+
+def test_a_reference_is_the_mean_of_its_parts_and_knows_its_noise(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    parts = []
+    for part in range(8):
+        pixels = (1 + 0.1 * rng.standard_normal((40, 50, 3))).astype(np.float32)
+        parts.append(tmp_path / f"{part}.exr")
+        write_exr(parts[-1], pixels, ["R", "G", "B"])
+    noise = rendering._write_reference(tmp_path / "reference.exr", parts, 4)
+    mean = np.mean([read_exr(path)[0] for path in parts], axis=0)
+    np.testing.assert_allclose(read_exr(tmp_path / "reference.exr")[0], mean, rtol=1e-3)
+    # Of a Gaussian of this deviation: E|x| = sigma sqrt(2 / pi), over 2 + 0.01; 6000 values tell it to 1 %.
+    assert noise == pytest.approx(0.1 / 8**0.5 * (2 / np.pi) ** 0.5 / 2.01, rel=0.05)
+
+
+# Tables
+
+
+def _results(ours: list[float], fast: list[float], high: list[float]) -> tuple[Results, list[Row]]:
+    """SMAPE of a model and of two settings of OIDN on rows ``a``, ``b``, ...; PSNR is 100 times its complement."""
+    rows = [
+        Row(Shot(name, "mitsuba", "parlour", 4, "box", frames=1), True) for name, _ in zip("abc", ours, strict=False)
+    ]
+    methods = [
+        Method("noisy", "baseline", "noisy", "noisy"),
+        Method("ours", "trainable", "ours", "cascaded_v2"),
+        Method("oidn(quality=fast)", "fixed", "fast", "oidn", {"quality": "fast"}),
+        Method("oidn(quality=high)", "fixed", "high", "oidn", {"quality": "high"}),
+    ]
+    scenes = [Scene(row.name, 32, 18, [0], [0], [0], 0.01) for row in rows]
+    cells = [
+        Cell(row.name, method.name, {SMAPE: values[i], PSNR: 100 * (1 - values[i])}, computing=Spread(7.0, 7, 7, 1))
+        for method, values in zip(methods, ([0.5] * len(rows), ours, fast, high), strict=True)
+        for i, row in enumerate(rows)
+    ]
+    machine = Machine("a processor", 2, 7.8, "cpu", 2, "Linux")
+    return Results("", "2026-10-21T12:00:00+00:00", machine, 1, scenes, methods, cells), rows
+
+
+def test_each_row_is_against_the_best_setting_of_that_row() -> None:
+    results, rows = _results([0.1, 0.2], fast=[0.2, 0.15], high=[0.3, 0.1])
+    first, second = suite_lines(results, rows)
+    assert (first.row, first.model, first.samples, first.reference_noise) == ("a", "ours", 4, 0.01)
+    assert (first.best[SMAPE].value, first.best[SMAPE].setting) == (0.2, "oidn(quality=fast)")
+    assert (second.best[SMAPE].value, second.best[SMAPE].setting) == (0.1, "oidn(quality=high)")
+    assert first.best[PSNR].value == pytest.approx(80)
+    assert first.ahead(SMAPE)
+    assert first.ahead(PSNR)
+    assert not second.ahead(SMAPE)
+    assert TEMPORAL not in first.best
+    said = verdict([first, second])
+    assert said[0] == "SMAPE: ahead of OIDN's best setting in 1 of 2 rows; behind in b"
+    # The mean of 1/2 and 2 is 1: neither is favoured.
+    assert said[2] == "SMAPE over that of OIDN's best setting, geometric mean of 2 rows: 1.000"
+    text = markdown([first, second], [])
+    assert "| a | 0.1000 | 0.2000 | 0.500 | 90.00 | 80.00 |  |  | 7 | 7 | (quality=fast) | 0.0100 |" in text
+
+
+def test_a_reference_with_much_of_the_error_is_named() -> None:
+    results, rows = _results([0.015], fast=[0.018], high=[0.02])
+    assert verdict(suite_lines(results, rows))[-1] == "references with more than half of the error themselves: a"
+
+
+def test_without_the_peer_nothing_is_claimed() -> None:
+    results, rows = _results([0.1], fast=[0.2], high=[0.3])
+    results = dataclasses.replace(results, methods=results.methods[:2], cells=results.cells[:2])
+    (line,) = suite_lines(results, rows)
+    assert line.best == {}
+    assert verdict([line]) == ["OIDN was not there to compare with; pip install 'mcdenoise[peers]'"]
+    assert "| a | 0.1000 |" in markdown([line], [])
+
+
+def test_points_of_a_curve_are_no_rows() -> None:
+    results, rows = _results([0.2, 0.1], fast=[0.3, 0.2], high=[0.4, 0.3])
+    names = {"a": "scene-samples-1", "b": "scene-samples-2"}
+    rows = [
+        Row(dataclasses.replace(row.shot, name=names[row.name], samples=number, curve=True), True)
+        for number, row in enumerate(rows, 1)
+    ]
+    results = dataclasses.replace(
+        results,
+        scenes=[dataclasses.replace(scene, name=names[scene.name]) for scene in results.scenes],
+        cells=[dataclasses.replace(cell, scene=names[cell.scene]) for cell in results.cells],
+    )
+    assert suite_lines(results, rows) == []
+    lines = error_lines(results, rows)
+    curves = {"ours": [(1, 0.2), (2, 0.1)], "input": [(1, 0.5), (2, 0.5)], "OIDN, best": [(1, 0.3), (2, 0.2)]}
+    assert sample_curves(lines) == {"scene-samples": curves}
+    assert "| scene-samples-2 | 0.5000 | 0.1000 | 0.2000 |" in markdown([], lines)
+
+
+def test_close_ups_stand_side_by_side(tmp_path: Path) -> None:
+    results, rows = _results([0.1], fast=[0.2], high=[0.3])
+    truth = np.full((18, 32, 3), 0.25, np.float32)
+    for folder, image in (("noisy", truth * 2), ("ours", truth), ("reference", truth)):
+        path = tmp_path / "images" / "a" / folder / "0.exr"
+        path.parent.mkdir(parents=True)
+        write_exr(path, image, ["R", "G", "B"])
+    written = write_close_ups(tmp_path, results, rows, ["noisy", "ours", "oidn(quality=fast)"])
+    assert [path.stem for path in written] == list(PARTS["parlour"])
+    import PIL.Image
+
+    with PIL.Image.open(written[0]) as sheet:
+        pixels = np.asarray(sheet)
+    width = (pixels.shape[1] - 2 * 4) // 3
+    noisy, ours, reference = (pixels[26:, left : left + width] for left in range(0, pixels.shape[1], width + 4))
+    np.testing.assert_array_equal(ours, reference)
+    assert noisy.min() > reference.max()
+
+
+# The command
+
+
+def test_the_command_scores_what_is_there(
+    small_sequence: Path, tmp_path: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shot = Shot("small", "mitsuba", "parlour", 1, "centre", frames=4)
+    absent = Shot("absent", "mitsuba", "parlour", 1, "centre", frames=1)
+    monkeypatch.setattr("mcdenoise.suite.rows.SHOTS", (shot, absent))
+    shutil.copytree(small_sequence, tmp_path / "data" / "small")
+    out = tmp_path / "out"
+    status, said, message = run(
+        *("--suite", "wild", "--data", tmp_path / "data", "--no-render", "-o", out, "--threads", 1),
+        *("--models", "cascaded_v2_micro", "--json", tmp_path / "suite.json"),
+    )
+    assert status == 0, message
+    assert "## cascaded_v2_micro" in said
+    assert "not rendered: absent" in said
+    text = (out / "suite.md").read_text()
+    assert text in said
+    lines = [line for line in text.splitlines() if line.startswith("| small")]
+    assert [line.split(" | ")[0] for line in lines] == ["| small", "| small-still"]
+    assert (out / "suite.json").read_text() == (tmp_path / "suite.json").read_text()
+    assert (out / "close-ups" / "small" / "mirror.png").is_file()
+    assert (out / "index.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--suite", "wild"), "--data: expected the folder of the suite's frames, found none"),
+        (("--suite", "wild", "--data", "data", "--ops"), "--suite: expected neither folders of sequences nor --ops"),
+        (("--suite", "wild", "--data", "data", "--no-render"), "--out: expected a folder to write to with --no-render"),
+        (("--suite", "wild", "--data", "data", "--rows", "none-such"), "--rows: expected names of rows such as"),
+        (("--suite", "wild", "--data", "data", "--models", "nothing"), "nothing"),
+        (("--suite", "tame", "--data", "data"), "wild"),
+        (("--suite", "wild", "--data", "data", "--no-render", "-o", "out"), "expected frames of the suite, found none"),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(
+    tmp_path: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], expected: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, _, message = run(*arguments)
+    assert status == 2
+    assert expected in message
+    assert message.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
