@@ -161,7 +161,11 @@ def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
         ("steps = 12", "steps = 0", "steps: expected at least 1, found 0"),
         ('"cascaded_v2_micro"', '"cascade"', "cascade"),
         ("[[data]]", "[data]", "expected tables [[data]], found [data]"),
-        ('[[data]]\nseeds = "0-1"', '[[data]]\nseed = "0-1"', "[[data]] 1: unknown key 'seed'; known are blender_python"),
+        (
+            '[[data]]\nseeds = "0-1"',
+            '[[data]]\nseed = "0-1"',
+            "[[data]] 1: unknown key 'seed'; known are blender_p",
+        ),
         ("frames = 3", "frames = 2.5", "[[data]] 1: "),
         ("frames = 3", "frames = 0", "[[data]] 1: --frames: expected at least 1, found 0"),
         ("frames = 3", "clean_references = 1", "[[data]] 1: clean_references: expected a value of type bool, found 1"),
