@@ -41,7 +41,7 @@ from mcdenoise.ops.lag import THRESHOLD
 
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of the falloffs with normal, depth and distance
 _USES = frozenset({"albedo", "normal", "depth", "current", "length", ALBEDO_HISTORY})
-_COARSE_CHANNELS = 4  # the logarithm of the mean, and how much the pixels of a block differ
+_COARSE_CHANNELS = 7  # logarithms of the means, with the history and of the frame, and how much its pixels differ
 _FEATURE_TAPS = 9  # of the kernel for features
 # "albedo" weighs that of the 3x3 pixels around, that of the history, and that which the pyramid makes of it.
 _PARTS = {"importance": 1, "history": 1, "albedo": 3, "matt": 1, "gain": 3, "features": _FEATURE_TAPS}
@@ -145,18 +145,21 @@ class PyramidNetwork(nn.Module):
         return answered(frame, result, None if others is None else mean[:, 6:]), None
 
     def _coarse(self, frame: Frame, exposure: Tensor) -> list[Tensor]:
-        """At each coarser scale the logarithm of the mean radiance, and how much single pixels of the frame differ."""
+        """At each coarser scale the logarithms of mean radiances, and how much single pixels of the frame differ.
+
+        Over a block the means of the frame and of its history have little noise, so that a highlight that has moved, or
+        light that has changed, shows as their difference.
+        """
         color = frame.color * exposure
-        single = (color if frame.current is None else frame.current * exposure).mean(1, keepdim=True)
-        moments = torch.cat([color, single, single.square()], 1)
+        alone = color if frame.current is None else frame.current * exposure
+        single = alone.mean(1, keepdim=True)
+        moments = torch.cat([color, alone, single, single.square()], 1)
         found: list[Tensor] = []
-        for level in range(1, self.unet.levels * self.unet.stride):
-            if (1 << level) > self.unet.multiple:
-                break
+        for _ in range(self.unet.levels + self.unet.stride - 2):
             moments = downsample(moments)
-            mean, square = moments[:, 3:4], moments[:, 4:5]
+            mean, square = moments[:, 6:7], moments[:, 7:]
             spread = (square - mean.square()).clamp_min(1e-12).sqrt() / (mean + 0.01)
-            found.append(torch.log1p(torch.cat([moments[:, :3], spread], 1)))
+            found.append(torch.log1p(torch.cat([moments[:, :6], spread], 1)))
         return found[self.unet.stride - 1 :]
 
     def _filtered(self, light: Tensor, predicted: list[Tensor], guides: Tensor) -> Tensor:
