@@ -148,7 +148,7 @@ class Accumulated(Wrapper):
     def needs(self) -> Needs:
         """As those inside but for what is handed to it; whatever tells motion is of use."""
         needs = self.inner.needs
-        given = frozenset({"current", "length"})
+        given = frozenset({"current", "length", ALBEDO_HISTORY})
         uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth", "albedo"}
         return Needs(needs.buffers - given, uses, needs.trainable, None)
 
