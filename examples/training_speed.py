@@ -33,12 +33,12 @@ from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.models import DEFAULT, create_model
 from mcdenoise.train import TrainConfig
-from mcdenoise.train.cache import NOISY, Shot
+from mcdenoise.train.cache import Shot
 from mcdenoise.train.clips import ClipSampler
 from mcdenoise.train.config import check_config
 from mcdenoise.train.data import DataFolders
 from mcdenoise.train.devices import open_fabric
-from mcdenoise.train.front import split
+from mcdenoise.train.front import ACCUMULATED, split
 from mcdenoise.train.loop import Trainer
 
 WARM_UP = 2
@@ -51,7 +51,7 @@ def noise(config: TrainConfig) -> ClipSampler:
     def uniform(channels: int) -> NDArray[np.float32]:
         return generator.random((config.frames, channels, config.crop, config.crop), np.float32)
 
-    noisy = np.concatenate([uniform(NOISY["color"] + NOISY["current"]), np.ceil(8 * uniform(1)).clip(1)], 1)
+    noisy = np.concatenate([uniform(ACCUMULATED["color"] + ACCUMULATED["current"]), np.ceil(8 * uniform(1)).clip(1)], 1)
     features = {"albedo": uniform(3), "normal": 2 * uniform(3) - 1, "depth": 10 * uniform(1), "reference": uniform(3)}
     return ClipSampler([Shot((noisy,), features, demodulated=True)], config.frames, config.crop)
 

@@ -40,7 +40,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.data.files import write_text
 from mcdenoise.data.sequences import with_unique_names
 from mcdenoise.errors import InputError
-from mcdenoise.evaluate import METRICS, noise_floor
+from mcdenoise.evaluate import USUAL, noise_floor
 from mcdenoise.models import DEFAULT
 
 SWEEPS = {
@@ -55,7 +55,7 @@ BY = ("source", "quality")
 
 def table(scores: list[Score], markdown: bool) -> str:
     """One row for each scene and method; a metric that was not computed is a dash."""
-    metrics = [name for name in METRICS if any(name in score.values for score in scores)]
+    metrics = [name for name in USUAL if any(name in score.values for score in scores)]
     header = ["scene", "frames", "image", *metrics]
     rows = [
         [score.scene, str(score.frames), score.method]
@@ -85,7 +85,7 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     options = parse()
-    metrics = tuple(name for name in METRICS if not (options.no_flip and name == "FLIP"))
+    metrics = tuple(name for name in USUAL if not (options.no_flip and name == "FLIP"))
     settings = Settings(
         rounds=0, threads=options.threads, pictures=0, metrics=metrics, flip_every=options.flip_every, on_the_way=True
     )

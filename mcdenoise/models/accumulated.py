@@ -283,7 +283,8 @@ class Accumulated(Wrapper):
             parts = [part * scale for part in parts]
         if (alpha := alpha_of(frame)) is not None:
             parts.append(alpha.expand(-1, COLOR.stop, -1, -1))
-        parts += [buffer for name in self._found(frame) if (buffer := frame.buffer(name)) is not None]
+        buffers = (frame.buffer(name) for name in self._found(frame))
+        parts += [buffer for buffer in buffers if buffer is not None]
         return [part.to(entering.dtype) for part in parts]
 
     def _with_carried(self, frame: Frame, carried: tuple[Tensor, ...]) -> Frame:

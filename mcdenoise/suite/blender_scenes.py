@@ -13,6 +13,7 @@ that moves. ``garden``: outdoors under the sun and an HDR sky, with grass, a fen
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import os
@@ -20,7 +21,11 @@ import random
 import sys
 from typing import Any
 
-import bpy  # type: ignore[import-not-found]  # of Blender's own Python
+bpy: Any
+try:
+    bpy = importlib.import_module("bpy")
+except ImportError:  # mcdenoise's own Python need not have it.
+    bpy = None
 
 PASSES: tuple[str, ...] = ("z", "position", "normal", "vector", "emit", "environment")
 PASSES += tuple(f"{kind}_{part}" for kind in ("diffuse", "glossy") for part in ("direct", "indirect", "color"))
