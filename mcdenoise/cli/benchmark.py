@@ -74,7 +74,7 @@ def benchmark(
         data: folder of the suite's frames.
         rows: which of the suite, such as "cycles-*,mitsuba-parlour-box-4"; all by default.
         blender_python: a Python that has Blender's module bpy, to render the suite's rows of Cycles; by default that
-            of the environment variable MCDENOISE_BLENDER_PYTHON, or else this one.
+            of the environment variable BLENDER_PYTHON, or else this one.
         render: --no-render scores the rows that are in the folder of --data and renders nothing.
         json: write what is in results.json, or ops.json, to this file too.
     """

@@ -16,13 +16,11 @@ from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.cycles import Blender, render_cycles
-from mcdenoise.scenes.random.takes import Sampling, random_takes
+from mcdenoise.scenes.random.takes import CLEANER, Sampling, random_takes
 from mcdenoise.scenes.render import render_sequence
 
 _FOR_TRAINING = RenderOptions(realisations=3, reference_spp=64, size="160x160")
 _WILD_STILLS = 0.5
-# Samples of a reference for each one of the noisy color.
-_CLEANER = 4
 
 
 def generate(
@@ -110,7 +108,7 @@ def generate(
                     )
                 else:
                     # Hardly less noisy than the color, a reference would teach nothing.
-                    reference_spp = max(arguments["reference_spp"], _CLEANER * take.spp if wild else 0)
+                    reference_spp = max(arguments["reference_spp"], CLEANER * take.spp if wild else 0)
                     written = render_sequence(
                         take.made.scene,
                         take.made.cameras,

@@ -20,32 +20,30 @@ import math
 from collections.abc import Mapping, Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
 from mcdenoise.models._layers import answered, carried, completed
+from mcdenoise.models._pyramid import Pyramid, filtered, inside
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.oidn import Auxiliary, Oidn, Quality
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.inputs import FEATURES, image_statistics, input_of
-from mcdenoise.nn.unet import Head, UNet
-from mcdenoise.ops import demodulate, downsample, kernel_conv, upsample
-from mcdenoise.ops._backend import one_backend
+from mcdenoise.nn.inputs import FEATURES, input_of
+from mcdenoise.nn.unet import UNet
+from mcdenoise.ops import demodulate, downsample, kernel_conv
 from mcdenoise.ops._rows import by_rows
 
 # The frame's own radiance without albedo, as it was before OIDN, and the same without a history.
 NOISY, NOISY_CURRENT = "noisy", "noisy_current"
-_USES = frozenset({"albedo", "normal", "depth", "current", "length", NOISY, NOISY_CURRENT})
 _TAPS = 9
 _COARSE_CHANNELS = 4  # how the noisy means differ from OIDN's, and how much single pixels do
-_PARTS = {"importance": 1, "history": 1, "noisy history": 1, "repair": 1, "gain": 1}
-# Before anything was learnt: half and half, and hardly anything is put back.
-_AT_REST = {"importance": 2.0, "noisy history": 2.0, "repair": -4.0}
+# What is predicted of a pixel, and what it is before anything was learnt: half and half; hardly anything is put back.
+_PARTS = {"importance": (2.0,), "history": (0.0,), "noisy history": (2.0,), "repair": (-4.0,), "gain": (0.0,)}
 # Squared length of a normal that is no mean of others, and the fraction of pixels that may have shorter ones.
 _UNIT, _MOST_MEANS = 0.98, 0.002
 # Relative difference of inverse depths at two pixels' distance that is no rounding of half floats.
@@ -54,7 +52,6 @@ _LEAST_SLOPE, _EVEN = 4e-3, 0.1
 # materials up to 0.0039, of rough glass and metal in Cycles 0.0069.
 _UNLIKE, _MOST_SPECKS = 0.1, 0.0045
 _THIRDS = (3, 4, 6, 8)  # of the width, at each level
-_LEAST = 1e-3  # of the light of a pixel that a scale keeps or hands on, and that a pixel is worth
 _MOST_GAIN = 0.25  # of the logarithm of the factor
 
 
@@ -162,47 +159,18 @@ def _specks(normal: Tensor) -> float:
     return count / max(nearest.numel(), 1)
 
 
-class RepairNetwork(nn.Module):
+class RepairNetwork(Pyramid):
     """Weighs OIDN's image, its history and the noisy radiance, and filters what they differ by.
 
     Args:
         widths: feature channels of each level of the U-Net, which begins at half the resolution.
     """
 
+    uses = frozenset({"albedo", "normal", "depth", "current", "length", NOISY, NOISY_CURRENT})
+
     def __init__(self, widths: Sequence[int]) -> None:
-        super().__init__()
-        scales = len(widths) + 1
-        self.unet = UNet(6 + 3 + FEATURES, widths, scales, _COARSE_CHANNELS, half=True)
-        # A kernel, what the scale keeps, and what it takes of the coarser one.
-        self.channels = [_TAPS + 2] * (scales - 1) + [_TAPS]
-        extra = [sum(_PARTS.values())] + [0] * (scales - 1)
-        self.heads = nn.ModuleList(
-            Head(self.unet, scale, own + more)
-            for scale, (own, more) in enumerate(zip(self.channels, extra, strict=True))
-        )
-        for head in self.heads:
-            nn.init.zeros_(head.weight)  # type: ignore[arg-type]
-            nn.init.zeros_(head.bias)  # type: ignore[arg-type]
-        rest = torch.cat([torch.full((count,), _AT_REST.get(name, 0.0)) for name, count in _PARTS.items()])
-        pixels = self.unet.stride**2
-        with torch.no_grad():
-            # The finest head predicts each channel for two by two pixels.
-            self.heads[0].bias[self.channels[0] * pixels :] = rest.repeat_interleave(pixels)  # type: ignore[operator]
-
-    @property
-    def needs(self) -> Needs:
-        """What the U-Net sees, and the radius of each filter at its scale behind it."""
-        behind = sum(2 << scale for scale in range(self.unet.scales))
-        ways = (self.unet.reach(scale) + max(1 << scale, self.unet.stride) for scale in range(self.unet.scales))
-        return Needs(uses=_USES, reach=max(ways) + behind, stride=self.unet.multiple)
-
-    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """Exposure and depth scale of the whole image."""
-        return image_statistics(frame)
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`."""
-        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
+        unet = UNet(6 + 3 + FEATURES, widths, len(widths) + 1, _COARSE_CHANNELS, half=True)
+        super().__init__(unet, _TAPS, _PARTS)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
@@ -213,22 +181,15 @@ class RepairNetwork(nn.Module):
         given = (frame.color, current, noisy, frame.extra.get(NOISY_CURRENT, noisy))
         before, now, noisy_before, noisy_now = (image * exposure for image in given)
         seen = torch.cat([input_of(frame, before), torch.log1p(noisy_before), torch.log1p(noisy_now)], 1)
-        levels = self.unet(seen, self._coarse(noisy_before, noisy_now, now))
-        predicted = [
-            head(level, _size(frame.size, scale)).to(torch.promote_types(before.dtype, torch.float32))
-            for scale, (head, level) in enumerate(zip(self.heads, levels, strict=True))
-        ]
-        split = predicted[0][:, self.channels[0] :].split(list(_PARTS.values()), 1)
-        parts = dict(zip(_PARTS, split, strict=True))
-        predicted[0] = predicted[0][:, : self.channels[0]]
+        predicted, parts = self.predict(seen, self._coarse(noisy_before, noisy_now, now), before.dtype)
 
         base = torch.lerp(now, before, torch.sigmoid(parts["history"]))
         lacking = torch.lerp(noisy_now, noisy_before, torch.sigmoid(parts["noisy history"])) - base
-        worth, others = _inside(parts["importance"]), carried(frame)
+        worth, others = inside(parts["importance"]), carried(frame)
         # Of the weights alone, in the last channel, the mean is what the others are divided by.
         weighted = [image * worth for image in (lacking, *([] if others is None else [others]))] + [worth]
-        filtered = _filtered(torch.cat(weighted, 1), predicted)
-        mean = filtered[:, :-1] / filtered[:, -1:]
+        found = filtered(torch.cat(weighted, 1), predicted, _smoothed)
+        mean = found[:, :-1] / found[:, -1:]
         gain = torch.exp(_MOST_GAIN * torch.tanh(parts["gain"]))
         image = (base + torch.sigmoid(parts["repair"]) * mean[:, :3]).clamp_min(0) * gain / exposure
         return answered(frame, image, None if others is None else mean[:, 3:]), None
@@ -246,32 +207,9 @@ class RepairNetwork(nn.Module):
         return found[1:]
 
 
-def _filtered(light: Tensor, predicted: Sequence[Tensor]) -> Tensor:
-    """Down: each scale keeps a part. Up: it is filtered together with what comes from the coarser scales."""
-    kept: list[Tensor] = []
-    sizes = [(light.shape[-2], light.shape[-1])]
-    for prediction in predicted[:-1]:
-        kept.append(_inside(prediction[:, -2:-1]) * light)
-        light = downsample(light - kept[-1])
-        sizes.append((light.shape[-2], light.shape[-1]))
-    # One for all scales: a tile of an image must not be filtered otherwise than the whole.
-    with one_backend(light):
-        for scale in reversed(range(len(predicted))):
-            prediction = predicted[scale]
-            if scale < len(kept):
-                light = kept[scale] + torch.sigmoid(prediction[:, -1:]) * upsample(light, sizes[scale])
-            # What is outside the image weighs nothing: the weights themselves are filtered, too.
-            light = kernel_conv(light, torch.softmax(prediction[:, :_TAPS], 1), border="zeros")
-    return light
-
-
-def _inside(logit: Tensor) -> Tensor:
-    """In [_LEAST, 1 - _LEAST]: nothing is ever lost altogether, and no mean is 0 / 0."""
-    return _LEAST + (1 - 2 * _LEAST) * torch.sigmoid(logit)
-
-
-def _size(size: tuple[int, int], scale: int) -> tuple[int, int]:
-    return -(-size[0] // (1 << scale)), -(-size[1] // (1 << scale))
+def _smoothed(light: Tensor, prediction: Tensor, scale: int) -> Tensor:
+    # What is outside the image weighs nothing: the weights themselves are filtered, too.
+    return kernel_conv(light, torch.softmax(prediction[:, :_TAPS], 1), border="zeros")
 
 
 @register_model("oidn_temporal")

@@ -33,6 +33,7 @@ from mcdenoise.scenes.cycles.process import Blender
 from mcdenoise.scenes.cycles.settings import WIDTHS, CyclesSettings, draw_settings
 from mcdenoise.scenes.cycles.translate import translate
 from mcdenoise.scenes.random import RandomScene
+from mcdenoise.scenes.random.takes import CLEANER
 from mcdenoise.scenes.render.folder import ReferenceState, write_reference
 from mcdenoise.scenes.render.tracer import scene_digest
 
@@ -48,7 +49,6 @@ _PASSES = {
 # How much farther than everything else the sky is, as the reader has it.
 _SKY = 1000.0
 _REFERENCE_STREAM = 1
-_CLEANER = 4
 _CONVENTIONS: dict[str, Any] = {
     "color_includes_albedo": True,
     "reference_includes_albedo": True,
@@ -115,7 +115,7 @@ def render_cycles(
     count = len(made.cameras)
     chosen = settings or draw_settings(seed, view=view, samples=samples, moving=count > 1)
     # Hardly less noisy than the color, a reference would teach nothing.
-    clean_samples = max(reference_samples, _CLEANER * chosen.samples) if reference_samples else 0
+    clean_samples = max(reference_samples, CLEANER * chosen.samples) if reference_samples else 0
     moves = check_moves(made.moves, count)
     # One after the other, so that an index of Blender's tells which object it is.
     movers = [name for name in made.scene if name in moves]

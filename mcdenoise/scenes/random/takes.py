@@ -19,6 +19,8 @@ from mcdenoise.scenes.render.film import Film
 Sampling: TypeAlias = Literal["centre", "filtered", "mixed"]
 
 _Value = TypeVar("_Value")
+# Samples of a reference for each one of the noisy color: hardly less noisy than that, it would teach nothing.
+CLEANER = 4
 _STREAM = 101
 _CENTRE_SHARE = 1 / 3
 _FILTERS = {"box": 0.5, "gaussian": 0.25, "tent": 0.1, "mitchell": 0.15}
