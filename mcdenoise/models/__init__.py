@@ -13,6 +13,7 @@ from mcdenoise.models.chain import Chain
 from mcdenoise.models.coarse_to_fine import CoarseToFine
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
+from mcdenoise.models.recurrent import Recurrent
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Region, Tiled
 
@@ -32,6 +33,7 @@ __all__ = [
     "ModelOverview",
     "Needs",
     "Output",
+    "Recurrent",
     "Region",
     "Skipping",
     "Stage",

@@ -40,7 +40,8 @@ class Needs:
     Args:
         buffers: names of the buffers that it cannot do without, see :data:`mcdenoise.frame.BUFFERS`.
         uses: names of those that it is better with.
-        trainable: whether it learns; False for filters without weights and for programs of others.
+        trainable: whether it has to be trained; False for filters without weights, for programs of others, and for
+            networks that come with their weights.
         reach: how many pixels away its result depends on a buffer; ``None`` where that is the whole image, so that it
             is neither computed in tiles nor skipped in parts.
         stride: a rectangle of the image has the same pixels as the whole where it begins at multiples of so many

@@ -188,7 +188,7 @@ class Accumulated(Wrapper):
         carried: tuple[Tensor, ...] = ()
         still: bool | Tensor = False
         if not reset and history is not None:
-            still = is_still(frame, history)
+            still = is_still(frame, history.view_projection)
             color, length, kept = self._blend(frame, entering, history.color, seen, history, still)
             cut = kept.mean() < _CUT_FRACTION
             if (found := journal()) is not None:
@@ -343,7 +343,7 @@ def motion_to_previous(frame: Frame, previous_view_projection: Tensor | None) ->
     return motion_from_position(position, previous_view_projection)
 
 
-def is_still(frame: Frame, history: History) -> bool | Tensor:
+def is_still(frame: Frame, previous_view_projection: Tensor | None) -> bool | Tensor:
     """Whether every pixel of a frame shows what it showed in the frame before, as far as the frame tells.
 
     Returns:
@@ -354,7 +354,7 @@ def is_still(frame: Frame, history: History) -> bool | Tensor:
         if torch.compiler.is_compiling():
             return ~frame.motion.any()
         return not (_thinned(frame.motion).any() or frame.motion.any())
-    pairs = [(history.view_projection, frame.view_projection)]
+    pairs = [(previous_view_projection, frame.view_projection)]
     if frame.previous_position is not None:
         pairs.append((frame.position, frame.previous_position))
     known = [(a, b) for a, b in pairs if a is not None and b is not None]

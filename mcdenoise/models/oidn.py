@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import math
 import weakref
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import torch
@@ -175,6 +176,19 @@ def _import_oidn() -> Any:
         raise InputError(
             "Open Image Denoise needs pyoidn, which is not installed; pip install 'mcdenoise[oidn]'"
         ) from error
+
+
+def library_of_oidn() -> Path:
+    """The file of the installed library that its weights are compiled into.
+
+    Raises:
+        InputError: the package ``pyoidn`` is not installed, or has no such file.
+    """
+    folder = Path(_import_oidn().__file__).parent
+    found = sorted(path for path in folder.rglob("*OpenImageDenoise_core*") if path.is_file())
+    if not found:
+        raise InputError(f"{folder}: expected the library OpenImageDenoise_core, found none")
+    return found[0]
 
 
 def _release_filters(filters: dict[Any, Any]) -> None:

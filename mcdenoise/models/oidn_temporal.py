@@ -1,96 +1,76 @@
-"""The method ``oidn_temporal``: Open Image Denoise made steady, and repaired where it lacks what the samples say.
+"""The method ``oidn_temporal``: Open Image Denoise made steady, and the best of its two ways with features.
 
-OIDN denoises every frame by itself, in the state of the art for a still, and flickers in a film. Here it comes first.
-Behind it are two histories, of its images and of the noisy ones, and a small network that decides for every pixel
+The library denoises every frame by itself, in the state of the art for a still, and flickers in a film. And it has to
+be told whether albedo and normal have noise, which is never true of a whole image: they are exact on a wall, and noisy
+behind glass, in a blurred mirror and out of focus. Here it comes first, once for noisy and once for clean features, and
+a small network decides for every pixel how much of four images is shown: these two; the result of the frame before,
+reprojected, which has the noise of many frames; and the samples themselves, where they have hardly any noise (many of
+them, lamps, mirrors) and OIDN only takes away.
 
-- how far the history of OIDN's images is to be trusted against its image of this frame;
-- how much of what the samples say otherwise is put back: the difference of the noisy radiance and OIDN's, filtered
-  with predicted kernels at several scales. Where there is hardly any noise (many samples, lamps, mirrors) that is the
-  pixel itself, elsewhere the mean over a neighbourhood, in which noise cancels out and a bias of OIDN's does not. It
-  combines as Back et al. 2020, "Deep Combiner for Independent and Correlated Pixel Estimates", do, with light split
-  into scales as in Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", Sec. 4;
-- a bounded factor.
-
-Untrained it gives OIDN's images, accumulated half and half with their history.
+Weighing the images of several denoisers pixel by pixel is what Zheng et al. 2021, "Ensemble Denoising for Monte Carlo
+Renderings", do; blending with the reprojected result what Chaitanya et al. 2017 and Balint et al. 2023, "Neural
+Partitioning Pyramids for Denoising Monte Carlo Renderings", Sec. 5, learn.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import timed
-from mcdenoise.models._layers import answered, carried, completed
-from mcdenoise.models._pyramid import Pyramid, filtered, inside
+from mcdenoise.models._layers import answered, completed
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.accumulated import Accumulated
-from mcdenoise.models.demodulated import Demodulated
-from mcdenoise.models.oidn import Auxiliary, Oidn, Quality
+from mcdenoise.models.oidn import Oidn, Quality
+from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT, Recurrent
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.inputs import FEATURES, input_of
-from mcdenoise.nn.unet import UNet
-from mcdenoise.ops import demodulate, downsample, kernel_conv
-from mcdenoise.ops._rows import by_rows
+from mcdenoise.nn.oidn import compress, oidn_exposure
+from mcdenoise.nn.unet import Head, UNet
 
-# The frame's own radiance without albedo, as it was before OIDN, and the same without a history.
-NOISY, NOISY_CURRENT = "noisy", "noisy_current"
-_TAPS = 9
-_COARSE_CHANNELS = 4  # how the noisy means differ from OIDN's, and how much single pixels do
-# What is predicted of a pixel, and what it is before anything was learnt: half and half; hardly anything is put back.
-_PARTS = {"importance": (2.0,), "history": (0.0,), "noisy history": (2.0,), "repair": (-4.0,), "gain": (0.0,)}
-# Squared length of a normal that is no mean of others, and the fraction of pixels that may have shorter ones.
-_UNIT, _MOST_MEANS = 0.98, 0.002
-# Relative difference of inverse depths at two pixels' distance that is no rounding of half floats.
-_LEAST_SLOPE, _EVEN = 4e-3, 0.1
-# Largest difference of two normals that is unlike, and the fraction of pixels: measured, of scenes without such
-# materials up to 0.0039, of rough glass and metal in Cycles 0.0069.
-_UNLIKE, _MOST_SPECKS = 0.1, 0.0045
+# The frame's own radiance as it was before OIDN; and OIDN's image where features are taken for clean.
+NOISY, CLEAN = "noisy", "clean"
+_WINDOWS = (3, 15)  # sides of the squares over which the image before is compared with this one
+_IN = 3 * 7 + 1 + len(_WINDOWS)
+# Before anything was learnt: both of OIDN's images and the one before are shown alike, and hardly any of the samples.
+_AT_REST = {"color": 0.0, CLEAN: 0.0, PREVIOUS: -1.0, PREVIOUS_LIGHT: -1.0, NOISY: -5.0}
+_BEFORE = (PREVIOUS, PREVIOUS_LIGHT)
+# Of the logarithm of the weight of the image before, for each difference of as much as the images' mean.
+_DOUBT = (10.0, 20.0)
+_MOST = 8.0  # of the logarithm of a weight
 _THIRDS = (3, 4, 6, 8)  # of the width, at each level
-_MOST_GAIN = 0.25  # of the logarithm of the factor
 
 
 class AfterOidn(Wrapper):
-    """A method on Open Image Denoise's image of each frame, which it sees as ``color``.
+    """A method on Open Image Denoise's images of each frame.
 
-    The noisy radiance without albedo is there as ``noisy`` and ``noisy_current`` in ``frame.extra``: an
-    :class:`mcdenoise.models.Accumulated` may accumulate one of them. OIDN always sees the whole image. Its image is the
-    stage ``oidn``. It has no kernels, so that layers are those of the noisy frame in its proportions, see
+    It sees that of noisy features as ``color``, and in ``frame.extra`` that of clean ones as ``clean`` and the noisy
+    radiance as ``noisy``. OIDN always sees the whole image. Its images are the stages ``oidn`` and ``oidn_clean``. It
+    has no kernels, so that layers are those of the noisy frame in its proportions, see
     :func:`mcdenoise.models._layers.completed`, and alpha stays noisy.
 
     Args:
         inner: any method.
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
-        auxiliary: likewise; by default the features of a frame are taken as clean where :func:`has_exact_features`
-            says so, and as noisy elsewhere.
         threads: likewise.
 
     Raises:
         InputError: as of :class:`mcdenoise.models.oidn.Oidn`.
     """
 
-    def __init__(
-        self,
-        inner: Model,
-        *,
-        quality: Quality = "high",
-        auxiliary: Auxiliary | None = None,
-        threads: int | None = None,
-    ) -> None:
+    def __init__(self, inner: Model, *, quality: Quality = "high", threads: int | None = None) -> None:
         super().__init__(inner)
-        self.quality, self.auxiliary, self.threads = quality, auxiliary, threads
-        self._oidn = Oidn(quality, auxiliary or "noisy", threads=threads)
+        self.quality, self.threads = quality, threads
+        self._oidn, self._clean = (Oidn(quality, auxiliary, threads=threads) for auxiliary in ("noisy", "clean"))
 
     @property
     def needs(self) -> Needs:
         """As those inside but for what is handed to it; albedo and normal are of use."""
         needs = self.inner.needs
-        given = frozenset({NOISY, NOISY_CURRENT})
+        given = frozenset({NOISY, CLEAN})
         uses = (needs.uses - given) | self._oidn.needs.uses
         return Needs(needs.buffers - given, uses, needs.trainable, None)
 
@@ -106,139 +86,105 @@ class AfterOidn(Wrapper):
         """
         handed = self.before(frame)
         output, state = self.inner(handed, state)
-        return output._replace(stages={"oidn": handed.color, **output.stages}), state
+        stages = {"oidn": handed.color, "oidn_clean": handed.extra[CLEAN], **output.stages}
+        return output._replace(stages=stages), state
 
     def before(self, frame: Frame) -> Frame:
         """The frame as the method inside sees it."""
-        if self.auxiliary is None:
-            self._oidn.auxiliary = "clean" if has_exact_features(frame) else "noisy"
         output = completed(frame, self._oidn(frame)[0])
-        with timed("accumulate", frame.color.device):
-            light = frame.color if frame.albedo is None else by_rows(demodulate, frame.color, frame.albedo)
-        extra = {**frame.extra, NOISY: light, NOISY_CURRENT: light}
+        # Without features there is one way only.
+        clean = output.image if frame.albedo is None else self._clean(frame)[0].image
+        extra = {**frame.extra, NOISY: frame.color, CLEAN: clean}
         return frame.replace(color=output.image, layers=output.layers, extra=extra, skip=None)
 
 
-def has_exact_features(frame: Frame) -> bool:
-    """Whether features are those of one ray through the center of each pixel, and so have no noise.
+class TemporalNetwork(nn.Module):
+    """Weighs the images of this frame, that of the frame before, and the samples.
 
-    The normals of hardly any pixel are shorter than one, as means of several are. And depth goes on evenly from pixel
-    to pixel: along a plane its inverse is linear in the image, along what is curved nearly so, but not where rays go
-    through a point of each pixel, or of a lens, that was drawn. Where one of four triples of neighbours in a row or a
-    column or more have ``|a - 2 b + c| < |a - c| / 10``, rays went through the centers. Nor are there many normals
-    unlike all four around them where these are alike: rough metal and glass scatter the rays, and some renderers hand
-    over the features of what such a ray hits.
-
-    Args:
-        frame: any; without a normal or a depth nothing tells that, and the answer is no.
-    """
-    if frame.normal is None or frame.depth is None:
-        return False
-    squares = frame.normal.square().sum(1)
-    # Nothing was hit: no normal.
-    if float(((squares < _UNIT) & (squares > 0)).float().mean()) > _MOST_MEANS:
-        return False
-    even = told = 0
-    for inverse in ((near := frame.depth.detach().reciprocal()), near.mT):
-        a, b, c = inverse[..., :-2], inverse[..., 1:-1], inverse[..., 2:]
-        slope = (a - c).abs()
-        known = (slope > _LEAST_SLOPE * b) & (torch.minimum(a, c) > 0)
-        told += int(known.sum())
-        even += int((known & ((a - 2 * b + c).abs() < _EVEN * slope)).sum())
-    return even > told / 4 and _specks(frame.normal) < _MOST_SPECKS
-
-
-def _specks(normal: Tensor) -> float:
-    """Fraction of the pixels that are unlike all of their four neighbours, of which those opposite are alike."""
-    inside = normal.detach()[..., 1:-1, 1:-1]
-    left, right = normal.detach()[..., 1:-1, :-2], normal.detach()[..., 1:-1, 2:]
-    above, below = normal.detach()[..., :-2, 1:-1], normal.detach()[..., 2:, 1:-1]
-    nearest = torch.stack([(inside - other).abs().amax(1) for other in (left, right, above, below)]).amin(0)
-    around = torch.maximum((left - right).abs().amax(1), (above - below).abs().amax(1))
-    count = int(((nearest > _UNLIKE) & (around < nearest / 2)).sum())
-    return count / max(nearest.numel(), 1)
-
-
-class RepairNetwork(Pyramid):
-    """Weighs OIDN's image, its history and the noisy radiance, and filters what they differ by.
+    ``image = sum_k w_k image_k / sum_k w_k`` with ``w_k = exp(8 tanh(p_k / 8))``. That of the frame before is
+    multiplied with how much of it shows the same surface, and with ``exp(-sum_s c_s d_s)``: light that has moved on,
+    which surfaces say nothing of, shows as a difference d of the images' means over 3x3 and 15x15 pixels; how much it
+    counts is predicted, too. The network sees all of this, images on OIDN's scale of radiance, and albedo and normal.
 
     Args:
         widths: feature channels of each level of the U-Net, which begins at half the resolution.
     """
 
-    uses = frozenset({"albedo", "normal", "depth", "current", "length", NOISY, NOISY_CURRENT})
-
     def __init__(self, widths: Sequence[int]) -> None:
-        unet = UNet(6 + 3 + FEATURES, widths, len(widths) + 1, _COARSE_CHANNELS, half=True)
-        super().__init__(unet, _TAPS, _PARTS)
+        super().__init__()
+        self.unet = UNet(_IN, widths, 1, half=True)
+        self.head = Head(self.unet, 0, len(_AT_REST) + len(_WINDOWS))
+        nn.init.zeros_(self.head.weight)
+        with torch.no_grad():
+            # Each channel is predicted for two by two pixels.
+            at_rest = torch.tensor([*_AT_REST.values(), *(0.0 for _ in _WINDOWS)])
+            self.head.bias.copy_(at_rest.repeat_interleave(self.head.side**2))  # type: ignore[union-attr]
+
+    @property
+    def needs(self) -> Needs:
+        """What the U-Net sees; albedo and normal are of use, the samples, and the image of the frame before."""
+        uses = frozenset({"albedo", "normal", NOISY, CLEAN, PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
+        return Needs(
+            uses=uses, reach=self.unet.reach(0) + self.unet.stride + max(_WINDOWS) // 2, stride=self.unet.multiple
+        )
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """The exposure of the whole image."""
+        return {"oidn_exposure": oidn_exposure(frame.color)}
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`."""
+        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
-        exposure = frame.statistics["exposure"]
-        current = frame.color if frame.current is None else frame.current
-        noisy = frame.extra.get(NOISY, current)
-        given = (frame.color, current, noisy, frame.extra.get(NOISY_CURRENT, noisy))
-        before, now, noisy_before, noisy_now = (image * exposure for image in given)
-        seen = torch.cat([input_of(frame, before), torch.log1p(noisy_before), torch.log1p(noisy_now)], 1)
-        predicted, parts = self.predict(seen, self._coarse(noisy_before, noisy_now, now), before.dtype)
-
-        base = torch.lerp(now, before, torch.sigmoid(parts["history"]))
-        lacking = torch.lerp(noisy_now, noisy_before, torch.sigmoid(parts["noisy history"])) - base
-        worth, others = inside(parts["importance"]), carried(frame)
-        # Of the weights alone, in the last channel, the mean is what the others are divided by.
-        weighted = [image * worth for image in (lacking, *([] if others is None else [others]))] + [worth]
-        found = filtered(torch.cat(weighted, 1), predicted, _smoothed)
-        mean = found[:, :-1] / found[:, -1:]
-        gain = torch.exp(_MOST_GAIN * torch.tanh(parts["gain"]))
-        image = (base + torch.sigmoid(parts["repair"]) * mean[:, :3]).clamp_min(0) * gain / exposure
-        return answered(frame, image, None if others is None else mean[:, 3:]), None
-
-    def _coarse(self, noisy_before: Tensor, noisy_now: Tensor, now: Tensor) -> list[Tensor]:
-        """At each coarser scale how far the noisy mean is from OIDN's, relatively, and how much single pixels are."""
-        alone = (noisy_now - now).mean(1, keepdim=True)
-        moments = torch.cat([noisy_before - now, now.mean(1, keepdim=True), alone, alone.square()], 1)
-        found: list[Tensor] = []
-        for _ in range(self.unet.levels):
-            moments = downsample(moments)
-            mean = moments[:, 3:4] + 0.01
-            spread = (moments[:, 5:6] - moments[:, 4:5].square()).clamp_min(1e-12).sqrt() / mean
-            found.append(torch.cat([torch.asinh(moments[:, :3] / mean), torch.log1p(spread)], 1))
-        return found[1:]
+        exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
+        now = frame.color
+        images = {name: frame.extra.get(name, torch.zeros_like(now) if name in _BEFORE else now) for name in _AT_REST}
+        same = frame.extra.get(PREVIOUS_WEIGHT, torch.zeros_like(now[:, :1]))
+        albedo = torch.ones_like(now) if frame.albedo is None else frame.albedo
+        normal = torch.zeros_like(now) if frame.normal is None else frame.normal
+        means = (now + images[CLEAN]) * exposure / 2, images[PREVIOUS_LIGHT] * exposure
+        differences = [_difference(*means, same, window) for window in _WINDOWS]
+        seen = [
+            *(compress(image * exposure) for image in images.values()),
+            *differences,
+            same,
+            albedo.clamp(0, 1),
+            normal,
+        ]
+        predicted = self.head(self.unet(torch.cat(seen, 1))[0], frame.size).to(exposure.dtype)
+        found = torch.exp(_MOST * torch.tanh(predicted / _MOST)).split(1, 1)
+        weights, doubts = dict(zip(images, found, strict=False)), found[len(images) :]
+        holds = same
+        for least, doubt, difference in zip(_DOUBT, doubts, differences, strict=True):
+            holds = holds * torch.exp(-least * doubt * difference)
+        weights |= {name: weights[name] * holds for name in _BEFORE}
+        total = sum(weights[name] * image for name, image in images.items())
+        return answered(frame, total / sum(weights.values()), None), None
 
 
-def _smoothed(light: Tensor, prediction: Tensor, scale: int) -> Tensor:
-    # What is outside the image weighs nothing: the weights themselves are filtered, too.
-    return kernel_conv(light, torch.softmax(prediction[:, :_TAPS], 1), border="zeros")
+def _difference(now: Tensor, before: Tensor, same: Tensor, window: int) -> Tensor:
+    """How far the means of two images over a window are apart, in parts of their mean, where both show the same."""
+    means = torch.cat([now * same, before * same, same], 1)
+    for kernel in ((1, window), (window, 1)):
+        means = F.avg_pool2d(means, kernel, 1, (kernel[0] // 2, kernel[1] // 2))
+    a, b, count = means.split([3, 3, 1], 1)
+    difference: Tensor = (a - b).abs().mean(1, keepdim=True) / ((a + b).mean(1, keepdim=True) / 2 + 0.01 * count + 1e-6)
+    return difference
 
 
 @register_model("oidn_temporal")
-def oidn_temporal(
-    width: int = 24,
-    *,
-    quality: Quality = "high",
-    auxiliary: Auxiliary | None = None,
-    threads: int | None = None,
-    alpha_min: float = 0.1,
-) -> Model:
-    """Open Image Denoise (optional package pyoidn), a history behind it, and a network that repairs both.
+def oidn_temporal(width: int = 24, *, quality: Quality = "high", threads: int | None = None) -> Model:
+    """Open Image Denoise (optional package pyoidn) made steady, and the best of its two ways with features.
 
     Args:
         width: feature channels of the finest level of the network, a multiple of 3.
         quality: see :class:`AfterOidn`.
-        auxiliary: likewise.
         threads: likewise.
-        alpha_min: see :class:`mcdenoise.models.Accumulated`.
 
     Raises:
         InputError: as of :class:`AfterOidn`.
     """
-    # What OIDN has made has no fireflies and no noise to tell a change of light from: the network sees both images.
-    history = Accumulated(
-        Tiled(RepairNetwork([width * thirds // 3 for thirds in _THIRDS])),
-        alpha_min=alpha_min,
-        firefly_limit=math.inf,
-        lag_threshold=math.inf,
-        also=(NOISY,),
-    )
-    return AfterOidn(Demodulated(history), quality=quality, auxiliary=auxiliary, threads=threads)
+    network = TemporalNetwork([width * thirds // 3 for thirds in _THIRDS])
+    return AfterOidn(Recurrent(Tiled(network)), quality=quality, threads=threads)

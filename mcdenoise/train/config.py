@@ -54,6 +54,7 @@ class TrainConfig:
         lamps: chance that a clip gets lamps: rectangles of constant radiance, without noise, brighter than the rest.
         exposure: the light of a clip is scaled by up to so many stops.
         tint: each colour channel of the light is scaled by up to so many stops.
+        reorder: chance that the frames of a clip come in another order, see :class:`mcdenoise.train.clips.ClipSampler`.
         gloss: chance that what has no albedo in a clip (mirrors, glass, lamps) is darker, by up to six stops.
         precision: bfloat16 runs convolutions in bfloat16.
         seed: of weights and clips.
@@ -82,6 +83,7 @@ class TrainConfig:
     exposure: float = 0.0
     tint: float = 0.0
     gloss: float = 0.0
+    reorder: float = 0.0
     precision: Precision = "float32"
     seed: int = 0
 
@@ -153,7 +155,7 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
         raise InputError(f"learning_rate: expected a positive number, found {config.learning_rate}")
     if not 0 <= config.ema < 1:
         raise InputError(f"ema: expected in [0, 1), found {config.ema}")
-    for name in ("lamps", "gloss"):
+    for name in ("lamps", "gloss", "reorder"):
         if not 0 <= settings[name] <= 1:
             raise InputError(f"{name}: expected in [0, 1], found {settings[name]}")
     _ = config.model_settings, config.loss_weights

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Skipping, State, Wrapper
 from mcdenoise.models.accumulated import ALBEDO_HISTORY, CAUSTICS
-from mcdenoise.models.oidn_temporal import NOISY, NOISY_CURRENT, AfterOidn
+from mcdenoise.models.oidn_temporal import CLEAN, NOISY, AfterOidn
 from mcdenoise.ops import remodulate
 
 # What comes of accumulation, with the number of channels.
@@ -20,7 +20,7 @@ ACCUMULATED: Mapping[str, int] = {"color": 3, "current": 3, "length": 1}
 
 @dataclass(frozen=True)
 class Front:
-    """Wrappers without weights, up to the one that accumulates; none where a model does not begin with them.
+    """Wrappers without weights, up to the last that denoises or accumulates; none where a model does not begin so.
 
     Args:
         wrappers: outermost first, each with the settings of its constructor.
@@ -31,7 +31,7 @@ class Front:
     @property
     def accumulates(self) -> bool:
         """Whether frames come out with a history: with ``current`` and ``length``."""
-        return bool(self.wrappers)
+        return any(kind is Accumulated for kind, _ in self.wrappers)
 
     @property
     def demodulates(self) -> bool:
@@ -39,18 +39,18 @@ class Front:
         return any(kind is Demodulated for kind, _ in self.wrappers)
 
     @property
-    def keeps_noisy(self) -> bool:
-        """Whether frames come out with the noisy radiance beside what was made of it."""
+    def denoises(self) -> bool:
+        """Whether frames come out denoised, with the noisy radiance beside."""
         return any(kind is AfterOidn for kind, _ in self.wrappers)
 
     @property
     def parts(self) -> dict[str, int]:
         """Names of the buffers that each noise of its own changes, with their channels: radiance, and histories."""
         if not self.accumulates:
-            return {"color": 3}
+            return {"color": 3, **({CLEAN: 3, NOISY: 3} if self.denoises else {})}
         also = {name for _, settings in self.wrappers for name in settings.get("also", ())}
         history = {ALBEDO_HISTORY: 3} if "albedo" in also else {}
-        return {**ACCUMULATED, **history, **({NOISY: 3, NOISY_CURRENT: 3} if self.keeps_noisy else {})}
+        return {**ACCUMULATED, **history}
 
     @property
     def settings(self) -> list[Any]:
@@ -130,7 +130,7 @@ def split(model: Model) -> tuple[Front, Model]:
     while isinstance(model, Wrapper) and type(model) in (AfterOidn, Demodulated, Accumulated):
         wrappers.append((type(model), _settings(model)))
         model = model.inner
-        if wrappers[-1][0] is Accumulated:
+        if wrappers[-1][0] in (AfterOidn, Accumulated):
             found, rest = len(wrappers), model
     front = Front(tuple(wrappers[:found]))
     while type(rest) is Skipping:

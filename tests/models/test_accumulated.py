@@ -532,20 +532,20 @@ def test_a_still_frame_is_known_by_its_motion_or_by_camera_and_positions() -> No
     history: History = shot.state[0]
     frame = wall(color)
     assert frame.position is not None
-    assert is_still(frame, history)
-    assert is_still(frame.replace(previous_position=frame.position.clone()), history)
+    assert is_still(frame, history.view_projection)
+    assert is_still(frame.replace(previous_position=frame.position.clone()), history.view_projection)
     moved = frame.position.clone()
     moved[0, 2, 13, 17] += 1e-3
-    assert not is_still(frame.replace(previous_position=moved), history)
+    assert not is_still(frame.replace(previous_position=moved), history.view_projection)
     assert frame.view_projection is not None
-    assert not is_still(frame.replace(view_projection=frame.view_projection * 1.0001), history)
-    assert is_still(still(color), history)
+    assert not is_still(frame.replace(view_projection=frame.view_projection * 1.0001), history.view_projection)
+    assert is_still(still(color), history.view_projection)
     motion = torch.zeros(1, 2, 20, 30)
     motion[0, 1, 13, 17] = 1e-6
-    assert not is_still(still(color, motion=motion), history)
+    assert not is_still(still(color, motion=motion), history.view_projection)
     # The frame's own motion goes before its positions.
-    assert not is_still(frame.replace(motion=motion), history)
-    assert not is_still(Frame(color=color), history)
+    assert not is_still(frame.replace(motion=motion), history.view_projection)
+    assert not is_still(Frame(color=color), history.view_projection)
 
 
 def test_the_method_inside_is_told_that_nothing_moves() -> None:

@@ -1,0 +1,156 @@
+"""The method ``oidn_open``: Open Image Denoise's network in torch, with derivatives, on any device, to be trained on.
+
+The weights are those that the user has: of the library of the optional package pyoidn, or of an archive (``.tza``) as
+the library's own training scripts export it. The result is the library's, up to rounding.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._journal import timed
+from mcdenoise.models._registry import register_model
+from mcdenoise.models._tza import Archive, archives_in, read_tza
+from mcdenoise.models.oidn import Auxiliary, Oidn, Quality, library_of_oidn
+from mcdenoise.models.tiled import Tiled
+from mcdenoise.nn.oidn import OidnUNet, Size, compress, expand, oidn_exposure
+
+_CHANNELS = 9  # color, albedo, normal
+_SIZES: dict[tuple[bool, Quality], Size] = {(False, "fast"): "small", (True, "fast"): "small", (True, "high"): "large"}
+_PROBE = 48  # side of the image that tells which weights the library takes
+_CLOSE = 1e-2  # largest difference there; other weights make one of more than 0.1
+
+
+class OidnOpen(nn.Module):
+    """The network, from radiance to radiance.
+
+    Args:
+        size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
+    """
+
+    def __init__(self, size: Size = "base") -> None:
+        super().__init__()
+        self.unet = OidnUNet(_CHANNELS, size)
+
+    @property
+    def needs(self) -> Needs:
+        """Color, albedo and normal. It comes with its weights, which can be trained further."""
+        buffers = frozenset({"color", "albedo", "normal"})
+        return Needs(buffers, trainable=False, reach=self.unet.reach, stride=self.unet.multiple)
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """The exposure of the whole image."""
+        return {"oidn_exposure": oidn_exposure(frame.color)}
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`."""
+        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        assert frame.albedo is not None
+        assert frame.normal is not None
+        exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
+        with timed("network", frame.color.device):
+            seen = seen_by_oidn(frame.color * exposure, frame.albedo, frame.normal)
+            image = expand(self.unet(seen).to(exposure.dtype)) / exposure
+        return Output(image.to(frame.color.dtype)), None
+
+
+def seen_by_oidn(color: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+    """What the network is given.
+
+    Args:
+        color: ``(B, 3, H, W)`` exposed radiance.
+        albedo: likewise, in [0, 1].
+        normal: likewise, in [-1, 1], of the world or of the camera.
+
+    Returns:
+        ``(B, 9, H, W)``, in [0, 1].
+    """
+    return torch.cat([compress(color), albedo.clamp(0, 1), normal.clamp(-1, 1) * 0.5 + 0.5], 1)
+
+
+def load_archive(unet: OidnUNet, archive: Archive, where: str) -> None:
+    """Give a network the weights of an archive, layer by layer.
+
+    Of inputs and results that the archive lacks, the weights are zero.
+
+    Raises:
+        InputError: they are those of another network.
+    """
+    names = [name.removesuffix(".weight") for name in archive if name.endswith(".weight")]
+    layers = unet.convolutions
+    if len(names) != len(layers):
+        raise InputError(f"{where}: expected {len(layers)} convolutions, found {len(names)}")
+    with torch.no_grad():
+        for name, layer in zip(names, layers, strict=True):
+            weight, bias = archive[f"{name}.weight"], archive[f"{name}.bias"]
+            given, own = tuple(weight.shape), tuple(layer.weight.shape)
+            fits = given[0] == own[0] or (layer is layers[-1] and given[0] < own[0])
+            if not fits or given[1] > own[1] or given[2:] != own[2:]:
+                raise InputError(f"{where}: '{name}': expected weights of shape {own}, found {given}")
+            layer.weight.zero_()
+            layer.weight[: given[0], : given[1]] = weight
+            layer.bias.zero_()  # type: ignore[union-attr]
+            layer.bias[: given[0]] = bias  # type: ignore[index]
+
+
+@functools.cache
+def archive_of_library(quality: Quality = "high", auxiliary: Auxiliary = "noisy") -> Archive:
+    """The weights that the installed library takes for color, albedo and normal of high dynamic range.
+
+    They are compiled into it, without names: those are taken with which an image comes out as the library's own.
+
+    Args:
+        quality: see :class:`mcdenoise.models.oidn.Oidn`.
+        auxiliary: likewise; "prefiltered" takes those of "clean".
+
+    Raises:
+        InputError: the package ``pyoidn`` is not installed, or its library has no such weights.
+    """
+    clean = auxiliary != "noisy"
+    size = _SIZES.get((clean, quality), "base")
+    generator = torch.Generator().manual_seed(0)
+    color, albedo, normal = (torch.rand(1, 3, _PROBE, _PROBE, generator=generator) for _ in range(3))
+    frame = Frame(color=color, albedo=albedo, normal=normal)
+    wanted = Oidn(quality, "clean" if clean else "noisy", threads=1)(frame)[0].image
+    path, model = library_of_oidn(), OidnOpen(size).eval()
+    for archive in archives_in(path):
+        try:
+            load_archive(model.unet, archive, str(path))
+        except InputError:
+            continue
+        if next(iter(archive.values())).shape[1] == _CHANNELS:
+            with torch.no_grad():
+                if float((model(frame)[0].image - wanted).abs().max()) < _CLOSE:
+                    return archive
+    raise InputError(f"{path}: expected the weights that the library denoises with, found none")
+
+
+@register_model("oidn_open")
+def oidn_open(*, quality: Quality = "high", auxiliary: Auxiliary = "noisy", archive: Path | str | None = None) -> Model:
+    """Open Image Denoise's network in torch: differentiable (weights of the optional package pyoidn, or a .tza file).
+
+    Args:
+        quality: see :class:`mcdenoise.models.oidn.Oidn`.
+        auxiliary: likewise, but that nothing is filtered before: "prefiltered" is refused.
+        archive: a file of weights (``.tza``) to take instead of the library's, for the network of this quality.
+
+    Raises:
+        InputError: the package is not installed, or the file is no such archive.
+    """
+    if auxiliary == "prefiltered":
+        raise InputError("auxiliary: expected noisy or clean, found 'prefiltered'")
+    model = OidnOpen(_SIZES.get((auxiliary == "clean", quality), "base"))
+    weights = archive_of_library(quality, auxiliary) if archive is None else read_tza(Path(archive))
+    load_archive(model.unet, weights, str(archive or "pyoidn"))
+    return Tiled(model)

@@ -1,0 +1,111 @@
+"""A method that is given its own image of the frame before, as it is seen from here."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from mcdenoise.frame import MOTION, Frame, tells_motion
+from mcdenoise.models._interface import Needs, Output, State
+from mcdenoise.models._journal import journal, note, timed
+from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.models.accumulated import is_still, motion_to_previous, surface_before
+from mcdenoise.ops import Surface, demodulate, remodulate, reproject
+
+# The image of the frame before at the places of this one, and how much of each of its pixels shows the same surface.
+PREVIOUS, PREVIOUS_WEIGHT = "previous", "previous_weight"
+PREVIOUS_LIGHT = "previous_light"  # the same with the albedo of this frame
+
+
+class Before(NamedTuple):
+    """What is kept of a frame. All of it zeros is that of no frame: nothing there shows what is here.
+
+    Args:
+        image: ``(B, 6, H, W)`` that the method made of it, and the same without albedo.
+        weight: ``(B, 1, 1, 1)`` 1, or 0 where there was no frame.
+        surface: what was seen.
+        view_projection: ``(B, 4, 4)`` by which camera.
+    """
+
+    image: Tensor
+    weight: Tensor
+    surface: Surface
+    view_projection: Tensor | None
+
+
+class Recurrent(Wrapper):
+    """Hands a method its image of the frame before, reprojected.
+
+    The method finds it in ``frame.extra``, ``(B, 3, H, W)`` each, 0 where nothing shows the same surface:
+
+    - ``previous``: that image itself. Every reprojection blurs it a little more.
+    - ``previous_light``: its radiance without albedo, with the albedo of this frame. What is textured stays sharp; but
+      the albedo of few samples a pixel has noise of its own.
+
+    ``previous_weight`` ``(B, 1, H, W)`` in [0, 1] is how much of it shows the same surface, see
+    :func:`mcdenoise.ops.reproject`: of the first frame, and where nothing tells how things move, 0. What blends its
+    image with those is steady and has the noise of many frames; it is trained over clips to tell where they no longer
+    hold.
+
+    Args:
+        inner: a method without a state.
+    """
+
+    @property
+    def needs(self) -> Needs:
+        """As those inside but for what is handed to it; whatever tells motion is of use."""
+        needs = self.inner.needs
+        given = frozenset({PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
+        uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth"}
+        return Needs(needs.buffers - given, uses, needs.trainable, None)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        frame = frame.with_depth()
+        with timed("accumulate", frame.color.device):
+            image, weight = self._previous(frame, state)
+        image, light = image.split(3, 1)
+        light = light if frame.albedo is None else remodulate(light, frame.albedo)
+        before = {PREVIOUS: image, PREVIOUS_LIGHT: light, PREVIOUS_WEIGHT: weight}
+        handed = frame.replace(extra={**frame.extra, **before})
+        output, _ = self.inner(handed)
+        keeps = frame.hints.keep_all or not frame.hints.last
+        note("remember", "for the next frame" if keeps else "last frame", float(not keeps))
+        if not keeps:
+            return output, None
+        surface = Surface(frame.position, frame.normal, frame.depth)
+        light = output.image if frame.albedo is None else demodulate(output.image, frame.albedo)
+        weight = torch.ones_like(weight[..., :1, :1])
+        return output, Before(torch.cat([output.image, light], 1), weight, surface, frame.view_projection)
+
+    def _previous(self, frame: Frame, before: Before | None) -> tuple[Tensor, Tensor]:
+        nothing = torch.zeros_like(frame.color).repeat(1, 2, 1, 1), torch.zeros_like(frame.color[:, :1])
+        if before is None:
+            _report("first frame", 0.0)
+            return nothing
+        if before.image.shape != nothing[0].shape or before.image.device != frame.color.device:
+            _report("size change", 0.0)
+            return nothing
+        still = is_still(frame, before.view_projection)
+        motion = motion_to_previous(frame, before.view_projection)
+        if motion is None or not tells_motion(frame.buffers):
+            _report("no motion", 0.0)
+            return nothing
+        if isinstance(still, Tensor):
+            motion = torch.where(still, 0, motion)
+        surface, previous = surface_before(frame), before.surface
+        if surface.depth is None or previous.depth is None:
+            # What tells how far two positions may be apart.
+            surface, previous = surface._replace(position=None), previous._replace(position=None)
+        found, weight = reproject(before.image, None if still is True else motion, surface, previous)
+        weight = weight * before.weight
+        _report("", float(weight.detach().mean()) if journal() is not None else 0.0)
+        return found, weight
+
+
+def _report(reset: str, history: float) -> None:
+    if (found := journal()) is not None:
+        found.reset, found.history = reset, history
+        note("reproject", reset or "the image of the frame before", float(reset != ""))

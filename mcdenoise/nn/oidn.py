@@ -1,0 +1,206 @@
+"""The network of Open Image Denoise, and the scale of radiance that it works on.
+
+Its layers, transfer function and exposure are those of the library (https://www.openimagedenoise.org, version 2.5,
+Apache License 2.0), so that weights of the one are weights of the other.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Literal, NamedTuple, TypeAlias, get_args
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mcdenoise.nn._cpu import ConvBlock, ReLU, max_pool
+from mcdenoise.ops._window import corner
+
+Size: TypeAlias = Literal["small", "base", "large"]
+
+MAX_RADIANCE = 65504.0  # of half precision: what is brighter counts as that
+_COLORS = 3
+_LEVELS = 5
+_MULTIPLE = 1 << (_LEVELS - 1)
+# Peak numbers for each pixel beside the features: what goes in and what comes out, in float32.
+_LIVE_IMAGES = 40
+
+# Of PU, as the library has it: a line in the dark, then a power, then a logarithm.
+_A, _B, _C, _D = 1.41283765e03, 1.64593172e00, 4.31384981e-01, -2.94139609e-03
+_E, _F, _G = 1.92653254e-01, 6.26026094e-03, 9.98620152e-01
+_Y0, _Y1, _X0, _X1 = 1.57945760e-06, 3.22087631e-02, 2.23151711e-03, 3.70974749e-01
+_WHITE = _E * math.log(MAX_RADIANCE + _F) + _G
+_KEY, _BIN, _DARK = 0.18, 16, 1e-8
+_LUMINANCE = (0.212671, 0.715160, 0.072169)
+
+
+class _Widths(NamedTuple):
+    """Channels of the convolutions of each level, finest encoder first, coarsest decoder first."""
+
+    encoder: tuple[tuple[int, ...], ...]
+    decoder: tuple[tuple[int, ...], ...]
+
+
+_SIZES: dict[Size, _Widths] = {
+    "small": _Widths(((32, 32), (32,), (32,), (32,), (32, 32)), ((64, 64), (64, 64), (64, 32), (32, 32))),
+    "base": _Widths(((32, 32), (48,), (64,), (80,), (96, 96)), ((112, 112), (96, 96), (64, 64), (64, 32))),
+    "large": _Widths(
+        ((64, 64), (96, 96), (128, 128), (192, 192), (256, 256)), ((192, 192), (128, 128), (96, 96), (64, 64))
+    ),
+}
+
+
+class OidnUNet(nn.Module):
+    """Open Image Denoise's U-Net: 3x3 convolutions with ReLU, 2x2 max-pooling, and nearest neighbours on the way up.
+
+    What the decoder is given of the encoder is pooled already, and at full resolution it is the input itself. Images
+    are padded with zeros to whole pixels of the coarsest level, a sixteenth of the resolution.
+
+    Args:
+        in_channels: of the input: 3 color, 3 albedo and 3 normal in the library.
+        size: which of the library's: "small" has 62 thousand multiply-adds a pixel, "base" 125, "large" 312.
+        out_channels: of what is predicted.
+
+    Raises:
+        ValueError: there is no such size.
+    """
+
+    def __init__(self, in_channels: int = 9, size: Size = "base", out_channels: int = _COLORS) -> None:
+        super().__init__()
+        if size not in _SIZES:
+            raise ValueError(f"size: expected one of {', '.join(get_args(Size))}, found '{size}'")
+        encoder, decoder = _SIZES[size]
+        self.size: Size = size
+        entering = [in_channels, *(widths[-1] for widths in encoder[:-1])]
+        self.encoder = nn.ModuleList(itertools.starmap(_block, zip(entering, encoder, strict=True)))
+        skips = [*(widths[-1] for widths in encoder[-3::-1]), in_channels]
+        coarser = [encoder[-1][-1], *(widths[-1] for widths in decoder[:-1])]
+        entering = [below + skip for below, skip in zip(coarser, skips, strict=True)]
+        self.decoder = nn.ModuleList(itertools.starmap(_block, zip(entering, decoder, strict=True)))
+        self.last = nn.Conv2d(decoder[-1][-1], out_channels, 3, padding=1)
+
+    @property
+    def convolutions(self) -> list[nn.Conv2d]:
+        """All of them, in the order of the library's archives."""
+        return [layer for layer in self.modules() if isinstance(layer, nn.Conv2d)]
+
+    @property
+    def multiple(self) -> int:
+        """Side of the coarsest pixels."""
+        return _MULTIPLE
+
+    @property
+    def reach(self) -> int:
+        """How far from a pixel the result may depend on it: a pixel of a level with each of its convolutions."""
+        levels = [*range(_LEVELS), *range(_LEVELS - 2, -1, -1)]
+        counts = [len(widths) for part in _SIZES[self.size] for widths in part]
+        convolutions: int = sum(count << level for count, level in zip(counts, levels, strict=True))
+        return convolutions + 1 + _MULTIPLE - 1
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that an image takes while it is computed, for each of its pixels, with what goes in and out.
+
+        Args:
+            bfloat16: whether convolutions are in bfloat16, else in float32.
+        """
+        return 3.5 * _SIZES[self.size].encoder[0][0] * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Predict.
+
+        Args:
+            x: ``(B, in_channels, H, W)``.
+
+        Returns:
+            ``(B, out_channels, H, W)``.
+        """
+        height, width = x.shape[-2:]
+        x = F.pad(x, (0, -width % _MULTIPLE, 0, -height % _MULTIPLE)).contiguous(memory_format=torch.channels_last)
+        skips = [x]
+        for level, block in enumerate(self.encoder):
+            x = block(x)
+            if level < _LEVELS - 1:
+                x = max_pool(x)
+                skips.append(x)
+        # The coarsest level is where pooling ended.
+        skips.pop()
+        for block in self.decoder:
+            skip = skips.pop()
+            x = block(torch.cat([F.interpolate(x, scale_factor=2.0), skip.to(x.dtype)], 1))
+        return corner(self.last(x), height, width)
+
+
+def _block(in_channels: int, widths: tuple[int, ...]) -> ConvBlock:
+    layers: list[nn.Module] = []
+    for entering, leaving in itertools.pairwise([in_channels, *widths]):
+        layers += [nn.Conv2d(entering, leaving, 3, padding=1), ReLU()]
+        nn.init.kaiming_normal_(layers[-2].weight, nonlinearity="relu")  # type: ignore[arg-type]
+        nn.init.zeros_(layers[-2].bias)  # type: ignore[arg-type]
+    return ConvBlock(*layers)
+
+
+def compress(radiance: Tensor) -> Tensor:
+    """Radiance on a scale on which equal steps look equal, from 0 to 1.
+
+    Args:
+        radiance: any shape; exposed, see :func:`oidn_exposure`. What is outside [0, 65504] counts as its limit.
+
+    Returns:
+        The same shape, in [0, 1]. Its derivative is finite, also at 0.
+
+    Source: Aydin et al. 2008, "Extending Quality Metrics to Full Luminance Range Images", as fitted in Open Image
+    Denoise: ``a y`` up to y0, ``b y^c + d`` up to y1, ``e log(y + f) + g`` above, over its value at 65504.
+    """
+    y = radiance.clamp(0, MAX_RADIANCE)
+    power = _B * y.clamp_min(_Y0).pow(_C) + _D
+    found = torch.where(y <= _Y0, _A * y, torch.where(y <= _Y1, power, _E * torch.log(y + _F) + _G))
+    return found / _WHITE
+
+
+def expand(compressed: Tensor) -> Tensor:
+    """The inverse of :func:`compress`; what is negative counts as 0.
+
+    Args:
+        compressed: any shape.
+
+    Returns:
+        The same shape; not negative, and not limited above.
+    """
+    x = compressed.clamp_min(0) * _WHITE
+    power = ((x - _D) / _B).clamp_min(1e-12).pow(1 / _C)
+    # What takes another way does not overflow on this one.
+    bright = torch.exp((x.clamp_min(_X1) - _G) / _E) - _F
+    return torch.where(x <= _X0, x / _A, torch.where(x <= _X1, power, bright))
+
+
+def oidn_exposure(color: Tensor) -> Tensor:
+    """The factor that Open Image Denoise brings an image's radiance to its range with.
+
+    ``0.18 / exp2(mean(log2(luminance)))`` over the means of bins of some 16x16 pixels, without black ones.
+
+    Args:
+        color: ``(B, 3, H, W)`` radiance.
+
+    Returns:
+        ``(B, 1, 1, 1)``, positive, at least in float32; 1 for a black image. It has no gradient.
+    """
+    color = color.detach().to(torch.promote_types(color.dtype, torch.float32))
+    weights = color.new_tensor(_LUMINANCE).reshape(1, _COLORS, 1, 1)
+    luminance = (color * weights).sum(1, keepdim=True)
+    bins = _binned(_binned(luminance, 2), 3)
+    lit = bins > _DARK
+    count = lit.sum((1, 2, 3), keepdim=True)
+    mean = torch.where(lit, torch.log2(bins.clamp_min(_DARK)), 0).sum((1, 2, 3), keepdim=True) / count.clamp_min(1)
+    return torch.where(count > 0, _KEY / torch.exp2(mean), 1)
+
+
+def _binned(image: Tensor, axis: int) -> Tensor:
+    """The means over equal parts of an axis. Sums: autocast would round a product of matrices to half precision."""
+    side = image.shape[axis]
+    count = -(-side // _BIN)
+    edges = torch.arange(1, count + 1, device=image.device) * side // count
+    part = torch.searchsorted(edges, torch.arange(side, device=image.device), right=True)
+    shape = [size if each != axis else count for each, size in enumerate(image.shape)]
+    sizes = torch.bincount(part, minlength=count).reshape([-1 if each == axis else 1 for each in range(4)])
+    return image.new_zeros(shape).index_add(axis, part, image) / sizes

@@ -1,0 +1,276 @@
+"""Open Image Denoise's network in torch: the library's own results, its equations, and archives of weights."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import math
+import struct
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from toys import frame_of, refused
+
+from mcdenoise import Denoiser, Frame
+from mcdenoise.models import create_model
+from mcdenoise.models._tza import archives_in, read_tza
+from mcdenoise.models.oidn import Oidn
+from mcdenoise.models.oidn_open import OidnOpen, archive_of_library, load_archive
+from mcdenoise.nn.oidn import MAX_RADIANCE, OidnUNet, compress, expand, oidn_exposure
+
+NAME = "oidn_open"
+has_oidn = pytest.mark.skipif(
+    importlib.util.find_spec("pyoidn") is None, reason="Open Image Denoise is in the extra mcdenoise[oidn]"
+)
+
+
+def lit(height: int = 45, width: int = 70, seed: int = 0) -> Frame:
+    """Radiance over five decades, an albedo, and normals of any length up to one."""
+    draws = torch.Generator().manual_seed(seed)
+    color = torch.exp(4 * torch.randn(1, 3, height, width, generator=draws))
+    albedo = torch.rand(1, 3, height, width, generator=draws)
+    normal = 2 * torch.rand(1, 3, height, width, generator=draws) - 1
+    return Frame(color=color, albedo=albedo, normal=normal)
+
+
+@has_oidn
+@pytest.mark.parametrize("quality", ["fast", "balanced", "high"])
+@pytest.mark.parametrize("auxiliary", ["noisy", "clean"])
+def test_is_what_the_library_computes(quality: Any, auxiliary: Any) -> None:
+    frame = lit()
+    with torch.no_grad():
+        image = create_model(NAME, quality=quality, auxiliary=auxiliary)(frame)[0].image
+    expected = Oidn(quality, auxiliary, threads=1)(frame)[0].image
+    # On the network's own scale, where rounding is even: some twenty layers in float32, summed in another order.
+    exposure = oidn_exposure(frame.color)
+    torch.testing.assert_close(compress(image * exposure), compress(expected * exposure), rtol=0, atol=20 * 2.0**-22)
+
+
+@has_oidn
+def test_its_derivative_is_what_the_library_does_to_a_changed_image() -> None:
+    frame = lit(32, 48)
+    model = create_model(NAME)
+    library = Oidn("high", threads=1)
+    # The exposure, which has no derivative, is that of the luminance: the change leaves that of every bin as it is.
+    change = torch.randn(1, 3, 32, 48) * 0.05 * frame.color
+    weights = torch.tensor([0.212671, 0.715160, 0.072169]).reshape(1, 3, 1, 1)
+    change = change - (change * weights).sum(1, keepdim=True) / weights.sum()
+    step = 2.0**-4
+    apart = [library(frame.replace(color=frame.color + sign * step * change))[0].image for sign in (1, -1)]
+    expected = (apart[0] - apart[1]) / (2 * step)
+    color = frame.color.clone().requires_grad_()
+    image = model(frame.replace(color=color))[0].image
+    (slope,) = torch.autograd.grad(image, color, expected)
+    # Along the change, weighed with itself. ReLUs and pools change sides on the way, over so small a step
+    # few of them.
+    assert float((slope * change).sum()) == pytest.approx(float(expected.square().sum()), rel=0.05)
+
+
+@has_oidn
+def test_tiles_are_the_whole_image() -> None:
+    whole, tiles = Denoiser(NAME), Denoiser(NAME, tile=64)
+    frame = frame_of(200, 330)
+    torch.testing.assert_close(tiles(frame), whole(frame), rtol=1e-4, atol=1e-5)
+    assert "tiles" in tiles.report.tiles
+
+
+@has_oidn
+def test_refuses_what_it_does_not_do() -> None:
+    assert "found 'prefiltered'" in refused(lambda: create_model(NAME, auxiliary="prefiltered"))
+    model = create_model(NAME)
+    assert model.needs.missing(Frame(torch.rand(1, 3, 8, 8))) == ["albedo", "normal"]
+
+
+def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    archive_of_library.cache_clear()
+    assert "pip install 'mcdenoise[oidn]'" in refused(lambda: create_model(NAME, quality="balanced"))
+
+
+def written_out(unet: OidnUNet, x: Tensor) -> Tensor:
+    """The base network layer by layer, as the library names them."""
+
+    def conv(layer: torch.nn.Conv2d, x: Tensor) -> Tensor:
+        padded = torch.nn.functional.pad(x, (1, 1, 1, 1))
+        patches = padded.unfold(2, 3, 1).unfold(3, 3, 1)
+        return torch.einsum("bihwkl,oikl->bohw", patches, layer.weight) + layer.bias.reshape(1, -1, 1, 1)  # type: ignore
+
+    def pool(x: Tensor) -> Tensor:
+        return x.unflatten(2, (-1, 2)).unflatten(4, (-1, 2)).amax((3, 5))
+
+    def up(x: Tensor) -> Tensor:
+        return x.repeat_interleave(2, 2).repeat_interleave(2, 3)
+
+    c0, c1, c2, c3, c4, c5a, c5b, d4a, d4b, d3a, d3b, d2a, d2b, d1a, d1b, d0 = unet.convolutions
+    pooled = [x]
+    features = pool(conv(c1, conv(c0, x).relu()).relu())
+    pooled.append(features)
+    for layer in (c2, c3):
+        features = pool(conv(layer, features).relu())
+        pooled.append(features)
+    features = pool(conv(c4, features).relu())
+    features = conv(c5b, conv(c5a, features).relu()).relu()
+    for (a, b), skip in zip(((d4a, d4b), (d3a, d3b), (d2a, d2b), (d1a, d1b)), reversed(pooled), strict=True):
+        features = conv(b, conv(a, torch.cat([up(features), skip], 1)).relu()).relu()
+    return conv(d0, features)
+
+
+@pytest.mark.parametrize("size", ["small", "base"])
+def test_layers_written_out_in_float64(size: Any) -> None:
+    torch.manual_seed(0)
+    unet = OidnUNet(9, size).double()
+    x = torch.rand(1, 9, 32, 48, dtype=torch.float64)
+    torch.testing.assert_close(unet(x), written_out(unet, x), rtol=1e-10, atol=1e-12)
+    # An image of another size is that one with zeros below and beside it.
+    smaller = x[..., :30, :37]
+    padded = torch.nn.functional.pad(smaller, (0, 11, 0, 2))
+    torch.testing.assert_close(unet(smaller), written_out(unet, padded)[..., :30, :37], rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", ["small", "base", "large"])
+def test_a_pixel_farther_than_the_reach_changes_nothing(size: Any) -> None:
+    torch.manual_seed(0)
+    unet = OidnUNet(9, size).eval()
+    side = 2 * unet.reach + 33
+    x = torch.rand(1, 9, 16, side)
+    other = x.clone()
+    other[..., 0] += 100
+    with torch.no_grad():
+        changed = (unet(x) != unet(other)).any(1)[0].any(0)
+    assert changed[0]
+    assert not changed[unet.reach + 1 :].any()
+
+
+def test_the_scale_of_radiance() -> None:
+    dark, bright = math.log10(1e-9), math.log10(MAX_RADIANCE)
+    radiance = torch.cat([torch.zeros(1), torch.logspace(dark, bright, 4001, dtype=torch.float64)])
+    scale = compress(radiance)
+    assert scale[0] == 0
+    assert float(scale[-1]) == pytest.approx(1, abs=1e-9)
+    assert (scale.diff() > 0).all()
+    torch.testing.assert_close(expand(scale), radiance, rtol=1e-7, atol=1e-12)
+    assert compress(torch.tensor([-1.0, 1e9])).tolist() == pytest.approx([0, 1], abs=1e-6)
+    assert expand(torch.tensor([-1.0])).item() == 0
+
+
+@pytest.mark.parametrize("function", [compress, expand])
+def test_derivatives_of_the_scale(function: Any) -> None:
+    # Inside of each of its three parts.
+    values = torch.tensor([1e-6, 1e-3, 5.0] if function is compress else [5e-4, 0.05, 0.4], dtype=torch.float64)
+    assert torch.autograd.gradcheck(function, values.requires_grad_(), eps=1e-8, atol=1e-5)
+    edge = torch.tensor([0.0, 1.0], requires_grad=True)
+    function(edge).sum().backward()
+    assert edge.grad is not None
+    assert edge.grad.isfinite().all()
+
+
+def test_gradients_of_the_network_in_float64() -> None:
+    torch.manual_seed(0)
+    model = OidnOpen("small").double()
+    # An exposure of its own, which has a gradient in nothing.
+    frame = lit(16, 16).to(torch.float64).replace(statistics={"oidn_exposure": torch.ones(1, 1, 1, 1).double()})
+    frame = frame.replace(color=0.1 + 0.8 * frame.albedo)
+
+    def image(color: Tensor) -> Tensor:
+        return model(frame.replace(color=color))[0].image
+
+    assert torch.autograd.gradcheck(image, (frame.color.clone().requires_grad_(),), fast_mode=True, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(16, 16), (17, 40), (100, 77), (5, 3)])
+def test_exposure_bin_by_bin(size: tuple[int, int]) -> None:
+    color = lit(*size).color
+    color[..., : size[0] // 2, : size[1] // 2] = 0
+    weights = (0.212671, 0.715160, 0.072169)
+    luminance = sum(weight * color[0, channel].double() for channel, weight in enumerate(weights)).numpy()  # type: ignore
+    counts = [-(-side // 16) for side in size]
+    logarithms = []
+    for row, column in itertools.product(*map(range, counts)):
+        tall, wide = (
+            slice(i * side // n, (i + 1) * side // n) for i, side, n in zip((row, column), size, counts, strict=True)
+        )
+        mean = luminance[tall, wide].mean()
+        if mean > 1e-8:
+            logarithms.append(math.log2(mean))
+    expected = 0.18 / 2 ** np.mean(logarithms)
+    assert oidn_exposure(color).item() == pytest.approx(expected, rel=1e-5)
+    assert oidn_exposure(torch.zeros(2, 3, 20, 20)).flatten().tolist() == [1, 1]
+
+
+def archive(tensors: dict[str, np.ndarray[Any, Any]], before: bytes = b"") -> bytes:
+    """An archive as the library's scripts write it: values on multiples of 64, and the table behind them."""
+    values, table = b"", struct.pack("<I", len(tensors))
+    start = 64
+    for name, tensor in tensors.items():
+        kind = {"float32": b"f", "float16": b"h"}[tensor.dtype.name]
+        layout = "oihw"[: tensor.ndim].encode() if tensor.ndim == 4 else b"x"
+        table += struct.pack("<H", len(name)) + name.encode() + struct.pack("<B", tensor.ndim)
+        table += struct.pack(f"<{tensor.ndim}I", *tensor.shape) + layout + kind
+        table += struct.pack("<Q", start + len(values))
+        values += tensor.tobytes() + b"\0" * (-tensor.nbytes % 64)
+    head = struct.pack("<HBBQ", 0x41D7, 2, 0, start + len(values)).ljust(start, b"\0")
+    return before + head + values + table
+
+
+def weights_of(unet: OidnUNet) -> dict[str, np.ndarray[Any, Any]]:
+    found = {}
+    for index, layer in enumerate(unet.convolutions):
+        found[f"conv{index}.weight"] = layer.weight.detach().numpy().astype(np.float16)
+        found[f"conv{index}.bias"] = np.full(len(layer.weight), index / 8, np.float32)
+    return found
+
+
+def test_a_network_of_a_file_of_one_s_own(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    path = tmp_path / "mine.tza"
+    path.write_bytes(archive(weights_of(OidnUNet(9, "small"))))
+    model = create_model(NAME, quality="fast", archive=path)
+    layers = model.inner.unet.convolutions  # type: ignore[attr-defined]
+    tensors = read_tza(path)
+    assert len(tensors) == 2 * len(layers)
+    for index, layer in enumerate(layers):
+        assert torch.equal(layer.weight, tensors[f"conv{index}.weight"])
+        assert torch.equal(layer.bias, torch.full_like(layer.bias, index / 8))
+    message = refused(lambda: create_model(NAME, archive=path))
+    assert "expected weights of shape (48, 32, 3, 3), found (32, 32, 3, 3)" in message
+
+
+def test_more_inputs_and_results_than_the_archive_has_weigh_nothing(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    path = tmp_path / "mine.tza"
+    path.write_bytes(archive(weights_of(OidnUNet(9, "small"))))
+    plain, more = OidnUNet(9, "small"), OidnUNet(13, "small", 4)
+    for unet in (plain, more):
+        load_archive(unet, read_tza(path), "here")
+    x = torch.rand(1, 13, 16, 32)
+    torch.testing.assert_close(more(x)[:, :3], plain(x[:, :9]))
+    assert not more(x)[:, 3].any()
+
+
+def test_archives_are_found_in_a_library(tmp_path: Path) -> None:
+    path = tmp_path / "library.so"
+    one, other = {"a": np.arange(4, dtype=np.float32)}, {"b": np.ones((1, 2, 3, 3), np.float16)}
+    # The mark alone, by chance, is no archive.
+    chance = struct.pack("<HBBQ", 0x41D7, 2, 0, 1 << 60)
+    path.write_bytes(archive(one, b"x" * 77) + chance + archive(other, b"y" * 13) + chance)
+    first, second = archives_in(path)
+    assert first["a"].tolist() == [0, 1, 2, 3]
+    assert second["b"].shape == (1, 2, 3, 3)
+
+
+def test_refuses_what_is_no_archive(tmp_path: Path) -> None:
+    path = tmp_path / "mine.tza"
+    assert f"{path}: expected an archive of weights" in refused(lambda: read_tza(path))
+    path.write_bytes(b"PK\x03\x04")
+    assert "(.tza, version 2), found another" in refused(lambda: read_tza(path))
+    whole = archive({"a": np.arange(4000, dtype=np.float32)})
+    for length in (4, 12, 100, len(whole) - 3):
+        path.write_bytes(whole[:length])
+        assert "found a damaged one" in refused(lambda: read_tza(path))
+    path.write_bytes(whole[:12] + b"\xff" * (len(whole) - 12))
+    assert "found a damaged one" in refused(lambda: read_tza(path))

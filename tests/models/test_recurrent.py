@@ -1,0 +1,136 @@
+"""A method that is given its own image of the frame before: where it was, what no longer shows, and how it ends."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+from toys import frame_of
+
+from mcdenoise import Denoiser, Frame
+from mcdenoise.frame import Hints
+from mcdenoise.models import Needs, Output, Recurrent, State
+from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_WEIGHT
+
+
+class Shows:
+    """Half of the image of the frame before, and remembers what it was given."""
+
+    needs = Needs(reach=0)
+
+    def __call__(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        self.previous, self.weight = frame.extra[PREVIOUS], frame.extra[PREVIOUS_WEIGHT]
+        stays = self.weight / 2
+        return Output(torch.lerp(frame.color, self.previous, stays)), None
+
+
+def moving(color: Tensor, motion: tuple[float, float], depth: Tensor | None = None) -> Frame:
+    height, width = color.shape[-2:]
+    field = torch.tensor(motion, dtype=torch.float32).reshape(1, 2, 1, 1).expand(1, 2, height, width)
+    return Frame(color, motion=field, depth=torch.ones(1, 1, height, width) if depth is None else depth)
+
+
+def test_the_first_frame_has_none() -> None:
+    inner = Shows()
+    color = torch.rand(1, 3, 5, 6)
+    output, _ = Recurrent(inner)(moving(color, (0, 0)))
+    assert torch.equal(output.image, color)
+    assert not inner.weight.any()
+    assert not inner.previous.any()
+
+
+def test_a_still_camera_gives_the_exponential_mean() -> None:
+    model, state = Recurrent(Shows()), None
+    colors = torch.rand(4, 1, 3, 5, 6)
+    for color in colors:
+        output, state = model(moving(color, (0, 0)), state)
+    expected = (colors[0] + colors[1]) / 8 + colors[2] / 4 + colors[3] / 2
+    torch.testing.assert_close(output.image, expected)
+
+
+def test_what_moves_takes_its_image_along() -> None:
+    inner = Shows()
+    model = Recurrent(inner)
+    first = torch.rand(1, 3, 5, 8)
+    _, state = model(moving(first, (0, 0)))
+    # Everything was two pixels further left.
+    model(moving(torch.rand(1, 3, 5, 8), (-2, 0)), state)
+    torch.testing.assert_close(inner.previous[..., 2:], first[..., :-2])
+    assert (inner.weight[..., 2:] == 1).all()
+    assert not inner.weight[..., :2].any()
+    assert not inner.previous[..., :2].any()
+
+
+def test_what_shows_another_surface_has_none() -> None:
+    inner = Shows()
+    model = Recurrent(inner)
+    near, far = torch.ones(1, 1, 5, 8), torch.full((1, 1, 5, 8), 3.0)
+    columns = torch.arange(8).expand(1, 1, 5, 8)
+    _, state = model(moving(torch.rand(1, 3, 5, 8), (0, 0), torch.where(columns < 4, near, far)))
+    # A pillar that ended at the fourth column now ends at the second.
+    model(moving(torch.rand(1, 3, 5, 8), (0, 0), torch.where(columns < 2, near, far)), state)
+    assert (inner.weight == (columns < 2) + (columns >= 4)).all()
+
+
+def test_positions_and_cameras_tell_motion_too() -> None:
+    inner = Shows()
+    model = Recurrent(inner)
+    centers = (torch.arange(8.0) + 0.5) / 4 - 1
+    grid = torch.stack(torch.meshgrid(centers, centers, indexing="xy"))
+    position = torch.cat([grid, torch.ones(1, 8, 8)])[None]
+    # Row vectors: one pixel to the right is a quarter in x.
+    camera = torch.eye(4)[None].clone()
+    frame = Frame(torch.rand(1, 3, 8, 8), position=position, view_projection=camera)
+    _, state = model(frame)
+    moved = camera.clone()
+    moved[:, 3, 0] = 0.25
+    shifted = position - torch.tensor([0.25, 0, 0]).reshape(1, 3, 1, 1)
+    model(Frame(torch.rand(1, 3, 8, 8), position=shifted, view_projection=moved), state)
+    torch.testing.assert_close(inner.previous[..., 1:], frame.color[..., :-1])
+
+
+@pytest.mark.parametrize("names", [(), ("depth",), ("position",)])
+def test_where_nothing_tells_motion_every_frame_is_a_first_one(names: tuple[str, ...]) -> None:
+    inner = Shows()
+    model, state = Recurrent(inner), None
+    for seed in range(2):
+        frame = frame_of(6, 7, seed=seed)
+        frame = Frame(frame.color, **{name: frame.buffer(name) for name in names})
+        output, state = model(frame, state)
+        assert torch.equal(output.image, frame.color)
+
+
+def test_a_resize_begins_anew_and_the_state_is_tensors() -> None:
+    denoiser = Denoiser(Recurrent(Shows()))
+    for size in ((6, 8), (6, 8), (5, 4)):
+        denoiser(moving(torch.rand(1, 3, *size), (0, 0)))
+        leaves = [leaf for leaf in pytree.tree_leaves(denoiser._state) if leaf is not None]
+        assert all(isinstance(leaf, Tensor) for leaf in leaves)
+    assert denoiser.report.reset == "size change"
+
+
+def test_nothing_is_kept_of_the_last_frame() -> None:
+    frame = moving(torch.rand(1, 3, 5, 6), (0, 0))
+    assert Recurrent(Shows())(frame.replace(hints=Hints(last=True)))[1] is None
+
+
+def test_a_state_of_zeros_is_that_of_no_frame() -> None:
+    inner = Shows()
+    frame = moving(torch.rand(1, 3, 5, 6), (0, 0))
+    _, state = Recurrent(inner)(frame)
+    zeros = pytree.tree_map_only(Tensor, torch.zeros_like, state)
+    Recurrent(inner)(frame, zeros)
+    assert not inner.weight.any()
+
+
+def test_the_gradient_goes_through_the_state() -> None:
+    model, state = Recurrent(Shows()), None
+    colors = [torch.rand(1, 3, 4, 5, dtype=torch.float64, requires_grad=True) for _ in range(3)]
+    for color in colors:
+        output, state = model(moving(color, (0.25, -0.5)).to(torch.float64).replace(color=color), state)
+    inside = output.image[..., 1:-1, 1:-1].sum()
+    gradients = torch.autograd.grad(inside, colors)
+    # A quarter, a quarter and a half of what is inside; what is taken of its neighbours is taken bilinearly.
+    assert float(sum(gradient.sum() for gradient in gradients)) == pytest.approx(3 * 2 * 3)
+    assert float(gradients[2].sum()) == pytest.approx(3 * 2 * 3 / 2)
