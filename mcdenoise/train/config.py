@@ -38,6 +38,7 @@ class TrainConfig:
         schedule: constant, or cosine down to 0 after a warm-up of 200 steps.
         temporal_weight: of the temporal loss.
         display_weight: of the error on a display, see :func:`mcdenoise.train.losses.display_error`.
+        relative: each clip's error counts in parts of that of the image which the trained part of the model is given.
         key: each clip is brought to this typical radiance, a middle gray such as 0.2, before its light is scaled; 0
             leaves it as it was rendered.
         gradient_norm: largest norm of a step's gradient; 0 does not limit it.
@@ -72,6 +73,7 @@ class TrainConfig:
     schedule: Schedule = "constant"
     temporal_weight: float = 0.1
     display_weight: float = 0.0
+    relative: bool = False
     key: float = 0.0
     gradient_norm: float = 0.0
     ema: float = 0.0

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Skipping, State, Wrapper
 from mcdenoise.models.accumulated import ALBEDO_HISTORY, CAUSTICS
-from mcdenoise.models.oidn_temporal import CLEAN, NOISY, AfterOidn
+from mcdenoise.models.oidn_temporal import CLEAN, EXACT, NOISY, AfterOidn
 from mcdenoise.ops import remodulate
 
 # What comes of accumulation, with the number of channels.
@@ -47,7 +47,7 @@ class Front:
     def parts(self) -> dict[str, int]:
         """Names of the buffers that each noise of its own changes, with their channels: radiance, and histories."""
         if not self.accumulates:
-            return {"color": 3, **({CLEAN: 3, NOISY: 3} if self.denoises else {})}
+            return {"color": 3, **({CLEAN: 3, NOISY: 3, EXACT: 1} if self.denoises else {})}
         also = {name for _, settings in self.wrappers for name in settings.get("also", ())}
         history = {ALBEDO_HISTORY: 3} if "albedo" in also else {}
         return {**ACCUMULATED, **history}

@@ -12,6 +12,7 @@ from mcdenoise.models import Output
 
 RESULT = "image"
 _DARK = 1e-3
+_LEAST = 1e-3  # of an error that another is divided by
 
 
 def stage_loss(
@@ -21,6 +22,7 @@ def stage_loss(
     *,
     temporal_weight: float = 0.1,
     display_weight: float = 0.0,
+    relative_to: Tensor | None = None,
 ) -> Tensor:
     """The total loss: spatial and temporal SMAPE of the image, its error on a display, and those of stages before it.
 
@@ -33,6 +35,8 @@ def stage_loss(
         weights: of the result, ``"image"``, and of stages by name; those without one do not count.
         temporal_weight: ``w_t``, the paper's ``w_c = w_d``, 0.1; 0 leaves the temporal loss out.
         display_weight: ``w_d`` of :func:`display_error`; 0, as in the paper, leaves it out.
+        relative_to: an image of the same shape: each clip's error counts in parts of that which this image has, so that
+            clips of little noise are learnt from as much as those of much.
 
     Returns:
         A scalar, the mean over the batch.
@@ -51,15 +55,17 @@ def stage_loss(
         0.0
     """
     images = {RESULT: output.image, **output.stages}
-    loss = reference.new_zeros(())
-    for stage, weight in weights.items():
-        loss = loss + weight * smape_linear(images[stage], reference).mean()
+
+    def errors(image: Tensor) -> Tensor:
+        total = smape_linear(image, reference).mean(1)
         if temporal_weight:
-            flicker = temporal_smape_linear(images[stage], reference).mean()
-            loss = loss + weight * temporal_weight * flicker
+            total = total + temporal_weight * temporal_smape_linear(image, reference).mean(1)
         if display_weight:
-            loss = loss + weight * display_weight * display_error(images[stage], reference).mean()
-    return loss
+            total = total + display_weight * display_error(image, reference).mean(1)
+        return total
+
+    loss = sum(weight * errors(images[stage]) for stage, weight in weights.items()) + reference.new_zeros(())
+    return (loss if relative_to is None else loss / (errors(relative_to) + _LEAST)).mean()
 
 
 def display_error(image: Tensor, reference: Tensor) -> Tensor:
