@@ -18,44 +18,41 @@ and so decides what rules decide elsewhere:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Output, State
+from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._pyramid import Pyramid, filtered, inside
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import ALBEDO_HISTORY, Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.inputs import FEATURES, guides_of, input_of
-from mcdenoise.nn.unet import UNet
-from mcdenoise.ops import cross_bilateral_filter, downsample, kernel_conv
+from mcdenoise.nn.inputs import FEATURES, features_of, guides_of, image_statistics, input_of
+from mcdenoise.nn.unet import Head, UNet
+from mcdenoise.ops import cross_bilateral_filter, downsample, kernel_conv, upsample
+from mcdenoise.ops._backend import one_backend
 from mcdenoise.ops._steps.network import softplus
 from mcdenoise.ops.demodulation import modulation
 from mcdenoise.ops.lag import THRESHOLD
 
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of the falloffs with normal, depth and distance
+_USES = frozenset({"albedo", "normal", "depth", "current", "length", ALBEDO_HISTORY})
 _COARSE_CHANNELS = 7  # logarithms of the means, with the history and of the frame, and how much its pixels differ
-# What is predicted of a pixel, and what it is before anything was learnt: the history is trusted, light is matt,
-# features are exact. "albedo" weighs that of the 3x3 pixels around, of the history, and of the pyramid's own making.
-_PARTS = {
-    "importance": (0.0,),
-    "history": (2.0,),
-    "albedo": (1.0, 0.0, 0.0),
-    "matt": (-1.0,),
-    "gain": (0.0, 0.0, 0.0),
-    "features": (0.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0, 0.0),
-}
+_FEATURE_TAPS = 9  # of the kernel for features
+# "albedo" weighs that of the 3x3 pixels around, that of the history, and that which the pyramid makes of it.
+_PARTS = {"importance": 1, "history": 1, "albedo": 3, "matt": 1, "gain": 3, "features": _FEATURE_TAPS}
+# What they are before anything was learnt: the history is trusted, light is matt, features are exact.
+_AT_REST = {"history": 2.0, "matt": -1.0}
 _QUARTERS = (4, 6, 8, 12, 16)  # of the width, at each level
+_LEAST = 1e-3  # of the light of a pixel that a scale keeps or hands on, and that a pixel is worth
 _MOST_GAIN = 1.0  # of the logarithm of the factor
 
 
-class PyramidNetwork(Pyramid):
+class PyramidNetwork(nn.Module):
     """Predicts all weights of the pyramid, and filters the image with them.
 
     It sees demodulated radiance, and turns it into what it filters by itself.
@@ -66,53 +63,97 @@ class PyramidNetwork(Pyramid):
         half: whether the U-Net begins at half the resolution.
     """
 
-    uses = frozenset({"albedo", "normal", "depth", "current", "length", ALBEDO_HISTORY})
-
     def __init__(self, widths: Sequence[int], kernel_size: int = 5, half: bool = False) -> None:
-        unet = UNet(9 + FEATURES, widths, len(widths) + half, _COARSE_CHANNELS, half)
-        super().__init__(unet, kernel_size**2, _PARTS, falloffs=len(SCALE_UNITS), spread=0.01)
+        super().__init__()
+        scales = len(widths) + half
+        self.unet = UNet(9 + FEATURES, widths, scales, _COARSE_CHANNELS, half)
+        self.taps = kernel_size**2
+        # Kernel, its three falloffs, what a scale keeps, and what it takes of the coarser one.
+        self.channels = [self.taps + 5] * (scales - 1) + [self.taps + 3]
+        extra = [sum(_PARTS.values())] + [0] * (scales - 1)
+        self.heads = nn.ModuleList(
+            Head(self.unet, scale, own + more)
+            for scale, (own, more) in enumerate(zip(self.channels, extra, strict=True))
+        )
+        for head in self.heads:
+            nn.init.normal_(head.weight, std=0.01)  # type: ignore[arg-type]
+            nn.init.zeros_(head.bias)  # type: ignore[arg-type]
+        rest = torch.cat([torch.full((count,), _AT_REST.get(name, 0.0)) for name, count in _PARTS.items()])
+        rest[-_FEATURE_TAPS // 2] = 4.0
+        rest[2] = 1.0  # the albedo of the pixels around
+        with torch.no_grad():
+            # A head of half the resolution predicts each channel for two by two pixels.
+            self.heads[0].bias[self.channels[0] * self.heads[0].side ** 2 :] = rest.repeat_interleave(  # type: ignore
+                self.heads[0].side ** 2  # type: ignore
+            )
+
+    @property
+    def needs(self) -> Needs:
+        """What the U-Net sees, and the radius of each filter at its scale behind it."""
+        radius = math.isqrt(self.taps) // 2
+        behind = sum((radius + 1) << scale for scale in range(self.unet.scales))
+        ways = (self.unet.reach(scale) + max(1 << scale, self.unet.stride) for scale in range(self.unet.scales))
+        return Needs(uses=_USES, reach=max(ways) + behind, stride=self.unet.multiple)
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """Exposure and depth scale of the whole image."""
+        return image_statistics(frame)
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`."""
+        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         exposure = frame.statistics["exposure"]
         image = frame.color * exposure
-        alone = image if frame.current is None else frame.current * exposure
-        albedo = torch.ones_like(image) if frame.albedo is None else modulation(frame.albedo)
+        albedo = modulation(features_of(frame)[0]) if frame.albedo is not None else torch.ones_like(image)
         before = modulation(frame.extra[ALBEDO_HISTORY]) if ALBEDO_HISTORY in frame.extra else albedo
         seen = torch.cat([input_of(frame, image), torch.log1p(image * albedo), before], 1)
-        predicted, parts = self.predict(seen, self._coarse(image, alone), image.dtype)
+        levels = self.unet(seen, self._coarse(frame, exposure))
+        sizes = _sizes(frame.size, len(levels))
+        predicted = [
+            head(level, size).to(torch.promote_types(image.dtype, torch.float32))
+            for head, level, size in zip(self.heads, levels, sizes, strict=True)
+        ]
+        parts = dict(zip(_PARTS, predicted[0][:, self.channels[0] :].split(list(_PARTS.values()), 1), strict=True))
+        predicted[0] = predicted[0][:, : self.channels[0]]
 
         # Features of the pixel, which may be of one sample, and what the samples around it say.
         features = torch.cat([albedo, *guides_of(frame)], 1)
         smooth, guides = kernel_conv(features, torch.softmax(parts["features"], 1)).split([3, 4], 1)
         matt = 1 - torch.sigmoid(parts["matt"])
+        alone = image if frame.current is None else frame.current * exposure
         color = torch.lerp(alone, image, torch.sigmoid(parts["history"]))
         others, ratio = carried(frame), _ratio(albedo, albedo, matt)
         if others is not None:
-            # Layers, which are parts of the color, and behind them an alpha, which is not.
-            count = len(frame.layers)
-            others = torch.cat([others[:, : 3 * count] * ratio.repeat(1, count, 1, 1), others[:, 3 * count :]], 1)
+            others = torch.cat(
+                [others[:, : 3 * (count := len(frame.layers))] * ratio.repeat(1, count, 1, 1), others[:, 3 * count :]],
+                1,
+            )
         light = [color * ratio, albedo, *([] if others is None else [others])]
         # Of the weights alone, in the last channel, the mean is what it is divided by.
-        worth = inside(parts["importance"])
+        worth = _inside(parts["importance"])
         weighted = torch.cat([*light, torch.ones_like(worth)], 1) * worth
-        found = self._filtered(weighted, predicted, guides)
-        mean = found[:, :-1] / found[:, -1:]
+        filtered = self._filtered(weighted, predicted, guides)
+        mean = filtered[:, :-1] / filtered[:, -1:]
         near, past, wide = torch.softmax(parts["albedo"], 1).split(1, 1)
         smooth = near * smooth + past * before + wide * mean[:, 3:6]
         gain = torch.exp(_MOST_GAIN * torch.tanh(parts["gain"]))
         result = mean[:, :3] * gain / _ratio(albedo, smooth, matt) / exposure
         return answered(frame, result, None if others is None else mean[:, 6:]), None
 
-    def _coarse(self, image: Tensor, alone: Tensor) -> list[Tensor]:
+    def _coarse(self, frame: Frame, exposure: Tensor) -> list[Tensor]:
         """At each coarser scale the logarithms of mean radiances, and how much single pixels of the frame differ.
 
         Over a block the means of the frame and of its history have little noise, so that a highlight that has moved, or
         light that has changed, shows as their difference.
         """
+        color = frame.color * exposure
+        alone = color if frame.current is None else frame.current * exposure
         single = alone.mean(1, keepdim=True)
-        moments = torch.cat([image, alone, single, single.square()], 1)
+        moments = torch.cat([color, alone, single, single.square()], 1)
         found: list[Tensor] = []
         for _ in range(self.unet.levels + self.unet.stride - 2):
             moments = downsample(moments)
@@ -122,29 +163,46 @@ class PyramidNetwork(Pyramid):
         return found[self.unet.stride - 1 :]
 
     def _filtered(self, light: Tensor, predicted: list[Tensor], guides: Tensor) -> Tensor:
-        """All scales with kernels that fall off where the guides differ."""
+        """Down: each scale keeps a part. Up: it is filtered together with what comes from the coarser scales."""
+        kept: list[Tensor] = []
+        for prediction in predicted[:-1]:
+            keep = _inside(prediction[:, -2:-1])
+            kept.append(keep * light)
+            light = downsample(light - kept[-1])
         guiding = [guides]
-        for _ in predicted[1:]:
+        for _ in kept:
             guiding.append(downsample(guiding[-1]))
-
-        def at(light: Tensor, prediction: Tensor, scale: int) -> Tensor:
-            guide = guiding[scale]
-            falloffs = softplus(prediction[:, self.taps : self.taps + len(SCALE_UNITS)], SCALE_UNITS)
-            return cross_bilateral_filter(
-                light,
-                prediction[:, : self.taps],
-                [guide[:, :3], guide[:, 3:]],
-                [falloffs[:, :1], falloffs[:, 1:2]],
-                falloffs[:, 2:],
-                border="renormalize",
-            )
-
-        return filtered(light, predicted, at)
+        # One for all scales: a tile of an image must not be filtered otherwise than the whole.
+        with one_backend(light):
+            for scale in reversed(range(len(predicted))):
+                prediction, guide = predicted[scale], guiding[scale]
+                if scale < len(kept):
+                    size = (guide.shape[-2], guide.shape[-1])
+                    light = kept[scale] + torch.sigmoid(prediction[:, -1:]) * upsample(light, size)
+                falloffs = softplus(prediction[:, self.taps : self.taps + 3], SCALE_UNITS)
+                light = cross_bilateral_filter(
+                    light,
+                    prediction[:, : self.taps],
+                    [guide[:, :3], guide[:, 3:]],
+                    [falloffs[:, :1], falloffs[:, 1:2]],
+                    falloffs[:, 2:],
+                    border="renormalize",
+                )
+        return light
 
 
 def _ratio(albedo: Tensor, smooth: Tensor, matt: Tensor) -> Tensor:
     """Albedo over the effective albedo of what is smooth: from demodulated radiance to what is filtered."""
     return albedo / torch.lerp(torch.ones_like(smooth), smooth, matt)
+
+
+def _inside(logit: Tensor) -> Tensor:
+    """In [_LEAST, 1 - _LEAST]: nothing is ever lost altogether, and no mean is 0 / 0."""
+    return _LEAST + (1 - 2 * _LEAST) * torch.sigmoid(logit)
+
+
+def _sizes(size: tuple[int, int], scales: int) -> list[tuple[int, int]]:
+    return [(-(-size[0] // side), -(-size[1] // side)) for side in (1 << scale for scale in range(scales))]
 
 
 def _pyramid(

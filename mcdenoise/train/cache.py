@@ -292,7 +292,6 @@ def _build(folder: Path, plan: _Plan) -> None:
     """Decode the frames one after the other; only features in the making are held in memory."""
     sequence = plan.sequence
     steps = {start: plan.begin(start[1]) for start in plan.starts}
-    prepare = plan.front.prepare()
     features: dict[str, list[Array]] = {_feature_name(name): [] for name in plan.shared}
     features |= {_feature_name(name, k): [] for name in plan.own for k in range(plan.realisations)}
     camera: Tensor | None = None
@@ -305,10 +304,9 @@ def _build(folder: Path, plan: _Plan) -> None:
         for i, number in enumerate(sequence.numbers):
             for realisation in range(plan.realisations):
                 frame = _read(sequence, number, realisation, digest)
-                prepared = prepare(frame)
                 for first in plan.firsts:
                     if first <= i:
-                        seen = dict(steps[first, realisation](prepared).items())
+                        seen = dict(steps[first, realisation](frame).items())
                         noisy = torch.cat([seen[name] for name in plan.front.parts], 1)
                         files[first, realisation].write(noisy.numpy().tobytes())
                 if realisation == 0 or plan.own:

@@ -15,16 +15,15 @@ from torch.nn.functional import normalize
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, Hints
 from mcdenoise.models.accumulated import ALBEDO_HISTORY
-from mcdenoise.models.oidn_temporal import CLEAN, NOISY
 from mcdenoise.nn.inputs import auto_exposure
-from mcdenoise.ops import NO_ALBEDO, demodulate, motion_from_position
+from mcdenoise.ops import NO_ALBEDO, demodulate
 from mcdenoise.train.cache import Array, Shot
 
 _KNOWN = frozenset(field.name for field in fields(Frame))
 
 
 # What holds radiance, colours, and vectors of the world: all else has no channels that could be shuffled.
-LIGHT = frozenset({"color", "current", CLEAN, NOISY, "reference", "diffuse", "specular", "emission"})
+LIGHT = frozenset({"color", "current", "reference", "diffuse", "specular", "emission"})
 _COLORED = LIGHT | {"albedo", ALBEDO_HISTORY, "specular_albedo", "variance"}
 _WORLD = frozenset({"normal", "position", "previous_position"})
 
@@ -90,8 +89,7 @@ class ClipSampler:
     surfaces send to each other, so albedos are left alone.
 
     Args:
-        shots: those shorter than ``frames`` are skipped, but for stills of which there are several realisations of the
-            noise: in their clips nothing moves, and each frame has another noise than the one before.
+        shots: those shorter than ``frames`` are skipped.
         frames: T of a clip.
         crop: side of the square crop in pixels.
         lamps: chance that a clip gets rectangles of constant radiance, without noise, up to 30 times as bright as its
@@ -102,8 +100,6 @@ class ClipSampler:
         tint: each colour channel of the light is scaled by up to so many stops, up or down.
         gloss: chance that what has no albedo in a clip (mirrors, glass, black gloss, and lamps) is darker, by up to six
             stops: emitters are common there, and a network that knows nothing else takes a black screen for one.
-        reorder: chance that the frames of a clip come in another order, where positions and cameras tell the motion
-            then: from one to the next the camera moves by several steps, back and forth.
 
     Raises:
         InputError: no shot is long enough, or one is smaller than the crop.
@@ -120,13 +116,11 @@ class ClipSampler:
         exposure: float = 0.0,
         tint: float = 0.0,
         gloss: float = 0.0,
-        reorder: float = 0.0,
     ) -> None:
-        self.shots = [shot for shot in shots if _gives_clips(len(shot), len(shot.colors), frames)]
+        self.shots = [shot for shot in shots if len(shot) >= frames]
         self.frames, self.crop = frames, crop
         self.lamps, self.key, self.exposure, self.tint, self.gloss = lamps, key, exposure, tint, gloss
-        self.reorder = reorder
-        check_sizes([(len(shot), len(shot.colors), shot.size) for shot in self.shots], frames, crop)
+        check_sizes([(len(shot), shot.size) for shot in self.shots], frames, crop)
         self.chances = torch.tensor([float(len(shot)) for shot in self.shots])
         self.flips_and_turns = nn.Sequential(
             RandomHorizontalFlip(p=0.5),
@@ -148,25 +142,18 @@ class ClipSampler:
     def _draw_one(self) -> dict[str, Tensor]:
         shot = self.shots[int(torch.multinomial(self.chances, 1))]
         height, width = shot.size
-        realisation, start = _randint(len(shot.colors)), _randint(max(len(shot) - self.frames, 0) + 1)
+        realisation, start = _randint(len(shot.colors)), _randint(len(shot) - self.frames + 1)
         top, left = _randint(height - self.crop + 1), _randint(width - self.crop + 1)
         order, axes = torch.randperm(3).tolist(), torch.randperm(3).tolist()
         turn = self._draw_turn()
-        still = len(shot) < self.frames
-        read = [
-            shot.read(
-                slice(start, start + (1 if still else self.frames)),
-                slice(top, top + self.crop),
-                slice(left, left + self.crop),
-                realisation=(realisation + t) % len(shot.colors),
-                channels=dict.fromkeys(_COLORED, order) | dict.fromkeys(_WORLD, axes),
-                turn=turn.image,
-            )
-            for t in range(self.frames if still else 1)
-        ]
-        clip = {name: torch.cat([each[name] for each in read]) for name in read[0]}
-        if still and "motion" in clip:
-            clip["motion"].zero_()
+        clip = shot.read(
+            slice(start, start + self.frames),
+            slice(top, top + self.crop),
+            slice(left, left + self.crop),
+            realisation=realisation,
+            channels=dict.fromkeys(_COLORED, order) | dict.fromkeys(_WORLD, axes),
+            turn=turn.image,
+        )
         signs = (torch.randint(2, (3, 1, 1)) * 2 - 1).float()
         for name in _WORLD & clip.keys():
             clip[name] *= signs
@@ -177,8 +164,6 @@ class ClipSampler:
             view[:, :3] = view[:, axes] * signs.reshape(3, 1)
             view[..., :2] = turn.vectors(view[..., :2].mT).mT
             clip["view_projection"] = view
-        if self.reorder and not still and float(torch.rand(())) < self.reorder:
-            clip = _reordered(clip, torch.randperm(self.frames))
         stops = self.exposure * (2 * torch.rand(1) - 1) + self.tint * (2 * torch.rand(3) - 1)
         factor = torch.exp2(stops).reshape(3, 1, 1)
         if self.key:
@@ -214,7 +199,7 @@ class ClipSampler:
         albedo = torch.rand(1, 1, 1, 1).expand(1, 3, 1, 1) * _randint(2)
         normal = normalize(torch.randn(1, 3, 1, 1), dim=1)
         light = demodulate(radiance, albedo) if demodulated else radiance
-        painted = {name: light for name in ("color", "current", CLEAN, NOISY)}
+        painted = {name: light for name in ("color", "current")}
         painted |= {"albedo": albedo, ALBEDO_HISTORY: albedo, "normal": normal, "reference": radiance}
         # Depth, motion and history stay: lamps hang on whatever is there. Nor do they reflect, or have noise.
         painted |= {"emission": radiance} | dict.fromkeys(("diffuse", "specular", "variance"), torch.zeros(1, 3, 1, 1))
@@ -222,37 +207,18 @@ class ClipSampler:
             clip[name][..., top : top + height, left : left + width] = painted[name]
 
 
-def _reordered(clip: dict[str, Tensor], order: Tensor) -> dict[str, Tensor]:
-    """The frames in another order, without what tells the motion from one to the next alone."""
-    if not clip.keys() >= {"position", "view_projection"}:
-        return clip
-    reordered = {name: buffer[order] for name, buffer in clip.items()}
-    if "motion" in clip:
-        before = reordered["view_projection"].roll(1, 0)
-        reordered["motion"] = motion_from_position(reordered["position"], before)
-        reordered["motion"][0] = torch.inf
-    if "previous_position" in clip:
-        # What moves by itself has another place now, which the test of the history finds.
-        reordered["previous_position"] = reordered["position"]
-    return reordered
-
-
-def _gives_clips(length: int, realisations: int, frames: int) -> bool:
-    return length >= frames or (length == 1 and realisations > 1)
-
-
-def check_sizes(shots: Sequence[tuple[int, int, tuple[int, int]]], frames: int, crop: int) -> None:
+def check_sizes(shots: Sequence[tuple[int, tuple[int, int]]], frames: int, crop: int) -> None:
     """See that clips can be cut from shots.
 
     Args:
-        shots: of each the number of frames and of realisations of their noise, and height and width in pixels.
+        shots: number of frames, and height and width in pixels of each.
         frames: T of a clip.
         crop: side of the square crop in pixels.
 
     Raises:
         InputError: no shot is long enough, or one that is is smaller than the crop.
     """
-    sizes = [size for length, realisations, size in shots if _gives_clips(length, realisations, frames)]
+    sizes = [size for length, size in shots if length >= frames]
     if not sizes:
         raise InputError(f"training clips: expected a sequence of at least {frames} frames, found none")
     for size in sizes:

@@ -38,7 +38,6 @@ class TrainConfig:
         schedule: constant, or cosine down to 0 after a warm-up of 200 steps.
         temporal_weight: of the temporal loss.
         display_weight: of the error on a display, see :func:`mcdenoise.train.losses.display_error`.
-        relative: each clip's error counts in parts of that of the image which the trained part of the model is given.
         key: each clip is brought to this typical radiance, a middle gray such as 0.2, before its light is scaled; 0
             leaves it as it was rendered.
         gradient_norm: largest norm of a step's gradient; 0 does not limit it.
@@ -55,7 +54,6 @@ class TrainConfig:
         lamps: chance that a clip gets lamps: rectangles of constant radiance, without noise, brighter than the rest.
         exposure: the light of a clip is scaled by up to so many stops.
         tint: each colour channel of the light is scaled by up to so many stops.
-        reorder: chance that the frames of a clip come in another order, see :class:`mcdenoise.train.clips.ClipSampler`.
         gloss: chance that what has no albedo in a clip (mirrors, glass, lamps) is darker, by up to six stops.
         precision: bfloat16 runs convolutions in bfloat16.
         seed: of weights and clips.
@@ -73,7 +71,6 @@ class TrainConfig:
     schedule: Schedule = "constant"
     temporal_weight: float = 0.1
     display_weight: float = 0.0
-    relative: bool = False
     key: float = 0.0
     gradient_norm: float = 0.0
     ema: float = 0.0
@@ -85,7 +82,6 @@ class TrainConfig:
     exposure: float = 0.0
     tint: float = 0.0
     gloss: float = 0.0
-    reorder: float = 0.0
     precision: Precision = "float32"
     seed: int = 0
 
@@ -157,7 +153,7 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
         raise InputError(f"learning_rate: expected a positive number, found {config.learning_rate}")
     if not 0 <= config.ema < 1:
         raise InputError(f"ema: expected in [0, 1), found {config.ema}")
-    for name in ("lamps", "gloss", "reorder"):
+    for name in ("lamps", "gloss"):
         if not 0 <= settings[name] <= 1:
             raise InputError(f"{name}: expected in [0, 1], found {settings[name]}")
     _ = config.model_settings, config.loss_weights

@@ -80,7 +80,7 @@ class DataFolders:
             _check_trainable(sequence, wanted)
         features = used.intersection(*(features_of(sequence) for sequence in opened))
         folders = DataFolders(config, front, features, opened[: len(training)], opened[len(training) :])
-        lengths = [(len(s) - len(folders._held_out(s)), s.realisations, s.size) for s in folders.training]
+        lengths = [(len(s) - len(folders._held_out(s)), s.size) for s in folders.training]
         check_sizes(lengths, config.frames, config.crop)
         return folders
 
@@ -128,7 +128,6 @@ class DataFolders:
             exposure=config.exposure,
             tint=config.tint,
             gloss=config.gloss,
-            reorder=config.reorder,
         )
         return TrainingData(sampler, watched, description)
 

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Skipping, State, Wrapper
 from mcdenoise.models.accumulated import ALBEDO_HISTORY, CAUSTICS
-from mcdenoise.models.oidn_temporal import CLEAN, EXACT, NOISY, AfterOidn
 from mcdenoise.ops import remodulate
 
 # What comes of accumulation, with the number of channels.
@@ -20,7 +19,7 @@ ACCUMULATED: Mapping[str, int] = {"color": 3, "current": 3, "length": 1}
 
 @dataclass(frozen=True)
 class Front:
-    """Wrappers without weights, up to the last that denoises or accumulates; none where a model does not begin so.
+    """Wrappers without weights, up to the one that accumulates; none where a model does not begin with them.
 
     Args:
         wrappers: outermost first, each with the settings of its constructor.
@@ -31,7 +30,7 @@ class Front:
     @property
     def accumulates(self) -> bool:
         """Whether frames come out with a history: with ``current`` and ``length``."""
-        return any(kind is Accumulated for kind, _ in self.wrappers)
+        return bool(self.wrappers)
 
     @property
     def demodulates(self) -> bool:
@@ -39,15 +38,10 @@ class Front:
         return any(kind is Demodulated for kind, _ in self.wrappers)
 
     @property
-    def denoises(self) -> bool:
-        """Whether frames come out denoised, with the noisy radiance beside."""
-        return any(kind is AfterOidn for kind, _ in self.wrappers)
-
-    @property
     def parts(self) -> dict[str, int]:
         """Names of the buffers that each noise of its own changes, with their channels: radiance, and histories."""
         if not self.accumulates:
-            return {"color": 3, **({CLEAN: 3, NOISY: 3, EXACT: 1} if self.denoises else {})}
+            return {"color": 3}
         also = {name for _, settings in self.wrappers for name in settings.get("also", ())}
         history = {ALBEDO_HISTORY: 3} if "albedo" in also else {}
         return {**ACCUMULATED, **history}
@@ -57,13 +51,8 @@ class Front:
         """Everything that the frames depend on, as JSON knows it."""
         return [[kind.__name__, settings] for kind, settings in self.wrappers]
 
-    def prepare(self) -> Callable[[Frame], Frame]:
-        """What is made of each frame whatever shot it is in: Open Image Denoise is slow, and has no history."""
-        denoisers = [AfterOidn(_Seen(), **settings) for kind, settings in self.wrappers if kind is AfterOidn]
-        return denoisers[0].before if denoisers else lambda frame: frame
-
     def begin(self, *, keep_fireflies: bool = False) -> Callable[[Frame], Frame]:
-        """What makes of each prepared frame of one shot what the rest of the model sees.
+        """What makes of each frame of one shot what the rest of the model sees.
 
         Args:
             keep_fireflies: whatever the shot looks like, take its fireflies for caustics.
@@ -71,8 +60,6 @@ class Front:
         seen = _Seen()
         model: Model = seen
         for kind, settings in reversed(self.wrappers):
-            if kind is AfterOidn:
-                continue
             caustics = {"firefly_limit": CAUSTICS} if keep_fireflies and kind is Accumulated else {}
             model = kind(model, **{**settings, **caustics})
         state: State = None
@@ -127,10 +114,10 @@ def split(model: Model) -> tuple[Front, Model]:
     wrappers: list[tuple[type[Wrapper], dict[str, Any]]] = []
     found, rest = 0, model
     # Not those that are derived from them, which may do anything.
-    while isinstance(model, Wrapper) and type(model) in (AfterOidn, Demodulated, Accumulated):
+    while isinstance(model, Wrapper) and type(model) in (Demodulated, Accumulated):
         wrappers.append((type(model), _settings(model)))
         model = model.inner
-        if wrappers[-1][0] in (AfterOidn, Accumulated):
+        if wrappers[-1][0] is Accumulated:
             found, rest = len(wrappers), model
     front = Front(tuple(wrappers[:found]))
     while type(rest) is Skipping:

@@ -111,8 +111,6 @@ def train(
     front, rest = split(network)
     if config.keep_fireflies and not front.accumulates:
         raise InputError("keep_fireflies: expected a model that begins with Accumulated, found another")
-    if config.relative and front.demodulates:
-        raise InputError("relative: expected a model that is given radiance with its albedo, found one without")
     folders = DataFolders.open(config, front, rest.needs, sequences, validation or [])
 
     run, settled = RunFolder(out), dataclasses.asdict(config)
@@ -227,8 +225,7 @@ class Trainer:
         with _drawn_resolutions(self.network) if self.config.draw_resolutions else nullcontext():
             output = self.model(clip.buffers)
         weights = {"temporal_weight": self.config.temporal_weight, "display_weight": self.config.display_weight}
-        relative_to = clip["color"] if self.config.relative else None
-        loss = stage_loss(output, clip["reference"], self.losses, **weights, relative_to=relative_to)
+        loss = stage_loss(output, clip["reference"], self.losses, **weights)
         self.stepper.zero_grad()
         self.fabric.backward(loss)
         norm = self.fabric.clip_gradients(

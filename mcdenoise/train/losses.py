@@ -12,7 +12,6 @@ from mcdenoise.models import Output
 
 RESULT = "image"
 _DARK = 1e-3
-_LEAST = 1e-3  # of an error that another is divided by
 
 
 def stage_loss(
@@ -22,7 +21,6 @@ def stage_loss(
     *,
     temporal_weight: float = 0.1,
     display_weight: float = 0.0,
-    relative_to: Tensor | None = None,
 ) -> Tensor:
     """The total loss: spatial and temporal SMAPE of the image, its error on a display, and those of stages before it.
 
@@ -35,8 +33,6 @@ def stage_loss(
         weights: of the result, ``"image"``, and of stages by name; those without one do not count.
         temporal_weight: ``w_t``, the paper's ``w_c = w_d``, 0.1; 0 leaves the temporal loss out.
         display_weight: ``w_d`` of :func:`display_error`; 0, as in the paper, leaves it out.
-        relative_to: an image of the same shape: each clip's error counts in parts of that which this image has, so that
-            clips of little noise are learnt from as much as those of much.
 
     Returns:
         A scalar, the mean over the batch.
@@ -55,17 +51,15 @@ def stage_loss(
         0.0
     """
     images = {RESULT: output.image, **output.stages}
-
-    def errors(image: Tensor) -> Tensor:
-        total = smape_linear(image, reference).mean(1)
+    loss = reference.new_zeros(())
+    for stage, weight in weights.items():
+        loss = loss + weight * smape_linear(images[stage], reference).mean()
         if temporal_weight:
-            total = total + temporal_weight * temporal_smape_linear(image, reference).mean(1)
+            flicker = temporal_smape_linear(images[stage], reference).mean()
+            loss = loss + weight * temporal_weight * flicker
         if display_weight:
-            total = total + display_weight * display_error(image, reference).mean(1)
-        return total
-
-    loss = sum(weight * errors(images[stage]) for stage, weight in weights.items()) + reference.new_zeros(())
-    return (loss if relative_to is None else loss / (errors(relative_to) + _LEAST)).mean()
+            loss = loss + weight * display_weight * display_error(images[stage], reference).mean()
+    return loss
 
 
 def display_error(image: Tensor, reference: Tensor) -> Tensor:

@@ -1,32 +1,27 @@
-"""Open Image Denoise with a network behind it: what it gives untrained, what it can learn to give, and its training."""
+"""Open Image Denoise made steady: what of it and of the frame before is shown, and where it is ahead."""
 
 from __future__ import annotations
 
 import copy
 import importlib.util
 import itertools
-import math
 import sys
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
-from toys import frame_of, refused, small, whole_frame
+from toys import frame_of, refused, whole_frame
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import create_model, pretrained_models
+from mcdenoise.models import create_model
 from mcdenoise.models.noisy import Noisy
 from mcdenoise.models.oidn import Oidn
-from mcdenoise.models.oidn_temporal import CLEAN, EXACT, NOISY, AfterOidn, TemporalNetwork, has_exact_features
+from mcdenoise.models.oidn_temporal import CLEAN, EXACT, NOISY, AfterOidn, Steadied, has_exact_features
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
 from mcdenoise.nn.oidn import oidn_exposure
-from mcdenoise.train.cache import open_cached
-from mcdenoise.train.clips import Clip
-from mcdenoise.train.front import split
-from mcdenoise.train.unroll import unroll
 
 if importlib.util.find_spec("pyoidn") is None:
     pytest.skip("Open Image Denoise is in the extra mcdenoise[oidn]", allow_module_level=True)
@@ -35,48 +30,35 @@ NAME = "oidn_temporal"
 
 
 def given(height: int = 21, width: int = 34, weight: float = 1.0) -> Frame:
-    """What the network sees: five images, all different."""
+    """What the last step sees: five images, all different."""
     extra = {name: torch.rand(1, 3, height, width) + 0.1 for name in (CLEAN, NOISY, PREVIOUS, PREVIOUS_LIGHT)}
     extra[PREVIOUS_WEIGHT] = torch.full((1, 1, height, width), weight)
     return frame_of(height, width, extra=extra)
 
 
-def forced(*logits: float) -> TemporalNetwork:
-    """A network that predicts the same everywhere: logarithms of three parts, of the history's weight, of two doubts."""
-    network = TemporalNetwork((8, 8))
-    with torch.no_grad():
-        network.head.bias.copy_(torch.tensor(logits).repeat_interleave(4))
-    return network
-
-
-def test_a_still_untrained_is_the_mean_of_both_ways() -> None:
+def test_a_still_is_the_mean_of_both_ways() -> None:
     model = create_model(NAME, threads=1)
     frame = frame_of(24, 40)
     noisy, clean = (Oidn("high", auxiliary, threads=1)(frame)[0].image for auxiliary in ("noisy", "clean"))
     output, _ = model(frame)
-    samples = math.exp(-8 * math.tanh(5 / 8))
     # Normals at random are no exact ones.
-    expected = (noisy + clean + samples * frame.color) / (2 + samples)
-    torch.testing.assert_close(output.image, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(output.image, (noisy + clean) / 2)
     torch.testing.assert_close(output.stages["oidn"], noisy)
     torch.testing.assert_close(output.stages["oidn_clean"], clean)
 
 
 @pytest.mark.parametrize("exact", [0.0, 1.0])
 def test_weights_written_out_in_float64(exact: float) -> None:
-    logits = (0.3, -0.7, 1.1, 2.2, -1.5, -2.5)
-    height, width = 9, 18
+    height, width, history = 9, 18, 7.0
     frame = given(height, width).to(torch.float64)
     same = torch.rand(1, 1, height, width, dtype=torch.float64)
     extra = {**frame.extra, PREVIOUS_WEIGHT: same, EXACT: torch.full_like(same, exact)}
     frame = frame.replace(extra=extra)
-    image = forced(*logits).double()(frame)[0].image
-    p = 8 * torch.tanh(torch.tensor(logits, dtype=torch.float64) / 8)
-    parts = torch.softmax(torch.stack([p[0], p[1] + math.log(3) * exact, p[2]]), 0)
+    image = Steadied(history)(frame)[0].image
     exposure = oidn_exposure(frame.color).item()
     now, clean, noisy = (each[0] * exposure for each in (frame.color, extra[CLEAN], extra[NOISY]))
     before = extra[PREVIOUS_LIGHT if exact else PREVIOUS][0] * exposure
-    mean = (now + clean) / 2
+    mean = (now + 3 * clean) / 4 if exact else (now + clean) / 2
 
     def over(image: Tensor, row: int, column: int, window: int) -> Tensor:
         """The sum over the pixels of the window that are in the image, in parts of all of the window's."""
@@ -89,37 +71,33 @@ def test_weights_written_out_in_float64(exact: float) -> None:
         inside = over(torch.ones_like(same[0]), row, column, 15)
         deviation = over((noisy - mean).abs(), row, column, 15).mean()
         noise = deviation / (over(mean, row, column, 15).mean() + 0.01 * inside + 1e-6) + 0.02
-        logarithm = p[3]
-        for doubt, window, least in ((p[4], 3, 4), (p[5], 15, 12)):
+        n = history * same[0, 0, row, column]
+        for window, doubt in ((3, 4), (15, 12)):
             a, b, count = (
                 over(part * same[0], row, column, window) for part in (before, mean, torch.ones_like(same[0]))
             )
             change = (a - b).abs().mean() / ((a + b).mean() / 2 + 0.01 * count + 1e-6)
-            logarithm = logarithm - least * torch.exp(doubt) * change / noise
-        n = same[0, 0, row, column] * torch.exp(logarithm)
-        here = (parts[:, None] * torch.stack([each[:, row, column] for each in (now, clean, noisy)])).sum(0)
-        expected = (here + n * before[:, row, column]) / (1 + n) / exposure
+            n = n * torch.exp(-doubt * change / noise)
+        expected = (mean[:, row, column] + n * before[:, row, column]) / (1 + n) / exposure
         torch.testing.assert_close(image[0, :, row, column], expected)
 
 
-@pytest.mark.parametrize("index", range(4))
-def test_it_can_give_each_of_what_it_weighs(index: int) -> None:
+def test_where_nothing_speaks_against_it_ten_parts_are_of_the_frame_before() -> None:
     frame = given()
-    logits = [-50.0] * 6
-    logits[index] = 50
-    if index == 3:
-        frame = frame.replace(extra={**frame.extra, PREVIOUS: (frame.color + frame.extra[CLEAN]) / 2})
-    image = forced(*logits)(frame)[0].image
-    wanted = frame.color if index == 0 else frame.extra[(CLEAN, NOISY, PREVIOUS)[index - 1]]
-    # Logarithms are at least -8, and images differ by less than 2.
-    torch.testing.assert_close(image, wanted, rtol=0, atol=2 * math.exp(-8))
+    mean = (frame.color + frame.extra[CLEAN]) / 2
+    # Noise that is gone in the means of any window, and stays in the samples.
+    rows, columns = torch.meshgrid(torch.arange(21), torch.arange(34), indexing="ij")
+    before = mean * (1 + 0.001 * (-1) ** (rows + columns))
+    noisy = mean * (1 + 0.9 * (-1) ** (rows + columns))
+    extra = {**frame.extra, PREVIOUS: before, NOISY: noisy}
+    image = Steadied()(frame.replace(extra=extra))[0].image
+    torch.testing.assert_close((image - mean) / (before - mean), torch.full_like(mean, 10 / 11), rtol=0.02, atol=0)
 
 
-def test_an_image_of_another_surface_weighs_nothing_whatever_is_predicted() -> None:
+def test_an_image_of_another_surface_weighs_nothing() -> None:
     frame = given(weight=0.0)
-    network = forced(0, 0, 0, 50, -50, -50)
     other = frame.replace(extra={**frame.extra, PREVIOUS: torch.full_like(frame.color, 1e4)})
-    assert torch.equal(network(frame)[0].image, network(other)[0].image)
+    assert torch.equal(Steadied()(frame)[0].image, Steadied()(other)[0].image)
 
 
 def test_light_that_has_moved_on_counts_little() -> None:
@@ -129,44 +107,33 @@ def test_light_that_has_moved_on_counts_little() -> None:
     before = now.clone()
     before[..., 10:16, 10:16] = 5
     extra = {**frame.extra, CLEAN: now, NOISY: now, PREVIOUS: before, PREVIOUS_LIGHT: before}
-    image = TemporalNetwork((8, 8))(frame.replace(color=now, extra=extra))[0].image
+    image = Steadied()(frame.replace(color=now, extra=extra))[0].image
     # Of what would be ten parts of 5 in eleven.
     assert image.max() < 0.2001
 
 
-def test_a_gradient_reaches_every_weight_and_none_is_asked_of_oidn() -> None:
-    model = small(NAME, threads=1).train()
-    torch.nn.init.normal_(model.inner.inner.inner.head.weight, std=0.1)  # type: ignore[attr-defined]
-    state = None
-    for seed in range(2):
-        output, state = model(whole_frame(model, 24, 40, seed=seed), state)
-    output.image.sum().backward()
-    for name, weight in model.named_parameters():
-        assert weight.grad is not None, name
-        assert weight.grad.isfinite().all(), name
-        assert weight.grad.abs().max() > 0, name
+def test_none_is_asked_of_oidn_for_a_gradient() -> None:
+    model = create_model(NAME, threads=1)
     frame = whole_frame(model, 24, 40)
     color = frame.color.requires_grad_()
     assert "the library has no derivatives" in refused(lambda: model(frame.replace(color=color)))
 
 
-def test_gradients_of_the_network_in_float64() -> None:
-    torch.manual_seed(2)
-    network = TemporalNetwork((6, 8)).double()
-    torch.nn.init.normal_(network.head.weight, std=0.02)
+def test_gradients_of_the_last_step_in_float64() -> None:
     frame = given(9, 10).to(torch.float64)
 
-    def image(previous: Tensor, bias: Tensor) -> Tensor:
-        handed = frame.replace(extra={**frame.extra, PREVIOUS: previous})
-        return torch.func.functional_call(network, {"head.bias": bias}, (handed,))[0].image
+    def image(previous: Tensor, clean: Tensor) -> Tensor:
+        handed = frame.replace(extra={**frame.extra, PREVIOUS: previous, CLEAN: clean})
+        return Steadied()(handed)[0].image
 
-    inputs = (frame.extra[PREVIOUS].clone().requires_grad_(), network.head.bias.detach().clone().requires_grad_())
+    inputs = tuple(frame.extra[name].clone().requires_grad_() for name in (PREVIOUS, CLEAN))
     assert torch.autograd.gradcheck(image, inputs, atol=1e-6, fast_mode=True)
+    assert torch.autograd.gradgradcheck(image, inputs, atol=1e-5, fast_mode=True)
 
 
 def test_tiles_are_the_whole_image_which_oidn_sees() -> None:
-    whole = Denoiser(small(NAME, threads=1))
-    tiles = Denoiser(small(NAME, threads=1), tile=64)
+    whole = Denoiser(create_model(NAME, threads=1))
+    tiles = Denoiser(create_model(NAME, threads=1), tile=64)
     for seed in range(2):
         frame = whole_frame(whole.model, 200, 330, seed=seed)
         torch.testing.assert_close(tiles(frame), whole(frame), rtol=1e-4, atol=1e-4)
@@ -175,7 +142,7 @@ def test_tiles_are_the_whole_image_which_oidn_sees() -> None:
 
 @pytest.mark.parametrize("names", [(), ("albedo",), ("albedo", "normal"), ("normal", "depth"), ("motion",)])
 def test_without_features(names: tuple[str, ...]) -> None:
-    denoiser = Denoiser(small(NAME, threads=1))
+    denoiser = Denoiser(create_model(NAME, threads=1))
     for seed in range(2):
         frame = whole_frame(denoiser.model, 24, 40, seed=seed)
         image = denoiser(Frame(frame.color, **{name: frame.buffer(name) for name in names}))
@@ -184,7 +151,7 @@ def test_without_features(names: tuple[str, ...]) -> None:
 
 
 def test_a_copy_has_a_library_of_its_own() -> None:
-    model = small(NAME, threads=1, quality="fast")
+    model = create_model(NAME, threads=1, quality="fast")
     other = copy.deepcopy(model)
     frame = whole_frame(model, 24, 40)
     assert other._oidn is not model._oidn
@@ -232,23 +199,7 @@ def test_the_network_is_told_whether_features_are_exact(exact: bool) -> None:
     assert torch.equal(told, torch.full_like(told, float(exact)))
 
 
-def test_training_sees_what_the_whole_model_sees(small_sequence: Path, tmp_path: Path) -> None:
-    model = small(NAME, threads=1)
-    assert isinstance(model, AfterOidn)
-    front, rest = split(model)
-    sequence = open_sequence(small_sequence)
-    features = {"albedo", "normal", "depth", "motion", "position", "view_projection"}
-    (shot,) = open_cached(sequence, tmp_path, front=front, features=features, firsts=[0]).shots
-    output = unroll(rest, Clip.of(shot.read()))
-    state = None
-    for t, number in enumerate(sequence.numbers):
-        expected, state = model(sequence.frame(number).validate()[0], state)
-        # Motion is kept in half precision where nothing is lost by that, and computed of positions otherwise.
-        torch.testing.assert_close(output.image[:, t], expected.image, rtol=2e-3, atol=2e-3)
-
-
-@pytest.mark.skipif(NAME not in pretrained_models(), reason="there are no weights yet")
-def test_with_its_weights_it_is_ahead_of_oidn(small_sequence: Path) -> None:
+def test_it_is_ahead_of_oidn(small_sequence: Path) -> None:
     sequence = open_sequence(small_sequence)
     denoiser, oidn = Denoiser(NAME, threads=1), [Denoiser("oidn", auxiliary=each) for each in ("noisy", "clean")]
     errors = torch.zeros(3)
@@ -262,3 +213,4 @@ def test_with_its_weights_it_is_ahead_of_oidn(small_sequence: Path) -> None:
 
 def test_refuses_what_is_no_setting() -> None:
     assert "quality: expected one of fast, balanced, high" in refused(lambda: create_model(NAME, quality="best"))
+    assert "history: expected above 0, found 0" in refused(lambda: create_model(NAME, history=0))

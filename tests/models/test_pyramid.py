@@ -10,9 +10,8 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Output, create_model
-from mcdenoise.models._pyramid import inside
 from mcdenoise.models.accumulated import ALBEDO_HISTORY
-from mcdenoise.models.pyramid import PyramidNetwork, _ratio
+from mcdenoise.models.pyramid import _PARTS, PyramidNetwork, _inside, _ratio
 
 SIZE = (21, 34)
 
@@ -71,7 +70,7 @@ def test_the_ratio_of_albedos_leaves_matt_light_alone() -> None:
 
 
 def test_a_pixel_is_never_worth_nothing() -> None:
-    worth = inside(torch.tensor([-1e30, 0.0, 1e30]))
+    worth = _inside(torch.tensor([-1e30, 0.0, 1e30]))
     assert worth.tolist() == pytest.approx([1e-3, 0.5, 1 - 1e-3], rel=1e-6)
 
 
@@ -131,7 +130,7 @@ def test_the_albedo_of_what_is_multiplied_back_may_be_that_of_the_history() -> N
         for head in net.heads:
             head.weight.zero_()  # type: ignore[operator]
         # Of the history, the second of three, and of what is not matt.
-        for place, logit in ((3, 1000.0), (sum(list(net.parts.values())[:3]), -1000.0)):
+        for place, logit in ((3, 1000.0), (sum(list(_PARTS.values())[:3]), -1000.0)):
             net.heads[0].bias[net.channels[0] + place] = logit  # type: ignore[index,operator]
     noisy, history = (torch.rand(1, 3, *SIZE, dtype=torch.float64) * 0.9 + 0.05 for _ in range(2))
     light = torch.ones_like(noisy)

@@ -246,47 +246,6 @@ def test_the_camera_sees_the_crop_as_the_motion_has_it() -> None:
     torch.testing.assert_close(found, clip["motion"][:, 1], rtol=1e-4, atol=2e-4)
 
 
-def test_a_still_of_several_noises_is_a_clip_in_which_nothing_moves() -> None:
-    stack = numbered(1)
-    features = {"reference": stack[:, :3].numpy(), "motion": torch.full((1, 2, 6, 7), torch.inf).numpy()}
-    colors = tuple((stack[:, :3] + 1e4 * k).numpy() for k in range(2))
-    still = Shot(colors, features, parts={"color": 3})
-    clip = ClipSampler([still], 3, 4).draw(list(range(20)))
-    noises = (clip["color"] - clip["reference"]) / 1e4
-    assert torch.equal(noises.amin((2, 3, 4)), noises.amax((2, 3, 4)))
-    order = noises[:, :, 0, 0, 0]
-    assert {tuple(each) for each in order.tolist()} == {(0, 1, 0), (1, 0, 1)}
-    assert torch.equal(clip["reference"][:, 0], clip["reference"][:, 2])
-    assert not clip["motion"].any()
-    alone = Shot(colors[:1], features, parts={"color": 3})
-    assert "at least 3 frames, found none" in refused(lambda: ClipSampler([alone], 3, 4))
-
-
-def test_frames_in_another_order_move_as_their_cameras_say() -> None:
-    torch.manual_seed(0)
-    view = torch.tensor([[1.1, 0.2, 0.1, 0.1], [-0.1, 1.3, 0.0, -0.2], [0.1, 0.1, 1.0, 1.0], [0.2, 0.3, 0.1, 1.5]])
-    position = 2 * torch.rand(4, 3, 9, 9) - 1
-    features = {
-        "position": position,
-        "motion": torch.rand(4, 2, 9, 9),
-        "view_projection": torch.stack([view + 0.01 * t for t in range(4)]),
-        "reference": torch.arange(4.0).reshape(4, 1, 1, 1).expand(4, 3, 9, 9),
-    }
-    arrays = {name: value.numpy() for name, value in features.items()}
-    shot = Shot((arrays["reference"],), arrays, parts={"color": 3})
-    clip = ClipSampler([shot], 4, 8, reorder=0.5).draw(list(range(60)))
-    orders = clip["reference"][:, :, 0, 0, 0].long()
-    assert torch.equal(clip["color"][:, :, 0, 0, 0].long(), orders)
-    assert 15 < int((orders != torch.arange(4)).any(1).sum()) < 45
-    for index, order in enumerate(orders):
-        if order.equal(torch.arange(4)):
-            assert clip["motion"][index].isfinite().all()
-            continue
-        assert clip["motion"][index, 0].isinf().all()
-        expected = motion_from_position(clip["position"][index, 1:], clip["view_projection"][index, :-1])
-        assert torch.equal(clip["motion"][index, 1:], expected)
-
-
 def test_frames_of_a_clip() -> None:
     clip = ClipSampler([shot_of(numbered())], 2, 4).draw([1, 2, 3])
     assert (len(clip), clip.batch) == (2, 3)
