@@ -65,7 +65,9 @@ def _overview(name: str, *, pretrained: bool) -> ModelOverview:
     except InputError as error:
         return ModelOverview(name, "", "not available", reason=str(error))
     needs, macs = model.needs, None
-    if needs.trainable:
+    parameters = sum(each.numel() for each in model.parameters()) if isinstance(model, nn.Module) else 0
+    ready = "networks with weights" if pretrained or not needs.trainable else "networks to train"
+    if parameters:
         # The counter knows torch's convolutions, not those that are fused where nobody asks for derivatives.
         with FlopCounterMode(display=False) as counter, torch.enable_grad():
             model(_frame())
@@ -73,8 +75,8 @@ def _overview(name: str, *, pretrained: bool) -> ModelOverview:
     return ModelOverview(
         name,
         description,
-        "without weights" if not needs.trainable else "networks with weights" if pretrained else "networks to train",
-        sum(parameter.numel() for parameter in model.parameters()) if isinstance(model, nn.Module) else 0,
+        ready if parameters else "without weights",
+        parameters,
         macs,
         pretrained,
         sorted(needs.buffers),

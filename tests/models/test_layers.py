@@ -19,7 +19,7 @@ from mcdenoise.models._layers import REST, closed, fractions, split
 from mcdenoise.models.joint_bilateral import JointBilateral
 from mcdenoise.models.noisy import Noisy
 
-OIDN = ("oidn", "oidn_temporal")
+OIDN = ("oidn", "oidn_open", "oidn_temporal")
 MODELS = [
     pytest.param(
         name,
@@ -160,11 +160,11 @@ def test_alpha_is_filtered_with_the_kernels_or_kept(name: str) -> None:
         assert output.alpha.min() >= 0
         assert output.alpha.max() <= 1
         told = denoiser.report.stages["alpha"].reason
-        if name in ("noisy", "oidn"):
+        if name in ("noisy", *OIDN):
             assert torch.equal(output.alpha, frame.alpha)
-        assert told.startswith("kept" if name == "oidn" else "filtered")
+        assert told.startswith("kept" if name in OIDN else "filtered")
         assert_sum(output.image, output.layers)
-    if name not in ("noisy", "oidn"):
+    if name not in ("noisy", *OIDN):
         assert output.alpha.std() < 0.9 * frame.alpha.std()
 
 

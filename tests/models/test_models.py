@@ -220,7 +220,7 @@ def test_a_gradient_reaches_every_parameter(name: str) -> None:
 
 
 # A library comes first that has no derivatives.
-@pytest.mark.parametrize("name", [name for name in TRAINABLE if name != "oidn_temporal"])
+@pytest.mark.parametrize("name", TRAINABLE)
 def test_a_gradient_goes_through_the_state(name: str) -> None:
     """From the second frame's image to the color of the first, in the direction of which it changes the image."""
     model = small(name)
