@@ -40,6 +40,7 @@ _CLEAN_PARTS = (1.0, 3.0)
 # single samples deviate takes from the logarithm of its weight.
 _WINDOWS, _DOUBTS = (3, 15), (4.0, 12.0)
 _LEAST_NOISE = 0.02  # that single samples deviate by, in parts of their mean
+_LEAST_MEAN = 0.01  # of what differences are parts, where the typical radiance of the image is 0.18
 # Squared length of a normal that is no mean of others, and the fraction of pixels that may have shorter ones.
 _UNIT, _MOST_MEANS = 0.98, 0.002
 # Relative difference of inverse depths at two pixels' distance that is no rounding of half floats.
@@ -148,15 +149,18 @@ class Steadied(nn.Module):
         part = torch.where(exact > 0, _CLEAN_PARTS[1], _CLEAN_PARTS[0])
         image = (now + part * clean) / (1 + part)
 
-        mean = image * exposure
-        noise = _relative(noisy * exposure, mean, torch.ones_like(same), max(_WINDOWS), inside=True) + _LEAST_NOISE
+        # In units of the image: to multiply it with its exposure would round it once more.
+        least = _LEAST_MEAN / exposure
+        noise = _relative(noisy, image, torch.ones_like(same), max(_WINDOWS), least, inside=True) + _LEAST_NOISE
         n = self.history * same
         for window, doubt in zip(_WINDOWS, _DOUBTS, strict=True):
-            n = n * torch.exp(-doubt * _relative(before * exposure, mean, same, window) / noise)
+            n = n * torch.exp(-doubt * _relative(before, image, same, window, least) / noise)
         return answered(frame, torch.lerp(image, before, n / (1 + n)), None), None
 
 
-def _relative(image: Tensor, other: Tensor, counted: Tensor, window: int, *, inside: bool = False) -> Tensor:
+def _relative(
+    image: Tensor, other: Tensor, counted: Tensor, window: int, least: Tensor, *, inside: bool = False
+) -> Tensor:
     """How far two images are apart over a window: their means, or (``inside``) their pixels; in parts of the mean."""
     both = torch.cat([(image - other).abs(), other] if inside else [image, other], 1) * counted
     means = torch.cat([both, counted], 1)
@@ -165,7 +169,7 @@ def _relative(image: Tensor, other: Tensor, counted: Tensor, window: int, *, ins
     a, b, count = means.split([3, 3, 1], 1)
     apart = (a if inside else (a - b).abs()).mean(1, keepdim=True)
     typical = (b if inside else (a + b) / 2).mean(1, keepdim=True)
-    relative: Tensor = apart / (typical + 0.01 * count + 1e-6)
+    relative: Tensor = apart / (typical + least * (count + 1e-4))
     return relative
 
 
