@@ -23,8 +23,9 @@ MAX_RADIANCE = 65504.0  # of half precision: what is brighter counts as that
 _COLORS = 3
 _LEVELS = 5
 _MULTIPLE = 1 << (_LEVELS - 1)
-# Peak numbers for each pixel beside the features: what goes in and what comes out, in float32.
-_LIVE_IMAGES = 40
+# Peak numbers for each pixel, measured: at most twice the features that are brought to full resolution, and 100 of
+# images, which stay float32, around them.
+_LIVE_IMAGES = 100
 
 # Of PU, as the library has it: a line in the dark, then a power, then a logarithm.
 _A, _B, _C, _D = 1.41283765e03, 1.64593172e00, 4.31384981e-01, -2.94139609e-03
@@ -104,7 +105,8 @@ class OidnUNet(nn.Module):
         Args:
             bfloat16: whether convolutions are in bfloat16, else in float32.
         """
-        return 3.5 * _SIZES[self.size].encoder[0][0] * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
+        entering = _SIZES[self.size].decoder[-2][-1]
+        return 2 * entering * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
 
     def forward(self, x: Tensor) -> Tensor:
         """Predict.
