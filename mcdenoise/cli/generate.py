@@ -107,7 +107,6 @@ def generate(
                         progress=show,
                     )
                 else:
-                    # Hardly less noisy than the color, a reference would teach nothing.
                     reference_spp = max(arguments["reference_spp"], CLEANER * take.spp if wild else 0)
                     written = render_sequence(
                         take.made.scene,

@@ -253,16 +253,10 @@ class Accumulated(Wrapper):
         still: bool | Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Color and length of the frame with its history, and how many pixels of each image have one."""
-        motion = None
-        if isinstance(still, Tensor):
-            motion = motion_to_previous(frame, history.view_projection)
-            motion = None if motion is None else torch.where(still, 0, motion)
-        elif not still or (frame.hints.keep_all and frame.motion is not None):
-            motion = motion_to_previous(frame, history.view_projection)
+        motion = motion_unless_still(frame, history.view_projection, still)
         surface, previous = surface_before(frame)._replace(label=seen), history.surface
-        if self.rule == "relative" and (surface.depth is None or previous.depth is None):
-            # What tells how far two positions may be apart.
-            surface, previous = surface._replace(position=None), previous._replace(position=None)
+        if self.rule == "relative":
+            surface, previous = comparable(surface, previous)
         return blend(
             *(entering, before, history.length, motion, surface, previous),
             alpha_min=self.alpha_min,
@@ -341,6 +335,23 @@ def motion_to_previous(frame: Frame, previous_view_projection: Tensor | None) ->
     if position is None or previous_view_projection is None:
         return None
     return motion_from_position(position, previous_view_projection)
+
+
+def motion_unless_still(frame: Frame, previous_view_projection: Tensor | None, still: bool | Tensor) -> Tensor | None:
+    """Motion as :func:`motion_to_previous` has it, where :func:`is_still` says that something moves; else ``None``."""
+    if isinstance(still, Tensor):
+        motion = motion_to_previous(frame, previous_view_projection)
+        return None if motion is None else torch.where(still, 0, motion)
+    if still and not (frame.hints.keep_all and frame.motion is not None):
+        return None
+    return motion_to_previous(frame, previous_view_projection)
+
+
+def comparable(surface: Surface, previous: Surface) -> tuple[Surface, Surface]:
+    """Two surfaces for the relative test: depth tells how far positions may be apart, without it they are left out."""
+    if surface.depth is not None and previous.depth is not None:
+        return surface, previous
+    return surface._replace(position=None), previous._replace(position=None)
 
 
 def is_still(frame: Frame, previous_view_projection: Tensor | None) -> bool | Tensor:

@@ -11,7 +11,7 @@ from mcdenoise.frame import MOTION, Frame, tells_motion
 from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._journal import journal, note, timed
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.accumulated import is_still, motion_to_previous, surface_before
+from mcdenoise.models.accumulated import comparable, is_still, motion_unless_still, surface_before
 from mcdenoise.ops import Surface, demodulate, remodulate, reproject
 
 # The image of the frame before at the places of this one, and how much of each of its pixels shows the same surface.
@@ -88,18 +88,11 @@ class Recurrent(Wrapper):
         if before.image.shape != nothing[0].shape or before.image.device != frame.color.device:
             _report("size change", 0.0)
             return nothing
-        still = is_still(frame, before.view_projection)
-        motion = motion_to_previous(frame, before.view_projection)
-        if motion is None or not tells_motion(frame.buffers):
+        if not tells_motion(frame.buffers) or (frame.motion is None and before.view_projection is None):
             _report("no motion", 0.0)
             return nothing
-        if isinstance(still, Tensor):
-            motion = torch.where(still, 0, motion)
-        surface, previous = surface_before(frame), before.surface
-        if surface.depth is None or previous.depth is None:
-            # What tells how far two positions may be apart.
-            surface, previous = surface._replace(position=None), previous._replace(position=None)
-        found, weight = reproject(before.image, None if still is True else motion, surface, previous)
+        motion = motion_unless_still(frame, before.view_projection, is_still(frame, before.view_projection))
+        found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
         weight = weight * before.weight
         _report("", float(weight.detach().mean()) if journal() is not None else 0.0)
         return found, weight

@@ -61,13 +61,12 @@ class OidnUNet(nn.Module):
     Args:
         in_channels: of the input: 3 color, 3 albedo and 3 normal in the library.
         size: which of the library's: "small" has 62 thousand multiply-adds a pixel, "base" 125, "large" 312.
-        out_channels: of what is predicted.
 
     Raises:
         ValueError: there is no such size.
     """
 
-    def __init__(self, in_channels: int = 9, size: Size = "base", out_channels: int = _COLORS) -> None:
+    def __init__(self, in_channels: int = 9, size: Size = "base") -> None:
         super().__init__()
         if size not in _SIZES:
             raise ValueError(f"size: expected one of {', '.join(get_args(Size))}, found '{size}'")
@@ -79,7 +78,7 @@ class OidnUNet(nn.Module):
         coarser = [encoder[-1][-1], *(widths[-1] for widths in decoder[:-1])]
         entering = [below + skip for below, skip in zip(coarser, skips, strict=True)]
         self.decoder = nn.ModuleList(itertools.starmap(_block, zip(entering, decoder, strict=True)))
-        self.last = nn.Conv2d(decoder[-1][-1], out_channels, 3, padding=1)
+        self.last = nn.Conv2d(decoder[-1][-1], _COLORS, 3, padding=1)
 
     @property
     def convolutions(self) -> list[nn.Conv2d]:
@@ -115,7 +114,7 @@ class OidnUNet(nn.Module):
             x: ``(B, in_channels, H, W)``.
 
         Returns:
-            ``(B, out_channels, H, W)``.
+            ``(B, 3, H, W)``.
         """
         height, width = x.shape[-2:]
         x = F.pad(x, (0, -width % _MULTIPLE, 0, -height % _MULTIPLE)).contiguous(memory_format=torch.channels_last)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
-from toys import Mean, Shot, Watching, refused, still
+from toys import Mean, Shot, Watching, refused, still, whole_frame
 
 from mcdenoise.data import open_sequence
 from mcdenoise.frame import Frame, Hints
@@ -54,6 +54,19 @@ def test_albedo_is_divided_out_before_averaging() -> None:
     for one in color:
         seen = history.update(still(one, albedo=albedo))
     torch.testing.assert_close(seen.color, demodulate(color.mean(0), albedo))
+
+
+def test_images_that_are_accumulated_as_well_have_the_weights_of_the_color() -> None:
+    """A linear map: an image that is a multiple of the color stays one, in a history of its own."""
+    watching = Watching()
+    model, state = Accumulated(watching, lag_threshold=math.inf, firefly_limit=math.inf, also=("sun",)), None
+    for seed in range(3):
+        frame = whole_frame(model, 24, 40, seed=seed)
+        _, state = model(frame.replace(extra={"sun": 3 * frame.color, "other": frame.color}), state)
+        seen = watching.frames[-1]
+        torch.testing.assert_close(seen.extra["sun"], 3 * seen.color)
+        assert torch.equal(seen.extra["other"], frame.color)
+    assert not torch.equal(seen.color, frame.color)
 
 
 def test_reset_makes_the_next_frame_the_first() -> None:

@@ -219,7 +219,6 @@ def test_a_gradient_reaches_every_parameter(name: str) -> None:
         assert parameter.grad.abs().max() > 0, key
 
 
-# A library comes first that has no derivatives.
 @pytest.mark.parametrize("name", TRAINABLE)
 def test_a_gradient_goes_through_the_state(name: str) -> None:
     """From the second frame's image to the color of the first, in the direction of which it changes the image."""

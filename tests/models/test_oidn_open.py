@@ -20,7 +20,7 @@ from mcdenoise import Denoiser, Frame
 from mcdenoise.models import create_model
 from mcdenoise.models._tza import archives_in, read_tza
 from mcdenoise.models.oidn import Oidn
-from mcdenoise.models.oidn_open import OidnOpen, archive_of_library, load_archive
+from mcdenoise.models.oidn_open import OidnOpen, archive_of_library
 from mcdenoise.nn.oidn import MAX_RADIANCE, OidnUNet, compress, expand, oidn_exposure
 
 NAME = "oidn_open"
@@ -78,7 +78,7 @@ def test_tiles_are_the_whole_image() -> None:
     whole, tiles = Denoiser(NAME), Denoiser(NAME, tile=64)
     frame = frame_of(200, 330)
     torch.testing.assert_close(tiles(frame), whole(frame), rtol=1e-4, atol=1e-5)
-    assert "tiles" in tiles.report.tiles
+    assert tiles.report.tiles.startswith("6 x 4 tiles")
 
 
 @has_oidn
@@ -240,18 +240,6 @@ def test_a_network_of_a_file_of_one_s_own(tmp_path: Path) -> None:
         assert torch.equal(layer.bias, torch.full_like(layer.bias, index / 8))
     message = refused(lambda: create_model(NAME, archive=path))
     assert "expected weights of shape (48, 32, 3, 3), found (32, 32, 3, 3)" in message
-
-
-def test_more_inputs_and_results_than_the_archive_has_weigh_nothing(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    path = tmp_path / "mine.tza"
-    path.write_bytes(archive(weights_of(OidnUNet(9, "small"))))
-    plain, more = OidnUNet(9, "small"), OidnUNet(13, "small", 4)
-    for unet in (plain, more):
-        load_archive(unet, read_tza(path), "here")
-    x = torch.rand(1, 13, 16, 32)
-    torch.testing.assert_close(more(x)[:, :3], plain(x[:, :9]))
-    assert not more(x)[:, 3].any()
 
 
 def test_archives_are_found_in_a_library(tmp_path: Path) -> None:

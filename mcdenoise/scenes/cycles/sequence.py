@@ -114,7 +114,6 @@ def render_cycles(
             raise InputError(f"{name}: expected at least {least}, found {value}")
     count = len(made.cameras)
     chosen = settings or draw_settings(seed, view=view, samples=samples, moving=count > 1)
-    # Hardly less noisy than the color, a reference would teach nothing.
     clean_samples = max(reference_samples, CLEANER * chosen.samples) if reference_samples else 0
     moves = check_moves(made.moves, count)
     # One after the other, so that an index of Blender's tells which object it is.
