@@ -40,7 +40,7 @@ from mcdenoise.ops.demodulation import modulation
 from mcdenoise.ops.lag import THRESHOLD
 
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # of the falloffs with normal, depth and distance
-_USES = frozenset({"albedo", "normal", "depth", "current", "length", ALBEDO_HISTORY})
+_USES, _HISTORY = frozenset({"albedo", "normal", "depth"}), frozenset({"current", "length", ALBEDO_HISTORY})
 _COARSE_CHANNELS = 7  # logarithms of the means, with the history and of the frame, and how much its pixels differ
 _FEATURE_TAPS = 9  # of the kernel for features
 # "albedo" weighs that of the 3x3 pixels around, that of the history, and that which the pyramid makes of it.
@@ -61,16 +61,23 @@ class PyramidNetwork(nn.Module):
         widths: feature channels of each level of the U-Net, finest first.
         kernel_size: side of the kernels at every scale.
         half: whether the U-Net begins at half the resolution.
+        others: names in ``frame.extra`` of images ``(B, 3, H, W)`` that other methods have made of the frame: it sees
+            them, and the result is a mean of its own image and of them with weights that it predicts. One that a frame
+            lacks is the noisy one.
     """
 
-    def __init__(self, widths: Sequence[int], kernel_size: int = 5, half: bool = False) -> None:
+    def __init__(
+        self, widths: Sequence[int], kernel_size: int = 5, half: bool = False, others: Sequence[str] = ()
+    ) -> None:
         super().__init__()
         scales = len(widths) + half
-        self.unet = UNet(9 + FEATURES, widths, scales, _COARSE_CHANNELS, half)
+        self.others = tuple(others)
+        self.unet = UNet(9 + FEATURES + 3 * len(self.others), widths, scales, _COARSE_CHANNELS, half)
         self.taps = kernel_size**2
         # Kernel, its three falloffs, what a scale keeps, and what it takes of the coarser one.
         self.channels = [self.taps + 5] * (scales - 1) + [self.taps + 3]
-        extra = [sum(_PARTS.values())] + [0] * (scales - 1)
+        self.parts = {"others": 1 + len(self.others), **_PARTS} if self.others else _PARTS
+        extra = [sum(self.parts.values())] + [0] * (scales - 1)
         self.heads = nn.ModuleList(
             Head(self.unet, scale, own + more)
             for scale, (own, more) in enumerate(zip(self.channels, extra, strict=True))
@@ -78,9 +85,10 @@ class PyramidNetwork(nn.Module):
         for head in self.heads:
             nn.init.normal_(head.weight, std=0.01)  # type: ignore[arg-type]
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
-        rest = torch.cat([torch.full((count,), _AT_REST.get(name, 0.0)) for name, count in _PARTS.items()])
-        rest[-_FEATURE_TAPS // 2] = 4.0
-        rest[2] = 1.0  # the albedo of the pixels around
+        at_rest = {name: torch.full((count,), _AT_REST.get(name, 0.0)) for name, count in self.parts.items()}
+        at_rest["features"][_FEATURE_TAPS // 2] = 4.0
+        at_rest["albedo"][0] = 1.0  # of the pixels around
+        rest = torch.cat(list(at_rest.values()))
         with torch.no_grad():
             # A head of half the resolution predicts each channel for two by two pixels.
             self.heads[0].bias[self.channels[0] * self.heads[0].side ** 2 :] = rest.repeat_interleave(  # type: ignore
@@ -93,7 +101,9 @@ class PyramidNetwork(nn.Module):
         radius = math.isqrt(self.taps) // 2
         behind = sum((radius + 1) << scale for scale in range(self.unet.scales))
         ways = (self.unet.reach(scale) + max(1 << scale, self.unet.stride) for scale in range(self.unet.scales))
-        return Needs(uses=_USES, reach=max(ways) + behind, stride=self.unet.multiple)
+        # Other methods have made theirs of this frame, not of its history.
+        uses = _USES | (frozenset(self.others) or _HISTORY)
+        return Needs(uses=uses, reach=max(ways) + behind, stride=self.unet.multiple)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """Exposure and depth scale of the whole image."""
@@ -110,14 +120,18 @@ class PyramidNetwork(nn.Module):
         image = frame.color * exposure
         albedo = modulation(features_of(frame)[0]) if frame.albedo is not None else torch.ones_like(image)
         before = modulation(frame.extra[ALBEDO_HISTORY]) if ALBEDO_HISTORY in frame.extra else albedo
-        seen = torch.cat([input_of(frame, image), torch.log1p(image * albedo), before], 1)
+        # In the unit of the image, and with their albedo.
+        others = [frame.extra[name] * exposure if name in frame.extra else image * albedo for name in self.others]
+        logarithms = [torch.log1p(each) for each in (image * albedo, *others)]
+        seen = torch.cat([input_of(frame, image), logarithms[0], before, *logarithms[1:]], 1)
         levels = self.unet(seen, self._coarse(frame, exposure))
         sizes = _sizes(frame.size, len(levels))
         predicted = [
             head(level, size).to(torch.promote_types(image.dtype, torch.float32))
             for head, level, size in zip(self.heads, levels, sizes, strict=True)
         ]
-        parts = dict(zip(_PARTS, predicted[0][:, self.channels[0] :].split(list(_PARTS.values()), 1), strict=True))
+        counts = list(self.parts.values())
+        parts = dict(zip(self.parts, predicted[0][:, self.channels[0] :].split(counts, 1), strict=True))
         predicted[0] = predicted[0][:, : self.channels[0]]
 
         # Features of the pixel, which may be of one sample, and what the samples around it say.
@@ -126,13 +140,13 @@ class PyramidNetwork(nn.Module):
         matt = 1 - torch.sigmoid(parts["matt"])
         alone = image if frame.current is None else frame.current * exposure
         color = torch.lerp(alone, image, torch.sigmoid(parts["history"]))
-        others, ratio = carried(frame), _ratio(albedo, albedo, matt)
-        if others is not None:
-            others = torch.cat(
-                [others[:, : 3 * (count := len(frame.layers))] * ratio.repeat(1, count, 1, 1), others[:, 3 * count :]],
+        layers, ratio = carried(frame), _ratio(albedo, albedo, matt)
+        if layers is not None:
+            layers = torch.cat(
+                [layers[:, : 3 * (count := len(frame.layers))] * ratio.repeat(1, count, 1, 1), layers[:, 3 * count :]],
                 1,
             )
-        light = [color * ratio, albedo, *([] if others is None else [others])]
+        light = [color * ratio, albedo, *([] if layers is None else [layers])]
         # Of the weights alone, in the last channel, the mean is what it is divided by.
         worth = _inside(parts["importance"])
         weighted = torch.cat([*light, torch.ones_like(worth)], 1) * worth
@@ -141,8 +155,11 @@ class PyramidNetwork(nn.Module):
         near, past, wide = torch.softmax(parts["albedo"], 1).split(1, 1)
         smooth = near * smooth + past * before + wide * mean[:, 3:6]
         gain = torch.exp(_MOST_GAIN * torch.tanh(parts["gain"]))
-        result = mean[:, :3] * gain / _ratio(albedo, smooth, matt) / exposure
-        return answered(frame, result, None if others is None else mean[:, 6:]), None
+        result = mean[:, :3] * gain / _ratio(albedo, smooth, matt)
+        if others:
+            weights = torch.softmax(parts["others"], 1).split(1, 1)
+            result = sum(w * each for w, each in zip(weights, [result, *(o / albedo for o in others)], strict=True))
+        return answered(frame, result / exposure, None if layers is None else mean[:, 6:]), None
 
     def _coarse(self, frame: Frame, exposure: Tensor) -> list[Tensor]:
         """At each coarser scale the logarithms of mean radiances, and how much single pixels of the frame differ.
@@ -201,6 +218,16 @@ def _inside(logit: Tensor) -> Tensor:
     return _LEAST + (1 - 2 * _LEAST) * torch.sigmoid(logit)
 
 
+def widths_of(width: int, levels: int = len(_QUARTERS)) -> list[int]:
+    """Feature channels of each level, finest first: of 32 they are 32, 48, 64, 96 and 128.
+
+    Args:
+        width: those of the finest level, a multiple of 4.
+        levels: how many there are.
+    """
+    return [width * quarters // 4 for quarters in _QUARTERS[:levels]]
+
+
 def _sizes(size: tuple[int, int], scales: int) -> list[tuple[int, int]]:
     return [(-(-size[0] // side), -(-size[1] // side)) for side in (1 << scale for scale in range(scales))]
 
@@ -224,7 +251,7 @@ def _pyramid(
         anti_lag: likewise.
         tolerance: see :class:`mcdenoise.models.Skipping`.
     """
-    widths = [width * quarters // 4 for quarters in _QUARTERS[: len(_QUARTERS) - half]]
+    widths = widths_of(width, len(_QUARTERS) - half)
     return Demodulated(
         Accumulated(
             Skipping(Tiled(PyramidNetwork(widths, kernel_size, half)), tolerance, alpha_min),

@@ -15,6 +15,7 @@ from torch.nn.functional import normalize
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, Hints
 from mcdenoise.models.accumulated import ALBEDO_HISTORY
+from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_CLEAN
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.ops import NO_ALBEDO, demodulate
 from mcdenoise.train.cache import Array, Shot
@@ -23,7 +24,7 @@ _KNOWN = frozenset(field.name for field in fields(Frame))
 
 
 # What holds radiance, colours, and vectors of the world: all else has no channels that could be shuffled.
-LIGHT = frozenset({"color", "current", "reference", "diffuse", "specular", "emission"})
+LIGHT = frozenset({"color", "current", "reference", "diffuse", "specular", "emission", NOISY, OIDN, OIDN_CLEAN})
 _COLORED = LIGHT | {"albedo", ALBEDO_HISTORY, "specular_albedo", "variance"}
 _WORLD = frozenset({"normal", "position", "previous_position"})
 
@@ -202,7 +203,8 @@ class ClipSampler:
         painted = {name: light for name in ("color", "current")}
         painted |= {"albedo": albedo, ALBEDO_HISTORY: albedo, "normal": normal, "reference": radiance}
         # Depth, motion and history stay: lamps hang on whatever is there. Nor do they reflect, or have noise.
-        painted |= {"emission": radiance} | dict.fromkeys(("diffuse", "specular", "variance"), torch.zeros(1, 3, 1, 1))
+        painted |= dict.fromkeys(("emission", NOISY, OIDN, OIDN_CLEAN), radiance)
+        painted |= dict.fromkeys(("diffuse", "specular", "variance"), torch.zeros(1, 3, 1, 1))
         for name in painted.keys() & clip.keys():
             clip[name][..., top : top + height, left : left + width] = painted[name]
 

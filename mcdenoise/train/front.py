@@ -11,15 +11,17 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Skipping, State, Wrapper
 from mcdenoise.models.accumulated import ALBEDO_HISTORY, CAUSTICS
+from mcdenoise.models.with_oidn import EXACT, NOISY, OIDN, OIDN_CLEAN, WithOidn
 from mcdenoise.ops import remodulate
 
-# What comes of accumulation, with the number of channels.
+# What comes of accumulation, and of Open Image Denoise, with the number of channels.
 ACCUMULATED: Mapping[str, int] = {"color": 3, "current": 3, "length": 1}
+GIVEN: Mapping[str, int] = {OIDN: 3, OIDN_CLEAN: 3, NOISY: 3, EXACT: 1}
 
 
 @dataclass(frozen=True)
 class Front:
-    """Wrappers without weights, up to the one that accumulates; none where a model does not begin with them.
+    """Wrappers without weights, up to the last one that hands on images; none where a model does not begin with them.
 
     Args:
         wrappers: outermost first, each with the settings of its constructor.
@@ -30,26 +32,28 @@ class Front:
     @property
     def accumulates(self) -> bool:
         """Whether frames come out with a history: with ``current`` and ``length``."""
-        return bool(self.wrappers)
+        return self._has(Accumulated)
 
     @property
     def demodulates(self) -> bool:
         """Whether frames come out without albedo in their radiance."""
-        return any(kind is Demodulated for kind, _ in self.wrappers)
+        return self._has(Demodulated)
 
     @property
     def parts(self) -> dict[str, int]:
         """Names of the buffers that each noise of its own changes, with their channels: radiance, and histories."""
-        if not self.accumulates:
-            return {"color": 3}
         also = {name for _, settings in self.wrappers for name in settings.get("also", ())}
         history = {ALBEDO_HISTORY: 3} if "albedo" in also else {}
-        return {**ACCUMULATED, **history}
+        accumulated = ACCUMULATED if self.accumulates else {"color": 3}
+        return {**accumulated, **history, **(GIVEN if self._has(WithOidn) else {})}
 
     @property
     def settings(self) -> list[Any]:
         """Everything that the frames depend on, as JSON knows it."""
         return [[kind.__name__, settings] for kind, settings in self.wrappers]
+
+    def _has(self, wanted: type[Wrapper]) -> bool:
+        return any(kind is wanted for kind, _ in self.wrappers)
 
     def begin(self, *, keep_fireflies: bool = False) -> Callable[[Frame], Frame]:
         """What makes of each frame of one shot what the rest of the model sees.
@@ -114,10 +118,10 @@ def split(model: Model) -> tuple[Front, Model]:
     wrappers: list[tuple[type[Wrapper], dict[str, Any]]] = []
     found, rest = 0, model
     # Not those that are derived from them, which may do anything.
-    while isinstance(model, Wrapper) and type(model) in (Demodulated, Accumulated):
+    while isinstance(model, Wrapper) and type(model) in (Demodulated, Accumulated, WithOidn):
         wrappers.append((type(model), _settings(model)))
         model = model.inner
-        if wrappers[-1][0] is Accumulated:
+        if wrappers[-1][0] is not Demodulated:
             found, rest = len(wrappers), model
     front = Front(tuple(wrappers[:found]))
     while type(rest) is Skipping:

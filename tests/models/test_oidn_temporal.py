@@ -19,8 +19,10 @@ from mcdenoise.metrics import smape_linear
 from mcdenoise.models import create_model
 from mcdenoise.models.noisy import Noisy
 from mcdenoise.models.oidn import Oidn
-from mcdenoise.models.oidn_temporal import CLEAN, EXACT, NOISY, AfterOidn, Steadied, has_exact_features
+from mcdenoise.models.oidn_temporal import Mixed
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
+from mcdenoise.models.steadied import Steadied
+from mcdenoise.models.with_oidn import EXACT, NOISY, OIDN, OIDN_CLEAN, WithOidn, has_exact_features
 from mcdenoise.nn.oidn import oidn_exposure
 
 if importlib.util.find_spec("pyoidn") is None:
@@ -30,8 +32,8 @@ NAME = "oidn_temporal"
 
 
 def given(height: int = 21, width: int = 34, weight: float = 1.0) -> Frame:
-    """What the last step sees: five images, all different."""
-    extra = {name: torch.rand(1, 3, height, width) + 0.1 for name in (CLEAN, NOISY, PREVIOUS, PREVIOUS_LIGHT)}
+    """What the last step sees: four images, all different."""
+    extra = {name: torch.rand(1, 3, height, width) + 0.1 for name in (NOISY, PREVIOUS, PREVIOUS_LIGHT)}
     extra[PREVIOUS_WEIGHT] = torch.full((1, 1, height, width), weight)
     return frame_of(height, width, extra=extra)
 
@@ -48,6 +50,15 @@ def test_a_still_is_the_mean_of_both_ways() -> None:
 
 
 @pytest.mark.parametrize("exact", [0.0, 1.0])
+def test_exact_features_have_three_parts_of_the_clean_way(exact: float) -> None:
+    frame = frame_of(9, 18)
+    noisy, clean = torch.rand(2, 1, 3, 9, 18)
+    extra = {OIDN: noisy, OIDN_CLEAN: clean, EXACT: torch.full((1, 1, 9, 18), exact)}
+    image = Mixed()(frame.replace(extra=extra))[0].image
+    torch.testing.assert_close(image, (noisy + 3 * clean) / 4 if exact else (noisy + clean) / 2)
+
+
+@pytest.mark.parametrize("exact", [0.0, 1.0])
 def test_weights_written_out_in_float64(exact: float) -> None:
     height, width, history = 9, 18, 7.0
     frame = given(height, width).to(torch.float64)
@@ -56,9 +67,8 @@ def test_weights_written_out_in_float64(exact: float) -> None:
     frame = frame.replace(extra=extra)
     image = Steadied(history)(frame)[0].image
     exposure = oidn_exposure(frame.color).item()
-    now, clean, noisy = (each[0] * exposure for each in (frame.color, extra[CLEAN], extra[NOISY]))
+    mean, noisy = (each[0] * exposure for each in (frame.color, extra[NOISY]))
     before = extra[PREVIOUS_LIGHT if exact else PREVIOUS][0] * exposure
-    mean = (now + 3 * clean) / 4 if exact else (now + clean) / 2
 
     def over(image: Tensor, row: int, column: int, window: int) -> Tensor:
         """The sum over the pixels of the window that are in the image, in parts of all of the window's."""
@@ -84,7 +94,7 @@ def test_weights_written_out_in_float64(exact: float) -> None:
 
 def test_where_nothing_speaks_against_it_ten_parts_are_of_the_frame_before() -> None:
     frame = given()
-    mean = (frame.color + frame.extra[CLEAN]) / 2
+    mean = frame.color
     # Noise that is gone in the means of any window, and stays in the samples.
     rows, columns = torch.meshgrid(torch.arange(21), torch.arange(34), indexing="ij")
     before = mean * (1 + 0.001 * (-1) ** (rows + columns))
@@ -106,7 +116,7 @@ def test_light_that_has_moved_on_counts_little() -> None:
     now = torch.full_like(frame.color, 0.2)
     before = now.clone()
     before[..., 10:16, 10:16] = 5
-    extra = {**frame.extra, CLEAN: now, NOISY: now, PREVIOUS: before, PREVIOUS_LIGHT: before}
+    extra = {**frame.extra, NOISY: now, PREVIOUS: before, PREVIOUS_LIGHT: before}
     image = Steadied()(frame.replace(color=now, extra=extra))[0].image
     # Of what would be ten parts of 5 in eleven.
     assert image.max() < 0.2001
@@ -122,11 +132,11 @@ def test_none_is_asked_of_oidn_for_a_gradient() -> None:
 def test_gradients_of_the_last_step_in_float64() -> None:
     frame = given(9, 10).to(torch.float64)
 
-    def image(previous: Tensor, clean: Tensor) -> Tensor:
-        handed = frame.replace(extra={**frame.extra, PREVIOUS: previous, CLEAN: clean})
+    def image(previous: Tensor, color: Tensor) -> Tensor:
+        handed = frame.replace(color=color, extra={**frame.extra, PREVIOUS: previous})
         return Steadied()(handed)[0].image
 
-    inputs = tuple(frame.extra[name].clone().requires_grad_() for name in (PREVIOUS, CLEAN))
+    inputs = tuple(each.clone().requires_grad_() for each in (frame.extra[PREVIOUS], frame.color))
     assert torch.autograd.gradcheck(image, inputs, atol=1e-6, fast_mode=True)
     assert torch.autograd.gradgradcheck(image, inputs, atol=1e-5, fast_mode=True)
 
@@ -195,7 +205,7 @@ def test_features_are_exact_of_rays_through_the_centers_alone() -> None:
 @pytest.mark.parametrize("exact", [False, True])
 def test_the_last_step_is_told_whether_features_are_exact(exact: bool) -> None:
     frame = plane(torch.zeros(2, 40, 60) if exact else torch.rand(2, 40, 60)).replace(albedo=torch.rand(1, 3, 40, 60))
-    told = AfterOidn(Noisy(), threads=1).before(frame).extra[EXACT]
+    told = WithOidn(Noisy(), threads=1).before(frame).extra[EXACT]
     assert torch.equal(told, torch.full_like(told, float(exact)))
 
 
