@@ -219,7 +219,8 @@ def test_a_gradient_reaches_every_parameter(name: str) -> None:
         assert parameter.grad.abs().max() > 0, key
 
 
-@pytest.mark.parametrize("name", TRAINABLE)
+# Before oidn_pyramid's network comes a library without derivatives.
+@pytest.mark.parametrize("name", [name for name in TRAINABLE if name != "oidn_pyramid"])
 def test_a_gradient_goes_through_the_state(name: str) -> None:
     """From the second frame's image to the color of the first, in the direction of which it changes the image."""
     model = small(name)

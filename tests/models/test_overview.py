@@ -41,9 +41,9 @@ def test_a_model_without_its_package_is_listed_with_the_reason(
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     archive_of_library.cache_clear()
     models(tmp_path / "models.json")
-    absent = json.loads((tmp_path / "models.json").read_text())[-3:]
+    absent = json.loads((tmp_path / "models.json").read_text())[-4:]
     assert [(entry["name"], entry["group"]) for entry in absent] == [
-        (name, "not available") for name in ("oidn", "oidn_open", "oidn_temporal")
+        (name, "not available") for name in ("oidn", "oidn_open", "oidn_pyramid", "oidn_temporal")
     ]
     assert all("pip install 'mcdenoise[oidn]'" in entry["reason"] for entry in absent)
     printed = capsys.readouterr().out
