@@ -25,6 +25,7 @@ from mcdenoise.data.readers.values import (
     USUAL_MOTION,
     Convention,
     Row,
+    noise_is_spread,
     normal_is_encoded,
     nothing_hit,
     read_motion,
@@ -225,10 +226,15 @@ def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
         shot.warnings.append(
             "'color': 8 or 16 bits of display values: what was brighter than white is lost; render floats"
         )
-    if "albedo" not in images:
+    albedo = np.clip(np.nan_to_num(images["albedo"]), 0, 1) if "albedo" in images else None
+    if noise_is_spread(np.nan_to_num(images["color"][..., :3]), albedo):
+        shot.warnings.append(
+            "'color': neighbouring pixels share noise, since the film's filter counts each sample in several of them, "
+            "as Mitsuba's default does; denoisers leave such noise in, OIDN most: render with a box filter"
+        )
+    if albedo is None:
         words.append("radiance")
         return
-    albedo = np.clip(np.nan_to_num(images["albedo"]), 0, 1)
     reference = images["reference"][..., :3] if "reference" in images else None
     shot.color_has_albedo, said, warning = read_radiance(images["color"][..., :3], albedo, reference, stated)
     words.append(said)
