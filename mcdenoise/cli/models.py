@@ -15,7 +15,7 @@ _MOTION = {"motion", "position", "previous_position", "view_projection"}
 
 
 def models(json: Json = None) -> None:
-    """List the models: what they need and use, weights, parameters, operations per pixel, and whether they learn.
+    """List the models by kind: their paper, what they need and use, weights, parameters, and operations per pixel.
 
     A model uses `motion` if it takes motion, or positions with cameras, or whichever of them there is.
 
@@ -23,19 +23,19 @@ def models(json: Json = None) -> None:
         json: write the list to this file too.
     """
     entries = overview()
-    columns = ("model", "needs", "uses", "weights", "parameters", "kMAC per pixel", "learns", "what")
-    for group in dict.fromkeys(entry.group for entry in entries):
-        table = Table(*columns, title=group, title_justify="left")
-        for entry in (each for each in entries if each.group == group):
+    columns = ("model", "paper", "needs", "uses", "weights", "parameters", "kMAC per pixel", "what")
+    for kind in dict.fromkeys(entry.kind for entry in entries):
+        table = Table(*columns, title=kind, title_justify="left")
+        for entry in (each for each in entries if each.kind == kind):
             motion = ["motion"] if _MOTION & set(entry.uses) else []
             table.add_row(
                 entry.name,
+                entry.paper or "-",
                 ", ".join(entry.needs) or "-",
                 ", ".join([*(name for name in entry.uses if name not in _MOTION), *motion]) or "-",
-                "shipped" if entry.pretrained else "-",
+                "not available" if entry.reason else entry.weights if entry.weights != "none" else "-",
                 f"{entry.parameters:,}" if entry.parameters else "-",
                 "-" if entry.kmacs_per_pixel is None else f"{entry.kmacs_per_pixel:.1f}",
-                "yes" if entry.trainable else "no",
                 entry.reason or entry.description,
             )
         show(table)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from importlib.metadata import entry_points
-from typing import Any
+from typing import Any, Literal, get_args
 
 from mcdenoise.errors import InputError
 from mcdenoise.models._adapter import as_model
@@ -18,6 +18,10 @@ from mcdenoise.models._interface import Model
 from mcdenoise.own import in_one_line, load_own
 
 GROUP = "mcdenoise.models"
+
+# What makes a model's image, in the order in which they are listed: predicted kernels; predicted pixels; bilateral
+# grids; a network with a memory of its own; a filter without weights; another denoiser; or nobody has said.
+Kind = Literal["kernel", "pixel", "grid", "recurrent", "filter", "peer", "other"]
 
 
 @dataclass(frozen=True)
@@ -28,11 +32,15 @@ class Entry:
         construct: makes it, with fresh weights.
         settings: what ``construct`` is given under this name.
         description: one line.
+        kind: what makes its image.
+        paper: its authors and year; empty where there is none.
     """
 
     construct: Callable[..., Any]
     settings: dict[str, Any]
     description: str
+    kind: Kind = "other"
+    paper: str = ""
 
     @property
     def architecture(self) -> dict[str, Any]:
@@ -46,7 +54,7 @@ _MODELS: dict[str, Entry] = {}
 
 
 def register_model(
-    name: str, description: str = "", **settings: Any
+    name: str, description: str = "", *, kind: Kind = "other", paper: str = "", **settings: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator that enters a model's constructor under ``name``.
 
@@ -56,17 +64,21 @@ def register_model(
     Args:
         name: in the register.
         description: one line; the first one of the constructor's docstring by default.
+        kind: what makes its image.
+        paper: its authors and year, such as "Schied et al. 2017".
         settings: for the constructor, under this name.
 
     Raises:
-        ValueError: the name is taken.
+        ValueError: the name is taken, or there is no such kind.
     """
+    if kind not in get_args(Kind):
+        raise ValueError(f"kind: expected one of {', '.join(get_args(Kind))}, found '{kind}'")
 
     def enter(constructor: Callable[..., Any]) -> Callable[..., Any]:
         if name in _MODELS:
             raise ValueError(f"model '{name}' is registered twice")
         about = description or (constructor.__doc__ or "").strip().partition("\n")[0]
-        _MODELS[name] = Entry(constructor, settings, about)
+        _MODELS[name] = Entry(constructor, settings, about, kind, paper)
         return constructor
 
     return enter
@@ -123,11 +135,6 @@ def build_model(name: str, **settings: Any) -> Model:
         raise InputError(f"model '{name}': {str(error).removeprefix('model: ')}") from error
     except Exception as error:
         raise InputError(f"model '{name}': the factory fails: {in_one_line(error)}") from error
-
-
-def describe_model(name: str) -> str:
-    """One line on a registered model."""
-    return find_model(name).description
 
 
 def _of_factory(name: str, factory: Any) -> Entry:

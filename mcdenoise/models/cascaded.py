@@ -163,7 +163,12 @@ class _NonNegative(Wrapper):
         return output._replace(image=output.image.clamp_min(0), layers=layers), state
 
 
-@register_model("cascaded", "the paper's network to the letter: P+K, width 40, 5x5 kernels, bilateral weights")
+@register_model(
+    "cascaded",
+    "the paper's network to the letter: P+K, width 40, 5x5 kernels, bilateral weights",
+    kind="kernel",
+    paper="DOI 10.1007/s00371-023-02951-6",
+)
 def cascaded(
     width: int = 40,
     kernel_size: int = 5,

@@ -217,4 +217,10 @@ for _name, _about, _settings in (
     ("cascaded_v2_tiny", "width 16, 3x3 kernels", {"width": 16, "kernel_size": 3}),
     ("cascaded_v2_micro", "width 16, 3x3 kernels, half the resolution", {"width": 16, "kernel_size": 3, "half": True}),
 ):
-    register_model(_name, f"P+K with history, logarithms, three resolutions: {_about}", **_settings)(_cascade)
+    register_model(
+        _name,
+        f"P+K with history, logarithms, three resolutions: {_about}",
+        kind="kernel",
+        paper="after DOI 10.1007/s00371-023-02951-6",
+        **_settings,
+    )(_cascade)

@@ -77,7 +77,7 @@ class Guided(nn.Module):
         return answered(frame, blurred[:, :3].clamp_min(0), None if others is None else blurred[:, 3:]), None
 
 
-@register_model("guided")
+@register_model("guided", kind="filter", paper="He et al. 2010")
 def guided(radius: int = 4, eps: float = 1e-2, *, alpha_min: float = 0.1) -> Model:
     """Kornia's guided filter of the accumulated and demodulated radiance.
 

@@ -99,7 +99,7 @@ def guide_of(frame: Frame, depth_weight: float) -> Tensor:
     return torch.cat(guides or [frame.color], 1)
 
 
-@register_model("joint_bilateral")
+@register_model("joint_bilateral", kind="filter", paper="Petschnigg et al. 2004")
 def joint_bilateral(sigma_color: float = 0.2, sigma_space: float = 4.0, *, alpha_min: float = 0.1) -> Model:
     """Kornia's joint bilateral filter of the accumulated and demodulated radiance.
 

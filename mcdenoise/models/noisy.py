@@ -15,7 +15,7 @@ from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.ops.lag import THRESHOLD
 
 
-@register_model("noisy")
+@register_model("noisy", kind="filter")
 class Noisy(nn.Module):
     """The frame's own color."""
 
@@ -32,7 +32,7 @@ class Noisy(nn.Module):
         return answered(frame, frame.color, carried(frame)), None
 
 
-@register_model("accumulated")
+@register_model("accumulated", kind="filter")
 def accumulated(*, alpha_min: float = 0.1, anti_lag: bool = True) -> Model:
     """The history of the shot without any filter: what the family ``cascaded_v2`` starts from.
 

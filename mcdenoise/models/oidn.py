@@ -131,7 +131,7 @@ class Oidn:
             raise RuntimeError(f"Open Image Denoise: {message}")
 
 
-@register_model("oidn")
+@register_model("oidn", kind="peer")
 def oidn(
     *,
     quality: Quality = "high",

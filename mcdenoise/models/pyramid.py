@@ -269,4 +269,4 @@ for _name, _about, _settings in (
     ("pyramid_small", "width 16, 5x5 kernels", {"width": 16}),
     ("pyramid_tiny", "width 24, 3x3 kernels, half the resolution", {"width": 24, "kernel_size": 3, "half": True}),
 ):
-    register_model(_name, f"{_ABOUT}: {_about}", **_settings)(_pyramid)
+    register_model(_name, f"{_ABOUT}: {_about}", kind="kernel", paper="after Balint et al. 2023", **_settings)(_pyramid)

@@ -144,7 +144,7 @@ class Svgf(nn.Module):
         return both[:, :-2], both[:, -2:], length
 
 
-@register_model("svgf")
+@register_model("svgf", kind="filter", paper="Schied et al. 2017")
 def svgf(
     *, alpha: float = 0.2, levels: int = 5, sigma_z: float = 1.0, sigma_n: float = 128.0, sigma_l: float = 4.0
 ) -> Model:
