@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import importlib.util
 import inspect
 import pkgutil
 from collections.abc import Callable
@@ -34,6 +35,7 @@ class Entry:
         description: one line.
         kind: what makes its image.
         paper: its authors and year; empty where there is none.
+        requires: the optional package that it cannot be made without; empty if there is none.
     """
 
     construct: Callable[..., Any]
@@ -41,6 +43,12 @@ class Entry:
     description: str
     kind: Kind = "other"
     paper: str = ""
+    requires: str = ""
+
+    @property
+    def installed(self) -> bool:
+        """Whether what it requires is installed."""
+        return not self.requires or importlib.util.find_spec(self.requires) is not None
 
     @property
     def architecture(self) -> dict[str, Any]:
@@ -54,7 +62,7 @@ _MODELS: dict[str, Entry] = {}
 
 
 def register_model(
-    name: str, description: str = "", *, kind: Kind = "other", paper: str = "", **settings: Any
+    name: str, description: str = "", *, kind: Kind = "other", paper: str = "", requires: str = "", **settings: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator that enters a model's constructor under ``name``.
 
@@ -66,6 +74,7 @@ def register_model(
         description: one line; the first one of the constructor's docstring by default.
         kind: what makes its image.
         paper: its authors and year, such as "Schied et al. 2017".
+        requires: the optional package that it cannot be made without.
         settings: for the constructor, under this name.
 
     Raises:
@@ -78,7 +87,7 @@ def register_model(
         if name in _MODELS:
             raise ValueError(f"model '{name}' is registered twice")
         about = description or (constructor.__doc__ or "").strip().partition("\n")[0]
-        _MODELS[name] = Entry(constructor, settings, about, kind, paper)
+        _MODELS[name] = Entry(constructor, settings, about, kind, paper, requires)
         return constructor
 
     return enter

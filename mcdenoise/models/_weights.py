@@ -48,8 +48,8 @@ def create_model(name: str, *, pretrained: bool = False, weights: Path | str | N
 
 
 def pretrained_models() -> list[str]:
-    """Names of the models that have shipped weights, sorted."""
-    return sorted(path.stem for path in _SHIPPED.glob("*.safetensors"))
+    """Names of the models that have shipped weights, and whose packages are installed, sorted."""
+    return sorted(path.stem for path in _SHIPPED.glob("*.safetensors") if find_model(path.stem).installed)
 
 
 def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -211,12 +212,13 @@ def _cascade(
     )
 
 
-for _name, _about, _settings in (
+_PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("cascaded_v2", "width 40, 5x5 kernels", {"width": 40}),
     ("cascaded_v2_small", "widths 16 and 32, 5x5 kernels", {"width": 16, "kernel_width": 32}),
     ("cascaded_v2_tiny", "width 16, 3x3 kernels", {"width": 16, "kernel_size": 3}),
     ("cascaded_v2_micro", "width 16, 3x3 kernels, half the resolution", {"width": 16, "kernel_size": 3, "half": True}),
-):
+)
+for _name, _about, _settings in _PRESETS:
     register_model(
         _name,
         f"P+K with history, logarithms, three resolutions: {_about}",

@@ -131,7 +131,7 @@ class Oidn:
             raise RuntimeError(f"Open Image Denoise: {message}")
 
 
-@register_model("oidn", kind="peer")
+@register_model("oidn", kind="peer", requires="pyoidn")
 def oidn(
     *,
     quality: Quality = "high",

@@ -20,7 +20,7 @@ from mcdenoise.models.tiled import Tiled
 from mcdenoise.models.with_oidn import OIDN, OIDN_CLEAN, WithOidn
 
 
-@register_model("oidn_pyramid", kind="peer", paper="after Zheng et al. 2021")
+@register_model("oidn_pyramid", kind="peer", paper="after Zheng et al. 2021", requires="pyoidn")
 def oidn_pyramid(
     *,
     width: int = 32,

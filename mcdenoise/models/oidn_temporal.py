@@ -47,7 +47,7 @@ class Mixed(nn.Module):
         return answered(frame, (noisy + part * clean) / (1 + part), None), None
 
 
-@register_model("oidn_temporal", kind="peer")
+@register_model("oidn_temporal", kind="peer", requires="pyoidn")
 def oidn_temporal(*, quality: Quality = "high", threads: int | None = None, history: float = 10.0) -> Model:
     """Open Image Denoise (optional package pyoidn) for noisy and for clean features, made steady by the frame before.
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -264,9 +265,10 @@ def _pyramid(
 
 
 _ABOUT = "one network weighs, splits and filters the noisy pixels at all scales"
-for _name, _about, _settings in (
+_PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("pyramid", "width 32, 5x5 kernels", {}),
     ("pyramid_small", "width 16, 5x5 kernels", {"width": 16}),
     ("pyramid_tiny", "width 24, 3x3 kernels, half the resolution", {"width": 24, "kernel_size": 3, "half": True}),
-):
+)
+for _name, _about, _settings in _PRESETS:
     register_model(_name, f"{_ABOUT}: {_about}", kind="kernel", paper="after Balint et al. 2023", **_settings)(_pyramid)
