@@ -12,7 +12,8 @@ Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Rend
    and sum from coarse to fine, each coarse image upsampled by 4x4 weights, 4 times a softmax;
 6. splat ``o'`` by a 5x5 softmax, and mix both by a sigmoid: ``o = mu o' + (1 - mu) d``.
 
-The radiance is whole, with its albedo. All weights are of means: no pixel is brighter than what it is made of.
+The radiance is whole, with its albedo. Each pixel hands on all of its light, but what a pixel receives are weights of
+any sum: a splat is no mean. Nothing but training keeps a constant image constant.
 
 What the code leaves to its data set or its user, and what is taken here:
 
@@ -71,7 +72,8 @@ class History(NamedTuple):
     """What is kept of a frame. All of it zeros is that of no frame.
 
     Args:
-        radiance: ``(B, 3 + C, H, W)`` exponential mean, with layers and alpha behind it.
+        radiance: ``(B, 3 + C, H, W)`` exponential mean; where there are layers or an alpha, with them behind it, and
+            with ones, of which the sum of all weights comes.
         image: ``(B, 3 + C, H, W)`` result, likewise.
         features: ``(B, 32, H, W)`` exponential mean.
         view_projection: ``(B, 4, 4)`` by which camera.
@@ -212,8 +214,9 @@ class Nppd(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.with_depth()
         dtype = torch.promote_types(frame.color.dtype, torch.float32)
-        others = carried(frame)
-        radiance = (frame.color if others is None else torch.cat([frame.color, others], 1)).to(dtype)
+        radiance, others = frame.color.to(dtype), carried(frame)
+        if others is not None:
+            radiance = torch.cat([radiance, others.to(dtype), torch.ones_like(radiance[:, :1])], 1)
         with timed("accumulate", frame.color.device):
             mean_before, image_before, features_before = self._warped(frame, state, radiance)  #                     1.
         features = self._encoded(frame, dtype)  #                                                                   2.
@@ -232,10 +235,9 @@ class Nppd(nn.Module):
                 size = (part.shape[-2], part.shape[-1])
                 denoised = part + learned_upsample(denoised, kernel, size, border="zeros")
             image = torch.lerp(denoised, _splatted(image_before, fine["previous"]), torch.sigmoid(fine["mu"]))  #   6.
-        result, mean = (each[:, :3].to(frame.color.dtype) for each in (image, radiance))
-        output = answered(frame, result, None if others is None else image[:, 3:])._replace(
-            stages={"accumulated": mean}
-        )
+        stages = {"accumulated": radiance[:, :3].to(frame.color.dtype)}
+        result = image[:, :3].to(frame.color.dtype)
+        output = answered(frame, result, None if others is None else _mean(image[:, 3:]))._replace(stages=stages)
         keeps = frame.hints.keep_all or not frame.hints.last
         return output, History(radiance, image, features, frame.view_projection) if keeps else None
 
@@ -288,6 +290,12 @@ def _logarithm(radiance: Tensor) -> Tensor:
     """``log(1 + x / mean x)`` of each image or stack of images."""
     mean = radiance.mean(tuple(range(1, radiance.dim())), keepdim=True)
     return torch.log1p(radiance / torch.where(mean > 0, mean, 1))
+
+
+def _mean(filtered: Tensor) -> Tensor:
+    """Of sums of weighted images, with those of the weights behind them, the means: an alpha of one stays one."""
+    total = filtered[:, -1:]
+    return filtered[:, :-1] / torch.where(total > 0, total, 1)
 
 
 def _splatted(image: Tensor, logits: Tensor) -> Tensor:
