@@ -179,7 +179,7 @@ class _Block(nn.Module):
         self.scale = nn.Parameter(torch.full((width,), 1e-6))
 
     def forward(self, x: Tensor) -> Tensor:
-        pixels = self.norm(self.spatial(x).movedim(1, -1))
+        pixels: Tensor = self.norm(self.spatial(x).movedim(1, -1))
         pixels = self.scale * self.narrow(F.gelu(self.wide(pixels)))
         return x + pixels.movedim(-1, 1)
 
@@ -269,7 +269,7 @@ class Nppd(nn.Module):
         count = samples.shape[1]
         seen = torch.cat([pixel[:, None].expand(-1, count, -1, -1, -1), _logarithm(samples)], 2)
         encoded: Tensor = self.encoder(seen.flatten(0, 1)).to(dtype)
-        return encoded.unflatten(0, (-1, count)).mean(1)
+        return torch.unflatten(encoded, 0, (-1, count)).mean(1)
 
     def _weights(self, seen: Tensor) -> tuple[dict[str, Tensor], list[dict[str, Tensor]]]:
         """What the network predicts at the finest scale, and at each coarser one."""

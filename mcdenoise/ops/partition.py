@@ -99,7 +99,7 @@ def learned_upsample(image: Tensor, kernel: Tensor, size: tuple[int, int], *, bo
     if image.numel() == 0:
         return image.new_zeros(*image.shape[:2], *size)
     spread = (image.to(dtype)[:, :, None] * kernel.to(dtype)[:, None]).flatten(1, 2).flatten(2)
-    whole = [2 * (length + margin) for length in found]
+    whole = (2 * (found[0] + margin), 2 * (found[1] + margin))
     return corner(unpad(F.fold(spread, whole, side, stride=2), margin, border), *size).to(image.dtype)
 
 
