@@ -1,7 +1,7 @@
 """Neural partitioning pyramids: a network shares out each pixel's light over five scales and splats it there.
 
 Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", SIGGRAPH, and its public code
-(balintio/nppd), which this page follows where it is more exact. A step is
+(balintio/nppd), which this page follows: steps, layers and weights are the code's. A step is
 
 1. warp what is kept of the frame before to this one: the mean of the radiance ``c'``, the result ``o'``, features
    ``f'``;
@@ -217,24 +217,19 @@ class Nppd(nn.Module):
         radiance, others = frame.color.to(dtype), carried(frame)
         if others is not None:
             radiance = torch.cat([radiance, others.to(dtype), torch.ones_like(radiance[:, :1])], 1)
-        with timed("accumulate", frame.color.device):
+        device = frame.color.device
+        with timed("accumulate", device):
             mean_before, image_before, features_before = self._warped(frame, state, radiance)  #                     1.
-        features = self._encoded(frame, dtype)  #                                                                   2.
-        both = torch.cat([mean_before[:, :3], radiance[:, :3]], 1)
-        fine, coarse = self._weights(torch.cat([_logarithm(both), features_before, features], 1))  #                3.
-        with timed("filter", frame.color.device):
-            trust = torch.sigmoid(fine["lambda"])  #                                                                4.
-            radiance = torch.lerp(radiance, mean_before, trust)
+        with timed("network", device):
+            features = self._encoded(frame, dtype)  #                                                               2.
+            both = torch.cat([mean_before[:, :3], radiance[:, :3]], 1)
+            fine, coarse = self._weights(torch.cat([_logarithm(both), features_before, features], 1))  #            3.
+        with timed("filter", device):
+            trust, mix = torch.sigmoid(fine["lambda"]), torch.sigmoid(fine["mu"])
+            radiance = torch.lerp(radiance, mean_before, trust)  #                                                  4.
             features = torch.lerp(features, features_before, trust)
-            parts = pyramid_partition(radiance, fine["partition"])  #                                               5.
-            splats = [fine["splat"], *(weights["splat"] for weights in coarse)]
-            filtered = [_splatted(part, logits) for part, logits in zip(parts, splats, strict=True)]
-            denoised = filtered.pop()
-            for part, weights in zip(reversed(filtered), reversed(coarse), strict=True):
-                kernel = 4 * torch.softmax(weights["upsample"], 1)
-                size = (part.shape[-2], part.shape[-1])
-                denoised = part + learned_upsample(denoised, kernel, size, border="zeros")
-            image = torch.lerp(denoised, _splatted(image_before, fine["previous"]), torch.sigmoid(fine["mu"]))  #   6.
+            denoised = _denoised(radiance, fine, coarse)  #                                                         5.
+            image = torch.lerp(denoised, _splatted(image_before, fine["previous"]), mix)  #                         6.
         stages = {"accumulated": radiance[:, :3].to(frame.color.dtype)}
         result = image[:, :3].to(frame.color.dtype)
         output = answered(frame, result, None if others is None else _mean(image[:, 3:]))._replace(stages=stages)
@@ -296,6 +291,17 @@ def _mean(filtered: Tensor) -> Tensor:
     """Of sums of weighted images, with those of the weights behind them, the means: an alpha of one stays one."""
     total = filtered[:, -1:]
     return filtered[:, :-1] / torch.where(total > 0, total, 1)
+
+
+def _denoised(radiance: Tensor, fine: dict[str, Tensor], coarse: list[dict[str, Tensor]]) -> Tensor:
+    """The pyramid: down in parts, splatted there, and summed from coarse to fine."""
+    parts = pyramid_partition(radiance, fine["partition"])
+    splatted = [_splatted(part, weights["splat"]) for part, weights in zip(parts, (fine, *coarse), strict=True)]
+    denoised = splatted.pop()
+    for part, weights in zip(reversed(splatted), reversed(coarse), strict=True):
+        kernel = 4 * torch.softmax(weights["upsample"], 1)
+        denoised = part + learned_upsample(denoised, kernel, (part.shape[-2], part.shape[-1]), border="zeros")
+    return denoised
 
 
 def _splatted(image: Tensor, logits: Tensor) -> Tensor:

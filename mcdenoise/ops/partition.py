@@ -33,7 +33,7 @@ def pyramid_partition(image: Tensor, logits: Tensor) -> tuple[Tensor, ...]:
 
     Differentiable in ``image`` and ``logits``, to any order.
 
-    Source: Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", Sec. 4.
+    Source: Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings".
 
     Example:
         >>> image = torch.tensor([[[[4.0, 8.0], [0.0, 0.0]]]])
@@ -78,7 +78,7 @@ def learned_upsample(image: Tensor, kernel: Tensor, size: tuple[int, int], *, bo
 
     Differentiable in ``image`` and ``kernel``, to any order.
 
-    Source: Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", Sec. 4, and its
+    Source: Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", and its
     published code, with ``K = 4``.
 
     Example:
