@@ -211,11 +211,11 @@ def _partition_cases() -> tuple[Case, ...]:
         return Case(name, kind, tensors, ("image", "logits"))
 
     return (
-        case("5x7, 3 levels", "ordinary", (1, 1, 5, 7), 3),
+        case("RGB, 5x6, 3 levels", "ordinary", (1, 3, 5, 6), 3),
         case("batch of 2, RGB, 2 levels", "ordinary", (2, 3, 2, 4), 2),
         case("one row, 5 channels, 4 levels", "ordinary", (1, 5, 1, 5), 4),
         case("one pixel, 5 levels", "ordinary", (1, 3, 1, 1), 5),
-        case("one level", "ordinary", (1, 3, 2, 3), 1),
+        case("one level", "ordinary", (1, 1, 2, 3), 1),
         case("fireflies, peaked weights", "stiff", (1, 3, 3, 2), 3, _radiance, 10.0),
     )
 
@@ -241,7 +241,7 @@ def _learned_cases() -> tuple[Case, ...]:
         return Case(f"{name}, {border}", kind, tensors, ("image", "kernel"), settings)
 
     return (
-        case("5x7", "ordinary", (1, 1, 5, 7), 4, "replicate"),
+        case("RGB, 5x4", "ordinary", (1, 3, 5, 4), 4, "replicate"),
         case("batch of 2, RGB", "ordinary", (2, 3, 4, 2), 4, "zeros"),
         case("2x2 taps, 5 channels", "ordinary", (1, 5, 3, 2), 2, "zeros"),
         case("6x6 taps, one row", "ordinary", (1, 1, 1, 4), 6, "replicate"),
