@@ -32,6 +32,7 @@ from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, 
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
+from mcdenoise.ops.partition import learned_upsample, pyramid_partition
 from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
 
 __all__ = ["OPS", "Case", "Inputs", "Kind", "Op", "map_tensors"]
@@ -192,6 +193,61 @@ def _image_cases(sizes: Callable[[int, int], tuple[int, int]], with_size: bool) 
 
 def _half(height: int, width: int) -> tuple[int, int]:
     return (height + 1) // 2, (width + 1) // 2
+
+
+def _partition_cases() -> tuple[Case, ...]:
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        levels: int,
+        draw: Callable[..., Tensor] = _normal,
+        logit: float = 2.0,
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            batch, _, height, width = size
+            return {"image": draw(g, *size), "logits": logit * _normal(g, batch, levels, height, width)}
+
+        return Case(name, kind, tensors, ("image", "logits"))
+
+    return (
+        case("RGB, 5x6, 3 levels", "ordinary", (1, 3, 5, 6), 3),
+        case("batch of 2, RGB, 2 levels", "ordinary", (2, 3, 2, 4), 2),
+        case("one row, 5 channels, 4 levels", "ordinary", (1, 5, 1, 5), 4),
+        case("one pixel, 5 levels", "ordinary", (1, 3, 1, 1), 5),
+        case("one level", "ordinary", (1, 1, 2, 3), 1),
+        case("fireflies, peaked weights", "stiff", (1, 3, 3, 2), 3, _radiance, 10.0),
+    )
+
+
+def _learned_cases() -> tuple[Case, ...]:
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        side: int,
+        border: str,
+        draw: Callable[..., Tensor] = _normal,
+        spread: float = 1.0,
+    ) -> Case:
+        batch, channels, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            coarse = _half(height, width)
+            kernel = 4 * torch.softmax(spread * _normal(g, batch, side**2, *coarse), 1)
+            return {"image": draw(g, batch, channels, *coarse), "kernel": kernel}
+
+        settings = {"size": (height, width), "border": border}
+        return Case(f"{name}, {border}", kind, tensors, ("image", "kernel"), settings)
+
+    return (
+        case("RGB, 5x4", "ordinary", (1, 3, 5, 4), 4, "replicate"),
+        case("batch of 2, RGB", "ordinary", (2, 3, 4, 2), 4, "zeros"),
+        case("2x2 taps, 5 channels", "ordinary", (1, 5, 3, 2), 2, "zeros"),
+        case("6x6 taps, one row", "ordinary", (1, 1, 1, 4), 6, "replicate"),
+        case("one pixel", "ordinary", (1, 3, 1, 1), 4, "replicate"),
+        case("fireflies, peaked weights", "stiff", (1, 3, 3, 4), 4, "replicate", _radiance, 10.0),
+    )
 
 
 def _fusion_cases() -> tuple[Case, ...]:
@@ -685,6 +741,19 @@ OPS: tuple[Op, ...] = (
         _fusion_cases() + extreme.fusions(),
         LaplacianFusion,
         images=("fine", "coarse"),
+    ),
+    Op(
+        pyramid_partition,
+        reference.pyramid_partition,
+        _partition_cases() + extreme.partitions(),
+        images=_IMAGE,
+        rounding=extreme.partition_rounding,
+    ),
+    Op(
+        learned_upsample,
+        reference.learned_upsample,
+        _learned_cases() + extreme.learned(),
+        images=_IMAGE,
     ),
     Op(
         demodulate,

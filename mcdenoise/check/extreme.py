@@ -351,6 +351,63 @@ def fusions() -> tuple[Case, ...]:
     )
 
 
+def partitions() -> tuple[Case, ...]:
+    """Of ``pyramid_partition``."""
+
+    def three(g: Generator, *shape: int) -> Tensor:
+        return 3 * normal(g, *shape)
+
+    def case(name: str, size: tuple[int, int, int, int], image: Draw, logits: Draw = three, levels: int = 3) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            return {"image": image(g, *size), "logits": logits(g, size[0], levels, *size[2:])}
+
+        return Case(name, "extreme", tensors, ())
+
+    return (
+        *(case(*tried) for tried in _tried()),
+        case("logits of 1e4, alike", (1, 3, 3, 4), radiance, _constant(1e4)),
+        case("logits of 1e4, of both signs", (1, 3, 3, 4), radiance, _alternating(1e4)),
+        case("7 levels of 3x2", (1, 3, 3, 2), radiance, levels=7),
+    )
+
+
+def partition_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
+    """The gradient of a softmax, ``w (v - sum(w v))``, is a difference of terms of the size of ``w``."""
+    image, logits = inputs["image"], inputs["logits"]
+    assert isinstance(image, Tensor)
+    assert isinstance(logits, Tensor)
+    return Rounding(gradients={"logits": 2 * torch.softmax(logits, 1) * image.abs().sum(1, keepdim=True)})
+
+
+def learned() -> tuple[Case, ...]:
+    """Of ``learned_upsample``."""
+
+    def weights(g: Generator, *shape: int) -> Tensor:
+        return 4 * torch.softmax(3 * normal(g, *shape), 1)
+
+    def case(
+        name: str,
+        size: tuple[int, int, int, int],
+        image: Draw,
+        border: str,
+        kernel: Draw = weights,
+        side: int = 4,
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            return {"image": image(g, *size), "kernel": kernel(g, size[0], side**2, *size[2:])}
+
+        settings = {"size": (2 * size[2] - 1, 2 * size[3]), "border": border}
+        return Case(f"{name}, {border}", "extreme", tensors, (), settings)
+
+    borders = itertools.cycle(("replicate", "zeros"))
+    return (
+        *(case(name, size, draw, next(borders)) for name, size, draw in _tried()),
+        case("all weights zero", (1, 3, 3, 4), radiance, "replicate", _constant(0.0)),
+        case("weights that cancel", (1, 3, 3, 4), radiance, "zeros", _alternating(1e4)),
+        case("8x8 taps on 1x2", (1, 3, 1, 2), radiance, "replicate", side=8),
+    )
+
+
 def demodulations(image: str) -> tuple[Case, ...]:
     """Of ``demodulate`` and ``remodulate``."""
 

@@ -158,6 +158,40 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     return _tensor(out, fine.shape)
 
 
+def pyramid_partition(image: Tensor, logits: Tensor) -> tuple[Tensor, ...]:
+    """``out_i[q] = mean of softmax(logits)[i] image`` over the pixels of block ``q`` that exist."""
+    batch, channels, height, width = image.shape
+    source, exponents, found = image.tolist(), logits.tolist(), []
+    for level in range(logits.shape[1]):
+        side = 2**level
+        shape = (batch, channels, -(-height // side), -(-width // side))
+        out = _zeros(shape)
+        for b, c, i, j in _indices(shape):
+            block = []
+            for y in range(side * i, min(side * (i + 1), height)):
+                for x in range(side * j, min(side * (j + 1), width)):
+                    here = {k: [channel[y][x]] for k, channel in enumerate(exponents[b])}
+                    block.append(_softmax(here)[level] * source[b][c][y][x])
+            out[b][c][i][j] = sum(block) / len(block)
+        found.append(_tensor(out, shape))
+    return tuple(found)
+
+
+def learned_upsample(image: Tensor, kernel: Tensor, size: tuple[int, int], *, border: str = "replicate") -> Tensor:
+    """Tap ``(r, s)`` of coarse pixel ``(i, j)`` goes to the fine one ``(2 i + r - K / 2 + 1, 2 j + s - K / 2 + 1)``."""
+    batch, channels, coarse_height, coarse_width = image.shape
+    side, shape = math.isqrt(kernel.shape[1]), (batch, channels, *size)
+    source, weights, out = image.tolist(), kernel.tolist(), _zeros(shape)
+    for b, c, i, j in _indices(image.shape):
+        for r, s in itertools.product(range(side), repeat=2):
+            y, x = 2 * i + r - side // 2 + 1, 2 * j + s - side // 2 + 1
+            if border == "replicate":
+                y, x = _clamp(y, 2 * coarse_height), _clamp(x, 2 * coarse_width)
+            if 0 <= y < size[0] and 0 <= x < size[1]:
+                out[b][c][y][x] += weights[b][r * side + s][i][j] * source[b][c][i][j]
+    return _tensor(out, shape)
+
+
 def demodulate(color: Tensor, albedo: Tensor, *, floor: float = 4e-2) -> Tensor:
     """``color / max(albedo, floor)``; unchanged where the albedo is below 1e-4 in every channel."""
     source, modulation = color.tolist(), _modulation(albedo, floor)

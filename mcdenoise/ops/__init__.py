@@ -12,6 +12,7 @@ from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, 
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
+from mcdenoise.ops.partition import learned_upsample, pyramid_partition
 from mcdenoise.ops.temporal import Accumulate, accumulate, motion_from_position, reproject
 
 __all__ = [
@@ -40,9 +41,11 @@ __all__ = [
     "kernel_conv",
     "kernel_splat",
     "laplacian_fusion",
+    "learned_upsample",
     "luminance_moments",
     "moments_variance",
     "motion_from_position",
+    "pyramid_partition",
     "remodulate",
     "reproject",
     "upsample",

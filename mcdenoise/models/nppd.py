@@ -1,0 +1,339 @@
+"""Neural partitioning pyramids: a network shares out each pixel's light over five scales and splats it there.
+
+Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", SIGGRAPH, and its public code
+(balintio/nppd), which this page follows: steps, layers and weights are the code's. A step is
+
+1. warp what is kept of the frame before to this one: the mean of the radiance ``c'``, the result ``o'``, features
+   ``f'``;
+2. encode every sample, and average: ``f = mean_s E(depth, normal, albedo, log(1 + radiance / mean radiance))``;
+3. predict all weights from ``log(1 + (c', c) / mean of both)``, ``f'`` and ``f``: 6 + 32 + 32 = 70 channels;
+4. ``c <- lambda c' + (1 - lambda) c`` and ``f <- lambda f' + (1 - lambda) f`` with one sigmoid ``lambda`` a pixel;
+5. share out ``c`` over K = 5 levels by a softmax, average each part down to its level, splat it there by a 5x5 softmax,
+   and sum from coarse to fine, each coarse image upsampled by 4x4 weights, 4 times a softmax;
+6. splat ``o'`` by a 5x5 softmax, and mix both by a sigmoid: ``o = mu o' + (1 - mu) d``.
+
+The radiance is whole, with its albedo. Each pixel hands on all of its light, but what a pixel receives are weights of
+any sum: a splat is no mean. Nothing but training keeps a constant image constant.
+
+What the code leaves to its data set or its user, and what is taken here:
+
+- sizes that are no multiples of 32: the network sees the image with its edge repeated, the pyramid no more than the
+  image, and its weights are cropped;
+- samples: those of ``frame.samples``, radiance alone, each with the features of its pixel; without them the color
+  counts as one sample. The published networks are trained on 2, 4, 8 or 32;
+- depth in [0, 1] (:func:`mcdenoise.nn.normalize_depth`) in place of that of the data set's reader; normals as the frame
+  has them;
+- history that lies outside of the image is zero, as all is before the first frame; at its rim
+  (:func:`mcdenoise.ops.reproject`) it is a mean of what there is, where the code blends it with black. Nothing tests
+  whether a surface is the same one: the warped features tell, and lambda and mu decide;
+- the code adds 1e-8 to a mean radiance; here it is the mean alone, so that the unit of radiance does not matter;
+- taps of a splat are numbered by where light goes; in the code by where it comes from, which only renames channels.
+
+As in the code, light that a kernel sends over the border of the image is lost, and the network learns to send none.
+
+Its authors train it with ``2 SMAPE`` in space, ``0.2 SMAPE`` of differences to the frame before, which is warped, and
+``0.025`` times a perceptual loss in each, on two frames at a time whose state has no gradient, by Adam at 1e-4 with a
+decay of 0.94 an epoch. The trainer here has SMAPE in space, and in time without warping, through whole clips.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import LARGEST_RADIANCE, MOTION, Frame, tells_motion
+from mcdenoise.models._interface import Needs, Output, State
+from mcdenoise.models._journal import journal, timed
+from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.accumulated import is_still, motion_unless_still
+from mcdenoise.nn.inputs import features_of, normalize_depth
+from mcdenoise.ops import kernel_splat, learned_upsample, pyramid_partition, reproject
+from mcdenoise.ops._window import corner
+
+Backbone = Literal["convunet", "convunext"]
+
+LEVELS = 5  # K
+FEATURES = 32  # of a sample
+_SPLAT, _UPSAMPLE = 5**2, 4**2
+_SLOPE = 0.3  # of the leaky ReLUs
+# What is predicted at the finest scale, in order, and at each coarser one: 57 and 41 channels.
+_FINE = {"splat": _SPLAT, "previous": _SPLAT, "mu": 1, "lambda": 1, "partition": LEVELS}
+_COARSE = {"splat": _SPLAT, "upsample": _UPSAMPLE}
+
+
+class History(NamedTuple):
+    """What is kept of a frame. All of it zeros is that of no frame.
+
+    Args:
+        radiance: ``(B, 3 + C, H, W)`` exponential mean; where there are layers or an alpha, with them behind it, and
+            with ones, of which the sum of all weights comes.
+        image: ``(B, 3 + C, H, W)`` result, likewise.
+        features: ``(B, 32, H, W)`` exponential mean.
+        view_projection: ``(B, 4, 4)`` by which camera.
+    """
+
+    radiance: Tensor
+    image: Tensor
+    features: Tensor
+    view_projection: Tensor | None
+
+
+class ConvUNet(nn.Module):
+    """The small network of the code: a U-Net of 3x3 convolutions, max-pooling, and upsampling by repetition.
+
+    Args:
+        in_channels: of the input.
+        out_channels: predicted at each scale, the finest first, by 1x1 convolutions.
+        width: feature channels of the finest level, the published 96; the six levels have 3, 3, 4, 6, 8, 12 and 16
+            thirds of it, one more on the way to each level than on the way from it.
+    """
+
+    multiple = 32  # of pixels, those of the coarsest level
+
+    def __init__(self, in_channels: int, out_channels: Sequence[int], width: int) -> None:
+        super().__init__()
+        # 96, 128, 192, 256, 384, 512 as published.
+        widths = [round(width * thirds / 3) for thirds in (3, 4, 6, 8, 12, 16)]
+        finer = [widths[0], *widths[:-1]]
+        *above, (before, bottom) = zip(finer, widths, strict=True)
+        entering = [in_channels, *widths[:-1]]
+        self.down = nn.ModuleList(
+            _convolutions(channels, *each)
+            for channels, each in zip(entering, [*above, (bottom, bottom, before)], strict=True)
+        )
+        # Each way up ends with as many features as the next finer level has.
+        self.up = nn.ModuleList(_convolutions(2 * own, own, ending) for ending, own in above)
+        self.heads = nn.ModuleList(
+            nn.Conv2d(ending, channels, 1) for (ending, _), channels in zip(above, out_channels, strict=True)
+        )
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Predict.
+
+        Args:
+            x: ``(B, in_channels, H, W)``, height and width multiples of 32.
+
+        Returns:
+            ``(B, out_channels[i], H / 2^i, W / 2^i)``.
+        """
+        levels: list[Tensor] = []
+        for level, block in enumerate(self.down):
+            x = block(x if level == 0 else F.max_pool2d(x, 2))
+            levels.append(x)
+        predicted: list[Tensor] = []
+        for level in reversed(range(len(self.up))):
+            x = self.up[level](torch.cat([F.interpolate(x, scale_factor=2), levels[level]], 1))
+            predicted.append(self.heads[level](x))
+        return predicted[::-1]
+
+
+class ConvUNeXt(nn.Module):
+    """The large network of the code: blocks of ConvNeXt (Liu et al. 2022), and pixels of 2x2 as channels up and down.
+
+    Args:
+        in_channels: of the input.
+        out_channels: predicted at each scale, the finest first, by 1x1 convolutions.
+        width: feature channels of the finest level, the published 128, a multiple of 4; the five levels have 1, 1, 2, 2
+            and 4 times it.
+    """
+
+    multiple = 16  # of pixels, those of the coarsest level
+
+    def __init__(self, in_channels: int, out_channels: Sequence[int], width: int) -> None:
+        super().__init__()
+        widths, depths = [width, width, 2 * width, 2 * width, 4 * width], (4, 4, 6, 6, 8)
+        entering = [in_channels, *(4 * each for each in widths[:-1])]
+        coming = [each // 4 + own for own, each in itertools.pairwise(widths)]
+        self.down = nn.ModuleList(_blocks(*each) for each in zip(entering, widths, depths, strict=True))
+        self.up = nn.ModuleList(_blocks(*each) for each in zip(coming, widths[:-1], depths[:-1], strict=True))
+        self.heads = nn.ModuleList(nn.Conv2d(*each, 1) for each in zip(widths, out_channels, strict=True))
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """As :meth:`ConvUNet.forward`, of multiples of 16."""
+        levels: list[Tensor] = []
+        for level, block in enumerate(self.down):
+            x = block(x if level == 0 else F.pixel_unshuffle(x, 2))
+            levels.append(x)
+        predicted = [self.heads[-1](x)]
+        for level in reversed(range(len(self.up))):
+            x = self.up[level](torch.cat([F.pixel_shuffle(x, 2), levels[level]], 1))
+            predicted.append(self.heads[level](x))
+        return predicted[::-1]
+
+
+class _Block(nn.Module):
+    """A residual block of ConvNeXt: 7x7 on each channel, layer norm, and two layers a pixel with four times as many."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.spatial = nn.Conv2d(width, width, 7, padding=3, groups=width)
+        self.norm = nn.LayerNorm(width, eps=1e-6)
+        self.wide, self.narrow = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
+        self.scale = nn.Parameter(torch.full((width,), 1e-6))
+
+    def forward(self, x: Tensor) -> Tensor:
+        pixels: Tensor = self.norm(self.spatial(x).movedim(1, -1))
+        pixels = self.scale * self.narrow(F.gelu(self.wide(pixels)))
+        return x + pixels.movedim(-1, 1)
+
+
+class Nppd(nn.Module):
+    """The method, see the page.
+
+    Args:
+        width: of the network.
+        backbone: which network.
+    """
+
+    def __init__(self, width: int, backbone: Backbone) -> None:
+        super().__init__()
+        self.encoder = nn.Sequential(
+            nn.Conv2d(10, FEATURES, 1),
+            nn.LeakyReLU(_SLOPE),
+            nn.Conv2d(FEATURES, FEATURES, 1),
+            nn.LeakyReLU(_SLOPE),
+            nn.Conv2d(FEATURES, FEATURES, 1),
+        )
+        predicted = [sum(_FINE.values())] + [sum(_COARSE.values())] * (LEVELS - 1)
+        network = ConvUNet if backbone == "convunet" else ConvUNeXt
+        self.network: ConvUNet | ConvUNeXt = network(6 + 2 * FEATURES, predicted, width)
+
+    @property
+    def needs(self) -> Needs:
+        """Means of the whole image, and a history: no tiles."""
+        return Needs(uses=MOTION | {"albedo", "normal", "depth", "samples", "view_projection"})
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        frame = frame.with_depth()
+        dtype = torch.promote_types(frame.color.dtype, torch.float32)
+        radiance, others = frame.color.to(dtype), carried(frame)
+        if others is not None:
+            radiance = torch.cat([radiance, others.to(dtype), torch.ones_like(radiance[:, :1])], 1)
+        device = frame.color.device
+        with timed("accumulate", device):
+            mean_before, image_before, features_before = self._warped(frame, state, radiance)  #                     1.
+        with timed("network", device):
+            features = self._encoded(frame, dtype)  #                                                               2.
+            both = torch.cat([mean_before[:, :3], radiance[:, :3]], 1)
+            fine, coarse = self._weights(torch.cat([_logarithm(both), features_before, features], 1))  #            3.
+        with timed("filter", device):
+            trust, mix = torch.sigmoid(fine["lambda"]), torch.sigmoid(fine["mu"])
+            radiance = torch.lerp(radiance, mean_before, trust)  #                                                  4.
+            features = torch.lerp(features, features_before, trust)
+            denoised = _denoised(radiance, fine, coarse)  #                                                         5.
+            image = torch.lerp(denoised, _splatted(image_before, fine["previous"]), mix)  #                         6.
+        stages = {"accumulated": radiance[:, :3].to(frame.color.dtype)}
+        result = image[:, :3].to(frame.color.dtype)
+        output = answered(frame, result, None if others is None else _mean(image[:, 3:]))._replace(stages=stages)
+        keeps = frame.hints.keep_all or not frame.hints.last
+        return output, History(radiance, image, features, frame.view_projection) if keeps else None
+
+    def _warped(self, frame: Frame, before: History | None, radiance: Tensor) -> list[Tensor]:
+        """Mean radiance, result and features of the frame before at the places of this one, 0 where there is none."""
+        channels = [radiance.shape[1], radiance.shape[1], FEATURES]
+        reset, motion = "first frame", None
+        if before is not None:
+            alike = before.radiance.shape == radiance.shape and before.radiance.device == radiance.device
+            known = tells_motion(frame.buffers) and (frame.motion is not None or before.view_projection is not None)
+            reset = "size change" if not alike else "" if known else "no motion"
+        if (found := journal()) is not None:
+            found.reset = reset
+        if reset or before is None:
+            return list(radiance.new_zeros(len(radiance), sum(channels), *frame.size).split(channels, 1))
+        motion = motion_unless_still(frame, before.view_projection, is_still(frame, before.view_projection))
+        warped, weight = reproject(torch.cat(before[:3], 1).to(radiance.dtype), motion)
+        if found is not None:
+            found.history = float(weight.detach().mean())
+        return list(warped.split(channels, 1))
+
+    def _encoded(self, frame: Frame, dtype: torch.dtype) -> Tensor:
+        """Features of the samples, averaged."""
+        samples = frame.color[:, None] if frame.samples is None else frame.samples[:, :, :3]
+        # Of samples nobody has looked at every value.
+        samples = samples.to(dtype).nan_to_num(0).clamp(0, LARGEST_RADIANCE)
+        albedo, normal, depth = features_of(frame)
+        pixel = torch.cat([normalize_depth(depth), normal, albedo], 1).to(dtype)
+        count = samples.shape[1]
+        seen = torch.cat([pixel[:, None].expand(-1, count, -1, -1, -1), _logarithm(samples)], 2)
+        encoded: Tensor = self.encoder(seen.flatten(0, 1)).to(dtype)
+        return torch.unflatten(encoded, 0, (-1, count)).mean(1)
+
+    def _weights(self, seen: Tensor) -> tuple[dict[str, Tensor], list[dict[str, Tensor]]]:
+        """What the network predicts at the finest scale, and at each coarser one."""
+        height, width = seen.shape[-2:]
+        multiple = self.network.multiple
+        below, right = ((side + multiple - 1) // multiple * multiple - side for side in (height, width))
+        predicted = self.network(F.pad(seen, (0, right, 0, below), mode="replicate"))
+        found = []
+        for level, weights in enumerate(predicted):
+            side = 1 << level
+            names = _COARSE if level else _FINE
+            cut = corner(weights, (height + side - 1) // side, (width + side - 1) // side).to(seen.dtype)
+            found.append(dict(zip(names, cut.split(list(names.values()), 1), strict=True)))
+        return found[0], found[1:]
+
+
+def _logarithm(radiance: Tensor) -> Tensor:
+    """``log(1 + x / mean x)`` of each image or stack of images."""
+    mean = radiance.mean(tuple(range(1, radiance.dim())), keepdim=True)
+    return torch.log1p(radiance / torch.where(mean > 0, mean, 1))
+
+
+def _mean(filtered: Tensor) -> Tensor:
+    """Of sums of weighted images, with those of the weights behind them, the means: an alpha of one stays one."""
+    total = filtered[:, -1:]
+    return filtered[:, :-1] / torch.where(total > 0, total, 1)
+
+
+def _denoised(radiance: Tensor, fine: dict[str, Tensor], coarse: list[dict[str, Tensor]]) -> Tensor:
+    """The pyramid: down in parts, splatted there, and summed from coarse to fine."""
+    parts = pyramid_partition(radiance, fine["partition"])
+    splatted = [_splatted(part, weights["splat"]) for part, weights in zip(parts, (fine, *coarse), strict=True)]
+    denoised = splatted.pop()
+    for part, weights in zip(reversed(splatted), reversed(coarse), strict=True):
+        kernel = 4 * torch.softmax(weights["upsample"], 1)
+        denoised = part + learned_upsample(denoised, kernel, (part.shape[-2], part.shape[-1]), border="zeros")
+    return denoised
+
+
+def _splatted(image: Tensor, logits: Tensor) -> Tensor:
+    return kernel_splat(image, torch.softmax(logits, 1), border="zeros")
+
+
+def _convolutions(entering: int, *widths: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for channels, width in zip((entering, *widths[:-1]), widths, strict=True):
+        layers += [nn.Conv2d(channels, width, 3, padding=1), nn.LeakyReLU(_SLOPE)]
+    return nn.Sequential(*layers)
+
+
+def _blocks(entering: int, width: int, depth: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(entering, width, 1), *(_Block(width) for _ in range(depth)))
+
+
+@register_model("nppd")
+def nppd(width: int = 18, backbone: Backbone = "convunet") -> Nppd:
+    """Partitioning pyramids of Balint et al. 2023, recurrent; the published networks are larger (width 96, 128).
+
+    Args:
+        width: feature channels of the finest level. 96 of ``"convunet"`` is the published small network, of 2 and 4
+            samples a pixel; 128 of ``"convunext"`` the large one, of 8 and 32.
+        backbone: ``"convunet"`` or ``"convunext"``.
+
+    Raises:
+        InputError: there is no such backbone, or none of that width.
+    """
+    if backbone not in ("convunet", "convunext"):
+        raise InputError(f"backbone: expected convunet or convunext, found '{backbone}'")
+    step = 1 if backbone == "convunet" else 4
+    if width < 1 or width % step:
+        raise InputError(f"width: expected a positive multiple of {step} for {backbone}, found {width}")
+    return Nppd(width, backbone)
