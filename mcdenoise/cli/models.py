@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
+from rich.markup import escape
 from rich.table import Table
 
 from mcdenoise.cli._options import Json
@@ -36,7 +37,7 @@ def models(json: Json = None) -> None:
                 "not available" if entry.reason else entry.weights if entry.weights != "none" else "-",
                 f"{entry.parameters:,}" if entry.parameters else "-",
                 "-" if entry.kmacs_per_pixel is None else f"{entry.kmacs_per_pixel:.1f}",
-                entry.reason or entry.description,
+                escape(entry.reason or entry.description),
             )
         show(table)
     write_json(json, [asdict(entry) for entry in entries])

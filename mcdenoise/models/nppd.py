@@ -319,7 +319,7 @@ def _blocks(entering: int, width: int, depth: int) -> nn.Sequential:
     return nn.Sequential(nn.Conv2d(entering, width, 1), *(_Block(width) for _ in range(depth)))
 
 
-@register_model("nppd")
+@register_model("nppd", kind="recurrent", paper="Balint et al. 2023")
 def nppd(width: int = 18, backbone: Backbone = "convunet") -> Nppd:
     """Partitioning pyramids of Balint et al. 2023, recurrent; the published networks are larger (width 96, 128).
 

@@ -53,6 +53,8 @@ def test_a_model_without_its_package_is_listed_with_the_reason(
     printed = capsys.readouterr().out
     assert all(name in printed for name in list_models())
     assert "not available" in printed
+    # What is in brackets is no markup.
+    assert "[oidn]" in printed
 
 
 def test_a_kind_that_is_none_is_refused() -> None:
