@@ -471,7 +471,8 @@ def _affinity_cases() -> tuple[Case, ...]:
         drawn["center"] = torch.zeros_like(drawn["center"])  # type: ignore[arg-type]
 
     def unknown(drawn: Inputs) -> None:
-        assert isinstance(known := drawn["previous_weight"], Tensor)
+        known = drawn["previous_weight"]
+        assert isinstance(known, Tensor)
         known[..., 0] = 0
 
     return (
@@ -486,7 +487,9 @@ def _affinity_cases() -> tuple[Case, ...]:
         case("fireflies", "stiff", (1, 2, 2), draw=_dim),
         case("bandwidths of up to 30", "stiff", (1, 2, 2), (*here, *_BEFORE), largest=30.0),
         # A half of the difference quotient would be of a negative weight, and there the least one counts.
-        case("no weight of the centre", "extreme", (1, 1, 3), change=no_center, smooth=("image", "features", "bandwidth")),
+        case(
+            "no weight of the centre", "extreme", (1, 1, 3), change=no_center, smooth=("image", "features", "bandwidth")
+        ),
         case("unknown history", "extreme", (1, 2, 2), (*here, *_BEFORE), change=unknown),
     )
 

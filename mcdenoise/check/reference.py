@@ -248,13 +248,13 @@ def affinity_filter(
     dilation: int = 1,
 ) -> Tensor:
     """Means with weights ``exp(-a |f_p - f_q|^2)``, ``c`` of the pixel itself; likewise over the frame before."""
+    frames: list[tuple[Image, Image, Image, Image | None]]
     frames = [(image.tolist(), features.tolist(), bandwidth.tolist(), None)]
     if previous is not None and previous_features is not None:
         assert previous_bandwidth is not None
         assert previous_weight is not None
-        of_before = (previous, previous_features, previous_bandwidth, previous_weight)
-        source, there, width_of, known = (each.tolist() for each in of_before)
-        frames.append((source, there, width_of, known))
+        of_before = previous_bandwidth.tolist(), previous_weight.tolist()
+        frames.append((previous.tolist(), previous_features.tolist(), *of_before))
     here, own, out = features.tolist(), center.tolist(), _zeros(image.shape)
     batch, channels, height, width = image.shape
     steps = range(-(kernel_size // 2), kernel_size // 2 + 1)

@@ -65,9 +65,9 @@ def affinity_filter(
     Differentiable in all tensors, to any order, where ``center`` is above 1e-6. What is kept for the derivative are the
     arguments, and no weight of a tap; it costs about three times the filter.
 
-    Source: Isik et al. 2021, "Interactive Monte Carlo Denoising using Affinity of Neural Features", Sec. 4: the
-    pairwise affinity, its dilated filters, and the temporal one. What the weight of a tap of unknown history is, and
-    the least weight of the centre, are not of the paper.
+    Source: Isik et al. 2021, "Interactive Monte Carlo Denoising using Affinity of Neural Features": the equations of
+    its pairwise affinity, of the dilated filters, and of the temporal one. The weight of what is not known of the frame
+    before, and the least weight of the centre, are added here.
 
     Example:
         >>> image = torch.tensor([0.0, 1.0, 5.0, 6.0]).reshape(1, 1, 1, 4)
@@ -127,7 +127,14 @@ def _check(
 
 
 def _affine(
-    here: Tensor, there: Tensor, values: Tensor, bandwidth: Tensor, kernel_size: int, dilation: int, *, skip_center: bool
+    here: Tensor,
+    there: Tensor,
+    values: Tensor,
+    bandwidth: Tensor,
+    kernel_size: int,
+    dilation: int,
+    *,
+    skip_center: bool,
 ) -> Tensor:
     radius = kernel_size // 2 * dilation
     padded = pad(there, radius, "zeros"), pad(values, radius, "zeros")
@@ -167,7 +174,7 @@ class _Affine(Function):
         *_: None,
     ) -> Tensor:
         here, there, values, bandwidth = ctx.saved_tensors
-        total = values.new_zeros(len(values), values.shape[1], *here.shape[-2:])
+        total: Tensor = values.new_zeros(len(values), values.shape[1], *here.shape[-2:])
         for dy, dx in taps_of(ctx.kernel_size, ctx.dilation, ctx.skip):
             difference, distance, weight = affinity_of(here, there, bandwidth, dy, dx)
             of_exponent = torch.zeros_like(weight)
