@@ -98,7 +98,7 @@ def from_before(frame: Frame, before: Before | None, channels: int) -> tuple[Ten
         ``(B, channels, H, W)`` image, and ``(B, 1, H, W)`` in [0, 1] how much of it shows the same surface; zeros of a
         first frame, of another size than the one before, and where nothing tells motion.
     """
-    nothing = frame.color.new_zeros(len(frame.color), channels, *frame.size), torch.zeros_like(frame.color[:, :1])
+    nothing = frame.color.new_zeros(frame.color.shape[0], channels, *frame.size), torch.zeros_like(frame.color[:, :1])
     if before is None:
         _report("first frame", 0.0)
         return nothing

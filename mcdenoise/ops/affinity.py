@@ -152,7 +152,7 @@ class _Affine(Function):
     def forward(
         here: Tensor, there: Tensor, values: Tensor, bandwidth: Tensor, kernel_size: int, dilation: int, skip: bool
     ) -> Tensor:
-        total = values.new_zeros(len(values), values.shape[1], *here.shape[-2:])
+        total = values.new_zeros(*values.shape[:2], *here.shape[-2:])
         for dy, dx in taps_of(kernel_size, dilation, skip):
             _, _, weight = affinity_of(here, there, bandwidth, dy, dx)
             total.addcmul_(weight, tap_of(values, here, dy, dx))
@@ -174,7 +174,7 @@ class _Affine(Function):
         *_: None,
     ) -> Tensor:
         here, there, values, bandwidth = ctx.saved_tensors
-        total: Tensor = values.new_zeros(len(values), values.shape[1], *here.shape[-2:])
+        total: Tensor = values.new_zeros(*values.shape[:2], *here.shape[-2:])
         for dy, dx in taps_of(ctx.kernel_size, ctx.dilation, ctx.skip):
             difference, distance, weight = affinity_of(here, there, bandwidth, dy, dx)
             of_exponent = torch.zeros_like(weight)

@@ -14,6 +14,7 @@ from toys import frame_of, small, whole_frame
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.check import reference
+from mcdenoise.export import export_model
 from mcdenoise.models import Demodulated
 from mcdenoise.models.anf import Anf
 from mcdenoise.nn import auto_exposure
@@ -219,3 +220,9 @@ def test_a_gradient_reaches_the_first_of_three_frames() -> None:
     (gradient,) = torch.autograd.grad(output.image.sum(), colors[:1])
     assert torch.isfinite(gradient).all()
     assert gradient.any()
+
+
+@pytest.mark.slow
+def test_it_is_one_graph_with_its_state(tmp_path: Path) -> None:
+    exported = export_model(small("anf"), tmp_path / "anf.pt2")
+    assert {"samples", "state.image", "state.weight"} < set(exported.inputs)

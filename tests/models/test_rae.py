@@ -13,6 +13,7 @@ from torch.utils import _pytree as pytree
 from toys import frame_of, small, whole_frame
 
 from mcdenoise import Denoiser, Frame
+from mcdenoise.export import export_model
 from mcdenoise.models import Demodulated, Exposed
 from mcdenoise.models.rae import Rae, input_of, view_normal
 from mcdenoise.train import TrainConfig, train
@@ -230,3 +231,9 @@ def test_a_gradient_reaches_the_first_of_three_frames() -> None:
     (gradient,) = torch.autograd.grad(output.image.sum(), colors[:1])
     assert torch.isfinite(gradient).all()
     assert gradient.any()
+
+
+@pytest.mark.slow
+def test_it_is_one_graph_with_its_state(tmp_path: Path) -> None:
+    exported = export_model(small("rae"), tmp_path / "rae.pt2")
+    assert {f"state.hidden.{stage}" for stage in range(6)} < set(exported.inputs)
