@@ -23,6 +23,7 @@ from mcdenoise.check.case import Case, Inputs, Kind, Op, map_tensors
 from mcdenoise.check.case import normal as _normal
 from mcdenoise.check.case import radiance as _radiance
 from mcdenoise.check.case import uniform as _uniform
+from mcdenoise.ops.affinity import AffinityFilter, affinity_filter
 from mcdenoise.ops.atrous import Atrous, atrous
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
 from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
@@ -483,6 +484,72 @@ def _atrous_cases() -> tuple[Case, ...]:
     )
 
 
+_BEFORE = ("previous", "previous_features", "previous_bandwidth", "previous_weight")
+
+
+def _affinity_cases() -> tuple[Case, ...]:
+    here = ("image", "features", "bandwidth", "center")
+
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int],
+        inputs: tuple[str, ...] = here,
+        draw: Callable[..., Tensor] = _normal,
+        kernel_size: int = 3,
+        dilation: int = 1,
+        *,
+        channels: tuple[int, int] = (1, 2),
+        largest: float = 2.0,
+        change: Callable[[Inputs], None] | None = None,
+        smooth: tuple[str, ...] | None = None,
+    ) -> Case:
+        batch, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            def one(low: float = 0.1, high: float = 1.0) -> Tensor:
+                return _uniform(g, batch, 1, height, width, low=low, high=high)
+
+            drawn: Inputs = {}
+            for before in ("", "previous_"):
+                drawn[before.rstrip("_") or "image"] = draw(g, batch, channels[0], height, width)
+                drawn[f"{before}features"] = _uniform(g, batch, channels[1], height, width)
+                drawn[f"{before}bandwidth"] = one(high=largest)
+            drawn |= {"center": one(), "previous_weight": one()}
+            if change is not None:
+                change(drawn)
+            return {argument: drawn[argument] for argument in inputs}
+
+        settings = {"kernel_size": kernel_size, "dilation": dilation}
+        return Case(name, kind, tensors, inputs if smooth is None else smooth, settings)
+
+    def no_center(drawn: Inputs) -> None:
+        drawn["center"] = torch.zeros_like(drawn["center"])  # type: ignore[arg-type]
+
+    def unknown(drawn: Inputs) -> None:
+        known = drawn["previous_weight"]
+        assert isinstance(known, Tensor)
+        known[..., 0] = 0
+
+    return (
+        case("2x3", "ordinary", (1, 2, 3)),
+        case("frame before, batch of 2", "ordinary", (2, 1, 2), (*here, *_BEFORE)),
+        case("5x5 taps, one row, RGB", "ordinary", (1, 1, 4), kernel_size=5, channels=(3, 1)),
+        case("taps 2 pixels apart", "ordinary", (1, 2, 3), dilation=2),
+        case("taps beyond the image", "ordinary", (1, 2, 2), dilation=8),
+        case("one tap", "ordinary", (1, 1, 2), kernel_size=1),
+        case("one pixel, frame before", "ordinary", (1, 1, 1), (*here, *_BEFORE), channels=(3, 8)),
+        case("one column, taps 2 pixels apart, frame before", "ordinary", (1, 4, 1), (*here, *_BEFORE), dilation=2),
+        case("fireflies", "stiff", (1, 2, 2), draw=_dim),
+        case("bandwidths of up to 30", "stiff", (1, 2, 2), (*here, *_BEFORE), largest=30.0),
+        # A half of the difference quotient would be of a negative weight, and there the least one counts.
+        case(
+            "no weight of the centre", "extreme", (1, 1, 3), change=no_center, smooth=("image", "features", "bandwidth")
+        ),
+        case("unknown history", "extreme", (1, 2, 2), (*here, *_BEFORE), change=unknown),
+    )
+
+
 def _luminance_cases() -> tuple[Case, ...]:
     def case(
         name: str, kind: Kind, batch: int, height: int, width: int, draw: Callable[..., Tensor] = _uniform
@@ -784,6 +851,14 @@ OPS: tuple[Op, ...] = (
         _atrous_cases() + extreme.transforms(),
         Atrous,
         rounding=extreme.transform_rounding,
+    ),
+    Op(
+        affinity_filter,
+        reference.affinity_filter,
+        _affinity_cases() + extreme.affinities(),
+        AffinityFilter,
+        images=("image", "previous"),
+        rounding=extreme.affinity_rounding,
     ),
     Op(
         luminance_moments,

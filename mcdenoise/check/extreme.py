@@ -13,10 +13,12 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Generator, Tensor
 
 from mcdenoise.check.case import Case, Inputs, Rounding, map_tensors, normal, radiance, uniform
 from mcdenoise.ops._window import Border, inside, offsets, pad, shifted, unpad
+from mcdenoise.ops.affinity import affinity_of, tap_of, taps_of
 from mcdenoise.ops.bilateral import cross_bilateral_weights
 from mcdenoise.ops.fireflies import clamp_fireflies
 from mcdenoise.ops.temporal import Surface, reproject
@@ -522,6 +524,91 @@ def transform_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     slopes = {"light": least**-0.5, "variance": 1e4 / least, "normal": 128.0, "depth": 1e4 / 1e-30}
     lost = 25 * limits.tiny / limits.eps * size
     return Rounding(gradients={name: torch.full_like(tensors[name], lost * slopes[name]) for name in tensors})
+
+
+def affinities() -> tuple[Case, ...]:
+    """Of ``affinity_filter``."""
+
+    def case(
+        name: str,
+        size: tuple[int, int, int, int],
+        image: Draw,
+        features: Draw = uniform,
+        bandwidth: float = 2.0,
+        center: float = 0.5,
+        *,
+        before: bool = False,
+        kernel_size: int = 3,
+        dilation: int = 1,
+    ) -> Case:
+        batch, _, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            def frame(prefix: str) -> Inputs:
+                widths = bandwidth * uniform(g, batch, 1, height, width, low=0.5)
+                named = {"features": features(g, batch, 4, height, width), "bandwidth": widths}
+                return {f"{prefix}{key}": value for key, value in named.items()}
+
+            inputs: Inputs = {"image": image(g, *size), **frame("")}
+            inputs["center"] = center * uniform(g, batch, 1, height, width, low=0.5)
+            if before:
+                inputs |= {"previous": image(g, *size), **frame("previous_")}
+                inputs["previous_weight"] = uniform(g, batch, 1, height, width).round()
+            return inputs
+
+        return Case(name, "extreme", tensors, (), {"kernel_size": kernel_size, "dilation": dilation})
+
+    size = (1, 3, 3, 4)
+    return (
+        *(case(*tried) for tried in _tried()),
+        case("7x7 taps, frame before", size, radiance, before=True, kernel_size=7),
+        case("taps 64 pixels apart", size, radiance, dilation=64),
+        *(case(f"features of {value:g}", size, radiance, _alternating(value)) for value in (1e-30, 6e4, 1e18, 1e30)),
+        case("features alike", size, radiance, _constant(0.3), 1e6),
+        case("bandwidths of 0", size, radiance, normal, 0.0, before=True),
+        case("bandwidths of 1e6", size, radiance, normal, 1e6, before=True),
+        case("like no other, no weight of the centre", size, radiance, normal, 1e6, 0.0),
+        case("no weight of the centre, frame before", size, radiance, center=0.0, before=True),
+    )
+
+
+def affinity_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
+    """A mean grows with a weight by the value of its tap and shrinks by the mean, each over the sum of the weights.
+
+    A weight below the smallest number of float32 may be 0 besides: then all of it is lost, times its value.
+    """
+    tensors = {name: value for name, value in inputs.items() if isinstance(value, Tensor)}
+    image, here = tensors["image"], tensors["features"]
+    if not image.numel():
+        return Rounding()
+    limits, radius = torch.finfo(torch.float32), settings["kernel_size"] // 2 * settings["dilation"]
+    values = [tensors[name] for name in ("image", "previous") if name in tensors]
+    brightest = max(float(each.abs().sum(1).amax()) for each in values)
+    total, lost = tensors["center"].clamp_min(1e-6), torch.zeros_like(tensors["center"])
+    taps = []
+    for name in ("", "previous_")[: len(values)]:
+        there, bandwidth = tensors[f"{name}features"], tensors[f"{name}bandwidth"]
+        known = tensors["previous_weight"] if name else torch.ones_like(bandwidth)
+        padded, inside = (F.pad(each, (radius,) * 4) for each in (there, known))
+        for at in taps_of(**settings, skip_center=not name):
+            difference, distance, weight = affinity_of(here, padded, bandwidth, *at)
+            counts = tap_of(inside, here, *at)
+            gone = torch.where(weight < limits.tiny, weight / limits.eps, 0)
+            total, lost = total + counts * weight, lost + counts * gone * brightest
+            taps.append((name, at, difference.abs(), distance, weight + gone, counts, bandwidth))
+    gradients: Inputs = {"center": 2 * brightest / total}
+    sums = {name: torch.zeros_like(each) for name, each in tensors.items() if name not in gradients}
+    far = {name: F.pad(sums[name], (radius,) * 4) for name in sums}
+    for name, at, difference, distance, weight, counts, bandwidth in taps:
+        term = 2 * brightest / total * weight
+        pull = 2 * bandwidth * counts * term * difference
+        sums["features"] += pull
+        sums[f"{name}bandwidth"] += counts * term * distance
+        tap_of(far[f"{name}features"], here, *at).add_(pull)
+        if name:
+            tap_of(far["previous_weight"], here, *at).add_(term)
+    gradients |= {name: each + tap_of(far[name], here, 0, 0) for name, each in sums.items()}
+    return Rounding(result=float((lost / total).amax()), gradients=gradients)
 
 
 def luminances() -> tuple[Case, ...]:

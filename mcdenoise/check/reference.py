@@ -268,6 +268,50 @@ def atrous(
     return _tensor(out, light.shape), _tensor(out_noise, variance.shape)
 
 
+def affinity_filter(
+    image: Tensor,
+    features: Tensor,
+    bandwidth: Tensor,
+    center: Tensor,
+    previous: Tensor | None = None,
+    previous_features: Tensor | None = None,
+    previous_bandwidth: Tensor | None = None,
+    previous_weight: Tensor | None = None,
+    *,
+    kernel_size: int = 7,
+    dilation: int = 1,
+) -> Tensor:
+    """Means with weights ``exp(-a |f_p - f_q|^2)``, ``c`` of the pixel itself; likewise over the frame before."""
+    frames: list[tuple[Image, Image, Image, Image | None]]
+    frames = [(image.tolist(), features.tolist(), bandwidth.tolist(), None)]
+    if previous is not None and previous_features is not None:
+        assert previous_bandwidth is not None
+        assert previous_weight is not None
+        of_before = previous_bandwidth.tolist(), previous_weight.tolist()
+        frames.append((previous.tolist(), previous_features.tolist(), *of_before))
+    here, own, out = features.tolist(), center.tolist(), _zeros(image.shape)
+    batch, channels, height, width = image.shape
+    steps = range(-(kernel_size // 2), kernel_size // 2 + 1)
+    for b, y, x in itertools.product(range(batch), range(height), range(width)):
+        taps = []
+        for source, there, band, known in frames:
+            for i, j in itertools.product(steps, repeat=2):
+                row, column = y + dilation * i, x + dilation * j
+                if not (0 <= row < height and 0 <= column < width):
+                    continue
+                if known is None and (i, j) == (0, 0):
+                    weight = max(own[b][0][y][x], 1e-6)
+                else:
+                    apart = sum((here[b][f][y][x] - there[b][f][row][column]) ** 2 for f in range(features.shape[1]))
+                    weight = math.exp(-band[b][0][y][x] * apart)
+                    weight *= 1 if known is None else known[b][0][row][column]
+                taps.append((weight, [source[b][c][row][column] for c in range(channels)]))
+        total = sum(weight for weight, _ in taps)
+        for c in range(channels):
+            out[b][c][y][x] = sum(weight * value[c] for weight, value in taps) / total
+    return _tensor(out, image.shape)
+
+
 def luminance_moments(light: Tensor) -> Tensor:
     """``(l, l^2)`` with ``l = 0.2126 R + 0.7152 G + 0.0722 B``."""
     batch, _, height, width = light.shape

@@ -34,7 +34,7 @@ from mcdenoise.ops.lag import THRESHOLD
 from mcdenoise.ops.temporal import Rule
 
 # A cut leaves a few accidental matches; a fast pan keeps far more than this fraction of the image.
-_CUT_FRACTION = 0.05
+CUT_FRACTION = 0.05
 # What a mirror or glass shows does not move as its surface does: a long history would smear it.
 SPECULAR_LENGTH = 2.0
 # Where clamping would take more than this fraction of the light of the median block, the shot's light is caustics,
@@ -190,7 +190,7 @@ class Accumulated(Wrapper):
         if not reset and history is not None:
             still = is_still(frame, history.view_projection)
             color, length, kept = self._blend(frame, entering, history.color, seen, history, still)
-            cut = kept.mean() < _CUT_FRACTION
+            cut = kept.mean() < CUT_FRACTION
             if (found := journal()) is not None:
                 found.history = float(kept.mean())
             if not compiling and not cut:

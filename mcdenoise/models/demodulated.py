@@ -23,7 +23,8 @@ class Demodulated(Wrapper):
     everywhere.
 
     Args:
-        inner: any method; it sees the radiance, that of the frame alone and their variance without albedo.
+        inner: any method; it sees the radiance, that of the frame alone and of its samples, and their variance without
+            albedo.
     """
 
     @property
@@ -64,6 +65,9 @@ def _without_albedo(frame: Frame) -> Frame:
         if image is not None
     }
     changes["layers"] = {name: by_rows(demodulate, layer, albedo) for name, layer in frame.layers.items()}
+    if frame.samples is not None:
+        light = [demodulate(each, albedo) for each in frame.samples[:, :, :3].unbind(1)]
+        changes["samples"] = torch.cat([torch.stack(light, 1), frame.samples[:, :, 3:]], 2)
     if frame.variance is not None:
         # That of a quotient is the variance over the square of the divisor.
         changes["variance"] = demodulate(demodulate(frame.variance, albedo), albedo)

@@ -23,7 +23,8 @@ class Before(NamedTuple):
     """What is kept of a frame. All of it zeros is that of no frame: nothing there shows what is here.
 
     Args:
-        image: ``(B, 6, H, W)`` that the method made of it, and the same without albedo.
+        image: ``(B, C, H, W)`` what is reprojected; of :class:`Recurrent`, 6 channels: what the method made of the
+            frame, and the same without albedo.
         weight: ``(B, 1, 1, 1)`` 1, or 0 where there was no frame.
         surface: what was seen.
         view_projection: ``(B, 4, 4)`` by which camera.
@@ -65,37 +66,53 @@ class Recurrent(Wrapper):
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.with_depth()
         with timed("accumulate", frame.color.device):
-            image, weight = self._previous(frame, state)
+            image, weight = from_before(frame, state, channels=6)
         image, light = image.split(3, 1)
         light = light if frame.albedo is None else remodulate(light, frame.albedo)
         before = {PREVIOUS: image, PREVIOUS_LIGHT: light, PREVIOUS_WEIGHT: weight}
         handed = frame.replace(extra={**frame.extra, **before})
         output, _ = self.inner(handed)
-        keeps = frame.hints.keep_all or not frame.hints.last
-        note("remember", "for the next frame" if keeps else "last frame", float(not keeps))
-        if not keeps:
-            return output, None
-        surface = Surface(frame.position, frame.normal, frame.depth)
         light = output.image if frame.albedo is None else demodulate(output.image, frame.albedo)
-        weight = torch.ones_like(weight[..., :1, :1])
-        return output, Before(torch.cat([output.image, light], 1), weight, surface, frame.view_projection)
+        return output, to_be_kept(frame, torch.cat([output.image, light], 1))
 
-    def _previous(self, frame: Frame, before: Before | None) -> tuple[Tensor, Tensor]:
-        nothing = torch.zeros_like(frame.color).repeat(1, 2, 1, 1), torch.zeros_like(frame.color[:, :1])
-        if before is None:
-            _report("first frame", 0.0)
-            return nothing
-        if before.image.shape != nothing[0].shape or before.image.device != frame.color.device:
-            _report("size change", 0.0)
-            return nothing
-        if not tells_motion(frame.buffers) or (frame.motion is None and before.view_projection is None):
-            _report("no motion", 0.0)
-            return nothing
-        motion = motion_unless_still(frame, before.view_projection, is_still(frame, before.view_projection))
-        found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
-        weight = weight * before.weight
-        _report("", float(weight.detach().mean()) if journal() is not None else 0.0)
-        return found, weight
+
+def to_be_kept(frame: Frame, image: Tensor) -> Before | None:
+    """What is kept of a frame and of an image of it ``(B, C, H, W)`` for the next one; nothing of the last frame."""
+    keeps = frame.hints.keep_all or not frame.hints.last
+    note("remember", "for the next frame" if keeps else "last frame", float(not keeps))
+    if not keeps:
+        return None
+    surface = Surface(frame.position, frame.normal, frame.depth)
+    return Before(image, torch.ones_like(image[:, :1, :1, :1]), surface, frame.view_projection)
+
+
+def from_before(frame: Frame, before: Before | None, channels: int) -> tuple[Tensor, Tensor]:
+    """What was kept of the frame before, at the places of this one.
+
+    Args:
+        frame: with a depth, if it has what tells one (:meth:`mcdenoise.frame.Frame.with_depth`).
+        before: by :func:`to_be_kept`.
+        channels: of the image that is kept.
+
+    Returns:
+        ``(B, channels, H, W)`` image, and ``(B, 1, H, W)`` in [0, 1] how much of it shows the same surface; zeros of a
+        first frame, of another size than the one before, and where nothing tells motion.
+    """
+    nothing = frame.color.new_zeros(frame.color.shape[0], channels, *frame.size), torch.zeros_like(frame.color[:, :1])
+    if before is None:
+        _report("first frame", 0.0)
+        return nothing
+    if before.image.shape != nothing[0].shape or before.image.device != frame.color.device:
+        _report("size change", 0.0)
+        return nothing
+    if not tells_motion(frame.buffers) or (frame.motion is None and before.view_projection is None):
+        _report("no motion", 0.0)
+        return nothing
+    motion = motion_unless_still(frame, before.view_projection, is_still(frame, before.view_projection))
+    found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
+    weight = weight * before.weight
+    _report("", float(weight.detach().mean()) if journal() is not None else 0.0)
+    return found, weight
 
 
 def _report(reset: str, history: float) -> None:

@@ -3,6 +3,7 @@
 from mcdenoise.ops._backend import use
 from mcdenoise.ops._constants import NO_ALBEDO
 from mcdenoise.ops._surface import Surface
+from mcdenoise.ops.affinity import AffinityFilter, affinity_filter
 from mcdenoise.ops.atrous import Atrous, atrous
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
 from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
@@ -18,6 +19,7 @@ from mcdenoise.ops.temporal import Accumulate, accumulate, motion_from_position,
 __all__ = [
     "NO_ALBEDO",
     "Accumulate",
+    "AffinityFilter",
     "Atrous",
     "ClampFireflies",
     "CrossBilateralFilter",
@@ -31,6 +33,7 @@ __all__ = [
     "Remodulate",
     "Surface",
     "accumulate",
+    "affinity_filter",
     "atrous",
     "clamp_fireflies",
     "cross_bilateral_filter",

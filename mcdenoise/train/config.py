@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT
+from mcdenoise.train.losses import Loss
 
 Schedule = Literal["constant", "cosine"]
 
@@ -30,6 +31,8 @@ class TrainConfig:
         width: feature channels, as in the settings; 0 takes the model's own, or that of the weights it starts from.
         losses: weights of the result and of stages on the way to it in the loss, such as image=1,initial=0.5; 1 for the
             result and for the stage initial, where the model has one, by default.
+        loss: of a clip: smape, the paper's, or rae, that of Chaitanya et al. 2017, whose later frames count more, see
+            :func:`mcdenoise.train.losses.rae_loss`.
         steps: optimiser steps.
         batch: clips in a step, of all processes together.
         frames: frames in a clip.
@@ -63,6 +66,7 @@ class TrainConfig:
     settings: str = ""
     width: int = 0
     losses: str = ""
+    loss: Loss = "smape"
     steps: int = 10_000
     batch: int = 8
     frames: int = 8
@@ -141,7 +145,8 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
     for name, low in lowest.items():
         if not settings[name] >= low:
             raise InputError(f"{name}: expected at least {low}, found {settings[name]}")
-    for name, known in (("schedule", get_args(Schedule)), ("precision", get_args(Precision))):
+    choices = {"loss": get_args(Loss), "schedule": get_args(Schedule), "precision": get_args(Precision)}
+    for name, known in choices.items():
         if settings[name] not in known:
             raise InputError(f"{name}: expected one of {', '.join(known)}, found '{settings[name]}'")
     for name in ("exposure", "tint"):

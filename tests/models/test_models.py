@@ -190,7 +190,8 @@ def test_exposure_only_scales_the_result(name: str, factor: float) -> None:
     model = small(name)
     frame = whole_frame(model, 33, 20)
     result, _ = model(frame)
-    scaled, _ = model(frame.replace(color=frame.color * factor))
+    samples = None if frame.samples is None else frame.samples * factor
+    scaled, _ = model(frame.replace(color=frame.color * factor, samples=samples))
     torch.testing.assert_close(scaled.image / factor, result.image, rtol=1e-4, atol=1e-5)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import get_args
+
 import pytest
 import torch
 from torch import Tensor
@@ -9,7 +12,7 @@ from torch.autograd import gradcheck
 
 from mcdenoise.errors import InputError
 from mcdenoise.models import Output
-from mcdenoise.train.losses import stage_loss, stage_weights
+from mcdenoise.train.losses import LOSSES, Loss, rae_loss, stage_loss, stage_weights
 
 BOTH = {"image": 1.0, "initial": 1.0}
 
@@ -63,6 +66,58 @@ def test_the_loss_of_one_frame() -> None:
     assert stage_loss(Output(one), one, {"image": 1.0}, temporal_weight=0).item() == 0
     with pytest.raises(ValueError, match="at least 2 frames"):
         stage_loss(Output(one), one, {"image": 1.0})
+
+
+def test_the_recurrent_autoencoders_loss_is_its_equation() -> None:
+    image, reference = (torch.rand(2, 7, 3, 3, 4, dtype=torch.float64) for _ in range(2))
+    # As the paper prints them.
+    printed = [0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0]
+    counts = [math.exp(-((6 - t) ** 2) / 8) for t in range(7)]
+    assert counts == pytest.approx(printed, abs=6e-4)
+
+    def mean(numbers: list[float]) -> float:
+        return sum(numbers) / len(numbers)
+
+    terms = []
+    for clip, true in zip(image.tolist(), reference.tolist(), strict=True):
+        pairs = [zip(values(r), values(y), strict=True) for r, y in zip(clip, true, strict=True)]
+        errors = [[math.log1p(a) - math.log1p(b) for a, b in pair] for pair in pairs]
+        for t, error in enumerate(errors):
+            # Of channel c, row y, column x: number 12 c + 4 y + x.
+            across = [abs(error[i + 1] - error[i]) for i in range(36) if i % 4 < 3]
+            down = [abs(error[i + 4] - error[i]) for i in range(36) if i % 12 < 8]
+            moved = [abs(a - b) for a, b in zip(error, errors[t - 1], strict=True)] if t else [0.0]
+            spatial = mean([abs(each) for each in error])
+            gradient = (mean(across) + mean(down)) / 2
+            terms.append(counts[t] * (0.8 * spatial + 0.1 * gradient + 0.1 * mean(moved)))
+    expected = sum(terms) / 2 / sum(counts)
+    assert rae_loss(image, reference).item() == pytest.approx(expected, rel=1e-12)
+    found = stage_loss(Output(image), reference, {"image": 2.0}, loss="rae")
+    assert found.item() == pytest.approx(2 * expected, rel=1e-12)
+
+
+def test_a_constant_error_has_no_gradient_and_no_flicker() -> None:
+    """And counts the same in clips of any length, of any size."""
+    for shape in ((1, 1, 3, 1, 1), (2, 3, 3, 4, 5), (1, 9, 3, 1, 6)):
+        ones = torch.ones(shape, dtype=torch.float64)
+        for temporal_weight in (0.0, 0.1, 5.0):
+            found = rae_loss(math.e * ones - 1, 0 * ones, temporal_weight=temporal_weight)
+            assert found.item() == pytest.approx(0.8)
+    with pytest.raises(ValueError, match=r"image: expected shape \(1, 2, 3, 4, 4\) as reference"):
+        rae_loss(torch.ones(1, 1, 3, 4, 4), torch.ones(1, 2, 3, 4, 4))
+
+
+def test_the_gradient_of_the_recurrent_autoencoders_loss() -> None:
+    # Errors and their differences stay away from zero: steps of two, and noise of a tenth.
+    place = torch.arange(12, dtype=torch.float64).reshape(1, 1, 1, 3, 4)
+    error = 1 + 2 * place + 50 * torch.arange(3, dtype=torch.float64).reshape(1, 3, 1, 1, 1)
+    reference = torch.rand(1, 3, 3, 3, 4, dtype=torch.float64)
+    image = (torch.expm1(0.01 * error + 1) + reference).requires_grad_()
+    assert gradcheck(rae_loss, (image, reference))
+
+
+def test_every_loss_has_its_name() -> None:
+    assert set(LOSSES) == set(get_args(Loss))
 
 
 def test_weights_that_nobody_asked_for_are_the_papers() -> None:

@@ -75,6 +75,11 @@ class _Trial:
         return found
 
     @property
+    def images(self) -> list[str]:
+        """The op's images, as far as the case has them."""
+        return [name for name in self.op.images if name in self.inputs]
+
+    @property
     def inner(self) -> torch.dtype:
         """The dtype in which the op computes."""
         return self.dtype if self.op.own else accumulator_dtype(self.dtype)
@@ -382,7 +387,7 @@ def _check_weights(trial: _Trial, weights: Tensor) -> Check:
 def _check_constant(trial: _Trial) -> Check:
     """The forward check once more, with constant images: a mean of equal numbers is that number."""
     inputs = dict(trial.inputs)
-    for name in trial.op.images:
+    for name in trial.images:
         inputs[name] = torch.full_like(_tensor(inputs[name]), _CONSTANT)
     constant = replace(trial, inputs=inputs)
     results = constant.run(constant.leaves)
@@ -394,10 +399,10 @@ def _check_exposure(trial: _Trial, result: Tensor) -> Check:
     message = ""
     for exposure in _EXPOSURES:
         inputs = dict(trial.inputs)
-        for name in trial.op.images:
+        for name in trial.images:
             inputs[name] = _tensor(inputs[name]) * exposure
         scaled = replace(trial, inputs=inputs)
-        if not all(bool(_normal_range(_tensor(inputs[name])).all()) for name in trial.op.images):
+        if not all(bool(_normal_range(_tensor(inputs[name])).all()) for name in trial.images):
             continue
         found, expected = scaled.run(scaled.leaves)[0], result * exposure
         if not torch.equal(found, expected) and bool(_normal_range(expected).all()):
