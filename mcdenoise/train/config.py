@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT
+from mcdenoise.train.losses import SpatialLoss
 
 Schedule = Literal["constant", "cosine"]
 
@@ -38,6 +39,7 @@ class TrainConfig:
         schedule: constant, or cosine down to 0 after a warm-up of 200 steps.
         temporal_weight: of the temporal loss.
         display_weight: of the error on a display, see :func:`mcdenoise.train.losses.display_error`.
+        spatial_loss: smape, or l1_display, which is :func:`mcdenoise.train.losses.display_difference`.
         key: each clip is brought to this typical radiance, a middle gray such as 0.2, before its light is scaled; 0
             leaves it as it was rendered.
         gradient_norm: largest norm of a step's gradient; 0 does not limit it.
@@ -71,6 +73,7 @@ class TrainConfig:
     schedule: Schedule = "constant"
     temporal_weight: float = 0.1
     display_weight: float = 0.0
+    spatial_loss: SpatialLoss = "smape"
     key: float = 0.0
     gradient_norm: float = 0.0
     ema: float = 0.0
@@ -141,7 +144,8 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
     for name, low in lowest.items():
         if not settings[name] >= low:
             raise InputError(f"{name}: expected at least {low}, found {settings[name]}")
-    for name, known in (("schedule", get_args(Schedule)), ("precision", get_args(Precision))):
+    choices = {"schedule": Schedule, "precision": Precision, "spatial_loss": SpatialLoss}
+    for name, known in ((name, get_args(choice)) for name, choice in choices.items()):
         if settings[name] not in known:
             raise InputError(f"{name}: expected one of {', '.join(known)}, found '{settings[name]}'")
     for name in ("exposure", "tint"):

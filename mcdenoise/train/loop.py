@@ -224,8 +224,14 @@ class Trainer:
         clip = clip.to(self.fabric.device)
         with _drawn_resolutions(self.network) if self.config.draw_resolutions else nullcontext():
             output = self.model(clip.buffers)
-        weights = {"temporal_weight": self.config.temporal_weight, "display_weight": self.config.display_weight}
-        loss = stage_loss(output, clip["reference"], self.losses, **weights)
+        loss = stage_loss(
+            output,
+            clip["reference"],
+            self.losses,
+            temporal_weight=self.config.temporal_weight,
+            display_weight=self.config.display_weight,
+            spatial_loss=self.config.spatial_loss,
+        )
         self.stepper.zero_grad()
         self.fabric.backward(loss)
         norm = self.fabric.clip_gradients(

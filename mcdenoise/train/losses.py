@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear, temporal_smape_linear
 from mcdenoise.models import Output
+
+SpatialLoss = Literal["smape", "l1_display"]
 
 RESULT = "image"
 _DARK = 1e-3
@@ -21,6 +24,7 @@ def stage_loss(
     *,
     temporal_weight: float = 0.1,
     display_weight: float = 0.0,
+    spatial_loss: SpatialLoss = "smape",
 ) -> Tensor:
     """The total loss: spatial and temporal SMAPE of the image, its error on a display, and those of stages before it.
 
@@ -33,6 +37,7 @@ def stage_loss(
         weights: of the result, ``"image"``, and of stages by name; those without one do not count.
         temporal_weight: ``w_t``, the paper's ``w_c = w_d``, 0.1; 0 leaves the temporal loss out.
         display_weight: ``w_d`` of :func:`display_error`; 0, as in the paper, leaves it out.
+        spatial_loss: ``L_s``: SMAPE, as in the paper, or :func:`display_difference`.
 
     Returns:
         A scalar, the mean over the batch.
@@ -53,7 +58,8 @@ def stage_loss(
     images = {RESULT: output.image, **output.stages}
     loss = reference.new_zeros(())
     for stage, weight in weights.items():
-        loss = loss + weight * smape_linear(images[stage], reference).mean()
+        spatial = smape_linear if spatial_loss == "smape" else display_difference
+        loss = loss + weight * spatial(images[stage], reference).mean()
         if temporal_weight:
             flicker = temporal_smape_linear(images[stage], reference).mean()
             loss = loss + weight * temporal_weight * flicker
@@ -77,6 +83,23 @@ def display_error(image: Tensor, reference: Tensor) -> Tensor:
     """
     shown, wanted = (each.clamp(0, 1).add(_DARK).pow(1 / 2.2) for each in (image, reference))
     return ((shown - wanted).square().mean((-3, -2, -1)) + _DARK**2).sqrt()
+
+
+def display_difference(image: Tensor, reference: Tensor) -> Tensor:
+    """Mean absolute difference of each frame on the curve of a display, which a bright pixel moves less than a dark.
+
+    ``mean(|g(x) - g(y)|)`` with ``g(x) = (max(x, 0) + c)^(1 / 2.2)``: what Meng et al. 2020 train with (its ``c`` is
+    0). Unlike :func:`display_error` it does not end where a display does.
+
+    Args:
+        image: ``(..., 3, H, W)`` scene-linear radiance.
+        reference: of the same shape.
+
+    Returns:
+        ``(...)``, one number a frame, differentiable where both are not equal, also in black: ``c = 0.001``.
+    """
+    shown, wanted = (each.clamp_min(0).add(_DARK).pow(1 / 2.2) for each in (image, reference))
+    return (shown - wanted).abs().mean((-3, -2, -1))
 
 
 def stage_weights(asked: Mapping[str, float], output: Output) -> dict[str, float]:
