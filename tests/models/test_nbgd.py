@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -134,3 +135,24 @@ def test_derivatives_of_more_than_100_in_a_guide_do_not_count_in_training() -> N
         guides = network.last.weight.grad[:3]
         assert bool((guides.abs() > 1e3).any()) is not training
         assert torch.isfinite(network.last.weight.grad).all()
+
+
+def test_it_learns_by_the_loss_of_its_authors(small_sequence: Path, tmp_path: Path) -> None:
+    for package in ("lightning_fabric", "tensorboard"):
+        pytest.importorskip(package, reason="training needs the packages of mcdenoise[train]")
+    from mcdenoise.train import TrainConfig, train
+
+    reports: list[Any] = []
+    config = TrainConfig(
+        model="nbgd",
+        crop=16,
+        frames=2,
+        batch=1,
+        steps=2,
+        validation_frames=1,
+        temporal_weight=0.0,
+        spatial_loss="l1_display",
+    )
+    weights = train(config, [small_sequence], tmp_path / "run", checkpoint_every=1, report=reports.append)
+    assert [report.step for report in reports] == [1, 2]
+    assert sum(part.numel() for part in create_model("nbgd", weights=weights).parameters()) == 29_425
