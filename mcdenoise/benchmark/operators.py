@@ -231,10 +231,17 @@ def largest_case(op: Op) -> Case:
 def enlarged(
     case: Case, width: int, height: int, *, dtype: torch.dtype = torch.float32, device: str = "cpu"
 ) -> tuple[Inputs, dict[str, Any]]:
-    """The inputs and settings of a case, repeated to a size; what has half the case's size gets half of the size."""
+    """The inputs and settings of a case, repeated to a size; what has half the case's size gets half of the size.
+
+    A grid of cells, which has five axes, gets as many of them as the size takes.
+    """
     old_height, old_width = _size(case)
 
     def repeat(tensor: Tensor) -> Tensor:
+        if tensor.ndim == 5:
+            rows, columns = (-(-side // case.settings["cell"]) for side in (height, width))
+            times = -(-rows // tensor.shape[2]), -(-columns // tensor.shape[3])
+            return tensor.to(device).repeat(1, 1, *times, 1)[:, :, :rows, :columns].contiguous()
         if tensor.ndim != 4:
             return tensor.to(device)
         whole = tuple(tensor.shape[-2:]) == (old_height, old_width)

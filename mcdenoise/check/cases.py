@@ -27,6 +27,7 @@ from mcdenoise.ops.affinity import AffinityFilter, affinity_filter
 from mcdenoise.ops.atrous import Atrous, atrous
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
 from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
+from mcdenoise.ops.bilateral_grid import GridSlice, GridSplat, cells_of, grid_slice, grid_splat
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
@@ -370,7 +371,7 @@ def _firefly_cases() -> tuple[Case, ...]:
         case("firefly in the corner", "stiff", (1, 3, 4, 5), (0, 0)),
         case("firefly at the border", "stiff", (1, 3, 4, 5), (3, 2)),
         case("fireflies side by side", "stiff", (1, 3, 4, 5), (1, 1), (1, 2), (2, 1), limit=2.0),
-        case("six decades", "stiff", (1, 3, 3, 4), draw=_radiance, limit=2.0),
+        case("fireflies of 100", "stiff", (1, 3, 3, 4), draw=_radiance, limit=2.0),
         # Black pixels beside: whether they count jumps at zero, so there is no derivative.
         case("black", "extreme", (1, 3, 3, 3), draw=black, differentiable=False),
         case("one bright pixel on black", "extreme", (1, 3, 3, 4), (1, 1), draw=black, differentiable=False),
@@ -597,6 +598,82 @@ def _moments_cases() -> tuple[Case, ...]:
         case("one row, other tolerances", "ordinary", (1, 1, 6), 5, sigma_z=3.0, sigma_n=8.0),
         case("fireflies", "stiff", (1, 2, 3), 3, draw=_dim),
         case("moments that cancel", "stiff", (1, 3, 3), 1, ("moments",), spread=1e-3),
+    )
+
+
+def _guide(g: Generator, batch: int, height: int, width: int, bins: int) -> Tensor:
+    """Between the centres of bins, or beyond the first and the last, and away from them."""
+    shape = (batch, 1, height, width)
+    between = torch.randint(bins + 1, shape, generator=g) - 0.5 + _uniform(g, *shape, low=0.15, high=0.85)
+    return (between.clamp(0.02 * bins, 0.98 * bins) * 256 / bins - 0.5) / 255
+
+
+def _splat_cases() -> tuple[Case, ...]:
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        cell: int,
+        bins: int,
+        image: Callable[..., Tensor] = _normal,
+        differentiable: tuple[str, ...] = ("image", "guide"),
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            return {"image": image(g, *size), "guide": _guide(g, size[0], *size[2:], bins)}
+
+        return Case(name, kind, tensors, differentiable, {"cell": cell, "bins": bins})
+
+    return (
+        case("3x4 in cells of 2", "ordinary", (1, 3, 3, 4), 2, 2),
+        case("batch of 2, cells that hang over", "ordinary", (2, 1, 3, 5), 4, 2),
+        case("cells of 3, 4 bins", "ordinary", (1, 1, 4, 3), 3, 4),
+        case("one bin", "ordinary", (1, 2, 2, 3), 2, 1),
+        case("cells of one pixel", "ordinary", (2, 1, 2, 1), 1, 2),
+        case("one pixel", "ordinary", (1, 3, 1, 1), 8, 3),
+        case("fireflies of 100", "stiff", (1, 1, 2, 3), 2, 2, lambda g, *shape: _radiance(g, *shape) / 100),
+        # A difference quotient in the guide of a firefly says little of the dark pixels beside it.
+        case("fireflies", "extreme", (1, 3, 3, 3), 2, 2, _radiance, ("image",)),
+    )
+
+
+def _slice_cases() -> tuple[Case, ...]:
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        cell: int,
+        bins: int,
+        grid: Callable[..., Tensor] = _normal,
+        known: Callable[[Tensor], Tensor] = lambda drawn: drawn,
+        differentiable: tuple[str, ...] = ("grid", "filled", "guide"),
+    ) -> Case:
+        batch, channels, height, width = size
+        cells = (cells_of(height, cell), cells_of(width, cell), bins)
+
+        def tensors(g: Generator) -> Inputs:
+            return {
+                "grid": grid(g, batch, channels, *cells),
+                "filled": known(_uniform(g, batch, 1, *cells, low=0.2)),
+                "guide": _guide(g, batch, height, width, bins),
+            }
+
+        return Case(name, kind, tensors, differentiable, {"cell": cell})
+
+    def half_empty(drawn: Tensor) -> Tensor:
+        return (drawn > 0.6).to(drawn.dtype)
+
+    return (
+        case("3x4 in cells of 2", "ordinary", (1, 3, 3, 4), 2, 2),
+        case("batch of 2, cells that hang over", "ordinary", (2, 1, 3, 5), 4, 2),
+        case("cells of 3, 4 bins", "ordinary", (1, 1, 4, 3), 3, 4),
+        case("one bin, all filled", "ordinary", (1, 2, 2, 3), 2, 1, known=torch.ones_like, differentiable=("grid",)),
+        case("cells of one pixel", "ordinary", (2, 1, 2, 1), 1, 2),
+        case("one pixel", "ordinary", (1, 3, 1, 1), 8, 3),
+        case("fireflies of 100", "stiff", (1, 1, 2, 3), 2, 2, lambda g, *shape: _radiance(g, *shape) / 100),
+        case("fireflies", "extreme", (1, 3, 3, 3), 2, 2, _radiance, differentiable=("grid",)),
+        # Where all cells around a pixel are empty, it jumps to the first that is filled.
+        case("empty cells", "extreme", (1, 3, 3, 5), 2, 4, known=half_empty, differentiable=("grid",)),
+        case("no cell is filled", "extreme", (1, 1, 2, 2), 2, 2, known=torch.zeros_like, differentiable=("grid",)),
     )
 
 
@@ -835,6 +912,22 @@ OPS: tuple[Op, ...] = (
         _demodulation_cases("image") + extreme.demodulations("image"),
         Remodulate,
         images=_IMAGE,
+    ),
+    Op(
+        grid_splat,
+        reference.grid_splat,
+        _splat_cases() + extreme.splats(),
+        GridSplat,
+        images=_IMAGE,
+        rounding=extreme.grid_rounding,
+    ),
+    Op(
+        grid_slice,
+        reference.grid_slice,
+        _slice_cases() + extreme.slices(),
+        GridSlice,
+        images=("grid",),
+        rounding=extreme.grid_rounding,
     ),
     Op(
         clamp_fireflies,

@@ -611,6 +611,115 @@ def affinity_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     return Rounding(result=float((lost / total).amax()), gradients=gradients)
 
 
+def _guides() -> dict[str, Draw]:
+    """Guides that are all equal, at the ends of the range and beyond, and of two values."""
+
+    def two(g: Generator, *shape: int) -> Tensor:
+        return (uniform(g, *shape) > 0.5).double()
+
+    return {
+        "0": _constant(0.0),
+        "1": _constant(1.0),
+        "0 or 1": two,
+        "beyond the range": lambda g, *shape: 6 * uniform(g, *shape) - 2,
+    }
+
+
+def splats() -> tuple[Case, ...]:
+    """Of ``grid_splat``."""
+
+    def case(
+        name: str,
+        size: tuple[int, int, int, int],
+        image: Draw,
+        guide: Draw = uniform,
+        cell: int = 2,
+        bins: int = 4,
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            return {"image": image(g, *size), "guide": guide(g, size[0], 1, *size[2:])}
+
+        return Case(name, "extreme", tensors, (), {"cell": cell, "bins": bins})
+
+    return (
+        *(case(*tried) for tried in _tried()),
+        *(case(f"guide {name}", (1, 3, 3, 4), radiance, draw) for name, draw in _guides().items()),
+        # The tents of the neighbours end there.
+        case("guide at the centres of bins", (1, 1, 2, 3), radiance, _guides()["0 or 1"], bins=256),
+        case("cells larger than the image", (1, 3, 3, 4), radiance, cell=100),
+    )
+
+
+def slices() -> tuple[Case, ...]:
+    """Of ``grid_slice``."""
+
+    def case(
+        name: str,
+        size: tuple[int, int, int, int],
+        image: Draw,
+        guide: Draw = uniform,
+        filled: Draw = lambda g, *shape: (uniform(g, *shape) > 0.3).double(),
+    ) -> Case:
+        batch, channels, rows, columns = size
+
+        def tensors(g: Generator) -> Inputs:
+            # Of the rows and columns of an image, whose pattern is that of the cells.
+            grid = image(g, batch, channels, rows, columns)[..., None] * uniform(g, batch, 1, rows, columns, 4)
+            known = filled(g, batch, 1, rows, columns, 4)
+            return {"grid": grid, "filled": known, "guide": guide(g, batch, 1, 2 * rows, 2 * columns - 1)}
+
+        return Case(name, "extreme", tensors, (), {"cell": 2})
+
+    return (
+        *(case(*tried) for tried in _tried()),
+        *(case(f"guide {name}", (1, 3, 2, 3), radiance, draw) for name, draw in _guides().items()),
+        case("cells of weight 1e-3", (1, 3, 2, 3), radiance, filled=_constant(1e-3)),
+    )
+
+
+def grid_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
+    """A guide becomes a coordinate up to the number of bins, and one over 255/256 of that moves it by one.
+
+    So one unit of the guide absorbs the rounding of the coordinate, and that of a tent's height of one. The derivatives
+    of a mean, ``sum a' (c - mean) / sum a``, are differences of terms of the size of both.
+    """
+    tensors = {name: value for name, value in inputs.items() if isinstance(value, Tensor)}
+    guide = tensors["guide"]
+    magnitude: Inputs = {"guide": guide.abs().clamp_min(1)}
+    if not len(guide):
+        return Rounding(magnitude)
+    bins = settings["bins"] if "bins" in settings else tensors["grid"].shape[-1]
+    around, slope = "vy,ux,bwyx", 255 / 256 * bins
+    position = guide[:, :1].clamp(0, 1) * slope + 0.5 / 256 * bins - 0.5
+    distance = (position - torch.arange(bins).reshape(-1, 1, 1)).abs()
+    rows, columns = (_tents(side, settings["cell"]) for side in guide.shape[2:])
+    heights, near = (1 - distance).clamp_min(0), (distance < 1).double()
+    if "image" in tensors:
+        image = tensors["image"].abs()
+        total = torch.einsum(f"{around}->bvuw", rows, columns, heights)[:, None]
+        inverse = torch.where(total > 0, 1 / total, 0)
+        mean = torch.einsum(f"{around},bcyx->bcvuw", rows, columns, heights, image) * inverse
+        own = torch.einsum(f"{around},bvuw->byx", rows, columns, near, inverse[:, 0])[:, None] * image
+        terms = own + torch.einsum(f"{around},bcvuw->bcyx", rows, columns, near, mean * inverse)
+        return Rounding(magnitude, gradients={"guide": slope * terms.sum(1, keepdim=True)})
+    grid, filled = tensors["grid"].abs(), tensors["filled"]
+    total = torch.einsum(f"{around},bvuw->byx", rows, columns, heights, filled[:, 0])[:, None]
+    inverse = torch.where(total > 0, 1 / total, 0)
+    mean = torch.einsum(f"{around},bcvuw->bcyx", rows, columns, heights, grid * filled) * inverse
+    cells = torch.einsum(f"{around},bcvuw->bcyx", rows, columns, near, grid * filled)
+    weights = torch.einsum(f"{around},bvuw->byx", rows, columns, near, filled[:, 0])[:, None]
+    of_guide = ((cells + weights * mean) * inverse).sum(1, keepdim=True) * slope
+    own = torch.einsum(f"{around},byx->bvuw", rows, columns, heights, inverse[:, 0])[:, None] * grid
+    of_filled = own + torch.einsum(f"{around},bcyx->bcvuw", rows, columns, heights, mean * inverse)
+    return Rounding(magnitude, gradients={"guide": of_guide, "filled": of_filled.sum(1, keepdim=True)})
+
+
+def _tents(side: int, cell: int) -> Tensor:
+    """``(cells, side)`` how much each pixel of a row is of each cell."""
+    place = (torch.arange(side, dtype=torch.float64) + 0.5) / cell
+    return (1 - (place - torch.arange(-(-side // cell))[:, None] - 0.5).abs()).clamp_min(0)
+
+
 def luminances() -> tuple[Case, ...]:
     """Of ``luminance_moments``."""
     return tuple(

@@ -425,6 +425,50 @@ def history_lag(
     return _tensor(out, shape)
 
 
+def grid_splat(image: Tensor, guide: Tensor, *, cell: int = 8, bins: int = 32) -> tuple[Tensor, Tensor]:
+    """``sum a image / sum a`` of each cell, and whether any ``a`` is above 0."""
+    batch, channels, height, width = image.shape
+    grid_shape = (-(-height // cell), -(-width // cell), bins)
+    source, guides = image.tolist(), guide.tolist()
+    grid, filled = _zeros((batch, channels, *grid_shape)), _zeros((batch, 1, *grid_shape))
+    for b, v, u, w in _indices((batch, *grid_shape)):
+        total, sums = 0.0, [0.0] * channels
+        for y, x in itertools.product(range(height), range(width)):
+            weight = _cell_weight(y, x, guides[b][0][y][x], v, u, w, cell, bins)
+            total += weight
+            for c in range(channels):
+                sums[c] += weight * source[b][c][y][x]
+        if total > 0:
+            filled[b][0][v][u][w] = 1.0
+            for c in range(channels):
+                grid[b][c][v][u][w] = sums[c] / total
+    return _tensor(grid, (batch, channels, *grid_shape)), _tensor(filled, (batch, 1, *grid_shape))
+
+
+def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = 8) -> Tensor:
+    """``sum a filled grid / sum a filled`` over all cells; 0 where the divisor is."""
+    batch, channels, *grid_shape = grid.shape
+    shape = (batch, channels, *guide.shape[2:])
+    means, known, guides, out = grid.tolist(), filled.tolist(), guide.tolist(), _zeros(shape)
+    for b, y, x in _indices((batch, *guide.shape[2:])):
+        total, sums = 0.0, [0.0] * channels
+        for v, u, w in _indices(grid_shape):
+            weight = _cell_weight(y, x, guides[b][0][y][x], v, u, w, cell, grid_shape[2]) * known[b][0][v][u][w]
+            total += weight
+            for c in range(channels):
+                sums[c] += weight * means[b][c][v][u][w]
+        for c in range(channels):
+            out[b][c][y][x] = sums[c] / total if total > 0 else 0.0
+    return _tensor(out, shape)
+
+
+def _cell_weight(y: int, x: int, guide: float, v: int, u: int, w: int, cell: int, bins: int) -> float:
+    """Of a pixel in a cell of a bilateral grid: a product of three tents."""
+    z = 255 * min(max(guide, 0.0), 1.0)
+    distances = ((x + 0.5) / cell - (u + 0.5), (y + 0.5) / cell - (v + 0.5), (z + 0.5) * bins / 256 - (w + 0.5))
+    return math.prod(max(1 - math.sqrt(distance**2 + 1e-8), 0.0) for distance in distances)
+
+
 def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
     """``clip = [x y z 1] @ M``; ``motion = ((clip.xy / clip.w + 1) / 2) (W, H) - centre``; infinite for ``w <= 0``."""
     batch, _, height, width = position.shape

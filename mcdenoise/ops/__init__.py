@@ -7,6 +7,7 @@ from mcdenoise.ops.affinity import AffinityFilter, affinity_filter
 from mcdenoise.ops.atrous import Atrous, atrous
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
 from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
+from mcdenoise.ops.bilateral_grid import GridSlice, GridSplat, grid_slice, grid_splat
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
@@ -25,6 +26,8 @@ __all__ = [
     "CrossBilateralFilter",
     "CrossBilateralWeights",
     "Demodulate",
+    "GridSlice",
+    "GridSplat",
     "HistoryLag",
     "KernelConv",
     "KernelSplat",
@@ -40,6 +43,8 @@ __all__ = [
     "cross_bilateral_weights",
     "demodulate",
     "downsample",
+    "grid_slice",
+    "grid_splat",
     "history_lag",
     "kernel_conv",
     "kernel_splat",

@@ -31,8 +31,8 @@ class TrainConfig:
         width: feature channels, as in the settings; 0 takes the model's own, or that of the weights it starts from.
         losses: weights of the result and of stages on the way to it in the loss, such as image=1,initial=0.5; 1 for the
             result and for the stage initial, where the model has one, by default.
-        loss: of a clip: smape, the paper's, or rae, that of Chaitanya et al. 2017, whose later frames count more, see
-            :func:`mcdenoise.train.losses.rae_loss`.
+        loss: of a clip, see :data:`mcdenoise.train.losses.LOSSES`: smape, the paper's; l1_display, that of Meng et al.
+            2020; or rae, that of Chaitanya et al. 2017, whose later frames count more.
         steps: optimiser steps.
         batch: clips in a step, of all processes together.
         frames: frames in a clip.

@@ -227,6 +227,7 @@ def image(*shape: int) -> Tensor:
 
 
 ONE, THREE = image(1, 1, 4, 5), image(1, 3, 4, 5)
+GRID = image(1, 3, 1, 1, 4)
 SURFACE = ops.Surface(position=THREE, normal=THREE)
 
 REFUSED: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], type[Exception], str]] = [
@@ -281,6 +282,15 @@ REFUSED: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], type[Ex
     (ops.demodulate, (THREE.int(), THREE), {}, TypeError, "color: expected a floating-point dtype"),
     (ops.demodulate, (THREE, THREE), {"floor": 0.0}, ValueError, "floor: expected a positive number, found 0.0"),
     (ops.remodulate, (THREE, image(1, 3, 5, 5)), {}, ValueError, "albedo: expected H = 4 as in image, found 5"),
+    (ops.grid_splat, (THREE, THREE), {}, ValueError, "guide: expected shape (B, 1, H, W), found (1, 3, 4, 5)"),
+    (ops.grid_splat, (THREE, image(1, 1, 5, 4)), {}, ValueError, "guide: expected H = 4 as in image, found 5"),
+    (ops.grid_splat, (THREE, ONE), {"cell": 0}, ValueError, "cell: expected at least 1, found 0"),
+    (ops.GridSplat, (), {"bins": 0}, ValueError, "bins: expected at least 1, found 0"),
+    (ops.grid_slice, (THREE, ONE, ONE), {}, ValueError, "grid: expected shape (B, C, rows, columns, bins), found (1,"),
+    (ops.grid_slice, (GRID, GRID, ONE), {}, ValueError, "filled: expected shape (B, 1, rows, columns, bins), found"),
+    (ops.grid_slice, (GRID, GRID[:, :1], ONE), {"cell": 2}, ValueError, "grid: expected (2, 3) rows and columns for"),
+    (ops.grid_slice, (GRID, GRID[:, :1], ONE.int()), {}, TypeError, "guide: expected a floating-point dtype"),
+    (ops.GridSlice, (), {"cell": -1}, ValueError, "cell: expected at least 1, found -1"),
     (ops.remodulate, (THREE, THREE), {"floor": float("nan")}, ValueError, "floor: expected a positive number"),
     (ops.clamp_fireflies, (THREE[0],), {}, ValueError, "image: expected shape (B, C, H, W), found (3, 4, 5)"),
     (ops.clamp_fireflies, (THREE.int(),), {}, TypeError, "image: expected a floating-point dtype"),

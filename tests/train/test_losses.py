@@ -61,6 +61,32 @@ def test_the_gradient_of_the_loss() -> None:
     assert gradcheck(loss, (initial, final))
 
 
+def test_the_loss_on_the_curve_of_a_display() -> None:
+    """In place of SMAPE, and the temporal loss as it was."""
+    image, reference = (3 * torch.rand(2, 3, 3, 4, 5, dtype=torch.float64) - 0.5 for _ in range(2))
+    shown, wanted = ((each.clamp_min(0) + 1e-3) ** (1 / 2.2) for each in (image, reference))
+    expected = (shown - wanted).abs().mean()
+    found = stage_loss(Output(image), reference, {"image": 2.0}, temporal_weight=0, loss="l1_display")
+    torch.testing.assert_close(found, 2 * expected)
+    smape, l1 = (
+        [
+            stage_loss(Output(image), reference, {"image": 1.0}, temporal_weight=weight, loss=name)
+            for weight in (0.0, 1.0)
+        ]
+        for name in ("smape", "l1_display")
+    )
+    torch.testing.assert_close(smape[1] - smape[0], l1[1] - l1[0])
+    assert not torch.isclose(smape[0], l1[0])
+
+
+def test_the_gradient_on_the_curve_of_a_display_is_finite_in_black() -> None:
+    image = torch.zeros(1, 1, 3, 2, 2, requires_grad=True)
+    stage_loss(Output(image), image.detach() + 0.1, {"image": 1.0}, temporal_weight=0, loss="l1_display").backward()
+    assert image.grad is not None
+    assert torch.isfinite(image.grad).all()
+    assert (image.grad < 0).all()
+
+
 def test_the_loss_of_one_frame() -> None:
     one = torch.rand(1, 1, 3, 2, 2)
     assert stage_loss(Output(one), one, {"image": 1.0}, temporal_weight=0).item() == 0

@@ -593,7 +593,7 @@ def test_a_frame_that_is_damaged_leaves_no_run(small_sequence: Path, tmp_path: P
         ("model", "noisy.py:factory", "noisy.py: expected a Python file with a factory of a model, found no such file"),
         ("model", "mcdenoise.ops:demodulate", "model 'mcdenoise.ops:demodulate': missing a required argument: 'color'"),
         ("schedule", "linear", "schedule: expected one of constant, cosine, found 'linear'"),
-        ("loss", "l2", "loss: expected one of smape, rae, found 'l2'"),
+        ("loss", "l2", "loss: expected one of smape, l1_display, rae, found 'l2'"),
         ("precision", "fp8", "precision: expected one of float32, bfloat16, found 'fp8'"),
         ("ema", 1.0, "ema: expected in [0, 1), found 1.0"),
         ("exposure", -1.0, "exposure: expected 0 to 10 stops, found -1.0"),

@@ -1,0 +1,182 @@
+"""The bilateral grid: an image as coarse cells in space and in the range of a guide, and the way back."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._module import module_of
+from mcdenoise.ops._window import accumulator_dtype
+
+CELL, BINS = 8, 32
+# A guide of [0, 1] is a value of 0 to 255, whose 256 steps are divided among the bins.
+_STEPS = 256
+# |x| of the tent is sqrt(x^2 + _ROUNDING): it has a derivative at 0.
+_ROUNDING = 1e-8
+
+
+def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BINS) -> tuple[Tensor, Tensor]:
+    """Average an image in the cells of a bilateral grid: blocks of pixels, apart by the value of a guide.
+
+    ``grid[v, u, w] = sum_p a[p] image[p] / sum_p a[p]`` over the pixels ``p = (x, y)`` with, for ``z = 255 guide[p]``,
+
+    ``a[p] = t((x + 0.5) / cell - (u + 0.5)) t((y + 0.5) / cell - (v + 0.5)) t((z + 0.5) bins / 256 - (w + 0.5))``
+
+    and the tent ``t(x) = max(1 - sqrt(x^2 + 1e-8), 0)``: every pixel is in up to eight cells. Where the size is no
+    multiple of ``cell``, the last cells hang over the image and hold the pixels that there are.
+
+    kornia has no bilateral grid. That of Chen et al. 2007 puts a pixel into the nearest cell and blurs the grid
+    afterwards; :func:`mcdenoise.ops.cross_bilateral_filter` compares each pixel with its neighbours at full
+    resolution, in a window that costs its area, where a grid costs eight cells a pixel at any size.
+
+    Args:
+        image: ``(B, C, H, W)``, any unit, from 0 to 1e34 in magnitude.
+        guide: ``(B, 1, H, W)`` in [0, 1]; what is beyond counts as 0 or 1.
+        cell: side of a cell in pixels, at least 1: the ``s_s`` of the paper.
+        bins: cells along the guide's range, at least 1: 256 over the ``s_r`` of the paper.
+
+    Returns:
+        ``(B, C, ceil(H / cell), ceil(W / cell), bins)`` means, 0 in cells without a pixel, and
+        ``(B, 1, ceil(H / cell), ceil(W / cell), bins)`` whether there is one: 1 or 0. Both in the dtype of ``image``.
+        Half precision is computed in float32. On the CPU, the same bits each time.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: a shape or a setting does not fit.
+
+    Differentiable in ``image`` and ``guide``, to any order, where no guide is below 0 or above 1 or at the end of a
+    tent: which cells are empty has no derivative. That in a guide is large, where it is the tail of a tent alone that
+    reaches a cell; the authors take those above 100 for 0.
+
+    Source: Meng et al. 2020, "Real-Time Monte Carlo Denoising with the Neural Bilateral Grid", Sec. 4, and its public
+    code; the grid itself: Chen, Paris and Durand 2007, "Real-time edge-aware image processing with the bilateral grid".
+
+    Example:
+        >>> image = torch.tensor([[[[1.0, 1.0, 5.0, 5.0]]]])
+        >>> grid, filled = grid_splat(image, torch.tensor([[[[0.0, 0.0, 1.0, 1.0]]]]), cell=4, bins=2)
+        >>> grid.flatten().tolist(), filled.flatten().tolist()
+        ([1.0, 5.0], [1.0, 1.0])
+    """
+    sizes = check_shapes(image=(image, "B C H W"), guide=(guide, "B 1 H W"))
+    _check_settings(cell, bins)
+    dtype = accumulator_dtype(image.dtype)
+    rows, columns = cells_of(sizes["H"], cell), cells_of(sizes["W"], cell)
+    index, weight = _taps(guide.to(dtype), cell, rows, columns, bins)
+    values = torch.cat([image.to(dtype), torch.ones_like(guide, dtype=dtype)], 1)
+    source = (values[:, :, None] * weight[:, None]).flatten(2)
+    empty = source.new_zeros(*source.shape[:2], rows * columns * bins)
+    total = empty.scatter_add(2, index[:, None].expand(source.shape), source)
+    total = total.reshape(*total.shape[:2], rows, columns, bins)
+    filled = total[:, -1:] > 0
+    grid = total[:, :-1] / torch.where(filled, total[:, -1:], 1)
+    return grid.to(image.dtype), filled.to(image.dtype)
+
+
+def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CELL) -> Tensor:
+    """Read an image out of a bilateral grid: at each pixel the mean of the eight cells around its place and its guide.
+
+    ``out[p] = sum_k a_k[p] filled[k] grid[k] / sum_k a_k[p] filled[k]`` with the weights ``a`` of :func:`grid_splat`,
+    which are those of trilinear interpolation; 0 where all eight are empty. So an image is smoothed where the guide is
+    constant, and what a guide tells apart by two bins at least does not mix.
+
+    Args:
+        grid: ``(B, C, ceil(H / cell), ceil(W / cell), bins)``, any unit, from 0 to 1e34 in magnitude.
+        filled: ``(B, 1, ceil(H / cell), ceil(W / cell), bins)`` weight of each cell in [0, 1]: 0 where nothing is known
+            of it.
+        guide: ``(B, 1, H, W)`` in [0, 1], of any resolution; what is beyond counts as 0 or 1.
+        cell: side of a cell in pixels, at least 1.
+
+    Returns:
+        ``(B, C, H, W)`` in the dtype of ``grid``. Half precision is computed in float32.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: a shape or a setting does not fit.
+
+    Differentiable in ``grid``, ``filled`` and ``guide``, to any order, where no guide is below 0 or above 1 or at the
+    centre of a bin, and not all cells around a pixel are empty.
+
+    Source: Meng et al. 2020, as :func:`grid_splat`. Their code takes cells of the value 0 for empty, which black pixels
+    make, too: at the edge of a black area it is brighter.
+
+    Example:
+        >>> image, guide = torch.rand(1, 3, 9, 11), torch.rand(1, 1, 9, 11)
+        >>> same = grid_slice(*grid_splat(torch.full_like(image, 2), guide), guide)
+        >>> bool((same - 2).abs().max() < 1e-6)
+        True
+    """
+    sizes = check_shapes(grid=(grid, "B C rows columns bins"), filled=(filled, "B 1 rows columns bins"))
+    sizes |= check_shapes(grid=(grid, "B C rows columns bins"), guide=(guide, "B 1 H W"))
+    _check_settings(cell, sizes["bins"])
+    rows, columns = sizes["rows"], sizes["columns"]
+    expected = cells_of(sizes["H"], cell), cells_of(sizes["W"], cell)
+    if (rows, columns) != expected:
+        raise ValueError(
+            f"grid: expected {expected} rows and columns for a guide of {sizes['H'], sizes['W']} in cells of {cell}, "
+            f"found {rows, columns}"
+        )
+    dtype = accumulator_dtype(grid.dtype)
+    index, weight = _taps(guide.to(dtype), cell, rows, columns, sizes["bins"])
+    known = filled.to(dtype)
+    cells = torch.cat([grid.to(dtype) * known, known], 1).flatten(2)
+    total = cells.new_zeros(())
+    # One after the other, which a cache can hold: all eight at once take three times as long.
+    for places, weights in zip(index.unflatten(1, (8, -1)).unbind(1), weight.flatten(2).unbind(1), strict=True):
+        found = cells.gather(2, places[:, None].expand(-1, cells.shape[1], -1))
+        total = total + found * weights[:, None]
+    total = total.unflatten(2, (sizes["H"], sizes["W"]))
+    image: Tensor = total[:, :-1] / torch.where(total[:, -1:] > 0, total[:, -1:], 1)
+    return image.to(grid.dtype)
+
+
+def cells_of(side: int, cell: int) -> int:
+    """How many cells of so many pixels a side of the image takes."""
+    return -(-side // cell)
+
+
+def _taps(guide: Tensor, cell: int, rows: int, columns: int, bins: int) -> tuple[Tensor, Tensor]:
+    """The eight cells around each pixel and its guide.
+
+    Returns:
+        ``(B, 8 H W)`` their places in a flattened grid, and ``(B, 8, H, W)`` their weights, 0 beyond the grid.
+    """
+    height, width = guide.shape[-2:]
+    v, row_weight = _spatial_taps(height, cell, rows, guide)
+    u, column_weight = _spatial_taps(width, cell, columns, guide)
+    position = guide[:, 0].clamp(0, 1) * ((_STEPS - 1) / _STEPS * bins) + (0.5 / _STEPS * bins - 0.5)
+    first = position.floor()
+    w = torch.stack([first, first + 1], 1)
+    bin_weight = _tent(position[:, None] - w) * ((w >= 0) & (w < bins))
+    place = (v[:, None, :, None] * columns + u[:, None, :]) * bins  # (2, 2, H, W)
+    index = w.long().clamp(0, bins - 1)[:, :, None, None] + place
+    weight = bin_weight[:, :, None, None] * (row_weight[:, None, :, None] * column_weight[:, None, :])
+    return index.flatten(1), weight.flatten(1, 3)
+
+
+def _spatial_taps(side: int, cell: int, count: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """``(2, side)`` the two cells whose centres are around each pixel, and their weights, 0 beyond the grid."""
+    # Twice the pixel's centre, in pixels: whole numbers, so that a distance is rounded once.
+    centre = 2 * torch.arange(side, device=like.device) + 1
+    first = torch.div(centre - cell, 2 * cell, rounding_mode="floor")
+    cells = torch.stack([first, first + 1])
+    distance = (centre - cell * (2 * cells + 1)).to(like.dtype) / (2 * cell)
+    return cells.clamp(0, count - 1), _tent(distance) * ((cells >= 0) & (cells < count))
+
+
+def _tent(distance: Tensor) -> Tensor:
+    return torch.relu(1 - torch.sqrt(distance.square() + _ROUNDING))
+
+
+def _check_settings(cell: int, bins: int) -> None:
+    for name, value in (("cell", cell), ("bins", bins)):
+        if value < 1:
+            raise ValueError(f"{name}: expected at least 1, found {value}")
+
+
+def _check_cell(cell: int) -> None:
+    _check_settings(cell, 1)
+
+
+GridSplat = module_of("GridSplat", grid_splat, _check_settings)
+GridSlice = module_of("GridSlice", grid_slice, _check_cell)
