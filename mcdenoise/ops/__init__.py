@@ -12,6 +12,7 @@ from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, 
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
+from mcdenoise.ops.softmax_splat import softmax_splat
 from mcdenoise.ops.temporal import Accumulate, accumulate, motion_from_position, reproject
 
 __all__ = [
@@ -45,6 +46,7 @@ __all__ = [
     "motion_from_position",
     "remodulate",
     "reproject",
+    "softmax_splat",
     "upsample",
     "use",
 ]
