@@ -163,7 +163,7 @@ def splats() -> tuple[Case, ...]:
 
 
 def splat_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """The gradient of a logit is ``w (x[p] - out[q])``, of two terms as large as what a window holds, and ``w <= 1``."""
+    """The gradient of a logit is ``w (x[p] - out[q])``, ``w <= 1``: two terms as large as what a window holds."""
     image, logits = inputs["image"], inputs["logits"]
     assert isinstance(image, Tensor)
     assert isinstance(logits, Tensor)
