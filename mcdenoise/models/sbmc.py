@@ -43,6 +43,7 @@ from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics
 from mcdenoise.nn.samples import (
     CHANNELS,
+    PLANNED,
     LeakyUNet,
     SampleEmbedding,
     chain,
@@ -53,8 +54,6 @@ from mcdenoise.nn.samples import (
 from mcdenoise.ops import softmax_splat
 
 PUBLISHED: Mapping[str, Any] = {"width": 128, "rounds": 3, "convolutions": 3, "kernel_size": 21}
-# Samples of a pixel that memory is planned for: eight, and the history.
-_SAMPLES = 9
 
 
 class SbmcNetwork(nn.Module):
@@ -77,7 +76,7 @@ class SbmcNetwork(nn.Module):
         self.embedding = SampleEmbedding(CHANNELS, width, rounds, convolutions)
         self.kernel = chain([2 * width, width, width, kernel_size**2], linear=True)
         self._reach = rounds * LeakyUNet.reach(convolutions) + kernel_size // 2
-        self._live = width * (4 * _SAMPLES + 8) + 4 * kernel_size**2
+        self._live = width * (4 * PLANNED + 8) + 4 * kernel_size**2
 
     @property
     def needs(self) -> Needs:
@@ -90,7 +89,7 @@ class SbmcNetwork(nn.Module):
         return image_statistics(frame)
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: embeddings, logits and weights, and buffers."""
+        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: embeddings, logits, weights and buffers."""
         return self._live * (2 if bfloat16 else 4) + 54 * 4
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:

@@ -21,6 +21,7 @@ from mcdenoise.ops._window import corner, up_to_multiple
 # Logarithm of the radiance 3, albedo 3, normal 3, depth 1, and one over the number of frames that it is a mean of.
 CHANNELS = 11
 LEVELS = 3  # of a U-Net
+PLANNED = 9  # samples of a pixel that memory is planned for: eight, and the history
 SLOPE = 0.01  # of the leaky ReLU below zero
 
 
