@@ -84,7 +84,8 @@ class LayeredNetwork(nn.Module):
         self.unet = LeakyUNet((LAYERS + 1) * width, width, convolutions)
         self.head = chain([width, LAYERS * self.taps + LAYERS - 1], linear=True)
         self._reach = 2 * LeakyUNet.reach(convolutions) + kernel_size // 2
-        self._live = width * (3 * PLANNED + 10) + 2 * LAYERS * self.taps
+        # Measured at the default's sizes, with eight samples and the history: 6.4 kB a pixel.
+        self._live = width * (6 * PLANNED + 12) + 2 * LAYERS * self.taps
 
     @property
     def needs(self) -> Needs:

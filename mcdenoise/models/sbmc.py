@@ -76,7 +76,8 @@ class SbmcNetwork(nn.Module):
         self.embedding = SampleEmbedding(CHANNELS, width, rounds, convolutions)
         self.kernel = chain([2 * width, width, width, kernel_size**2], linear=True)
         self._reach = rounds * LeakyUNet.reach(convolutions) + kernel_size // 2
-        self._live = width * (4 * PLANNED + 8) + 4 * kernel_size**2
+        # Measured at the default's sizes, with eight samples and the history: 8.2 kB a pixel.
+        self._live = width * (8 * PLANNED + 8) + 6 * kernel_size**2
 
     @property
     def needs(self) -> Needs:

@@ -116,7 +116,7 @@ def of_each(layer: nn.Module, samples: Tensor) -> Tensor:
     """A layer of images on every sample ``(B, S, C, H, W)``."""
     batch, count = samples.shape[:2]
     result: Tensor = layer(samples.flatten(0, 1))
-    return result.unflatten(0, (batch, count))
+    return result.reshape(batch, count, *result.shape[1:])
 
 
 def chain(widths: Sequence[int], *, linear: bool = False) -> nn.Sequential:
@@ -141,7 +141,7 @@ class LeakyUNet(nn.Module):
         convolutions: of each level, on the way down and on the way up.
     """
 
-    multiple = 1 << (LEVELS - 1)
+    multiple: int = 2 ** (LEVELS - 1)
 
     def __init__(self, in_channels: int, width: int, convolutions: int) -> None:
         super().__init__()
@@ -159,8 +159,9 @@ class LeakyUNet(nn.Module):
     def reach(convolutions: int) -> int:
         """How many pixels away a result depends on the input: with what is interpolated, and the coarsest pixels."""
         down, up = range(LEVELS), range(LEVELS - 1)
-        interpolated = sum(2 << level for level in up)
-        return convolutions * sum(1 << level for level in (*down, *up)) + interpolated + LeakyUNet.multiple - 1
+        interpolated: int = sum(2 << level for level in up)
+        convolved: int = sum(convolutions << level for level in (*down, *up))
+        return convolved + interpolated + LeakyUNet.multiple - 1
 
     def forward(self, x: Tensor) -> Tensor:
         """``(B, in_channels, H, W)`` to ``(B, width, H, W)``."""
