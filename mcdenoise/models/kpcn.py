@@ -1,8 +1,8 @@
 """KPCN, the kernel-predicting convolutional network: one network for diffuse light, and one for specular light.
 
 Bako et al. 2017, "Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings", ACM Transactions on
-Graphics (SIGGRAPH). Equation numbers are its own. ``PUBLISHED`` are its sizes: nine 5x5 convolutions of 100 channels and
-kernels of 21x21, with the 27 input channels of the re-implementation that Gharbi et al. 2019 published, 2.92 million
+Graphics (SIGGRAPH). Equation numbers are its own. ``PUBLISHED`` are its sizes: nine 5x5 convolutions of 100 channels
+and kernels of 21x21, with the 27 input channels of the re-implementation that Gharbi et al. 2019 published, 2.92 million
 parameters a branch; training them takes a GPU. The default is smaller, for a CPU.
 
 - Diffuse light is filtered without its albedo, specular light as ``log(1 + s)``, and the result is ``albedo diffuse +
