@@ -2,8 +2,8 @@
 
 Bako et al. 2017, "Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings", ACM Transactions on
 Graphics (SIGGRAPH). Equation numbers are its own. ``PUBLISHED`` are its sizes: nine 5x5 convolutions of 100 channels
-and kernels of 21x21, with the 27 input channels of the re-implementation that Gharbi et al. 2019 published, 2.92 million
-parameters a branch; training them takes a GPU. The default is smaller, for a CPU.
+and kernels of 21x21, with the 27 input channels of the re-implementation that Gharbi et al. 2019 published, 2.92
+million parameters a branch; training them takes a GPU. The default is smaller, for a CPU.
 
 - Diffuse light is filtered without its albedo, specular light as ``log(1 + s)``, and the result is ``albedo diffuse +
   exp(specular) - 1``, to which ``emission``, which has no noise, is added where the frame has it. The authors' diffuse
