@@ -82,6 +82,9 @@ BUFFERS: dict[str, BufferSpec] = {
 }
 
 
+# The buffers of radiance, which a scene with twice the light has twice of; samples have it in their first channels.
+RADIANCE = ("color", "current", "diffuse", "specular", "emission")
+
 # The buffers that say where a pixel was in the frame before, and nothing else: of no use without a history.
 MOTION = frozenset({"position", "motion", "previous_position"})
 
@@ -476,6 +479,11 @@ def _replace_invalid(color: Tensor, layers: Mapping[str, Tensor]) -> tuple[list[
             )
         usable = usable & of_layer
     return [by_rows(_mended, image, usable, reach=1) for image in images], int((~usable).sum())
+
+
+def scale_samples(samples: Tensor, factor: Tensor) -> Tensor:
+    """Samples ``(B, S, C, H, W)`` with their radiance times a factor that is like ``(B, 3, H, W)``; the rest stays."""
+    return torch.cat([samples[:, :, :3] * factor[:, None], samples[:, :, 3:]], 2)
 
 
 def _is_valid(image: Tensor) -> bool:

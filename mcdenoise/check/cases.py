@@ -35,6 +35,7 @@ from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kern
 from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
 from mcdenoise.ops.partition import learned_upsample, pyramid_partition
+from mcdenoise.ops.softmax_splat import softmax_splat
 from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
 
 __all__ = ["OPS", "Case", "Inputs", "Kind", "Op", "map_tensors"]
@@ -95,6 +96,31 @@ def _filter_cases() -> tuple[Case, ...]:
             weights=one_pixel_without_weights,
             differentiable=("image",),
         ),
+    )
+
+
+def _splat_cases() -> tuple[Case, ...]:
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        kernel_size: int,
+        image: Callable[..., Tensor] = _normal,
+        spread: float = 1.0,
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            return {"image": image(g, *size), "logits": spread * _normal(g, size[0], kernel_size**2, *size[2:])}
+
+        return Case(name, kind, tensors, ("image", "logits"))
+
+    return (
+        case("5x7", "ordinary", (1, 1, 5, 7), 3),
+        case("batch of 2, RGB", "ordinary", (2, 3, 2, 3), 3),
+        case("smaller than the kernel", "ordinary", (1, 3, 2, 3), 5),
+        case("one row", "ordinary", (1, 1, 1, 6), 5),
+        case("one pixel", "ordinary", (1, 3, 1, 1), 3),
+        case("kernel of one tap", "ordinary", (1, 3, 3, 2), 1),
+        case("fireflies, peaked weights", "stiff", (1, 3, 2, 3), 3, _radiance, 8.0),
     )
 
 
@@ -608,7 +634,7 @@ def _guide(g: Generator, batch: int, height: int, width: int, bins: int) -> Tens
     return (between.clamp(0.02 * bins, 0.98 * bins) * 256 / bins - 0.5) / 255
 
 
-def _splat_cases() -> tuple[Case, ...]:
+def _grid_splat_cases() -> tuple[Case, ...]:
     def case(
         name: str,
         kind: Kind,
@@ -636,7 +662,7 @@ def _splat_cases() -> tuple[Case, ...]:
     )
 
 
-def _slice_cases() -> tuple[Case, ...]:
+def _grid_slice_cases() -> tuple[Case, ...]:
     def case(
         name: str,
         kind: Kind,
@@ -852,6 +878,13 @@ OPS: tuple[Op, ...] = (
         rounding=extreme.filter_rounding,
     ),
     Op(
+        softmax_splat,
+        reference.softmax_splat,
+        _splat_cases() + extreme.splats(),
+        images=_IMAGE,
+        rounding=extreme.splat_rounding,
+    ),
+    Op(
         cross_bilateral_weights,
         reference.cross_bilateral_weights,
         _bilateral_cases() + extreme.bilateral(),
@@ -916,7 +949,7 @@ OPS: tuple[Op, ...] = (
     Op(
         grid_splat,
         reference.grid_splat,
-        _splat_cases() + extreme.splats(),
+        _grid_splat_cases() + extreme.grid_splats(),
         GridSplat,
         images=_IMAGE,
         rounding=extreme.grid_rounding,
@@ -924,7 +957,7 @@ OPS: tuple[Op, ...] = (
     Op(
         grid_slice,
         reference.grid_slice,
-        _slice_cases() + extreme.slices(),
+        _grid_slice_cases() + extreme.grid_slices(),
         GridSlice,
         images=("grid",),
         rounding=extreme.grid_rounding,

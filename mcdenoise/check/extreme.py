@@ -140,6 +140,43 @@ def filter_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     return Rounding(gradients={"kernel": (brightest * share).expand_as(kernel)})
 
 
+def splats() -> tuple[Case, ...]:
+    """Of ``softmax_splat``."""
+
+    def case(name: str, size: tuple[int, int, int, int], image: Draw, logits: Draw, kernel_size: int = 3) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            batch, _, height, width = size
+            return {"image": image(g, *size), "logits": logits(g, batch, kernel_size**2, height, width)}
+
+        return Case(name, "extreme", tensors, ())
+
+    def spread(factor: float, offset: float = 0.0) -> Draw:
+        return lambda g, *shape: offset + factor * normal(g, *shape)
+
+    size = (1, 3, 3, 4)
+    return (
+        *(case(name, size, draw, normal) for name, size, draw in _tried()),
+        case("logits of 1e4", size, radiance, spread(1.0, 1e4)),
+        case("logits of -1e4", size, radiance, spread(1.0, -1e4)),
+        case("logits to +-1e4", size, radiance, spread(1e4)),
+        case("all logits alike", size, radiance, _constant(0.0)),
+        case("7x7 on 1x2", (1, 3, 1, 2), radiance, normal, kernel_size=7),
+    )
+
+
+def splat_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
+    """The gradient of a logit is ``w (x[p] - out[q])``, ``w <= 1``: two terms as large as what a window holds."""
+    image, logits = inputs["image"], inputs["logits"]
+    assert isinstance(image, Tensor)
+    assert isinstance(logits, Tensor)
+    if not image.numel():
+        return Rounding()
+    size = round(logits.shape[1] ** 0.5)
+    # The means of a pixel's targets are of pixels that are up to twice the radius away.
+    brightest = torch.nn.functional.max_pool2d(image.abs().sum(1, keepdim=True), 2 * size - 1, 1, size - 1)
+    return Rounding(gradients={"logits": size**2 * brightest.expand_as(logits)})
+
+
 def bilateral() -> tuple[Case, ...]:
     """Of ``cross_bilateral_weights``."""
 
@@ -625,7 +662,7 @@ def _guides() -> dict[str, Draw]:
     }
 
 
-def splats() -> tuple[Case, ...]:
+def grid_splats() -> tuple[Case, ...]:
     """Of ``grid_splat``."""
 
     def case(
@@ -650,7 +687,7 @@ def splats() -> tuple[Case, ...]:
     )
 
 
-def slices() -> tuple[Case, ...]:
+def grid_slices() -> tuple[Case, ...]:
     """Of ``grid_slice``."""
 
     def case(

@@ -52,6 +52,26 @@ def kernel_splat(image: Tensor, kernel: Tensor, *, border: str = "replicate") ->
     return _tensor(out, image.shape)
 
 
+def softmax_splat(image: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
+    """``sum exp(l) image / sum exp(l)`` over what arrives at a pixel, and ``log(sum exp(l))``, in decimal numbers."""
+    source, exponents = image.tolist(), logits.tolist()
+    batch, channels, height, width = image.shape
+    out, log_weight = _zeros(image.shape), _zeros((batch, 1, height, width))
+    with localcontext(prec=40):
+        for b, y, x in itertools.product(range(batch), range(height), range(width)):
+            weights = {}
+            # What arrives by the tap t is of the pixel opposite to it.
+            for t, _, row, column in _taps(logits, y, x, "zeros"):
+                if row is not None:
+                    weights[row, column] = Decimal(exponents[b][logits.shape[1] - 1 - t][row][column]).exp()
+            total = sum(weights.values(), Decimal())
+            log_weight[b][0][y][x] = float(total.ln())
+            for c in range(channels):
+                light = (weight * Decimal(source[b][c][row][column]) for (row, column), weight in weights.items())
+                out[b][c][y][x] = float(sum(light, Decimal()) / total)
+    return _tensor(out, image.shape), _tensor(log_weight, (batch, 1, height, width))
+
+
 def cross_bilateral_weights(
     kernel: Tensor,
     guides: Sequence[Tensor] = (),

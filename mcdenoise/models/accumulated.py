@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import MOTION, Frame, tells_motion
+from mcdenoise.frame import MOTION, RADIANCE, Frame, tells_motion
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import Journal, journal, note, timed
 from mcdenoise.models._layers import alpha_of, completed
@@ -113,8 +113,9 @@ class Accumulated(Wrapper):
         lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test for changes of light.
         clamp_current: whether fireflies are clamped in what the method sees as ``current``, too.
         also: names of buffers ``(B, 3, H, W)`` of ``frame.extra`` that are accumulated as the color is, where a frame
-            has them: with its weights, and with what they have of fireflies. With ``"albedo"``, the method finds the
-            history of the albedo, anti-aliased by all its frames, as ``albedo_history`` in ``frame.extra``.
+            has them: with its weights, and with what they have of fireflies; or ``"diffuse"`` and ``"specular"``, which
+            the method sees accumulated in their place. With ``"albedo"``, the method finds the history of the albedo,
+            anti-aliased by all its frames, as ``albedo_history`` in ``frame.extra``.
 
     Raises:
         InputError: a setting is out of its range.
@@ -289,8 +290,8 @@ class Accumulated(Wrapper):
         layers = {name: next(parts)[:, COLOR] for name in frame.layers}
         alpha = frame.alpha if alpha_of(frame) is None else next(parts)[:, :1]
         also = {ALBEDO_HISTORY if name == "albedo" else name: next(parts)[:, COLOR] for name in self._found(frame)}
-        extra = {**frame.extra, **also}
-        return frame.replace(layers=layers, alpha=alpha, extra=extra)
+        own = {name: also.pop(name) for name in RADIANCE if name in also}
+        return frame.replace(layers=layers, alpha=alpha, extra={**frame.extra, **also}, **own)
 
     def _found(self, frame: Frame) -> list[str]:
         return [name for name in self.also if frame.buffer(name) is not None]

@@ -8,12 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mcdenoise.frame import Frame
+from mcdenoise.frame import Frame, scale_samples
 from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._journal import note, timed
 from mcdenoise.models._wrapper import Wrapper, run
 from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
 from mcdenoise.ops._rows import by_rows
+from mcdenoise.ops.demodulation import modulation
 
 
 class Demodulated(Wrapper):
@@ -23,8 +24,8 @@ class Demodulated(Wrapper):
     everywhere.
 
     Args:
-        inner: any method; it sees the radiance, that of the frame alone and of its samples, and their variance without
-            albedo.
+        inner: any method; it sees the radiance, that of the frame alone, of diffuse reflection and of the samples, and
+            the variance without albedo. Specular radiance by itself has none.
     """
 
     @property
@@ -61,16 +62,15 @@ def _without_albedo(frame: Frame) -> Frame:
     assert albedo is not None
     changes: dict[str, Any] = {
         name: by_rows(demodulate, image, albedo)
-        for name, image in (("color", frame.color), ("current", frame.current))
+        for name, image in (("color", frame.color), ("current", frame.current), ("diffuse", frame.diffuse))
         if image is not None
     }
     changes["layers"] = {name: by_rows(demodulate, layer, albedo) for name, layer in frame.layers.items()}
-    if frame.samples is not None:
-        light = [demodulate(each, albedo) for each in frame.samples[:, :, :3].unbind(1)]
-        changes["samples"] = torch.cat([torch.stack(light, 1), frame.samples[:, :, 3:]], 2)
     if frame.variance is not None:
         # That of a quotient is the variance over the square of the divisor.
         changes["variance"] = demodulate(demodulate(frame.variance, albedo), albedo)
+    if frame.samples is not None:
+        changes["samples"] = scale_samples(frame.samples, 1 / modulation(albedo).to(frame.samples.dtype))
     return frame.replace(**changes)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from mcdenoise.frame import Frame, Skip
+from mcdenoise.frame import RADIANCE, Frame, Skip, scale_samples
 from mcdenoise.models._interface import Output, State, prepared
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.nn.inputs import auto_exposure
@@ -39,10 +39,11 @@ class Exposed(Wrapper):
 
 
 def _scaled(frame: Frame, factor: Tensor) -> Frame:
-    current = None if frame.current is None else frame.current * factor
+    light = {name: image * factor for name, image in frame.items() if name in RADIANCE}
+    samples = None if frame.samples is None else scale_samples(frame.samples, factor)
     variance = None if frame.variance is None else frame.variance * factor.square()
     skip = frame.skip
     if skip is not None:
         skip = Skip(skip.mask, {name: image * factor for name, image in skip.images.items()})
     layers = {name: layer * factor for name, layer in frame.layers.items()}
-    return frame.replace(color=frame.color * factor, current=current, variance=variance, layers=layers, skip=skip)
+    return frame.replace(**light, samples=samples, variance=variance, layers=layers, skip=skip)

@@ -15,6 +15,7 @@ from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kern
 from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
 from mcdenoise.ops.partition import learned_upsample, pyramid_partition
+from mcdenoise.ops.softmax_splat import softmax_splat
 from mcdenoise.ops.temporal import Accumulate, accumulate, motion_from_position, reproject
 
 __all__ = [
@@ -56,6 +57,7 @@ __all__ = [
     "pyramid_partition",
     "remodulate",
     "reproject",
+    "softmax_splat",
     "upsample",
     "use",
 ]

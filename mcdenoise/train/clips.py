@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import Frame, Hints
+from mcdenoise.frame import RADIANCE, Frame, Hints
 from mcdenoise.models.accumulated import ALBEDO_HISTORY
 from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_CLEAN
 from mcdenoise.nn.inputs import auto_exposure
@@ -24,7 +24,7 @@ _KNOWN = frozenset(field.name for field in fields(Frame))
 
 
 # What holds radiance, colours, and vectors of the world: all else has no channels that could be shuffled.
-LIGHT = frozenset({"color", "current", "reference", "diffuse", "specular", "emission", NOISY, OIDN, OIDN_CLEAN})
+LIGHT = frozenset({*RADIANCE, "reference", NOISY, OIDN, OIDN_CLEAN})
 _COLORED = LIGHT | {"albedo", ALBEDO_HISTORY, "specular_albedo", "variance"}
 _WORLD = frozenset({"normal", "position", "previous_position"})
 

@@ -18,7 +18,7 @@ from torch.utils import _pytree as pytree
 from toys import refused, small, whole_frame
 
 from mcdenoise import Frame
-from mcdenoise.frame import Hints
+from mcdenoise.frame import RADIANCE, Hints, scale_samples
 from mcdenoise.models import (
     DEFAULT,
     Accumulated,
@@ -190,8 +190,9 @@ def test_exposure_only_scales_the_result(name: str, factor: float) -> None:
     model = small(name)
     frame = whole_frame(model, 33, 20)
     result, _ = model(frame)
-    samples = None if frame.samples is None else frame.samples * factor
-    scaled, _ = model(frame.replace(color=frame.color * factor, samples=samples))
+    light = {name: image * factor for name, image in frame.items() if name in RADIANCE}
+    samples = None if frame.samples is None else scale_samples(frame.samples, torch.tensor([factor]))
+    scaled, _ = model(frame.replace(**light, samples=samples))
     torch.testing.assert_close(scaled.image / factor, result.image, rtol=1e-4, atol=1e-5)
 
 
@@ -223,15 +224,17 @@ def test_a_gradient_reaches_every_parameter(name: str) -> None:
 # Before oidn_pyramid's network comes a library without derivatives.
 @pytest.mark.parametrize("name", [name for name in TRAINABLE if name != "oidn_pyramid"])
 def test_a_gradient_goes_through_the_state(name: str) -> None:
-    """From the second frame's image to the color of the first, in the direction of which it changes the image."""
+    """From the second frame's image to the light of the first, in the direction of which it changes the image."""
     model = small(name)
     first, second = (whole_frame(model, 24, 24, seed=seed) for seed in range(2))
-    color = first.color.requires_grad_()
-    _, state = model(first.replace(color=color))
+    light = {name: image.requires_grad_() for name, image in first.items() if name in RADIANCE}
+    _, state = model(first.replace(**light))
     output, _ = model(second, state)
-    (gradient,) = torch.autograd.grad(output.image.sum(), color)
-    assert torch.isfinite(gradient).all()
-    assert gradient.abs().sum() > 0
+    # A method that is given the light in parts does not look at their sum.
+    found = torch.autograd.grad(output.image.sum(), list(light.values()), allow_unused=True)
+    gradients = [gradient for gradient in found if gradient is not None]
+    assert all(torch.isfinite(gradient).all() for gradient in gradients)
+    assert sum(float(gradient.abs().sum()) for gradient in gradients) > 0
 
 
 # The register

@@ -128,12 +128,19 @@ def test_parts_are_found_outermost_first() -> None:
 
 def test_what_is_demodulated_sees_no_albedo_in_its_light() -> None:
     watching, frame = Watching(), frame_of(9, 7, variance=torch.rand(1, 3, 9, 7))
-    frame = frame.replace(current=frame.color / 2)
+    samples = torch.cat([frame.color, torch.ones(1, 2, 9, 7)], 1)[:, None].repeat(1, 3, 1, 1, 1)
+    frame = frame.replace(current=frame.color / 2, diffuse=frame.color / 3, specular=frame.color / 4, samples=samples)
     assert frame.albedo is not None
     output, _ = Demodulated(watching)(frame)
     seen = watching.frames[0]
     assert torch.equal(seen.color, demodulate(frame.color, frame.albedo))
     assert torch.equal(seen.current, demodulate(frame.color / 2, frame.albedo))
+    assert torch.equal(seen.diffuse, demodulate(frame.color / 3, frame.albedo))
+    # Of a coat, and whatever a sample holds beside its radiance, nothing is divided.
+    assert seen.specular is frame.specular
+    for sample in seen.samples.unbind(1):
+        torch.testing.assert_close(sample[:, :3], seen.color)
+        assert torch.equal(sample[:, 3:], torch.ones(1, 2, 9, 7))
     # Var(x / a) = Var(x) / a^2, with the divisor of the color.
     divisor = frame.color / demodulate(frame.color, frame.albedo)
     torch.testing.assert_close(seen.variance, frame.variance / divisor.square(), rtol=1e-4, atol=1e-5)
@@ -203,8 +210,13 @@ def test_exposed_methods_do_not_depend_on_the_unit_of_radiance(
 def test_all_radiance_is_exposed_alike_and_variance_by_the_square() -> None:
     watching = Watching()
     frame = frame_of(20, 24, variance=torch.rand(1, 3, 20, 24))
+    parts = {name: frame.color / count for count, name in enumerate(("diffuse", "specular", "emission"), 3)}
+    samples = torch.cat([frame.color, torch.ones(1, 2, 20, 24)], 1)[:, None]
     frame = frame.replace(
-        current=frame.color / 2, skip=Skip(torch.zeros(1, 1, 20, 24, dtype=torch.bool), {"image": 3 * frame.color})
+        **parts,
+        samples=samples,
+        current=frame.color / 2,
+        skip=Skip(torch.zeros(1, 1, 20, 24, dtype=torch.bool), {"image": 3 * frame.color}),
     )
     Exposed(watching)(frame)
     seen, exposure = watching.frames[0], auto_exposure(frame.color)
@@ -212,6 +224,10 @@ def test_all_radiance_is_exposed_alike_and_variance_by_the_square() -> None:
     torch.testing.assert_close(seen.color, frame.color * exposure)
     torch.testing.assert_close(seen.current, frame.color / 2 * exposure)
     torch.testing.assert_close(seen.variance, frame.variance * exposure.square())
+    for name, part in parts.items():
+        torch.testing.assert_close(seen.buffer(name), part * exposure)
+    torch.testing.assert_close(seen.samples[:, 0, :3], frame.color * exposure)
+    assert torch.equal(seen.samples[:, 0, 3:], torch.ones(1, 2, 20, 24))
     assert seen.skip is not None
     torch.testing.assert_close(seen.skip.images["image"], 3 * frame.color * exposure)
 

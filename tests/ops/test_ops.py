@@ -242,6 +242,8 @@ REFUSED: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], type[Ex
     (ops.kernel_splat, (THREE, image(2, 9, 4, 5)), {}, ValueError, "kernel: expected B = 1 as in image, found 2"),
     (ops.kernel_splat, (THREE, image(1, 16, 4, 5)), {}, ValueError, "kernel: expected K*K channels"),
     (ops.KernelSplat, (), {"border": ""}, ValueError, "border: expected one of"),
+    (ops.softmax_splat, (THREE, image(1, 9, 5, 4)), {}, ValueError, "logits: expected H = 4 as in image, found 5"),
+    (ops.softmax_splat, (THREE, image(1, 4, 4, 5)), {}, ValueError, "logits: expected K*K channels with odd K"),
     (ops.cross_bilateral_weights, (ONE, [THREE]), {}, ValueError, "scales: expected one for each of the 1 guides"),
     (ops.cross_bilateral_weights, (ONE, [THREE], [THREE]), {}, ValueError, "scales[0]: expected shape (B, 1, H, W)"),
     (ops.cross_bilateral_weights, (ONE, [image(1, 3, 4, 4)], [ONE]), {}, ValueError, "guides[0]: expected W = 5"),

@@ -1,0 +1,192 @@
+"""KPCN, the kernel-predicting convolutional network: one network for diffuse light, and one for specular light.
+
+Bako et al. 2017, "Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings", ACM Transactions on
+Graphics (SIGGRAPH). Equation numbers are its own. ``PUBLISHED`` are its sizes: nine 5x5 convolutions of 100 channels
+and kernels of 21x21, with the 27 input channels of the re-implementation that Gharbi et al. 2019 published, 2.92
+million parameters a branch; training them takes a GPU. The default is smaller, for a CPU.
+
+- Diffuse light is filtered without its albedo, specular light as ``log(1 + s)``, and the result is ``albedo diffuse +
+  exp(specular) - 1``, to which ``emission``, which has no noise, is added where the frame has it. The authors' diffuse
+  light is all that is not specular, with emission in it.
+- **A frame with color only**: renderers that do not tell the two apart give no ``diffuse`` and ``specular``. Then the
+  color, without its albedo, is what the diffuse branch filters, and there is no specular light: that branch is not
+  computed, and does not learn.
+
+What is taken where the paper or its re-implementation leaves something open, and what is different here:
+
+- the 27 channels: the image, albedo, normal and depth (10), the horizontal and vertical differences of the image's
+  luminance, albedo, normal and depth (16), and ``log(1 + variance)`` of the image (1). The paper has variances of every
+  feature from its renderer. Here that of the image is estimated from the 7x7 pixels of the same surface around, for
+  frames of one sample have none, and one of several is that of the color and not of its parts;
+- convolutions are padded with zeros, where the authors crop the border;
+- taps of a kernel that lie outside the image have no weight;
+- typical radiance is brought to 0.5 first (:class:`mcdenoise.models.Exposed`): otherwise the logarithm, and so the
+  result, depends on the unit of radiance;
+- depth in [0, 1]: ``d / (d + typical depth)``; the authors scale it by the largest;
+- the authors denoise single images of many samples. Here light is accumulated over frames by the rule of
+  :mod:`mcdenoise.models.cascaded`, as for all methods that are compared; ``alpha_min=1`` is a single image;
+- the authors train each branch with an L1 loss of its own, and both together afterwards; here the losses of the trainer
+  are of the sum from the start.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.cascaded import NORMAL_LIMIT, POSITION_LIMIT
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.exposed import Exposed
+from mcdenoise.models.tiled import Tiled
+from mcdenoise.nn.inputs import features_of, guides_of, image_statistics
+from mcdenoise.ops import cross_bilateral_filter, demodulate, luminance_moments, moments_variance
+
+PUBLISHED: Mapping[str, Any] = {"width": 100, "layers": 9, "kernel_size": 21}
+CHANNELS = 27
+_CONVOLUTION, _WINDOW = 5, 7  # sides, in pixels
+# Brighter light counts as this in the variance: float32 holds the square.
+_BRIGHTEST = 1e18
+
+
+class _Branch(nn.Sequential):
+    """Convolutions with ReLU, and the logits of a kernel for each pixel."""
+
+    def __init__(self, width: int, layers: int, kernel_size: int) -> None:
+        widths = [CHANNELS] + [width] * (layers - 1) + [kernel_size**2]
+        modules: list[nn.Module] = []
+        for entering, leaving in itertools.pairwise(widths):
+            modules += [nn.Conv2d(entering, leaving, _CONVOLUTION, padding=_CONVOLUTION // 2), nn.ReLU(inplace=True)]
+        super().__init__(*modules[:-1])
+
+    def filtered(self, image: Tensor, others: Tensor | None, frame: Frame) -> tuple[Tensor, Tensor | None]:
+        """An image ``(B, 3, H, W)`` with the kernels that are predicted for it, and others with the same kernels."""
+        logits = self(_seen(image, frame))
+        together = image if others is None else torch.cat([image, others], 1)
+        found = cross_bilateral_filter(together, logits, border="renormalize")  #                       Eqs. 8 and 9
+        return found[:, :3], None if others is None else found[:, 3:]
+
+
+class KpcnNetwork(nn.Module):
+    """Both branches, on light without albedo in the diffuse one.
+
+    Args:
+        width: channels of each convolution but the last, the paper's 100.
+        layers: how many 5x5 convolutions a branch has, at least 2, the paper's 9.
+        kernel_size: side of the kernels, odd, the paper's 21.
+
+    Raises:
+        InputError: a setting is out of its range.
+    """
+
+    def __init__(self, width: int, layers: int, kernel_size: int) -> None:
+        super().__init__()
+        if width < 1:
+            raise InputError(f"width: expected at least 1, found {width}")
+        if layers < 2:
+            raise InputError(f"layers: expected at least 2, found {layers}")
+        if kernel_size < 1 or kernel_size % 2 == 0:
+            raise InputError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
+        self.diffuse, self.specular = (_Branch(width, layers, kernel_size) for _ in range(2))
+        # What a result depends on: convolutions, the variance with the slope of the depth at its taps, and the kernel.
+        self._reach = layers * (_CONVOLUTION // 2) + _WINDOW // 2 + 1 + kernel_size // 2
+        # Measured at the default's sizes: 3.8 kB a pixel.
+        self._live = 4 * max(width, CHANNELS) + 6 * kernel_size**2
+
+    @property
+    def needs(self) -> Needs:
+        """Features, and the parts of the light."""
+        uses = frozenset({"albedo", "normal", "depth", "diffuse", "specular", "emission"})
+        return Needs(uses=uses, reach=self._reach)
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """The depth scale of the whole image."""
+        return image_statistics(frame)
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: features, logits and weights, and buffers."""
+        return self._live * (2 if bfloat16 else 4) + 54 * 4
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
+        others = carried(frame)
+        if frame.diffuse is None or frame.specular is None:
+            image, others = self.diffuse.filtered(frame.color, others, frame)
+            return answered(frame, image, others), None
+        matt, of_matt = self.diffuse.filtered(frame.diffuse, others, frame)
+        logarithm, of_shiny = self.specular.filtered(torch.log1p(frame.specular), others, frame)
+        shiny = torch.expm1(logarithm)
+        if frame.emission is not None:
+            shiny = shiny + frame.emission
+        if frame.albedo is not None:
+            # The albedo is multiplied into all of the result, see Demodulated.
+            shiny = demodulate(shiny, frame.albedo)
+        image = matt + shiny
+        if of_matt is not None and of_shiny is not None:
+            lit = image > 0
+            part = torch.where(lit, shiny / torch.where(lit, image, 1), 0).mean(1, keepdim=True)
+            others = torch.lerp(of_matt, of_shiny, part)
+        return answered(frame, image, others), None
+
+
+def _seen(image: Tensor, frame: Frame) -> Tensor:
+    """What a branch sees, ``(B, 27, H, W)``."""
+    moments = luminance_moments(image.clamp_max(_BRIGHTEST))
+    variance = moments_variance(moments, frame.normal, frame.depth, kernel_size=_WINDOW)
+    features = torch.cat([features_of(frame)[0], *guides_of(frame)], 1)
+    varying = torch.cat([moments[:, :1].to(image.dtype), features], 1)
+    across, down = (varying.diff(dim=dim) for dim in (-1, -2))
+    # The last pixel of a row or column has nothing to differ from.
+    differences = [F.pad(across, (0, 1)), F.pad(down, (0, 0, 0, 1))]
+    return torch.cat([image, features, *differences, torch.log1p(variance).to(image.dtype)], 1)
+
+
+@register_model(
+    "kpcn",
+    "diffuse and specular light by networks of their own, small, with a history",
+    kind="kernel",
+    paper="Bako et al. 2017",
+)
+def kpcn(
+    width: int = 24,
+    layers: int = 5,
+    kernel_size: int = 11,
+    *,
+    alpha_min: float = 0.2,
+    position_limit: float = POSITION_LIMIT,
+    normal_limit: float = NORMAL_LIMIT,
+) -> Model:
+    """KPCN of Bako et al. 2017; ``kpcn(**PUBLISHED)`` has the paper's sizes.
+
+    Args:
+        width: see :class:`KpcnNetwork`.
+        layers: likewise.
+        kernel_size: likewise.
+        alpha_min: smallest weight of the current frame in the accumulation; 1 for the paper's single images.
+        position_limit: see :func:`mcdenoise.models.cascaded.cascaded`.
+        normal_limit: likewise.
+    """
+    return Demodulated(
+        Accumulated(
+            Exposed(Tiled(KpcnNetwork(width, layers, kernel_size))),
+            alpha_min=alpha_min,
+            rule="bmfr",
+            position_limit=position_limit,
+            normal_limit=normal_limit,
+            firefly_limit=float("inf"),
+            specular_length=float("inf"),
+            lag_threshold=float("inf"),
+            also=("diffuse", "specular"),
+        )
+    )

@@ -1,0 +1,152 @@
+"""SBMC: every sample is splat over its neighbours with a kernel of its own.
+
+Gharbi et al. 2019, "Sample-based Monte Carlo Denoising using a Kernel-Splatting Network", ACM Transactions on Graphics
+(SIGGRAPH). ``PUBLISHED`` are the sizes of their code: embeddings of 128 channels by chains of three 1x1 convolutions,
+three rounds of them and of a U-Net of three levels with three convolutions each, on the mean over the samples, and
+kernels of 21x21; it takes a GPU to train. The default is smaller, for a CPU.
+
+Kernels are splat: a sample says to which pixels its light goes, so that a firefly is got rid of where it is, and each
+pixel is the mean of what arrives, by weights that are exponentials (:func:`mcdenoise.ops.softmax_splat`, one sample
+after the other).
+
+Where a frame has ``samples`` ``(B, S, C, H, W)``, their first three channels are radiance. **Where it has none, its
+color is the one sample of a pixel.** What is different here:
+
+- features are those of the pixel, and not of each sample; random numbers and probabilities of the path are not seen;
+- light is accumulated over frames by the rule of :mod:`mcdenoise.models.cascaded`, without albedo, as for all methods
+  that are compared. Beside samples, which are of the frame alone, the accumulated color is one more sample, marked by
+  one over its length. The authors denoise single images with their albedo; :class:`SbmcNetwork` alone does;
+- typical radiance is brought to 0.5 first (:class:`mcdenoise.models.Exposed`): otherwise the logarithm that the network
+  sees, and so the result, depends on the unit of radiance;
+- convolutions are padded with zeros, where the authors crop the border;
+- the losses are those of the trainer; the authors train on a relative error of tone-mapped radiance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.cascaded import NORMAL_LIMIT, POSITION_LIMIT
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.exposed import Exposed
+from mcdenoise.models.tiled import Tiled
+from mcdenoise.nn.inputs import image_statistics
+from mcdenoise.nn.samples import (
+    CHANNELS,
+    PLANNED,
+    LeakyUNet,
+    SampleEmbedding,
+    chain,
+    samples_input,
+    samples_of,
+    with_context,
+)
+from mcdenoise.ops import softmax_splat
+
+PUBLISHED: Mapping[str, Any] = {"width": 128, "rounds": 3, "convolutions": 3, "kernel_size": 21}
+
+
+class SbmcNetwork(nn.Module):
+    """Predicts a kernel for every sample, and splats the samples with them.
+
+    Args:
+        width: channels of the embedding of a sample, and of the U-Nets' finest level.
+        rounds: of embedding and U-Net.
+        convolutions: of each block of the U-Nets.
+        kernel_size: side of the kernels, odd.
+
+    Raises:
+        InputError: a setting is out of its range.
+    """
+
+    def __init__(self, width: int, rounds: int, convolutions: int, kernel_size: int) -> None:
+        super().__init__()
+        if kernel_size < 1 or kernel_size % 2 == 0:
+            raise InputError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
+        self.embedding = SampleEmbedding(CHANNELS, width, rounds, convolutions)
+        self.kernel = chain([2 * width, width, width, kernel_size**2], linear=True)
+        self._reach = rounds * LeakyUNet.reach(convolutions) + kernel_size // 2
+        # Measured at the default's sizes, with eight samples and the history: 8.2 kB a pixel.
+        self._live = width * (8 * PLANNED + 8) + 6 * kernel_size**2
+
+    @property
+    def needs(self) -> Needs:
+        """Features and samples; the length of a history marks what is accumulated."""
+        uses = frozenset({"albedo", "normal", "depth", "samples", "length"})
+        return Needs(uses=uses, reach=self._reach, stride=LeakyUNet.multiple)
+
+    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
+        """The depth scale of the whole image."""
+        return image_statistics(frame)
+
+    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
+        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: embeddings, logits, weights and buffers."""
+        return self._live * (2 if bfloat16 else 4) + 54 * 4
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
+        light, others = samples_of(frame), carried(frame)
+        known = with_context(*self.embedding(samples_input(frame, light)))
+        mean, total = light[:, 0], None
+        for sample, seen in zip(light.unbind(1), known.unbind(1), strict=True):
+            together = sample if others is None else torch.cat([sample, others.to(sample.dtype)], 1)
+            splat, weight = softmax_splat(together, self.kernel(seen).to(together.dtype))
+            if total is None:
+                mean, total = splat, weight
+            else:
+                # Of all samples so far, by the weights that arrived: a sum that no exponential overflows.
+                mean = torch.lerp(mean, splat, torch.sigmoid(weight - total).to(mean.dtype))
+                total = torch.logaddexp(total, weight)
+        return answered(frame, mean[:, :3], None if others is None else mean[:, 3:]), None
+
+
+@register_model(
+    "sbmc",
+    "splats every sample with a kernel of its own, small, with a history",
+    kind="kernel",
+    paper="Gharbi et al. 2019",
+)
+def sbmc(
+    width: int = 16,
+    rounds: int = 3,
+    convolutions: int = 2,
+    kernel_size: int = 11,
+    *,
+    alpha_min: float = 0.2,
+    position_limit: float = POSITION_LIMIT,
+    normal_limit: float = NORMAL_LIMIT,
+) -> Model:
+    """SBMC of Gharbi et al. 2019; ``sbmc(**PUBLISHED)`` has the sizes of their code.
+
+    Args:
+        width: see :class:`SbmcNetwork`.
+        rounds: likewise.
+        convolutions: likewise.
+        kernel_size: likewise.
+        alpha_min: smallest weight of the current frame in the accumulation.
+        position_limit: see :func:`mcdenoise.models.cascaded.cascaded`.
+        normal_limit: likewise.
+    """
+    return Demodulated(
+        Accumulated(
+            Exposed(Tiled(SbmcNetwork(width, rounds, convolutions, kernel_size))),
+            alpha_min=alpha_min,
+            rule="bmfr",
+            position_limit=position_limit,
+            normal_limit=normal_limit,
+            firefly_limit=float("inf"),
+            specular_length=float("inf"),
+            lag_threshold=float("inf"),
+        )
+    )

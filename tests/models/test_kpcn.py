@@ -1,0 +1,198 @@
+"""KPCN against its equations, written out in float64 with loops."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from toys import frame_of, refused
+
+from mcdenoise.frame import Frame, Hints
+from mcdenoise.models import Demodulated, Exposed, Tiled, create_model, overview, parts_of
+from mcdenoise.models.kpcn import CHANNELS, PUBLISHED, KpcnNetwork, kpcn
+from mcdenoise.ops import luminance_moments, moments_variance
+
+
+def drawn(width: int = 4, layers: int = 3, kernel_size: int = 3) -> KpcnNetwork:
+    """With weights in float64 of which every part of the equations is felt."""
+    torch.manual_seed(3)
+    network = KpcnNetwork(width, layers, kernel_size).double()
+    for parameter in network.parameters():
+        nn.init.normal_(parameter, std=0.1)
+    return network
+
+
+def parts(height: int, width: int, **changes: Any) -> Frame:
+    """A frame with its light in parts, in float64."""
+    generator = torch.Generator().manual_seed(5)
+    light = {name: 3 * torch.rand(1, 3, height, width, generator=generator) for name in ("diffuse", "specular")}
+    return frame_of(height, width, **light).to(torch.float64).replace(**changes)
+
+
+def seen(image: Tensor, frame: Frame) -> Tensor:
+    """The 27 channels, pixel by pixel."""
+    albedo, normal, depth = frame.albedo, frame.normal, frame.depth
+    assert albedo is not None
+    assert normal is not None
+    assert depth is not None
+    hit = torch.isfinite(depth)
+    near = torch.where(hit, depth / (depth + torch.exp(torch.log(depth[hit]).mean())), 1)
+    features = torch.cat([albedo, (normal + 1) / 2, near], 1)
+    bright = (image * torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64).reshape(1, 3, 1, 1)).sum(
+        1, keepdim=True
+    )
+    values = torch.cat([bright, features], 1)
+    across, down = torch.zeros_like(values), torch.zeros_like(values)
+    height, width = image.shape[-2:]
+    for y in range(height):
+        for x in range(width):
+            if x + 1 < width:
+                across[..., y, x] = values[..., y, x + 1] - values[..., y, x]
+            if y + 1 < height:
+                down[..., y, x] = values[..., y + 1, x] - values[..., y, x]
+    variance = moments_variance(luminance_moments(image), normal, depth, kernel_size=7)
+    return torch.cat([image, features, across, down, torch.log(1 + variance)], 1)
+
+
+def filtered(branch: Any, image: Tensor, frame: Frame) -> Tensor:
+    """Convolutions with ReLU between them, the softmax of Eq. 8, and the mean of Eq. 9 over the taps inside."""
+    x = seen(image, frame)
+    assert x.shape[1] == CHANNELS
+    convolutions = [layer for layer in branch if isinstance(layer, nn.Conv2d)]
+    for number, layer in enumerate(convolutions):
+        x = F.conv2d(x if number == 0 else x.clamp_min(0), layer.weight, layer.bias, padding=2)
+    side, (height, width) = math.isqrt(x.shape[1]), image.shape[-2:]
+    result = torch.zeros_like(image)
+    for y in range(height):
+        for x_ in range(width):
+            total = torch.zeros(1, 3).double()
+            weights = 0.0
+            for tap in range(side**2):
+                qy, qx = y + tap // side - side // 2, x_ + tap % side - side // 2
+                if 0 <= qy < height and 0 <= qx < width:
+                    weight = math.exp(float(x[0, tap, y, x_]))
+                    total, weights = total + weight * image[..., qy, qx], weights + weight
+            result[..., y, x_] = total / weights
+    return result
+
+
+@torch.no_grad()
+def test_the_network_written_out() -> None:
+    """On light whose diffuse part is without albedo: its result times albedo is ``a d + exp(l) - 1``."""
+    network, frame = drawn(), parts(6, 7, emission=torch.full((1, 3, 6, 7), 0.25).double())
+    assert frame.diffuse is not None
+    assert frame.specular is not None
+    assert frame.albedo is not None
+    matt = filtered(network.diffuse, frame.diffuse, frame)
+    shiny = torch.exp(filtered(network.specular, torch.log(1 + frame.specular), frame)) - 1
+    # What is divided by in Demodulated: the albedo, at least 0.04 where there is any.
+    albedo = frame.albedo.clamp_min(0.04)
+    output, state = network(frame)
+    torch.testing.assert_close(output.image * albedo, albedo * matt + shiny + 0.25, rtol=1e-9, atol=1e-9)
+    assert state is None
+
+
+@torch.no_grad()
+def test_color_only_is_the_diffuse_branch() -> None:
+    network, frame = drawn(), parts(6, 7)
+    alone = frame.replace(diffuse=None, specular=None)
+    expected = filtered(network.diffuse, frame.color, frame)
+    torch.testing.assert_close(network(alone)[0].image, expected, rtol=1e-9, atol=1e-9)
+    # One part without the other says no more.
+    torch.testing.assert_close(network(frame.replace(specular=None))[0].image, expected, rtol=1e-9, atol=1e-9)
+    dark = frame.replace(diffuse=frame.color, specular=torch.zeros_like(frame.color))
+    torch.testing.assert_close(network(dark)[0].image, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_color_only_teaches_the_diffuse_branch_only() -> None:
+    network = drawn()
+    network(parts(6, 7, diffuse=None, specular=None))[0].image.sum().backward()
+    assert all(parameter.grad is not None for parameter in network.diffuse.parameters())
+    assert all(parameter.grad is None for parameter in network.specular.parameters())
+
+
+@torch.no_grad()
+def test_light_without_noise_comes_back() -> None:
+    """Means of equal numbers, and a logarithm that is undone: the whole model, its albedo and its exposure."""
+    frame = parts(9, 8).to(torch.float32)
+    assert frame.albedo is not None
+    model = create_model("kpcn", width=4)
+    matt, shiny = 2 * frame.albedo.clamp_min(0.04), torch.full_like(frame.color, 3.0)
+    output, _ = model(frame.replace(color=matt + shiny, diffuse=matt, specular=shiny))
+    torch.testing.assert_close(output.image, matt + shiny, rtol=1e-4, atol=1e-4)
+
+
+@torch.no_grad()
+def test_both_parts_have_a_history() -> None:
+    """A still scene: what is filtered is the mean of two frames, of each part."""
+    model, frame = create_model("kpcn", width=4, alpha_min=0.5), parts(9, 8).to(torch.float32)
+    wall = {"position": torch.rand(1, 3, 9, 8), "motion": torch.zeros(1, 2, 9, 8)}
+    first, second = (
+        frame.replace(**wall, **{name: factor * getattr(frame, name) for name in ("color", "diffuse", "specular")})
+        for factor in (1.0, 3.0)
+    )
+    _, state = model(first)
+    output, _ = model(second, state)
+    both = frame.replace(**wall, **{name: 2 * getattr(frame, name) for name in ("color", "diffuse", "specular")})
+    torch.testing.assert_close(output.image, model(both)[0].image, rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_tiles_change_nothing() -> None:
+    network, frame = drawn(), parts(20, 150)
+    frame = frame.replace(statistics=network.statistics(frame))
+    whole, tiled = network(frame)[0].image, Tiled(network, side=32)(frame)[0].image
+    torch.testing.assert_close(tiled, whole, rtol=1e-12, atol=1e-12)
+
+
+@torch.no_grad()
+def test_layers_are_filtered_with_the_kernels_of_their_light() -> None:
+    network, frame = drawn(), parts(6, 7)
+    assert frame.diffuse is not None
+    assert frame.specular is not None
+    layers = {"matt": frame.diffuse, "shiny": frame.specular}
+    hints = Hints(alpha=True)
+    alpha = torch.ones_like(frame.color[:, :1])
+    output, _ = network(frame.replace(layers=layers, alpha=alpha, hints=hints))
+    torch.testing.assert_close(output.image, network(frame)[0].image)
+    torch.testing.assert_close(output.alpha, alpha)
+    # Without specular light all kernels are those of the diffuse branch.
+    dark = frame.replace(specular=torch.zeros_like(frame.specular), layers={"matt": frame.diffuse})
+    output, _ = network(dark)
+    torch.testing.assert_close(output.layers["matt"], output.image)
+
+
+def test_the_published_size() -> None:
+    """2.92 million parameters a branch with 27 inputs."""
+    with torch.device("meta"):
+        network = next(part for part in kpcn(**PUBLISHED).modules() if isinstance(part, KpcnNetwork))  # type: ignore[attr-defined]
+    for branch in (network.diffuse, network.specular):
+        assert sum(parameter.numel() for parameter in branch.parameters()) == 2_921_241
+        assert [layer.weight.shape[:2] for layer in branch if isinstance(layer, nn.Conv2d)] == [
+            (100, 27),
+            *[(100, 100)] * 7,
+            (441, 100),
+        ]
+    assert network.needs.reach == 18 + 4 + 10
+
+
+def test_the_default_is_small() -> None:
+    (entry,) = (entry for entry in overview() if entry.name == "kpcn")
+    # Five 5x5 convolutions of 27, 24, 24, 24, 24 and 121 channels; of a frame of color, one branch runs.
+    weights = 25 * (27 * 24 + 3 * 24 * 24 + 24 * 121)
+    assert entry.kmacs_per_pixel == pytest.approx(weights / 1e3)
+    assert entry.parameters == 2 * (weights + 4 * 24 + 121)
+
+
+def test_what_it_wears() -> None:
+    model = create_model("kpcn")
+    assert [len(list(parts_of(model, kind))) for kind in (Demodulated, Exposed, Tiled)] == [1, 1, 1]
+
+
+@pytest.mark.parametrize(("setting", "value"), [("width", 0), ("layers", 1), ("kernel_size", 4), ("kernel_size", 0)])
+def test_settings_out_of_range_are_refused(setting: str, value: int) -> None:
+    assert refused(lambda: create_model("kpcn", **{setting: value})).startswith(f"{setting}: expected ")
