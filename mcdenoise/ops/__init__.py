@@ -9,15 +9,18 @@ from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
+from mcdenoise.ops.gradients import TemporalGradient, temporal_gradient
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
+from mcdenoise.ops.regression import BlockRegression, block_regression
 from mcdenoise.ops.temporal import Accumulate, accumulate, motion_from_position, reproject
 
 __all__ = [
     "NO_ALBEDO",
     "Accumulate",
     "Atrous",
+    "BlockRegression",
     "ClampFireflies",
     "CrossBilateralFilter",
     "CrossBilateralWeights",
@@ -29,8 +32,10 @@ __all__ = [
     "MomentsVariance",
     "Remodulate",
     "Surface",
+    "TemporalGradient",
     "accumulate",
     "atrous",
+    "block_regression",
     "clamp_fireflies",
     "cross_bilateral_filter",
     "cross_bilateral_weights",
@@ -45,6 +50,7 @@ __all__ = [
     "motion_from_position",
     "remodulate",
     "reproject",
+    "temporal_gradient",
     "upsample",
     "use",
 ]
