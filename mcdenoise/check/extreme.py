@@ -565,7 +565,14 @@ def gradient_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     lost = {name: limits.tiny / limits.eps * largest**power for name, power in _POWERS.items()}
     seen = {name: inputs[name] for name in lost if isinstance(inputs.get(name), Tensor)}
     arguments: Inputs = {name: value.abs().clamp_min(lost[name]) for name, value in seen.items()}  # type: ignore[union-attr]
-    return Rounding(arguments, gradients=dict(zip(tensors, found_gradients, strict=True)))
+    gradients: Inputs = dict(zip(tensors, found_gradients, strict=True))
+    facing, deviation = inputs.get("normal"), inputs.get("variance")
+    if isinstance(facing, Tensor) and isinstance(deviation, Tensor) and found.any():
+        # So is the square of a weight, however large the variance that it is multiplied with beside that of its pixel.
+        spread = float(deviation.max()) / (float(size.detach()[found].min()) * largest) ** 2
+        lost_weight = 9 * defaults["levels"] * limits.tiny / limits.eps * threshold**2 * spread
+        gradients["normal"] = torch.full_like(facing, 2 * SIGMA_N * lost_weight)
+    return Rounding(arguments, gradients=gradients)
 
 
 def regressions() -> tuple[Case, ...]:
