@@ -544,7 +544,14 @@ def gradient_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     tensors = {name: inputs[name].clone().requires_grad_() for name in names if isinstance(inputs.get(name), Tensor)}  # type: ignore[union-attr]
     if not tensors["current"].numel():
         return Rounding()
-    defaults = {"stratum": 3, "levels": 5, "threshold": 2.0, "sigma_z": SIGMA_Z, "sigma_n": SIGMA_N, **settings}
+    defaults: dict[str, Any] = {
+        "stratum": 3,
+        "levels": 5,
+        "threshold": 2.0,
+        "sigma_z": SIGMA_Z,
+        "sigma_n": SIGMA_N,
+        **settings,
+    }
     threshold = defaults.pop("threshold")
     others = {name: inputs.get(name) for name in ("weight", "variance", "normal", "depth")}
     with torch.enable_grad():
@@ -572,6 +579,9 @@ def gradient_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
         spread = float(deviation.max()) / (float(size.detach()[found].min()) * largest) ** 2
         lost_weight = 9 * defaults["levels"] * limits.tiny / limits.eps * threshold**2 * spread
         gradients["normal"] = torch.full_like(facing, 2 * SIGMA_N * lost_weight)
+        distance = inputs.get("depth")
+        if isinstance(distance, Tensor):
+            gradients["depth"] = 2 * lost_weight / (1e-3 * distance.clamp_min(1e-30))
     return Rounding(arguments, gradients=gradients)
 
 

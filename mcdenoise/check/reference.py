@@ -383,8 +383,8 @@ def temporal_gradient(
             for y in range(stratum * i, min(stratum * (i + 1), height)):
                 for x in range(stratum * j, min(stratum * (j + 1), width)):
                     w, new, old = (each[b][0][y][x] for each in (weights, now, before))
-                    for place, term in enumerate((w * (new - old), w * max(new, old), w * w * noises[b][0][y][x])):
-                        sums[place] += term
+                    for k, term in enumerate((w * (new - old), w * max(new, old), w * w * noises[b][0][y][x])):
+                        sums[k] += term
             image[i, j] = sums
         for level in range(levels):
             filtered = {}
@@ -432,19 +432,19 @@ def block_regression(
         places = list(itertools.product(rows, columns))
         pixels = [(mirrored(y, height), mirrored(x, width)) for y, x in places]
         with localcontext(prec=60):
-            values = [[Decimal(feature[y][x]) for y, x in pixels] for feature in guides[b]]
+            values: list[list[Decimal]] = [[Decimal(feature[y][x]) for y, x in pixels] for feature in guides[b]]
             deviations = [_standardized(each, "1e-6") for each in values]
             for j in range(len(values) - squares, len(values)):
                 curved = [z * u for z, u in zip(deviations[j], _standardized(values[j], "1e-18"), strict=True)]
-                mean = sum(curved) / len(pixels)
+                mean = _mean(curved)
                 deviations.append([product - mean for product in curved])
-            products = [[sum(p * q for p, q in zip(z, other, strict=True)) for other in deviations] for z in deviations]
+            products = [[_product(z, other) for other in deviations] for z in deviations]
             for j in range(len(products)):
                 products[j][j] += len(pixels) * Decimal(ridge)
             for c in range(channels):
                 light = [Decimal(source[b][c][y][x]) for y, x in pixels]
-                mean = sum(light) / len(pixels)
-                right = [sum(p * (v - mean) for p, v in zip(z, light, strict=True)) for z in deviations]
+                mean = _mean(light)
+                right = [_product(z, [value - mean for value in light]) for z in deviations]
                 found = _solved(products, right)
                 for index, (y, x) in enumerate(places):
                     if 0 <= y < height and 0 <= x < width:
@@ -455,11 +455,18 @@ def block_regression(
 
 def _standardized(values: list[Decimal], least: str) -> list[Decimal]:
     """``(x - mean) / sqrt(variance + least mean square)``."""
-    mean = sum(values) / len(values)
-    square = sum(value * value for value in values) / len(values)
-    variance = sum((value - mean) ** 2 for value in values) / len(values)
+    mean, square = _mean(values), _mean([value * value for value in values])
+    variance = _mean([(value - mean) ** 2 for value in values])
     size = (variance + Decimal(least) * square).sqrt()
     return [(value - mean) / size if size else Decimal(0) for value in values]
+
+
+def _mean(values: list[Decimal]) -> Decimal:
+    return sum(values, Decimal()) / len(values)
+
+
+def _product(values: list[Decimal], others: list[Decimal]) -> Decimal:
+    return sum((one * other for one, other in zip(values, others, strict=True)), Decimal())
 
 
 def _solved(matrix: list[list[Decimal]], right: list[Decimal]) -> list[Decimal]:

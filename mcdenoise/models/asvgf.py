@@ -39,6 +39,8 @@ of the published code, 0.1, for light and for moments.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -106,7 +108,7 @@ class Asvgf(Svgf):
         Returns:
             ``(B, 1, H, W)`` in [0, 1].
         """
-        settings = {"levels": self.gradient_levels, "sigma_z": self.sigma_z, "sigma_n": self.sigma_n}
+        settings: dict[str, Any] = {"levels": self.gradient_levels, "sigma_z": self.sigma_z, "sigma_n": self.sigma_n}
         surface = (frame.normal, frame.depth)
         shaded = frame.extra.get(GRADIENT)
         if shaded is not None:

@@ -31,7 +31,7 @@ Layers and alpha are fitted and accumulated as the color is, and cut off below 0
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -193,7 +193,7 @@ def bmfr(
         block: see :func:`mcdenoise.ops.block_regression`.
         ridge: likewise.
     """
-    limits = {"position_limit": position_limit, "normal_limit": normal_limit}
+    limits: dict[str, Any] = {"position_limit": position_limit, "normal_limit": normal_limit}
     model: Model = Demodulated(
         Accumulated(
             Bmfr(block=block, second_alpha=second_alpha, ridge=ridge, **limits),

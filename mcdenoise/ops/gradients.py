@@ -88,8 +88,13 @@ def temporal_gradient(
     _check_settings(stratum, levels, threshold, sigma_z, sigma_n)
     if current.numel() == 0:
         return current
-    settings = {"stratum": stratum, "levels": levels, "sigma_z": sigma_z, "sigma_n": sigma_n}
-    difference, size, noise = sums_of_strata(current, previous, weight, variance, normal, depth, **settings)
+    difference, size, noise = sums_of_strata(
+        *(current, previous, weight, variance, normal, depth),
+        stratum=stratum,
+        levels=levels,
+        sigma_z=sigma_z,
+        sigma_n=sigma_n,
+    )
     some = size > 0
     size = torch.where(some, size, 1)
     error = bounded_quotient(threshold * torch.sqrt(torch.where(noise > 0, noise, 1)), size)
