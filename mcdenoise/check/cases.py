@@ -31,10 +31,12 @@ from mcdenoise.ops.bilateral_grid import GridSlice, GridSplat, cells_of, grid_sl
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
+from mcdenoise.ops.gradients import TemporalGradient, temporal_gradient
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
 from mcdenoise.ops.partition import learned_upsample, pyramid_partition
+from mcdenoise.ops.regression import BlockRegression, block_regression
 from mcdenoise.ops.softmax_splat import softmax_splat
 from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
 
@@ -703,6 +705,141 @@ def _grid_slice_cases() -> tuple[Case, ...]:
     )
 
 
+def _gradient_cases() -> tuple[Case, ...]:
+    everything = ("current", "previous", "weight", "variance", "normal", "depth")
+    both = ("current", "previous")
+
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int],
+        inputs: tuple[str, ...] = everything,
+        draw: Callable[..., Tensor] = _uniform,
+        noise: float = 0.05,
+        change: float = 0.4,
+        smooth: tuple[str, ...] | None = None,
+        alter: Callable[[dict[str, Any]], None] | None = None,
+        **settings: float,
+    ) -> Case:
+        batch, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            previous = draw(g, batch, 1, height, width) + 0.1
+            # Darker by about as much everywhere: a change that noise does not explain, and that is not all.
+            current = previous * (change + 0.1 * _uniform(g, batch, 1, height, width))
+            drawn: dict[str, Any] = {
+                "current": current,
+                "previous": previous,
+                "weight": _uniform(g, batch, 1, height, width, low=0.5),
+                "variance": (noise * previous * _uniform(g, batch, 1, height, width, low=0.5)).square(),
+                **_wall(g, *size),
+            }
+            if alter is not None:
+                alter(drawn)
+            return {argument: drawn[argument] for argument in inputs}
+
+        return Case(name, kind, tensors, inputs if smooth is None else smooth, settings)
+
+    def one_sample(drawn: dict[str, Any]) -> None:
+        """One pixel of each stratum, and none in the first."""
+        drawn["weight"] = torch.zeros_like(drawn["weight"])
+        drawn["weight"][..., 1::3, 2::3] = 1
+        drawn["weight"][..., :3, :3] = 0
+
+    def sky(drawn: dict[str, Any]) -> None:
+        drawn["depth"][..., 0, :] = torch.inf
+        drawn["normal"][..., 0, :] = 0
+
+    def off(drawn: dict[str, Any]) -> None:
+        drawn["current"][..., :3, :] = 0
+
+    def dark(drawn: dict[str, Any]) -> None:
+        drawn["current"], drawn["previous"] = 0 * drawn["current"], 0 * drawn["previous"]
+
+    def still(drawn: dict[str, Any]) -> None:
+        drawn["current"] = drawn["previous"].clone()
+
+    return (
+        case("4x5, strata of 2", "ordinary", (1, 4, 5), stratum=2, levels=2),
+        case("batch of 2", "ordinary", (2, 2, 5), levels=1),
+        case("luminance alone", "ordinary", (1, 5, 7), both),
+        case("strata of a pixel, normals", "ordinary", (1, 2, 3), (*both, "normal"), stratum=1, levels=3),
+        case("one row, depths", "ordinary", (1, 1, 7), (*both, "variance", "depth"), sigma_z=3.0),
+        case("one pixel", "ordinary", (1, 1, 1)),
+        case("no filter", "ordinary", (1, 4, 4), (*both, "weight", "variance"), levels=0, threshold=1.0),
+        case("brighter", "ordinary", (1, 3, 4), (*both, "variance"), change=2.0),
+        case("fireflies", "stiff", (1, 3, 4), draw=_dim, smooth=("weight", "normal", "depth"), stratum=2),
+        case("nearly all noise", "stiff", (1, 4, 4), (*both, "variance"), noise=0.6, smooth=both),
+        # A weight is no less than 0.
+        case("one sample a stratum", "extreme", (1, 5, 7), (*both, "weight"), alter=one_sample, smooth=both),
+        # Infinity has no difference quotient.
+        case("sky", "extreme", (1, 4, 4), alter=sky, smooth=(*both, "variance"), stratum=2),
+        # At the limits there is no derivative.
+        case("a light goes out", "extreme", (1, 6, 6), (*both, "depth"), alter=off, smooth=("depth",)),
+        case("no light", "extreme", (1, 3, 4), alter=dark, smooth=()),
+        case("nothing changes", "extreme", (1, 3, 4), alter=still, smooth=()),
+        case("nothing but noise", "extreme", (1, 3, 4), (*both, "variance"), noise=50.0, smooth=()),
+    )
+
+
+def _regression_cases() -> tuple[Case, ...]:
+    both = ("image", "features")
+
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        count: int = 2,
+        draw: Callable[..., Tensor] = _normal,
+        features: Callable[..., Tensor] = _normal,
+        differentiable: tuple[str, ...] = both,
+        **settings: Any,
+    ) -> Case:
+        batch, _, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            return {"image": draw(g, *size), "features": features(g, batch, count, height, width)}
+
+        return Case(name, kind, tensors, differentiable, {"block": 4, **settings})
+
+    def wall(g: Generator, *shape: int) -> Tensor:
+        """Constant, and one feature twice the other."""
+        rest = _uniform(g, shape[0], 1, *shape[2:])
+        return torch.cat([torch.full_like(rest, -0.8), rest, 2 * rest, torch.zeros_like(rest)], 1)
+
+    def far(g: Generator, *shape: int) -> Tensor:
+        return 1e6 + _uniform(g, *shape)
+
+    def equal(g: Generator, *shape: int) -> Tensor:
+        return torch.full(shape, 0.3, dtype=torch.float64)
+
+    def nearly(g: Generator, *shape: int) -> Tensor:
+        """Two features that differ by a thousandth."""
+        first = _normal(g, shape[0], 1, *shape[2:])
+        return torch.cat([first, first + 1e-3 * _normal(g, shape[0], 1, *shape[2:])], 1)
+
+    def scene(g: Generator, *shape: int) -> Tensor:
+        """In millimetres."""
+        return 1e3 * (5 + _uniform(g, *shape))
+
+    return (
+        case("one block", "ordinary", (1, 1, 4, 4)),
+        case("batch of 2, RGB, blocks over the border", "ordinary", (2, 3, 3, 5), offset=(1, 3)),
+        case("a square", "ordinary", (1, 1, 4, 4), squares=1),
+        case("blocks of 3, a large ridge", "ordinary", (1, 2, 4, 3), block=3, ridge=0.1, squares=2),
+        case("one row", "ordinary", (1, 1, 1, 6), 1, offset=(3, 2)),
+        case("one pixel", "ordinary", (1, 3, 1, 1), differentiable=("image",)),
+        case("fireflies", "stiff", (1, 1, 4, 4), draw=_radiance, differentiable=("image",)),
+        case("features that differ by a thousandth", "stiff", (1, 1, 4, 4), features=nearly, differentiable=("image",)),
+        case("position in millimetres", "stiff", (1, 1, 4, 5), 3, features=scene, squares=3, differentiable=("image",)),
+        # Where features are not independent, or nearly all is mean, no difference quotient is fine enough.
+        case("a flat wall", "extreme", (1, 1, 4, 5), 4, features=wall, squares=1, differentiable=("image",)),
+        case("features all equal", "extreme", (1, 3, 4, 4), features=equal, squares=2, differentiable=("image",)),
+        case("positions of 1e6", "extreme", (1, 1, 4, 4), features=far, squares=2, differentiable=("image",)),
+        case("more features than pixels", "extreme", (1, 1, 2, 2), 5, squares=2, differentiable=("image",)),
+    )
+
+
 def _camera(batch: int, eye_z: float, unit: float) -> Tensor:
     """Row-vector world-to-clip matrices that look along +z, with a little of everything in every entry."""
     matrix = torch.tensor(
@@ -997,6 +1134,20 @@ OPS: tuple[Op, ...] = (
         reference.moments_variance,
         _moments_cases() + extreme.moments(),
         MomentsVariance,
+    ),
+    Op(
+        temporal_gradient,
+        reference.temporal_gradient,
+        _gradient_cases() + extreme.gradients(),
+        TemporalGradient,
+        rounding=extreme.gradient_rounding,
+    ),
+    Op(
+        block_regression,
+        reference.block_regression,
+        _regression_cases() + extreme.regressions(),
+        BlockRegression,
+        images=_IMAGE,
     ),
     Op(
         motion_from_position,

@@ -17,10 +17,12 @@ import torch.nn.functional as F
 from torch import Generator, Tensor
 
 from mcdenoise.check.case import Case, Inputs, Rounding, map_tensors, normal, radiance, uniform
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z
 from mcdenoise.ops._window import Border, inside, offsets, pad, shifted, unpad
 from mcdenoise.ops.affinity import affinity_of, tap_of, taps_of
 from mcdenoise.ops.bilateral import cross_bilateral_weights
 from mcdenoise.ops.fireflies import clamp_fireflies
+from mcdenoise.ops.gradients import sums_of_strata
 from mcdenoise.ops.temporal import Surface, reproject
 
 Draw = Callable[..., Tensor]
@@ -785,6 +787,110 @@ def moments() -> tuple[Case, ...]:
         *(case(*tried) for tried in _tried()),
         case("moments that cancel altogether", (1, 3, 3, 5), radiance, 0.0, 1),
         case("window of 21", (1, 3, 3, 4), radiance, kernel_size=21),
+    )
+
+
+def gradients() -> tuple[Case, ...]:
+    """Of ``temporal_gradient``."""
+
+    def case(
+        name: str, size: tuple[int, int, int, int], draw: Draw, noise: float = 0.1, depth: Draw | None = None
+    ) -> Case:
+        batch, _, height, width = size
+        shape = (batch, 1, height, width)
+
+        def tensors(g: Generator) -> Inputs:
+            previous = draw(g, *shape).abs()
+            return {
+                "current": previous * uniform(g, *shape),
+                "previous": previous,
+                "weight": uniform(g, *shape),
+                "variance": (noise * previous).square().clamp_max(1e34),
+                "normal": normal(g, batch, 3, height, width),
+                "depth": uniform(g, *shape, low=1, high=9) if depth is None else depth(g, *shape),
+            }
+
+        return Case(name, "extreme", tensors, (), {"levels": 2, "stratum": 2})
+
+    size = (1, 3, 3, 5)
+    return (
+        *(case(*tried) for tried in _tried()),
+        case("noise of 1e15 times the light", size, radiance, noise=1e15),
+        *(case(f"depth {value:g}", size, radiance, depth=_constant(value)) for value in (0.0, 1e-30, 1e30, math.inf)),
+    )
+
+
+# Of the unit of luminance, in the unit of each.
+_POWERS = {"current": 1, "previous": 1, "variance": 2}
+
+
+def gradient_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
+    """The derivatives of ``sqrt((D / M)^2 - (t / M)^2 V)`` are differences of terms that may cancel altogether.
+
+    Such as in the weight of a single pixel, which ``D / M`` does not depend on. With ``|dD| <= dM`` the terms are no
+    more than ``2 ((D / M)^2 + t^2 V / M^2) dM / M + (t^2 V / M^2) dV / V`` over the result.
+    """
+    names = ("current", "previous", "weight")
+    tensors = {name: inputs[name].clone().requires_grad_() for name in names if isinstance(inputs.get(name), Tensor)}  # type: ignore[union-attr]
+    if not tensors["current"].numel():
+        return Rounding()
+    defaults: dict[str, Any] = {
+        "stratum": 3,
+        "levels": 5,
+        "threshold": 2.0,
+        "sigma_z": SIGMA_Z,
+        "sigma_n": SIGMA_N,
+        **settings,
+    }
+    threshold = defaults.pop("threshold")
+    others = {name: inputs.get(name) for name in ("weight", "variance", "normal", "depth")}
+    with torch.enable_grad():
+        difference, size, noise = sums_of_strata(**{**others, **tensors}, **defaults)  # type: ignore[arg-type]
+        some = size > 0
+        size = torch.where(some, size, 1)
+        change, noisy = (difference / size).square().detach(), threshold**2 * (noise / size.square()).detach()
+        found = some & (change > noisy)
+        result = torch.sqrt(torch.where(found, change - noisy, 1))
+        of_size = torch.where(found, 2 * (change + noisy) / result, 0) * torch.log(size)
+        of_noise = torch.where(found, noisy / result, 0) * torch.log(torch.where(noise > 0, noise, 1))
+        # The gradient of a pixel is that of all pixels of a stratum.
+        terms = defaults["stratum"] ** 2 * (of_size + of_noise).sum()
+        found_gradients = torch.autograd.grad(terms, list(tensors.values()), allow_unused=True, materialize_grads=True)
+    # In the unit of the largest luminance, what is below the smallest number of float32 is nothing.
+    limits = torch.finfo(torch.float32)
+    largest = max(float(tensors[name].detach().abs().max()) for name in ("current", "previous"))
+    lost = {name: limits.tiny / limits.eps * largest**power for name, power in _POWERS.items()}
+    seen = {name: inputs[name] for name in lost if isinstance(inputs.get(name), Tensor)}
+    arguments: Inputs = {name: value.abs().clamp_min(lost[name]) for name, value in seen.items()}  # type: ignore[union-attr]
+    gradients: Inputs = dict(zip(tensors, found_gradients, strict=True))
+    facing, deviation = inputs.get("normal"), inputs.get("variance")
+    if isinstance(facing, Tensor) and isinstance(deviation, Tensor) and found.any():
+        # So is the square of a weight, however large the variance that it is multiplied with beside that of its pixel.
+        spread = float(deviation.max()) / (float(size.detach()[found].min()) * largest) ** 2
+        lost_weight = 9 * defaults["levels"] * limits.tiny / limits.eps * threshold**2 * spread
+        gradients["normal"] = torch.full_like(facing, 2 * SIGMA_N * lost_weight)
+        distance = inputs.get("depth")
+        if isinstance(distance, Tensor):
+            gradients["depth"] = 2 * lost_weight / (1e-3 * distance.clamp_min(1e-30))
+    return Rounding(arguments, gradients=gradients)
+
+
+def regressions() -> tuple[Case, ...]:
+    """Of ``block_regression``."""
+
+    def case(name: str, size: tuple[int, int, int, int], draw: Draw, features: Draw = normal, squares: int = 1) -> Case:
+        batch, _, height, width = size
+
+        def tensors(g: Generator) -> Inputs:
+            return {"image": draw(g, *size), "features": features(g, batch, 2, height, width)}
+
+        return Case(name, "extreme", tensors, (), {"block": 3, "offset": (1, 2), "squares": squares})
+
+    size = (1, 3, 3, 4)
+    return (
+        *(case(*tried) for tried in _tried()),
+        # A feature of which nearly all is one pixel is its own square.
+        *(case(f"features {name}", size, radiance, draw, squares=0) for name, draw in IMAGES.items()),
     )
 
 

@@ -489,6 +489,143 @@ def _cell_weight(y: int, x: int, guide: float, v: int, u: int, w: int, cell: int
     return math.prod(max(1 - math.sqrt(distance**2 + 1e-8), 0.0) for distance in distances)
 
 
+def temporal_gradient(
+    current: Tensor,
+    previous: Tensor,
+    weight: Tensor | None = None,
+    variance: Tensor | None = None,
+    normal: Tensor | None = None,
+    depth: Tensor | None = None,
+    *,
+    stratum: int = 3,
+    levels: int = 5,
+    threshold: float = 2.0,
+    sigma_z: float = 1.0,
+    sigma_n: float = 128.0,
+) -> Tensor:
+    """``sqrt((D^2 - threshold^2 V) / M^2)`` of sums over strata, smoothed over neighbours of the same surface."""
+    now, before, out = current.tolist(), previous.tolist(), _zeros(current.shape)
+    weights = torch.ones_like(current).tolist() if weight is None else weight.tolist()
+    noises = torch.zeros_like(current).tolist() if variance is None else variance.tolist()
+    batch, _, height, width = current.shape
+    rows, columns = range(-(-height // stratum)), range(-(-width // stratum))
+    middles = [
+        [min(stratum * index + stratum // 2, size - 1) for index in strata]
+        for strata, size in ((rows, height), (columns, width))
+    ]
+    coarse_normal, coarse_depth = (
+        None if image is None else image[:, :, middles[0]][..., middles[1]] for image in (normal, depth)
+    )
+    same_surface = _edge_stopping(coarse_normal, coarse_depth, sigma_z, sigma_n)
+    for b in range(batch):
+        image = {}
+        largest = max(abs(value) for each in (now, before) for row in each[b][0] for value in row)
+        for i, j in itertools.product(rows, columns):
+            sums = [0.0, 0.0, 0.0]
+            for y in range(stratum * i, min(stratum * (i + 1), height)):
+                for x in range(stratum * j, min(stratum * (j + 1), width)):
+                    w, new, old = (each[b][0][y][x] for each in (weights, now, before))
+                    for k, term in enumerate((w * (new - old), w * max(new, old), w * w * noises[b][0][y][x])):
+                        sums[k] += term
+            image[i, j] = sums
+        for level in range(levels):
+            filtered = {}
+            for i, j in image:
+                taps = [
+                    (place, same_surface(b, i, j, *place))
+                    for dy, dx in itertools.product((-1, 0, 1), repeat=2)
+                    if (place := (i + dy * 2**level, j + dx * 2**level)) in image
+                ]
+                total = sum(w for _, w in taps)
+                change, size = (sum(w * image[place][k] for place, w in taps) / total for k in range(2))
+                filtered[i, j] = [change, size, sum(w * w * image[place][2] for place, w in taps) / total**2]
+            image = filtered
+        for y, x in itertools.product(range(height), range(width)):
+            change, size, noise = image[y // stratum, x // stratum]
+            if size > 1e-15 * largest * stratum**2:
+                squared = (change / size) ** 2 - (threshold * math.sqrt(noise) / size) ** 2
+                out[b][0][y][x] = min(1.0, math.sqrt(max(0.0, squared)))
+    return _tensor(out, current.shape)
+
+
+def block_regression(
+    image: Tensor,
+    features: Tensor,
+    *,
+    block: int = 32,
+    offset: tuple[int, int] = (0, 0),
+    squares: int = 0,
+    ridge: float = 1e-8,
+) -> Tensor:
+    """The normal equations of each block, ``(Z^T Z + n ridge) w = Z^T (y - m)``; ``out = m + Z w``.
+
+    By elimination in decimal numbers: float64 has too few digits for the square of a condition.
+    """
+    batch, channels, height, width = image.shape
+    source, guides, out = image.tolist(), features.tolist(), _zeros(image.shape)
+
+    def blocks(size: int, start: int) -> list[range]:
+        return [range(first, first + block) for first in range(-start, size, block)]
+
+    def mirrored(place: int, size: int) -> int:
+        return min(place % (2 * size), 2 * size - 1 - place % (2 * size))
+
+    for b, rows, columns in itertools.product(range(batch), blocks(height, offset[0]), blocks(width, offset[1])):
+        places = list(itertools.product(rows, columns))
+        pixels = [(mirrored(y, height), mirrored(x, width)) for y, x in places]
+        with localcontext(prec=60):
+            values: list[list[Decimal]] = [[Decimal(feature[y][x]) for y, x in pixels] for feature in guides[b]]
+            deviations = [_standardized(each, "1e-6") for each in values]
+            for j in range(len(values) - squares, len(values)):
+                curved = [z * u for z, u in zip(deviations[j], _standardized(values[j], "1e-18"), strict=True)]
+                mean = _mean(curved)
+                deviations.append([product - mean for product in curved])
+            products = [[_product(z, other) for other in deviations] for z in deviations]
+            for j in range(len(products)):
+                products[j][j] += len(pixels) * Decimal(ridge)
+            for c in range(channels):
+                light = [Decimal(source[b][c][y][x]) for y, x in pixels]
+                mean = _mean(light)
+                right = [_product(z, [value - mean for value in light]) for z in deviations]
+                found = _solved(products, right)
+                for index, (y, x) in enumerate(places):
+                    if 0 <= y < height and 0 <= x < width:
+                        fitted = sum((w * z[index] for w, z in zip(found, deviations, strict=True)), mean)
+                        out[b][c][y][x] = float(fitted)
+    return _tensor(out, image.shape)
+
+
+def _standardized(values: list[Decimal], least: str) -> list[Decimal]:
+    """``(x - mean) / sqrt(variance + least mean square)``."""
+    mean, square = _mean(values), _mean([value * value for value in values])
+    variance = _mean([(value - mean) ** 2 for value in values])
+    size = (variance + Decimal(least) * square).sqrt()
+    return [(value - mean) / size if size else Decimal(0) for value in values]
+
+
+def _mean(values: list[Decimal]) -> Decimal:
+    return sum(values, Decimal()) / len(values)
+
+
+def _product(values: list[Decimal], others: list[Decimal]) -> Decimal:
+    return sum((one * other for one, other in zip(values, others, strict=True)), Decimal())
+
+
+def _solved(matrix: list[list[Decimal]], right: list[Decimal]) -> list[Decimal]:
+    """Gauss's elimination; the matrix is positive definite, so that no rows need to be exchanged."""
+    rows = [[*row, value] for row, value in zip(matrix, right, strict=True)]
+    for j, pivot in enumerate(rows):
+        for row in rows[j + 1 :]:
+            factor = row[j] / pivot[j]
+            for k in range(j, len(row)):
+                row[k] -= factor * pivot[k]
+    found: list[Decimal] = []
+    for j in reversed(range(len(rows))):
+        known = sum((w * a for w, a in zip(reversed(found), rows[j][j + 1 : -1], strict=True)), Decimal())
+        found.append((rows[j][-1] - known) / rows[j][j])
+    return found[::-1]
+
+
 def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
     """``clip = [x y z 1] @ M``; ``motion = ((clip.xy / clip.w + 1) / 2) (W, H) - centre``; infinite for ``w <= 0``."""
     batch, _, height, width = position.shape

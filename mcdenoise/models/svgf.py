@@ -26,9 +26,9 @@ from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.ops import Surface, accumulate, atrous, luminance_moments, moments_variance
 
 # With fewer frames than these, moments in time say little.
-_FEW_FRAMES, _WINDOW = 4, 7
+_FEW_FRAMES, WINDOW = 4, 7
 # Brighter light counts as this in the moments: float32 holds the square.
-_BRIGHTEST = 1e18
+BRIGHTEST = 1e18
 
 
 class History(NamedTuple):
@@ -94,9 +94,7 @@ class Svgf(nn.Module):
         normal, depth = frame.normal, frame.depth
         with timed("accumulate", frame.color.device):
             light, moments, length = self._accumulate(frame, history)
-            # Sec. 4.2: the variance, from neighbours where there are few frames.
-            few = moments_variance(moments, normal, depth, kernel_size=_WINDOW) * (_FEW_FRAMES / length)
-            variance = torch.where(length < _FEW_FRAMES, few, moments_variance(moments))
+            variance = variance_of(moments, length, frame)
         filtered, kept = light, light
         with timed("filter", frame.color.device):
             for level in range(self.levels):
@@ -122,7 +120,7 @@ class Svgf(nn.Module):
         """Sec. 4.1: light, moments and length with the history, where there is one."""
         color, others = frame.color, carried(frame)
         light = color if others is None else torch.cat([color, others], 1)
-        entering = torch.cat([light, luminance_moments(color.clamp_max(_BRIGHTEST)).to(light.dtype)], 1)
+        entering = torch.cat([light, luminance_moments(color.clamp_max(BRIGHTEST)).to(light.dtype)], 1)
         reset, motion = "first frame", None
         if history is not None:
             motion = motion_to_previous(frame, history.view_projection)
@@ -132,7 +130,12 @@ class Svgf(nn.Module):
             found.reset = reset
         if reset or history is None:
             return light, entering[:, -2:], torch.ones_like(light[:, :1])
-        both, length = accumulate(
+        both, length = self._blend(frame, entering, history, motion)
+        return both[:, :-2], both[:, -2:], length
+
+    def _blend(self, frame: Frame, entering: Tensor, history: History, motion: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Light and moments with their history, and its length."""
+        return accumulate(
             entering,
             torch.cat([history.light, history.moments], 1),
             history.length,
@@ -141,7 +144,18 @@ class Svgf(nn.Module):
             history.surface,
             alpha_min=self.alpha,
         )
-        return both[:, :-2], both[:, -2:], length
+
+
+def variance_of(moments: Tensor, length: Tensor, frame: Frame) -> Tensor:
+    """Sec. 4.2: the variance of a sample's luminance, from neighbours where there are few frames.
+
+    Args:
+        moments: ``(B, 2, H, W)`` accumulated.
+        length: ``(B, 1, H, W)`` over so many frames.
+        frame: with the normals and depths of these pixels.
+    """
+    few = moments_variance(moments, frame.normal, frame.depth, kernel_size=WINDOW) * (_FEW_FRAMES / length)
+    return torch.where(length < _FEW_FRAMES, few, moments_variance(moments))
 
 
 @register_model("svgf", kind="filter", paper="Schied et al. 2017")

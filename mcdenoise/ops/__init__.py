@@ -11,10 +11,12 @@ from mcdenoise.ops.bilateral_grid import GridSlice, GridSplat, grid_slice, grid_
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
+from mcdenoise.ops.gradients import TemporalGradient, temporal_gradient
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
 from mcdenoise.ops.partition import learned_upsample, pyramid_partition
+from mcdenoise.ops.regression import BlockRegression, block_regression
 from mcdenoise.ops.softmax_splat import softmax_splat
 from mcdenoise.ops.temporal import Accumulate, accumulate, motion_from_position, reproject
 
@@ -23,6 +25,7 @@ __all__ = [
     "Accumulate",
     "AffinityFilter",
     "Atrous",
+    "BlockRegression",
     "ClampFireflies",
     "CrossBilateralFilter",
     "CrossBilateralWeights",
@@ -36,9 +39,11 @@ __all__ = [
     "MomentsVariance",
     "Remodulate",
     "Surface",
+    "TemporalGradient",
     "accumulate",
     "affinity_filter",
     "atrous",
+    "block_regression",
     "clamp_fireflies",
     "cross_bilateral_filter",
     "cross_bilateral_weights",
@@ -58,6 +63,7 @@ __all__ = [
     "remodulate",
     "reproject",
     "softmax_splat",
+    "temporal_gradient",
     "upsample",
     "use",
 ]

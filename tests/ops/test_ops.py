@@ -165,8 +165,10 @@ def test_inputs_are_left_alone(op: Op, case: Case) -> None:
 
 
 # Generating code takes seconds, so it is left out where another op has the same code: splatting is the derivative of
-# kernel_conv, and accumulate reprojects. For the 25 taps of atrous, with their derivatives, it takes minutes.
-GENERATOR = {"kernel_splat": "aot_eager", "reproject": "aot_eager", "atrous": "aot_eager"}
+# kernel_conv, and accumulate reprojects. For the many taps of atrous and of
+# temporal_gradient, with their derivatives, it takes minutes.
+# Torch's generator does not lower the derivative of a QR decomposition.
+GENERATOR = dict.fromkeys(("kernel_splat", "reproject", "atrous", "temporal_gradient", "block_regression"), "aot_eager")
 
 
 # The compiler raises deprecation warnings of torch's own making.
@@ -325,6 +327,20 @@ REFUSED: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], type[Ex
     (ops.moments_variance, (THREE[:, :2], None, image(1, 1, 5, 4)), {}, ValueError, "depth: expected H = 4 as in mom"),
     (ops.MomentsVariance, (), {"kernel_size": 2}, ValueError, "kernel_size: expected odd and at least 1, found 2"),
     (ops.MomentsVariance, (), {"sigma_z": math.inf}, ValueError, "sigma_z: expected a positive number, found inf"),
+    (ops.temporal_gradient, (THREE, THREE), {}, ValueError, "current: expected shape (B, 1, H, W), found (1, 3"),
+    (ops.temporal_gradient, (ONE, image(1, 1, 4, 4)), {}, ValueError, "previous: expected W = 5 as in current, found"),
+    (ops.temporal_gradient, (ONE, ONE, THREE), {}, ValueError, "weight: expected shape (B, 1, H, W)"),
+    (ops.temporal_gradient, (ONE, ONE, None, ONE.int()), {}, TypeError, "variance: expected a floating-point dtype"),
+    (ops.temporal_gradient, (ONE, ONE), {"stratum": 0}, ValueError, "stratum: expected at least 1, found 0"),
+    (ops.TemporalGradient, (), {"levels": -1}, ValueError, "levels: expected at least 0, found -1"),
+    (ops.TemporalGradient, (), {"threshold": math.nan}, ValueError, "threshold: expected at least 0, found nan"),
+    (ops.block_regression, (THREE, image(1, 2, 5, 4)), {}, ValueError, "features: expected H = 4 as in image, found 5"),
+    (ops.block_regression, (THREE, image(1, 0, 4, 5)), {}, ValueError, "features: expected at least 1 channels, found"),
+    (ops.block_regression, (THREE, ONE), {"squares": 2}, ValueError, "features: expected at least 2 channels, found 1"),
+    (ops.block_regression, (THREE, ONE), {"block": 1}, ValueError, "block: expected at least 2, found 1"),
+    (ops.block_regression, (THREE, ONE), {"offset": (0, 32)}, ValueError, "offset: expected two numbers from 0 to 31"),
+    (ops.BlockRegression, (), {"ridge": 0.0}, ValueError, "ridge: expected a positive number, found 0.0"),
+    (ops.BlockRegression, (), {"squares": -1}, ValueError, "squares: expected at least 0, found -1"),
     (ops.motion_from_position, (ONE, image(1, 4, 4)), {}, ValueError, "position: expected shape (B, 3, H, W)"),
     (ops.motion_from_position, (THREE, image(4, 4)), {}, ValueError, "previous_view_projection: expected shape"),
     (ops.motion_from_position, (THREE, image(2, 4, 4)), {}, ValueError, "previous_view_projection: expected B = 1"),

@@ -1,0 +1,118 @@
+"""Temporal anti-aliasing: the image before is blended in as far as it lies among the colors around a pixel.
+
+Karis 2014, "High-Quality Temporal Supersampling"; in the setting of Koskela et al. 2019 (BMFR), kernel ``taa``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import MOTION, Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._journal import timed
+from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.models.accumulated import is_still, motion_to_previous, motion_unless_still
+from mcdenoise.ops import reproject
+
+_GAMMA = 2.2
+
+
+class Shown(NamedTuple):
+    """What is kept of a frame.
+
+    Args:
+        image: ``(B, 3, H, W)`` its result, gamma-mapped.
+        view_projection: ``(B, 4, 4)`` by which camera.
+    """
+
+    image: Tensor
+    view_projection: Tensor | None
+
+
+class Antialiased(Wrapper):
+    """Blends the image of a method with its own reprojected result of the frame before, clamped to what is around.
+
+    Radiance is gamma-mapped, ``x^(1 / 2.2)``, and brought back afterwards; it is not cut off at 1, so that the result
+    is radiance like any other, and scales with the exposure. In YCoCg, the result before is clamped to the mean of the
+    range of the 3x3 pixels and of the range of the cross of five among them; ``result = alpha image + (1 - alpha)
+    before``. Surfaces are not compared, and no cut is looked for: the clamp is all that holds the past off.
+
+    Layers and alpha are those of the method.
+
+    Args:
+        inner: any method.
+        alpha: weight of the current image, in (0, 1].
+
+    Raises:
+        InputError: ``alpha`` is out of its range.
+    """
+
+    def __init__(self, inner: Model, *, alpha: float = 0.2) -> None:
+        super().__init__(inner)
+        if not 0 < alpha <= 1:
+            raise InputError(f"alpha: expected in (0, 1], found {alpha}")
+        self.alpha = alpha
+
+    @property
+    def needs(self) -> Needs:
+        """As those inside; whatever tells motion is of use."""
+        needs = self.inner.needs
+        return Needs(needs.buffers, needs.uses | MOTION | {"view_projection"}, needs.trainable, None)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        inner, before = (None, None) if state is None else state
+        output, inner = self.inner(frame, inner)
+        with timed("antialias", frame.color.device):
+            image = _mapped(output.image)
+            result = image
+            if before is not None and before.image.shape == image.shape and before.image.device == image.device:
+                result = self._blended(image, before, frame)
+            after = inner, Shown(result, frame.view_projection)
+            stages = {**output.stages, "denoised": output.image}
+            return output._replace(image=_unmapped(result), stages=stages), after
+
+    def _blended(self, image: Tensor, before: Shown, frame: Frame) -> Tensor:
+        if motion_to_previous(frame, before.view_projection) is None:
+            return image
+        motion = motion_unless_still(frame, before.view_projection, is_still(frame, before.view_projection))
+        previous, weight = reproject(before.image, motion)
+        low, high = _range(_to_ycocg(image))
+        clamped = torch.minimum(torch.maximum(_to_ycocg(previous), low), high)
+        blended = torch.lerp(_to_rgb(clamped), image, self.alpha).clamp_min(0)
+        return torch.where(weight > 0, blended, image)
+
+
+def _mapped(image: Tensor) -> Tensor:
+    """``x^(1 / 2.2)``, with a finite derivative at 0."""
+    least = torch.finfo(image.dtype).tiny
+    return torch.where(image > 0, image.clamp_min(least) ** (1 / _GAMMA), 0)
+
+
+def _unmapped(image: Tensor) -> Tensor:
+    return image**_GAMMA
+
+
+def _to_ycocg(image: Tensor) -> Tensor:
+    red, green, blue = image.split(1, 1)
+    return torch.cat([red + 2 * green + blue, 2 * (red - blue), 2 * green - red - blue], 1)
+
+
+def _to_rgb(image: Tensor) -> Tensor:
+    bright, orange, green = image.split(1, 1)
+    return torch.cat([bright + orange - green, bright + green, bright - orange - green], 1) / 4
+
+
+def _range(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Means of the minimum of 3x3 pixels and of the cross among them, and of their maximum; inside the image."""
+    # Those of both signs at once.
+    both = torch.cat([-image, image], 1)
+    box = F.max_pool2d(both, 3, 1, 1)
+    cross = torch.maximum(F.max_pool2d(both, (1, 3), 1, (0, 1)), F.max_pool2d(both, (3, 1), 1, (1, 0)))
+    low, high = ((box + cross) / 2).chunk(2, 1)
+    return -low, high

@@ -1,0 +1,169 @@
+"""A-SVGF: SVGF that gives up as much of its history as the light has changed.
+
+Schied et al. 2018, "Gradient Estimation for Real-Time Adaptive Temporal Filtering", Proceedings of the ACM on Computer
+Graphics and Interactive Techniques 1(2). What it has in common with SVGF is :class:`mcdenoise.models.svgf.Svgf`: it
+differs in the weight of the current frame (Sec. 4.4),
+
+``alpha' = (1 - lambda) alpha + lambda`` with ``lambda = min(1, |Delta| / max(l))`` of
+:func:`mcdenoise.ops.temporal_gradient`.
+
+The paper's renderer projects one sample of every 3x3 stratum of the frame before forward, and shades it once more with
+the random numbers that it had then. Its change ``Delta`` has no noise but that of the light itself. No file of a
+renderer holds such samples; one that streams may hand them over in ``frame.extra["gradient"]``, ``(B, 3, H, W)`` of its
+color's unit:
+
+- the luminance of the sample now,
+- the luminance of the same sample in the frame before,
+- 1 where there is one, and 0 elsewhere.
+
+They may be with or without the albedo, as long as both are alike: ``lambda`` is a quotient.
+
+Without them, the frame's luminance is compared with that of the reprojected history. This difference is noisy, so that
+lambda is taken of what exceeds two standard errors of it. Its variance where nothing changes is
+
+``variance(l) (1 + 1 / n)``, ``n`` being the frames that the history amounts to: its length, up to the ``2 / alpha - 1``
+of an exponential window;
+
+``variance(l)``, of a sample, is the larger one of SVGF's estimate from the history, and of the frame's own moments over
+7x7 pixels: a firefly that the history knows nothing of is no change of the light. What this costs against the
+paper's samples: a change that is smaller than the noise of a neighbourhood is not seen at once, and sharp edges of
+light delay it.
+
+What the paper leaves open: the length of a history of which a part is given up. A history in which the current frame
+has the weight ``alpha'`` counts as ``1 / alpha'`` frames, so that light that went on or off begins with an average
+anew. The transform of the strata (five levels of 3x3 taps, as many as the published code has) has the edge-stopping
+functions of SVGF without that of the luminance, which is what may have changed. The published code then takes the
+largest of the 5x5 strata around a pixel, which is not done here: of noise, that is the largest noise. ``alpha`` is that
+of the published code, 0.1, for light and for moments.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs
+from mcdenoise.models._registry import register_model
+from mcdenoise.models.accumulated import surface_before
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.svgf import BRIGHTEST, WINDOW, History, Svgf, variance_of
+from mcdenoise.ops import luminance_moments, moments_variance, reproject, temporal_gradient
+
+# Of `frame.extra`: samples of the frame before, shaded once more.
+GRADIENT = "gradient"
+
+
+class Asvgf(Svgf):
+    """SVGF with temporal gradients.
+
+    Args:
+        alpha: smallest weight of the current frame where nothing changes, in (0, 1].
+        gradient_levels: how often strata are filtered, see :func:`mcdenoise.ops.temporal_gradient`.
+        threshold: likewise, of differences with noise.
+        levels: see :class:`mcdenoise.models.svgf.Svgf`.
+        sigma_z: likewise.
+        sigma_n: likewise.
+        sigma_l: likewise.
+
+    Raises:
+        InputError: a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        *,
+        alpha: float = 0.1,
+        gradient_levels: int = 5,
+        threshold: float = 2.0,
+        levels: int = 5,
+        sigma_z: float = 1.0,
+        sigma_n: float = 128.0,
+        sigma_l: float = 4.0,
+    ) -> None:
+        super().__init__(alpha=alpha, levels=levels, sigma_z=sigma_z, sigma_n=sigma_n, sigma_l=sigma_l)
+        if gradient_levels < 0:
+            raise InputError(f"gradient_levels: expected at least 0, found {gradient_levels}")
+        if not threshold >= 0:
+            raise InputError(f"threshold: expected at least 0, found {threshold}")
+        self.gradient_levels, self.threshold = gradient_levels, threshold
+
+    @property
+    def needs(self) -> Needs:
+        """As SVGF; samples of the frame before that are shaded once more are of use."""
+        needs = super().needs
+        return Needs(needs.buffers, needs.uses | {GRADIENT}, trainable=False)
+
+    def changed(self, frame: Frame, history: History, motion: Tensor | None) -> Tensor:
+        """Lambda: how much of the history is to be given up.
+
+        Args:
+            frame: the current frame.
+            history: of the frame before.
+            motion: to the frame before, see :func:`mcdenoise.ops.reproject`.
+
+        Returns:
+            ``(B, 1, H, W)`` in [0, 1].
+        """
+        settings: dict[str, Any] = {"levels": self.gradient_levels, "sigma_z": self.sigma_z, "sigma_n": self.sigma_n}
+        surface = (frame.normal, frame.depth)
+        shaded = frame.extra.get(GRADIENT)
+        if shaded is not None:
+            now, before, there = shaded.split(1, 1)
+            return temporal_gradient(now, before, there, None, *surface, **settings)
+        past = torch.cat([history.moments, history.length.to(history.moments.dtype)], 1)
+        found, weight = reproject(past, motion, surface_before(frame), history.surface)
+        moments, length = found[:, :2], found[:, 2:].clamp_min(1)
+        current = luminance_moments(frame.color.clamp_max(BRIGHTEST)).to(moments.dtype)
+        spatial = moments_variance(current, *surface, kernel_size=WINDOW)
+        noise = torch.maximum(variance_of(moments, length, frame), spatial)
+        noise = noise * (1 + 1 / length.clamp_max(2 / self.alpha - 1))
+        noise = noise.clamp_max(BRIGHTEST**2 / 100)
+        return temporal_gradient(
+            current[:, :1], moments[:, :1], weight, noise, *surface, threshold=self.threshold, **settings
+        )
+
+    def _blend(self, frame: Frame, entering: Tensor, history: History, motion: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Sec. 4.4: light and moments with as much of their history as still holds, and its length."""
+        both, length = super()._blend(frame, entering, history, motion)
+        change = self.changed(frame, history, motion).to(both.dtype)
+        # (1 - lambda) (alpha c + (1 - alpha) h) + lambda c.
+        return torch.lerp(both, entering, change), 1 / (change + (1 - change) / length)
+
+
+@register_model("asvgf", kind="filter", paper="Schied et al. 2018")
+def asvgf(
+    *,
+    alpha: float = 0.1,
+    gradient_levels: int = 5,
+    threshold: float = 2.0,
+    levels: int = 5,
+    sigma_z: float = 1.0,
+    sigma_n: float = 128.0,
+    sigma_l: float = 4.0,
+) -> Model:
+    """SVGF with temporal gradients of Schied et al. 2018: by re-shaded samples where a frame has them, else by a test.
+
+    Args:
+        alpha: see :class:`Asvgf`.
+        gradient_levels: likewise.
+        threshold: likewise.
+        levels: likewise.
+        sigma_z: see :func:`mcdenoise.ops.atrous`.
+        sigma_n: likewise.
+        sigma_l: likewise.
+    """
+    return Demodulated(
+        Asvgf(
+            alpha=alpha,
+            gradient_levels=gradient_levels,
+            threshold=threshold,
+            levels=levels,
+            sigma_z=sigma_z,
+            sigma_n=sigma_n,
+            sigma_l=sigma_l,
+        )
+    )

@@ -1,0 +1,185 @@
+"""How much the light has changed since the frame before, and so how much of the history is to be given up."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, bounded_quotient, check_sigmas, edge_stopping, layouts
+from mcdenoise.ops._module import module_of
+from mcdenoise.ops._window import accumulator_dtype, corner, offsets, pad, shifted, up_to_multiple
+
+STRATUM, LEVELS = 3, 5
+# Standard errors up to which a change is taken for noise.
+THRESHOLD = 2.0
+# Of the largest luminance of an image.
+_BLACK = 1e-15
+
+
+def temporal_gradient(
+    current: Tensor,
+    previous: Tensor,
+    weight: Tensor | None = None,
+    variance: Tensor | None = None,
+    normal: Tensor | None = None,
+    depth: Tensor | None = None,
+    *,
+    stratum: int = STRATUM,
+    levels: int = LEVELS,
+    threshold: float = THRESHOLD,
+    sigma_z: float = SIGMA_Z,
+    sigma_n: float = SIGMA_N,
+) -> Tensor:
+    """The normalised change of luminance from frame to frame, over strata of pixels and their neighbourhood.
+
+    Per stratum of ``stratum x stratum`` pixels, with the weights ``w`` of the pixels that are compared, the change
+    ``D = sum w (current - previous)``, its normaliser ``M = sum w max(current, previous)``, and the noise of the change
+    ``V = sum w^2 variance``. These images of strata are filtered ``levels`` times over 3x3 taps that lie 1, 2, 4, ...
+    strata apart: ``D`` and ``M`` become ``sum e x / sum e`` over the taps inside the image, and ``V`` becomes
+    ``sum e^2 V / (sum e)^2``, with ``e = w_z w_n`` of :func:`mcdenoise.ops.atrous` for the middle pixels of the strata.
+    Of the filtered images,
+
+    ``out = sqrt(max(0, (D^2 - threshold^2 V) / M^2))``, at most 1, and 0 where ``M`` is no more than 1e-15 of the
+    image's largest luminance,
+
+    which is ``min(1, |D| / M)`` where there is no noise. Noise adds ``V`` to ``D^2`` on average; what is no larger than
+    ``threshold`` standard errors is taken for noise altogether. The weight of the current frame in its history is then
+    ``(1 - out) alpha + out``.
+
+    Args:
+        current: ``(B, 1, H, W)`` luminance now, at least 0, finite: of the samples of the frame before, shaded once
+            more with their random numbers; or else of this frame.
+        previous: ``(B, 1, H, W)`` luminance of the same samples, or at the same places, in the frame before, likewise.
+        weight: ``(B, 1, H, W)`` at least 0, how much of a pixel is compared: 0 where there is nothing to compare it
+            with, and 1 for the one sample of a stratum that was shaded once more; by default 1 everywhere.
+        variance: ``(B, 1, H, W)`` of ``current - previous`` where nothing changes, 0 to 1e34; by default 0, which is
+            right for samples with the same random numbers.
+        normal: ``(B, 3, H, W)`` unit normals, 0 where nothing was hit; without them ``w_n = 1``.
+        depth: ``(B, 1, H, W)`` distance, any unit, 0 to 1e35, ``inf`` where nothing was hit; without it ``w_z = 1``.
+        stratum: side of a stratum in pixels, at least 1; those at the right and lower border may be smaller.
+        levels: how often to filter, at least 0.
+        threshold: see above, at least 0.
+        sigma_z: see :func:`mcdenoise.ops.atrous`.
+        sigma_n: likewise.
+
+    Returns:
+        ``(B, 1, H, W)`` in [0, 1], the same for all pixels of a stratum, in the dtype of ``current``: 0 where nothing
+        has changed, 1 where light went on or off. Half precision is computed in float32.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: a shape or a setting does not fit.
+
+    Differentiable in all images, to any order, where ``current`` and ``previous`` differ, no depths within reach are
+    equal, and the result is neither 0 nor 1.
+
+    Source: Schied et al. 2018 (A-SVGF), Secs. 4.2 to 4.4; the noise of the change is ours.
+
+    Example:
+        >>> lit = torch.rand(1, 1, 9, 9, generator=torch.Generator().manual_seed(0))
+        >>> temporal_gradient(lit, lit).unique().tolist(), temporal_gradient(0 * lit, lit).unique().tolist()
+        ([0.0], [1.0])
+    """
+    given = {"weight": weight, "variance": variance}
+    images = {name: (image, "B 1 H W") for name, image in given.items() if image is not None}
+    check_shapes(current=(current, "B 1 H W"), previous=(previous, "B 1 H W"), **images, **layouts(normal, depth))
+    _check_settings(stratum, levels, threshold, sigma_z, sigma_n)
+    if current.numel() == 0:
+        return current
+    difference, size, noise = sums_of_strata(
+        *(current, previous, weight, variance, normal, depth),
+        stratum=stratum,
+        levels=levels,
+        sigma_z=sigma_z,
+        sigma_n=sigma_n,
+    )
+    some = size > 0
+    size = torch.where(some, size, 1)
+    error = bounded_quotient(threshold * torch.sqrt(torch.where(noise > 0, noise, 1)), size)
+    excess = (difference / size).square() - torch.where(noise > 0, error.square(), 0)
+    found = some & (excess > 0)
+    gradient = torch.where(found, torch.sqrt(torch.where(found, excess, 1)).clamp_max(1), 0)
+    result = F.interpolate(gradient, scale_factor=stratum, mode="nearest")
+    return corner(result, current.shape[-2], current.shape[-1]).to(current.dtype)
+
+
+def _check_settings(stratum: int, levels: int, threshold: float, sigma_z: float, sigma_n: float) -> None:
+    for name, value, least in (("stratum", stratum, 1), ("levels", levels, 0), ("threshold", threshold, 0)):
+        if not value >= least:
+            raise ValueError(f"{name}: expected at least {least}, found {value}")
+    check_sigmas(sigma_z, sigma_n)
+
+
+def sums_of_strata(
+    current: Tensor,
+    previous: Tensor,
+    weight: Tensor | None,
+    variance: Tensor | None,
+    normal: Tensor | None,
+    depth: Tensor | None,
+    *,
+    stratum: int,
+    levels: int,
+    sigma_z: float,
+    sigma_n: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``D``, ``M`` and ``V`` of :func:`temporal_gradient` after the filter, ``(B, 1, H / stratum, W / stratum)`` each.
+
+    In a unit of their own, in which the largest luminance is between 1/2 and 1, and ``M`` 0 where it counts as that.
+    """
+    dtype = accumulator_dtype(current.dtype)
+    now, before = current.to(dtype), previous.to(dtype)
+    # So that no square leaves the range. A power of two rounds nothing; in ONNX there is no such number.
+    largest = torch.maximum(now.detach(), before.detach()).abs().amax((1, 2, 3), keepdim=True)
+    power = largest if torch.compiler.is_exporting() else largest / torch.frexp(largest).mantissa
+    unit = torch.where(largest > 0, power, 1)
+    now, before = now / unit, before / unit
+    compared = torch.ones_like(now) if weight is None else weight.to(dtype)
+    noise = torch.zeros_like(now) if variance is None else compared.square() * (variance.to(dtype) / unit / unit)
+    change = torch.cat([compared * (now - before), compared * torch.maximum(now, before)], 1)
+    # Means in place of sums, over as many pixels beyond the border as inside.
+    change = F.avg_pool2d(up_to_multiple(change, stratum), stratum)
+    noise = F.avg_pool2d(up_to_multiple(noise, stratum), stratum) / stratum**2
+    normal, depth = (None if image is None else _middle(image, stratum) for image in (normal, depth))
+    for level in range(levels):
+        change, noise = _smoothed(change, noise, normal, depth, 1 << level, sigma_z, sigma_n)
+    difference, size = change.split(1, 1)
+    return difference, torch.where(size > _BLACK * (largest / unit), size, 0), noise
+
+
+TemporalGradient = module_of("TemporalGradient", temporal_gradient, _check_settings)
+
+
+def _middle(image: Tensor, stratum: int) -> Tensor:
+    """The middle pixel of every stratum, or the last one that it has."""
+    for dim in (-2, -1):
+        size = image.shape[dim]
+        place = torch.arange(stratum // 2, size + stratum // 2, stratum, device=image.device)
+        image = image.index_select(dim, place.clamp_max(size - 1))
+    return image
+
+
+def _smoothed(
+    change: Tensor,
+    noise: Tensor,
+    normal: Tensor | None,
+    depth: Tensor | None,
+    step: int,
+    sigma_z: float,
+    sigma_n: float,
+) -> tuple[Tensor, Tensor]:
+    """One level of the transform: the means over 3x3 taps ``step`` strata apart, and the variance of a mean."""
+    height, width = change.shape[-2:]
+    edge_weight = edge_stopping(normal, depth, change.dtype, step, sigma_z, sigma_n)
+    padded = pad(torch.cat([change, noise, torch.ones_like(noise)], 1), step, "zeros")
+    total, change_sum, noise_sum = torch.zeros_like(noise), torch.zeros_like(change), torch.zeros_like(noise)
+    for _, dy, dx in offsets(3):
+        tap = shifted(padded, step, dy * step, dx * step, height, width)
+        tap_change, tap_noise, inside = tap.split([2, 1, 1], 1)
+        weight = inside * edge_weight(dy * step, dx * step)
+        total = total + weight
+        change_sum = change_sum + weight * tap_change
+        noise_sum = noise_sum + weight.square() * tap_noise
+    return change_sum / total, noise_sum / total.square()

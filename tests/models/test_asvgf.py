@@ -1,0 +1,134 @@
+"""A-SVGF: what its temporal gradients do to the history of SVGF."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from test_svgf import HEIGHT, WIDTH, frame
+from torch import Tensor
+
+from mcdenoise.denoiser import Denoiser
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models import create_model
+from mcdenoise.models.asvgf import Asvgf
+from mcdenoise.models.svgf import Svgf
+
+
+def shaded(given: Frame, now: float, before: float, there: float = 1.0) -> Frame:
+    """The frame with samples of the frame before, shaded once more."""
+    values = torch.tensor([now, before, there], dtype=torch.float32).reshape(1, 3, 1, 1)
+    return given.replace(extra={"gradient": values.expand(1, 3, HEIGHT, WIDTH)})
+
+
+def test_where_samples_shaded_once_more_are_the_same_it_is_svgf() -> None:
+    model, plain = Asvgf(alpha=0.2), Svgf(alpha=0.2)
+    state = expected = None
+    for seed in range(6):
+        given = frame(seed=seed)
+        output, state = model(shaded(given, 0.7, 0.7), state)
+        image, expected = plain(given, expected)
+        assert torch.equal(output.image, image.image)
+        assert torch.equal(state.length, expected.length)
+
+
+@pytest.mark.parametrize("change", [0.25, 0.5, 1.0])
+def test_the_weight_of_the_frame_is_that_of_the_paper(change: float) -> None:
+    """``(1 - lambda) alpha + lambda``, of moments, which no filter changes; the length is one over it."""
+    model, state = Asvgf(alpha=0.2), None
+    dark, lit = frame(torch.zeros(1, 3, HEIGHT, WIDTH)), frame(torch.full((1, 3, HEIGHT, WIDTH), 2.0))
+    for _ in range(3):
+        _, state = model(shaded(lit, 1, 1), state)
+    _, state = model(shaded(dark, 1 - change, 1), state)
+    alpha = (1 - change) / 4 + change
+    expected = (1 - alpha) * torch.tensor([2.0, 4.0]).reshape(1, 2, 1, 1).expand_as(state.moments)
+    torch.testing.assert_close(state.moments, expected)
+    torch.testing.assert_close(state.length, torch.full_like(state.length, 1 / alpha))
+
+
+def test_strata_without_samples_keep_their_history() -> None:
+    model, state = Asvgf(), None
+    for seed in range(4):
+        _, state = model(shaded(frame(seed=seed), 0, 1, there=0), state)
+    assert (state.length == 4).all()
+
+
+def test_a_light_that_goes_out_is_gone_at_once() -> None:
+    """At alpha = 0.1, nine tenths of it would be left."""
+    model, plain, state, other = Asvgf(), Svgf(alpha=0.1), None, None
+    for seed in range(12):
+        _, state = model(frame(seed=seed), state)
+        _, other = plain(frame(seed=seed), other)
+    dark = frame(torch.zeros(1, 3, HEIGHT, WIDTH))
+    assert plain(dark, other)[0].image.mean() > 0.85
+    assert model(dark, state)[0].image.mean() < 0.1
+    # And it is there as fast when it comes back.
+    _, state = model(dark, model(dark, state)[1])
+    assert model(frame(seed=20), state)[0].image.mean() > 0.9
+
+
+def test_noise_is_hardly_taken_for_a_change() -> None:
+    """Of steady light with the noise of one sample, a history of hardly less than the 10 frames of ``alpha``.
+
+    What exceeds two standard errors of a neighbourhood gives up as much, which is a few parts in a hundred.
+    """
+    model, plain, state, other = Asvgf(alpha=0.1), Svgf(alpha=0.1), None, None
+    for seed in range(16):
+        output, state = model(frame(seed=seed), state)
+        expected, other = plain(frame(seed=seed), other)
+    assert state.length.mean() > 8
+    error, least = ((image - 1).square().mean() for image in (output.image, expected.image))
+    assert error < 1.3 * least
+
+
+def test_a_firefly_is_no_change_of_the_light() -> None:
+    model, state = Asvgf(), None
+    for seed in range(8):
+        _, state = model(frame(seed=seed), state)
+    given = frame(seed=8)
+    given.color[..., 12, 10] = 1e4
+    _, after = model(given, state)
+    assert after.length[..., 12, 10] > 6
+
+
+def test_a_constant_image_stays() -> None:
+    denoiser = Denoiser("asvgf")
+    given = frame(torch.full((1, 3, HEIGHT, WIDTH), 0.7), albedo=torch.full((1, 3, HEIGHT, WIDTH), 0.5))
+    for _ in range(6):
+        torch.testing.assert_close(denoiser(given), given.color, rtol=1e-5, atol=0)
+
+
+def test_extremes_stay_finite() -> None:
+    light = frame().color.clone()
+    light[..., ::5, ::7], light[..., ::3, ::4] = 1e16, 0
+    denoiser = Denoiser("asvgf")
+    for factor in (1.0, 1e-12, 1.0, 0.0, 1e-30):
+        image = denoiser(frame(light * factor))
+        assert image.isfinite().all()
+        assert image.min() >= 0
+
+
+def test_differentiable_through_time() -> None:
+    """Also by way of the weight; two thirds of the light are gone in the second frame."""
+    frames = [
+        frame(scale * (0.9 + 0.2 * torch.rand(1, 3, 2, 3, generator=torch.Generator().manual_seed(seed)).double()))
+        for seed, scale in enumerate((3.0, 1.0))
+    ]
+    model = Asvgf(levels=1, gradient_levels=1)
+
+    def last(first: Tensor) -> Tensor:
+        _, state = model(frames[0].replace(color=first))
+        return model(frames[1], state)[0].image
+
+    assert torch.autograd.gradcheck(last, (frames[0].color.requires_grad_(),))
+
+
+def test_says_what_it_needs_and_refuses_what_is_out_of_range() -> None:
+    model = create_model("asvgf")
+    assert "gradient" in model.needs.uses
+    assert not model.needs.trainable
+    with pytest.raises(InputError, match="buffer 'depth': the model needs it, found only"):
+        Denoiser("asvgf")(frame().replace(depth=None))
+    for name, value in {"alpha": 0.0, "levels": 0, "gradient_levels": -1, "threshold": -1.0}.items():
+        with pytest.raises(InputError, match=f"{name}: expected .*, found {value}"):
+            create_model("asvgf", **{name: value})

@@ -1,0 +1,178 @@
+"""BMFR: its two accumulations, its fit between them, and its anti-aliasing."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.denoiser import Denoiser
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models import Accumulated, create_model, parts_of
+from mcdenoise.models.antialiased import Antialiased
+from mcdenoise.models.bmfr import Bmfr, _start
+from mcdenoise.models.noisy import Noisy
+from mcdenoise.ops import block_regression
+
+HEIGHT, WIDTH = 40, 50
+
+
+def frame(light: Tensor | None = None, seed: int = 0, **changes: Tensor) -> Frame:
+    """A curved wall that stands still, lit by noise of mean 1."""
+    rows, columns = torch.meshgrid(torch.arange(HEIGHT) / 20, torch.arange(WIDTH) / 20, indexing="ij")
+    if light is None:
+        generator = torch.Generator().manual_seed(seed)
+        light = -torch.log(torch.rand(1, 3, HEIGHT, WIDTH, generator=generator).clamp_min(1e-6))
+    normal = F.normalize(torch.stack([(3 * rows).sin(), (2 * columns).cos(), torch.ones_like(rows)]), dim=0)
+    position = torch.stack([columns, rows, 3 + columns.sin()])
+    return Frame(
+        light,
+        **{"normal": normal[None], "position": position[None], "motion": torch.zeros(1, 2, HEIGHT, WIDTH), **changes},
+    )
+
+
+def test_a_frame_is_accumulated_fitted_and_accumulated_again() -> None:
+    """A scene at rest, frame by frame: the published weights, at the published places."""
+    denoiser = Denoiser(create_model("bmfr", taa=False))
+    first = second = torch.zeros(())
+    for number in range(12):
+        given = frame(seed=number)
+        alpha = max(1 / (number + 1), 0.2)
+        first = alpha * given.color + (1 - alpha) * first
+        features = torch.cat([given.normal, given.position], 1)
+        fitted = block_regression(first, features, squares=3, offset=_start(number, 32)).clamp_min(0)
+        alpha = max(1 / (number + 1), 0.1)
+        second = alpha * fitted + (1 - alpha) * second
+        output = denoiser.output(given)
+        torch.testing.assert_close(output.stages["accumulated"], first, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(output.stages["fitted"], fitted, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(output.image, second, rtol=1e-4, atol=1e-5)
+
+
+def test_blocks_begin_in_sixteen_places() -> None:
+    """Half a block before the image, and an offset of the table; all even, and each another one."""
+    places = [_start(number, 32) for number in range(16)]
+    assert places[:3] == [(30, 30), (22, 12), (2, 24)]
+    assert len(set(places)) == 16
+    assert all(0 <= start < 32 and start % 2 == 0 for place in places for start in place)
+    assert [_start(number, 32) for number in range(16, 32)] == places
+
+
+def test_images_of_a_batch_may_be_at_different_frames() -> None:
+    model, given = Bmfr(), frame().replace(length=torch.full((1, 1, HEIGHT, WIDTH), 2.0))
+    both = given.map(lambda image: torch.cat([image, image.flip(3)]))
+    _, one = model(given)
+    _, state = model(both)
+    state = state._replace(number=torch.tensor([1.0, 5.0]).reshape(2, 1, 1, 1))
+    torch.testing.assert_close(model(both, state)[0].image[:1], model(given, one)[0].image)
+
+
+def test_what_the_features_tell_comes_back() -> None:
+    """A constant; and light that is linear in them, and in squares of positions, through all of it."""
+    given = frame()
+    whole = (2 + given.position[:, :1] - 0.3 * given.position[:, 1:2].square() + 0.5 * given.normal[:, :1]).repeat(
+        1, 3, 1, 1
+    )
+    for light in (torch.full_like(whole, 0.7), whole):
+        denoiser = Denoiser("bmfr")
+        for _ in range(4):
+            torch.testing.assert_close(denoiser(given.replace(color=light)), light, rtol=1e-4, atol=0)
+
+
+def test_noise_falls_in_space_and_in_time() -> None:
+    """A fit of 10 functions to blocks of 1024 pixels leaves about 10 / 1024 of the variance of a frame."""
+    denoiser = Denoiser("bmfr")
+    errors = [(denoiser(frame(seed=seed)) - 1).square().mean().item() for seed in range(8)]
+    assert errors[0] < 3 * 10 / 1024
+    assert errors[-1] < errors[0] / 2
+
+
+def naive(new: list[list[list[float]]], before: list[list[list[float]]], alpha: float) -> Tensor:
+    """``taa`` of the public code, for a scene at rest, of gamma-mapped values ``[row][column][channel]``."""
+
+    def forth(rgb: list[float]) -> list[float]:
+        r, g, b = rgb
+        return [r + 2 * g + b, 2 * r - 2 * b, -r + 2 * g - b]
+
+    def back(ycc: list[float]) -> list[float]:
+        y, o, g = ycc
+        return [0.25 * (y + o - g), 0.25 * (y + g), 0.25 * (y - o - g)]
+
+    height, width = len(new), len(new[0])
+    out = torch.zeros(1, 3, height, width, dtype=torch.float64)
+    for y, x in itertools.product(range(height), range(width)):
+        around = [
+            (forth(new[y + dy][x + dx]), not (dy and dx))
+            for dy, dx in itertools.product((-1, 0, 1), repeat=2)
+            if 0 <= y + dy < height and 0 <= x + dx < width
+        ]
+        clamped = []
+        for c, value in enumerate(forth(before[y][x])):
+            box, cross = [color[c] for color, _ in around], [color[c] for color, central in around if central]
+            low, high = (min(box) + min(cross)) / 2, (max(box) + max(cross)) / 2
+            clamped.append(min(max(value, low), high))
+        for c, value in enumerate(back(clamped)):
+            out[0, c, y, x] = max(alpha * new[y][x][c] + (1 - alpha) * value, 0.0) ** 2.2
+    return out
+
+
+def test_anti_aliasing_is_that_of_the_public_code() -> None:
+    generator = torch.Generator().manual_seed(0)
+    colors = (
+        torch.rand(2, 3, 4, 5, generator=generator, dtype=torch.float64) * torch.tensor([1.0, 0.8, 0.6])[:, None, None]
+    )
+    model, still = Antialiased(Noisy()), torch.zeros(1, 2, 4, 5, dtype=torch.float64)
+    first, state = model(Frame(colors[:1], motion=still))
+    torch.testing.assert_close(first.image, colors[:1])
+    second, _ = model(Frame(colors[1:], motion=still), state)
+    shown = (colors ** (1 / 2.2)).permute(0, 2, 3, 1).tolist()
+    torch.testing.assert_close(second.image, naive(shown[1], shown[0], 0.2))
+    torch.testing.assert_close(second.stages["denoised"], colors[1:])
+    # Without a motion, and from beyond the border, there is nothing to blend with.
+    for motion in (None, still + 9):
+        alone, _ = model(Frame(colors[1:], motion=motion), state)
+        torch.testing.assert_close(alone.image, colors[1:])
+    # In any unit.
+    _, state = model(Frame(1e6 * colors[:1], motion=still))
+    torch.testing.assert_close(model(Frame(1e6 * colors[1:], motion=still), state)[0].image, 1e6 * second.image)
+
+
+def test_anti_aliasing_is_a_setting() -> None:
+    with_it, without = create_model("bmfr"), create_model("bmfr", taa=False)
+    assert [part.alpha for part in parts_of(with_it, Antialiased)] == [0.2]
+    assert not list(parts_of(without, Antialiased))
+    for model in (with_it, without):
+        assert [(part.alpha_min, part.rule) for part in parts_of(model, Accumulated)] == [(0.2, "bmfr")]
+    # Of what is black, nothing before is left.
+    assert not Denoiser(with_it)(frame(torch.zeros(1, 3, HEIGHT, WIDTH))).any()
+
+
+def test_extremes_stay_finite() -> None:
+    given = frame()
+    given.color[..., ::5, ::7], given.color[..., ::3, ::4] = 1e16, 0
+    given.normal[..., :9, :] = 0
+    given.position[..., :9, :] = 1e6
+    denoiser = Denoiser("bmfr")
+    for factor in (1.0, 1e-30, 1.0, 0.0):
+        image = denoiser(given.replace(color=given.color * factor))
+        assert image.isfinite().all()
+        assert image.min() >= 0
+
+
+def test_says_what_it_needs_and_refuses_what_is_out_of_range() -> None:
+    model = create_model("bmfr")
+    assert model.needs.buffers == {"color", "normal", "position"}
+    assert not model.needs.trainable
+    for absent in ("normal", "position"):
+        with pytest.raises(InputError, match=f"buffer '{absent}': the model needs it, found only"):
+            Denoiser("bmfr")(frame().replace(**{absent: None}))
+    wrong = {"alpha_min": 0.0, "second_alpha": 2.0, "block": 1, "ridge": 0.0}
+    for name, value in wrong.items():
+        with pytest.raises(InputError, match=f"{name}: expected .*, found {value}"):
+            create_model("bmfr", **{name: value})
+    with pytest.raises(InputError, match=r"alpha: expected in \(0, 1\], found 0"):
+        create_model("bmfr", taa_alpha=0)

@@ -1,0 +1,124 @@
+"""What block regression promises, beside its equation."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.ops import block_regression
+
+
+def drawn(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def scene(height: int = 40, width: int = 50) -> Tensor:
+    """Normals of a curved wall, and positions on it, far from the origin."""
+    rows, columns = torch.meshgrid(torch.arange(height) / 20.0, torch.arange(width) / 20.0, indexing="ij")
+    depth = 1000 + (0.7 * columns).sin() + 0.2 * rows.square()
+    normal = F.normalize(torch.stack([(3 * rows).sin(), (2 * columns).cos(), torch.ones_like(rows)]), dim=0)
+    return torch.cat([normal, torch.stack([100 + columns, rows - 50, depth])])[None].double()
+
+
+def test_what_is_linear_in_the_features_comes_back() -> None:
+    """But for the ridge, 1e-8; in float32 that is less than a rounding."""
+    features, weights = scene(), drawn(3, 6) - 0.5
+    image = 2 + torch.einsum("cf,bfhw->bchw", weights, features - features.mean((2, 3), keepdim=True))
+    for offset in ((0, 0), (5, 17)):
+        found = block_regression(image, features, offset=offset)
+        torch.testing.assert_close(found, image, rtol=0, atol=1e-5)
+        plain = block_regression(image, drawn(1, 6, 40, 50), offset=offset)
+        assert (plain - image).abs().max() > 0.1
+
+
+def test_squares_are_fitted_wherever_the_origin_is() -> None:
+    """A parabola of a position, which is not linear in it."""
+    place = (torch.arange(64, dtype=torch.float64) / 64).expand(1, 1, 32, 64)
+    image = 1 + (place - 0.3).square()
+    spread = (2.0**-5 * (32**2 - 1) ** 0.5 / 12**0.5) / 2
+    for origin in (0.0, 1e2, 1e4, 1e5):
+        found = block_regression(image, origin + place, squares=1)
+        # What deviates by 1e-7 of its size counts half, and all else is as much less. Each function is off by that of
+        # its deviation, which is no more than the image's, so that no pixel is off by more than three of both.
+        lost = 1e-8 + (1e-7 * (origin + 1) / spread) ** 2
+        assert (found - image).abs().max() < 6 * lost * image.std()
+        assert (block_regression(image, origin + place) - image).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16])
+def test_a_constant_stays(dtype: torch.dtype) -> None:
+    image = torch.full((1, 3, 40, 50), 0.7, dtype=dtype)
+    for features in (scene(), torch.zeros(1, 2, 40, 50), 1e6 + drawn(1, 2, 40, 50)):
+        found = block_regression(image, features, squares=1, offset=(3, 30))
+        assert found.dtype == dtype
+        torch.testing.assert_close(found, image, rtol=1e-15 if dtype == torch.float64 else 0, atol=0)
+
+
+def test_the_mean_of_every_block_stays() -> None:
+    image, features = 100 * drawn(2, 3, 64, 96), drawn(2, 4, 64, 96, seed=1)
+    found = block_regression(image, features, squares=2)
+    torch.testing.assert_close(F.avg_pool2d(found, 32), F.avg_pool2d(image, 32))
+
+
+def test_it_is_the_least_squares_of_a_block() -> None:
+    """The ridge is a hundred-millionth."""
+    image, features = drawn(1, 2, 32, 64), drawn(1, 3, 32, 64, seed=1)
+    found = block_regression(image, features)
+    for start in (0, 32):
+        y, x = (part[0, :, :, start : start + 32].flatten(1).T for part in (image, features))
+        x = torch.cat([torch.ones_like(x[:, :1]), x], 1)
+        expected = x @ torch.linalg.lstsq(x, y).solution
+        torch.testing.assert_close(found[0, :, :, start : start + 32].flatten(1).T, expected, rtol=0, atol=1e-7)
+
+
+def test_features_that_say_nothing_new_change_nothing() -> None:
+    """Multiples, sums, constants and zeros, which leave the normal equations singular; and another unit."""
+    image, features = drawn(1, 3, 40, 50), drawn(1, 2, 40, 50, seed=1)
+    expected = block_regression(image, features)
+    flat, total = torch.full_like(features[:, :1], 0.8), features.sum(1, keepdim=True)
+    redundant = torch.cat([features, -3 * features, flat, 0 * flat, total, features + 5], 1)
+    torch.testing.assert_close(block_regression(image, redundant), expected, rtol=0, atol=1e-7)
+    torch.testing.assert_close(block_regression(image, 1e4 * features), expected, rtol=1e-12, atol=0)
+
+
+def test_a_flat_wall_is_its_mean() -> None:
+    """What float32 rounds off a constant normal is no feature: 1e-7 of it."""
+    image = drawn(1, 3, 32, 32).float()
+    normal = torch.tensor([0.6, 0.0, -0.8]).reshape(1, 3, 1, 1).expand(1, 3, 32, 32)
+    mean = image.double().mean((2, 3), keepdim=True).float().expand_as(image)
+    assert torch.equal(block_regression(image, normal), mean)
+    rounded = normal * (1 + 2.0**-25 * (2 * drawn(1, 3, 32, 32) - 1))
+    found = block_regression(image.double(), rounded)
+    assert (found - mean).abs().max() < 0.1 * (block_regression(image, drawn(1, 2, 32, 32)) - mean).abs().max()
+
+
+def test_noise_is_left_in_proportion_to_the_features() -> None:
+    """Of 1024 independent values and k functions, the constant among them, k / 1024 of the variance."""
+    noise = torch.randn(64, 1, 32, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = block_regression(noise, scene(32, 32).expand(64, -1, -1, -1), squares=3)
+    # Of 64 sums of 10 squares the mean deviates by sqrt(2 / 640), 6 %; five of these.
+    assert found.square().mean().item() == pytest.approx(10 / 1024, rel=0.3)
+
+
+def test_beyond_the_border_the_image_is_mirrored() -> None:
+    image, features = drawn(1, 2, 21, 30), drawn(1, 2, 21, 30, seed=1)
+
+    def mirrored(part: Tensor) -> Tensor:
+        rows = torch.cat([part[..., :11, :].flip(-2), part], -2)
+        return torch.cat([rows[..., :2].flip(-1), rows], -1)
+
+    found = block_regression(image, features, block=16, offset=(11, 2))
+    whole = block_regression(mirrored(image), mirrored(features), block=16)
+    torch.testing.assert_close(found, whole[..., 11:, 2:], rtol=1e-10, atol=1e-10)
+
+
+def test_blocks_do_not_see_one_another() -> None:
+    image, features = drawn(1, 1, 64, 64), drawn(1, 2, 64, 64, seed=1)
+    changed = image.clone()
+    changed[..., :32, :32] = 1e4
+    same = block_regression(changed, features) == block_regression(image, features)
+    assert not same[..., :32, :32].any()
+    assert same[..., 32:, :].all()
+    assert same[..., 32:].all()
