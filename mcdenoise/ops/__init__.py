@@ -9,6 +9,7 @@ from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
+from mcdenoise.ops.importance import ImportanceFilter, importance_filter
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
@@ -23,6 +24,7 @@ __all__ = [
     "CrossBilateralWeights",
     "Demodulate",
     "HistoryLag",
+    "ImportanceFilter",
     "KernelConv",
     "KernelSplat",
     "LaplacianFusion",
@@ -37,6 +39,7 @@ __all__ = [
     "demodulate",
     "downsample",
     "history_lag",
+    "importance_filter",
     "kernel_conv",
     "kernel_splat",
     "laplacian_fusion",
