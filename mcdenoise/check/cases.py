@@ -396,7 +396,6 @@ def _importance_cases() -> tuple[Case, ...]:
         case("5x5, batch of 2, RGB", "ordinary", (2, 3, 2, 3), 5),
         case("7x7, larger than the image", "ordinary", (1, 2, 3, 2), 7),
         case("one pixel, 13x13", "ordinary", (1, 3, 1, 1), 13),
-        case("1x1", "ordinary", (1, 1, 2, 3), 1),
         case("map of zeros", "stiff", (1, 1, 3, 4), 3, spread=0.0),
         case("map of tens", "stiff", (1, 2, 3, 4), 5, spread=20.0),
         # No difference quotient is fine enough where the weights are those of a maximum.

@@ -499,7 +499,7 @@ def importances() -> tuple[Case, ...]:
 def importance_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     """A weight below the smallest number of float32 is 0, and derivatives of weights near 1 are small differences.
 
-    Two windows of weights ``a`` and ``b`` and means ``x`` and ``y`` are joined to ``a x / s + b y / s`` with ``s = a + b``,
+    Two windows of weights ``a`` and ``b`` and means ``x`` and ``y`` are joined to ``a x / s + b y / s``, ``s = a + b``,
     whose derivative in ``a`` is ``x / s - a x / s^2 - b y / s^2``. These terms may cancel. As ``s`` is at least 1, they
     are together at most three times the largest pixel, in every channel, in each joining of two windows, for each of
     the windows that a pixel is in.

@@ -14,8 +14,8 @@ from mcdenoise.ops._window import accumulator_dtype
 
 
 def _check_size(kernel_size: int) -> None:
-    if kernel_size < 1 or kernel_size % 2 == 0:
-        raise ValueError(f"kernel_size: expected an odd number of at least 1, found {kernel_size}")
+    if kernel_size < 3 or kernel_size % 2 == 0:
+        raise ValueError(f"kernel_size: expected odd and at least 3, found {kernel_size}")
 
 
 def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) -> Tensor:
@@ -26,13 +26,13 @@ def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) ->
 
     No exponential overflows and no window loses all its weights, whatever the map: a window is put together of pairs of
     disjoint windows, of which each has its largest importance ``M``, its sum of ``exp(m - M)``, which is at least 1,
-    and its mean. Windows of 2, 4, 8, ... pixels along one axis, then along the other, give any size: the cost grows with
-    ``log K``, and no tensor has ``K * K`` channels.
+    and its mean. Windows of 2, 4, 8, ... pixels along one axis, then along the other, give any size: the cost grows
+    with ``log K``, and no tensor has ``K * K`` channels.
 
     Args:
         image: ``(B, C, H, W)``, any unit and range.
         importance: ``(B, 1, H, W)`` ``m``, the logarithm of what each pixel is worth, finite, up to 1e30.
-        kernel_size: odd ``K``, at least 1; 1 returns the image.
+        kernel_size: odd ``K``, at least 3.
 
     Returns:
         ``(B, C, H, W)`` in the dtype of ``image``. Half precision is computed in float32. Between the smallest and the
@@ -40,7 +40,7 @@ def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) ->
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, or ``K`` is not an odd number.
+        ValueError: shapes disagree, or ``K`` is not odd and at least 3.
 
     Differentiable in ``image`` and ``importance``, to any order.
 
@@ -57,7 +57,7 @@ def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) ->
     """
     check_shapes(image=(image, "B C H W"), importance=(importance, "B 1 H W"))
     _check_size(kernel_size)
-    if image.numel() == 0 or kernel_size == 1:
+    if image.numel() == 0:
         return image
     dtype = torch.promote_types(accumulator_dtype(image.dtype), accumulator_dtype(importance.dtype))
     logarithm = importance.to(dtype)

@@ -276,7 +276,7 @@ REFUSED: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], type[Ex
     (ops.ClampFireflies, (), {"kernel_size": 1}, ValueError, "kernel_size: expected odd and at least 3, found 1"),
     (ops.importance_filter, (THREE, THREE), {"kernel_size": 3}, ValueError, "importance: expected shape (B, 1, H, W)"),
     (ops.importance_filter, (THREE, ONE.int()), {"kernel_size": 3}, TypeError, "importance: expected a floating-point"),
-    (ops.ImportanceFilter, (), {"kernel_size": 4}, ValueError, "kernel_size: expected an odd number of at least 1"),
+    (ops.ImportanceFilter, (), {"kernel_size": 4}, ValueError, "kernel_size: expected odd and at least 3, found 4"),
     (ops.atrous, (ONE, ONE), {}, ValueError, "light: expected at least 3 channels, found 1"),
     (ops.atrous, (THREE, THREE), {}, ValueError, "variance: expected shape (B, 1, H, W), found (1, 3, 4, 5)"),
     (ops.atrous, (THREE, ONE, ONE), {}, ValueError, "normal: expected shape (B, 3, H, W), found (1, 1, 4, 5)"),
