@@ -47,7 +47,7 @@ class Backbone(nn.Module):
         width: channels of every convolution, 48.
     """
 
-    multiple = 2**LEVELS
+    multiple: int = 2**LEVELS
 
     def __init__(self, in_channels: int, width: int) -> None:
         super().__init__()
@@ -67,7 +67,8 @@ class Backbone(nn.Module):
         A pixel of each level on the way down, one of the next coarser level on the way up, and the rest of the block of
         the coarsest level.
         """
-        return sum((1 << level) + (2 << level) for level in range(LEVELS)) + Backbone.multiple - 1
+        steps: int = sum(3 << level for level in range(LEVELS))
+        return steps + Backbone.multiple - 1
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """Features ``(B, 2 * width, ceil(H / s), ceil(W / s))`` for ``s`` = 1, 2, 4."""
@@ -124,7 +125,7 @@ class MrkpNetwork(TenChannels):
         levels = self.unet(self.input_of(frame, frame.color))
         scales = list(itertools.accumulate(range(SCALES), lambda x, _: downsample(x), initial=n.to(dtype)))
         blended = scales.pop()  # what is coarsest is not filtered
-        for n, level, head in zip(reversed(scales), reversed(levels), reversed(self.heads), strict=True):  # type: ignore[call-overload]
+        for n, level, head in zip(reversed(scales), reversed(levels), reversed(self.heads), strict=True):
             predicted = F.relu(head(level).to(dtype))
             kernel, alpha = predicted.split([self.taps, 1], 1)
             blended = _blend(_filter(n, kernel), blended, alpha)
