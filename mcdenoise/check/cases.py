@@ -32,6 +32,7 @@ from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remod
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
 from mcdenoise.ops.gradients import TemporalGradient, temporal_gradient
+from mcdenoise.ops.importance import ImportanceFilter, importance_filter
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
@@ -456,6 +457,37 @@ def _bright(g: Generator, *shape: int) -> Tensor:
 
 def _dim(g: Generator, *shape: int) -> Tensor:
     return _radiance(g, *shape) / 100
+
+
+def _importance_cases() -> tuple[Case, ...]:
+    both = ("image", "importance")
+
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        kernel_size: int,
+        spread: float = 1.0,
+        image: Callable[..., Tensor] = _normal,
+        differentiable: tuple[str, ...] = both,
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            drawn = image(g, *size)
+            return {"image": drawn, "importance": spread * _normal(g, size[0], 1, *size[2:])}
+
+        return Case(name, kind, tensors, differentiable, {"kernel_size": kernel_size})
+
+    return (
+        case("3x3", "ordinary", (1, 1, 4, 5), 3),
+        case("5x5, batch of 2, RGB", "ordinary", (2, 3, 2, 3), 5),
+        case("7x7, larger than the image", "ordinary", (1, 2, 3, 2), 7),
+        case("one pixel, 13x13", "ordinary", (1, 3, 1, 1), 13),
+        case("map of zeros", "stiff", (1, 1, 3, 4), 3, spread=0.0),
+        case("map of tens", "stiff", (1, 2, 3, 4), 5, spread=20.0),
+        # No difference quotient is fine enough where the weights are those of a maximum.
+        case("fireflies", "stiff", (1, 3, 3, 4), 5, image=_radiance, differentiable=("image",)),
+        case("map of ten thousands", "extreme", (1, 1, 3, 4), 3, spread=1e4, differentiable=("image",)),
+    )
 
 
 def _atrous_cases() -> tuple[Case, ...]:
@@ -1108,6 +1140,14 @@ OPS: tuple[Op, ...] = (
         rounding=extreme.firefly_rounding,
     ),
     Op(history_lag, reference.history_lag, _lag_cases() + extreme.lags(), HistoryLag),
+    Op(
+        importance_filter,
+        reference.importance_filter,
+        _importance_cases() + extreme.importances(),
+        ImportanceFilter,
+        images=_IMAGE,
+        rounding=extreme.importance_rounding,
+    ),
     Op(
         atrous,
         reference.atrous,

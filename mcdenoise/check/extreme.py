@@ -759,6 +759,56 @@ def _tents(side: int, cell: int) -> Tensor:
     return (1 - (place - torch.arange(-(-side // cell))[:, None] - 0.5).abs()).clamp_min(0)
 
 
+def importances() -> tuple[Case, ...]:
+    """Of ``importance_filter``."""
+
+    def case(
+        name: str, size: tuple[int, int, int, int], image: Draw, worth: Draw = normal, kernel_size: int = 3
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            return {"image": image(g, *size), "importance": worth(g, size[0], 1, *size[2:])}
+
+        return Case(name, "extreme", tensors, (), {"kernel_size": kernel_size})
+
+    def ten_thousands(g: Generator, *shape: int) -> Tensor:
+        return uniform(g, *shape, low=-1e4, high=1e4)
+
+    def cliff(g: Generator, *shape: int) -> Tensor:
+        """Windows on both sides of it see nothing but the lowest and nothing but the highest."""
+        drawn = 0.1 * normal(g, *shape)
+        return drawn + torch.where(torch.arange(shape[-1]) < shape[-1] // 2, -1e4, 1e4)
+
+    size = (1, 3, 3, 5)
+    return (
+        *(case(*tried) for tried in _tried()),
+        case("map of -1e4 to 1e4", size, radiance, ten_thousands, 5),
+        case("map with a cliff of 2e4", (1, 3, 2, 8), radiance, cliff),
+        *(case(f"map of {value:g}", size, radiance, _constant(value), 5) for value in (-1e30, -1e4, 1e4, 1e30)),
+        case("window of 21", (1, 3, 3, 4), radiance, kernel_size=21),
+    )
+
+
+def importance_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
+    """A weight below the smallest number of float32 is 0, and derivatives of weights near 1 are small differences.
+
+    Two windows of weights ``a`` and ``b`` and means ``x`` and ``y`` are joined to ``a x / s + b y / s``, ``s = a + b``,
+    whose derivative in ``a`` is ``x / s - a x / s^2 - b y / s^2``. These terms may cancel. As ``s`` is at least 1, they
+    are together at most three times the largest pixel, in every channel, in each joining of two windows, for each of
+    the windows that a pixel is in.
+    """
+    image, importance = inputs["image"], inputs["importance"]
+    assert isinstance(image, Tensor)
+    assert isinstance(importance, Tensor)
+    if not image.numel():
+        return Rounding()
+    size, kernel_size = float(image.abs().amax()), int(settings["kernel_size"])
+    rows, columns = (min(kernel_size, side) for side in image.shape[-2:])
+    windows, joinings = rows * columns, 4 * kernel_size.bit_length()
+    lost = windows * torch.finfo(torch.float32).tiny
+    terms = torch.full_like(importance, 3 * image.shape[1] * windows * joinings * size)
+    return Rounding(result=lost * size, gradients={"image": torch.full_like(image, lost), "importance": terms})
+
+
 def luminances() -> tuple[Case, ...]:
     """Of ``luminance_moments``."""
     return tuple(

@@ -332,6 +332,20 @@ def affinity_filter(
     return _tensor(out, image.shape)
 
 
+def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) -> Tensor:
+    """Fan et al. 2021: means over a window with the softmax of the importance in it; taps outside are absent."""
+    source, worth, out = image.tolist(), importance.tolist(), _zeros(image.shape)
+    radius, (_, _, height, width) = kernel_size // 2, image.shape
+    for b, c, y, x in _indices(image.shape):
+        rows = range(max(0, y - radius), min(height, y + radius + 1))
+        taps = list(itertools.product(rows, range(max(0, x - radius), min(width, x + radius + 1))))
+        largest = max(worth[b][0][row][column] for row, column in taps)
+        weights = [math.exp(worth[b][0][row][column] - largest) for row, column in taps]
+        total = math.fsum(w * source[b][c][row][column] for w, (row, column) in zip(weights, taps, strict=True))
+        out[b][c][y][x] = total / math.fsum(weights)
+    return _tensor(out, image.shape)
+
+
 def luminance_moments(light: Tensor) -> Tensor:
     """``(l, l^2)`` with ``l = 0.2126 R + 0.7152 G + 0.0722 B``."""
     batch, _, height, width = light.shape

@@ -12,6 +12,7 @@ from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remod
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
 from mcdenoise.ops.gradients import TemporalGradient, temporal_gradient
+from mcdenoise.ops.importance import ImportanceFilter, importance_filter
 from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
 from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
@@ -33,6 +34,7 @@ __all__ = [
     "GridSlice",
     "GridSplat",
     "HistoryLag",
+    "ImportanceFilter",
     "KernelConv",
     "KernelSplat",
     "LaplacianFusion",
@@ -52,6 +54,7 @@ __all__ = [
     "grid_slice",
     "grid_splat",
     "history_lag",
+    "importance_filter",
     "kernel_conv",
     "kernel_splat",
     "laplacian_fusion",

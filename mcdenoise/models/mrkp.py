@@ -1,0 +1,187 @@
+"""Kernel prediction at several scales: the network of Vogels et al. 2018 as Meng et al. 2020 modified it for 1 spp.
+
+Vogels et al. 2018, "Denoising with kernel prediction and asymmetric loss functions"; the layers are those of Meng's
+public code, MultiResolutionKernelPredictionCNN, whose 341,838 parameters this has. As in that code and unlike Vogels:
+
+- the weights of a kernel are made non-negative by a ReLU and divided by their sum, of each color channel over those
+  taps inside the image that are above zero in it, plus 1e-8; Vogels has a softmax;
+- alpha, how much a coarse scale counts, is one more channel beside the kernel's, behind a ReLU, unbounded; Vogels has a
+  small network and a sigmoid;
+- what is upsampled is aligned with the even pixels, which copy; odd ones are the mean of their two or four neighbours.
+
+What is not as in that code: typical radiance is brought to 0.5 before the network, so that the unit of a scene does not
+matter; depth is ``d / (d + typical depth)`` where the code scales each frame's to its smallest and largest; sides are
+padded inside the U-Net only, by repeating the edge; radiance below zero, which an alpha above one allows, is cut off.
+Meng trains with L1 on gamma-mapped images, the paper with SMAPE, and so does `mcdenoise train`.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
+from mcdenoise.models._registry import register_model
+from mcdenoise.ops import downsample, kernel_conv
+from mcdenoise.ops._window import accumulator_dtype, corner
+
+LEVELS, SCALES = 5, 3
+# Beside the sum of a kernel's weights.
+_EPSILON = 1e-8
+
+
+class Backbone(nn.Module):
+    """Meng's U-Net: one 3x3 convolution a level with 2x2 mean pooling, and 3x3 transposed convolutions up again.
+
+    Features of the encoder are concatenated behind those of the decoder; no convolution follows but the heads'. A side
+    is padded to a multiple of 32 by repeating the edge.
+
+    Args:
+        in_channels: of the input.
+        width: channels of every convolution, 48.
+    """
+
+    multiple: int = 2**LEVELS
+
+    def __init__(self, in_channels: int, width: int) -> None:
+        super().__init__()
+        entering, coarser = [in_channels] + [width] * (LEVELS - 1), [width] + [2 * width] * (LEVELS - 1)
+        self.encoder = nn.ModuleList(nn.Conv2d(each, width, 3, padding=1) for each in entering)
+        self.decoder = nn.ModuleList(
+            nn.ConvTranspose2d(each, width, 3, stride=2, padding=1, output_padding=1) for each in coarser
+        )
+        self.out_channels = 2 * width
+        for layer in (*self.encoder, *self.decoder):
+            with_glorot(layer)
+
+    @staticmethod
+    def reach() -> int:
+        """How far from a pixel of the input a feature of any scale depends on it, in pixels.
+
+        A pixel of each level on the way down, one of the next coarser level on the way up, and the rest of the block of
+        the coarsest level.
+        """
+        steps: int = sum(3 << level for level in range(LEVELS))
+        return steps + Backbone.multiple - 1
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Features ``(B, 2 * width, ceil(H / s), ceil(W / s))`` for ``s`` = 1, 2, 4."""
+        height, width = x.shape[-2:]
+        sides = [(side + self.multiple - 1) // self.multiple * self.multiple for side in (height, width)]
+        x = F.pad(x, (0, sides[1] - width, 0, sides[0] - height), mode="replicate")
+        skips = []
+        for convolution in self.encoder:
+            skips.append(F.relu(convolution(x)))
+            x = F.avg_pool2d(skips[-1], 2)
+        found = []
+        for deconvolution, skip in zip(self.decoder, reversed(skips), strict=True):
+            x = torch.cat([F.relu(deconvolution(x)), skip], 1)
+            found.append(x)
+        finest = enumerate(found[: -SCALES - 1 : -1])
+        return [corner(each, -(-height // (1 << scale)), -(-width // (1 << scale))) for scale, each in finest]
+
+
+def with_glorot(layer: nn.Module) -> nn.Module:
+    """A convolution with Glorot's initial weights, and biases of zero."""
+    weight, bias = layer.parameters()
+    nn.init.xavier_uniform_(weight)
+    nn.init.zeros_(bias)
+    return layer
+
+
+class MrkpNetwork(TenChannels):
+    """Predicts kernels and blending weights at three scales, filters each, and blends them from coarse to fine.
+
+    Args:
+        width: channels of every convolution, 48.
+        kernel_size: 5.
+    """
+
+    def __init__(self, width: int = 48, kernel_size: int = 5) -> None:
+        super().__init__()
+        self.unet, self.taps, self._radius = Backbone(10, width), kernel_size**2, kernel_size // 2
+        channels = self.taps + 1
+        self.heads = nn.ModuleList(
+            with_glorot(nn.Conv2d(self.unet.out_channels, channels, 3, padding=1)) for _ in range(SCALES)
+        )
+
+    @property
+    def needs(self) -> Needs:
+        """A pixel for each head, the radius of each filter, and two for each step up, at their scales."""
+        own = ((1 + self._radius) << (SCALES - 1)) + sum(4 << scale for scale in range(SCALES))
+        reach = self.unet.reach() + own
+        return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        others, dtype = carried(frame), accumulator_dtype(frame.color.dtype)
+        n = frame.color if others is None else torch.cat([frame.color, others], 1)
+        levels = self.unet(self.input_of(frame, frame.color))
+        scales = list(itertools.accumulate(range(SCALES), lambda x, _: downsample(x), initial=n.to(dtype)))
+        blended = scales.pop()  # what is coarsest is not filtered
+        for n, level, head in zip(reversed(scales), reversed(levels), reversed(self.heads), strict=True):
+            predicted = F.relu(head(level).to(dtype))
+            kernel, alpha = predicted.split([self.taps, 1], 1)
+            blended = _blend(_filter(n, kernel), blended, alpha)
+        blended = blended.clamp_min(0).to(frame.color.dtype)
+        return answered(frame, blended[:, :3], None if others is None else blended[:, 3:]), None
+
+
+def _filter(image: Tensor, kernel: Tensor) -> Tensor:
+    """``sum w c / (sum w + 1e-8)`` over taps inside the image whose channel is above zero; for layers, all inside."""
+    counted = torch.ones_like(image)
+    counted[:, :3] = (image[:, :3] > 0).to(image.dtype)
+    total, weight = kernel_conv(torch.cat([image * counted, counted], 1), kernel, border="zeros").chunk(2, 1)
+    return total / (weight + _EPSILON)
+
+
+def _blend(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
+    """``fine - alpha U D fine + alpha U coarse`` (Vogels, Eq. 4); of layers a mean, which stays between both."""
+    height, width = fine.shape[-2:]
+    color = fine[:, :3] + alpha * aligned(coarse[:, :3] - downsample(fine[:, :3]), height, width)
+    if fine.shape[1] == 3:
+        return color
+    others = torch.lerp(fine[:, 3:], aligned(coarse[:, 3:], height, width), alpha.clamp_max(1))
+    return torch.cat([color, others], 1)
+
+
+def aligned(image: Tensor, height: int, width: int) -> Tensor:
+    """``U`` of Meng's code: even pixels copy, odd ones are the mean of their neighbours inside the image.
+
+    Args:
+        image: ``(B, C, ceil(H / 2), ceil(W / 2))``.
+        height: of the result.
+        width: likewise.
+    """
+    padded = F.pad(image, (0, 1, 0, 1), mode="replicate")
+    size = [2 * side + 1 for side in image.shape[-2:]]
+    return corner(F.interpolate(padded, size, mode="bilinear", align_corners=True), height, width)
+
+
+@register_model(
+    "mrkp", "5x5 kernels at three scales, as in Meng's code of 2020", kind="kernel", paper="Vogels et al. 2018"
+)
+def mrkp(
+    width: int = 48,
+    kernel_size: int = 5,
+    *,
+    alpha_min: float = 0.2,
+    position_limit: float = POSITION_LIMIT,
+    normal_limit: float = NORMAL_LIMIT,
+) -> Model:
+    """Kernel prediction at several scales, behind the published accumulation.
+
+    Args:
+        width: channels of every convolution.
+        kernel_size: k of the kernels, odd.
+        alpha_min: smallest weight of the current frame in the accumulation.
+        position_limit: see :func:`mcdenoise.ops.reproject`.
+        normal_limit: likewise for normals.
+    """
+    return as_published(MrkpNetwork(width, kernel_size), alpha_min, position_limit, normal_limit)

@@ -1,0 +1,139 @@
+"""Kernel prediction with shared weights: a few maps of importance from which all kernels of all pixels are decoded.
+
+Fan et al. 2021, "Real-time Monte Carlo denoising with weight sharing kernel prediction network". This is the network of
+the public code for the BMFR data: six 5x5 convolutions of 14 channels without biases, LeakyReLU 0.1 between them, and
+12 channels at the end: six maps of importance for kernels of sides 3, 5, 7, 9, 11, 13 at one scale, and six of blending
+weights, of which a softmax is taken. The paper instead describes a U-Net with three maps for each of several scales
+and kernels of sides 3, 5 and 7, which is not here.
+
+Each convolution is trained as the sum of one of 5x5, one of 3x3, one of 1x1 and, but for the first and last, the
+identity (RepVGG, Ding et al. 2021). These are merged into one 5x5 kernel before it is applied, in training too: the sum
+is the same, and so are its derivatives. The merged network has 27,300 parameters.
+
+The public code exponentiates the maps as they are; :func:`mcdenoise.ops.importance_filter` is the same without
+overflow. The network sees the radiance with albedo, to the power of 1 / 2.2, and filters that without. As for `mrkp`,
+typical radiance is brought to 0.5 first, and depth is ``d / (d + typical depth)``, where the code scales each frame's
+to its smallest and largest. Its authors train with SMAPE of an epsilon of 0.01 in linear radiance with albedo.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
+from mcdenoise.models._registry import register_model
+from mcdenoise.ops import importance_filter, remodulate
+
+SIDES = (3, 5, 7, 9, 11, 13)
+_SLOPE, _GAMMA = 0.1, 1 / 2.2
+# Darker radiance counts as this before the power, whose derivative at zero is infinite.
+_DARKEST = 1e-6
+
+
+class Reparameterized(nn.Module):
+    """A 5x5 convolution without bias that is the sum of branches.
+
+    Args:
+        in_channels: of the input.
+        out_channels: of the result.
+        identity: whether the input itself is one of the branches.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, identity: bool) -> None:
+        super().__init__()
+        self.branches: Sequence[nn.Conv2d] = nn.ModuleList(  # type: ignore[assignment]
+            nn.Conv2d(in_channels, out_channels, side, padding=side // 2, bias=False) for side in (5, 3, 1)
+        )
+        self.identity = identity
+
+    def merged(self) -> Tensor:
+        """The one kernel ``(out_channels, in_channels, 5, 5)`` that does what all branches do."""
+        five, three, one = (branch.weight for branch in self.branches)
+        kernel = five + F.pad(three, (1,) * 4) + F.pad(one, (2,) * 4)
+        if self.identity:
+            same = torch.eye(len(five), dtype=five.dtype, device=five.device)
+            kernel = kernel + F.pad(same[:, :, None, None], (2,) * 4)
+        return kernel
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``(B, out_channels, H, W)``."""
+        return F.conv2d(x, self.merged(), padding=2)
+
+
+class WskpNetwork(TenChannels):
+    """Predicts maps of importance and how to blend what they give.
+
+    Args:
+        width: channels between the convolutions, 14.
+        layers: convolutions, 6; the public code has 3 as well.
+    """
+
+    def __init__(self, width: int = 14, layers: int = 6) -> None:
+        super().__init__()
+        if layers < 2:
+            raise InputError(f"layers: expected at least 2, found {layers}")
+        channels = [10, *[width] * (layers - 1), 2 * len(SIDES)]
+        self.layers: Sequence[Reparameterized] = nn.ModuleList(  # type: ignore[assignment]
+            Reparameterized(entering, leaving, 0 < i < layers - 1)
+            for i, (entering, leaving) in enumerate(itertools.pairwise(channels))
+        )
+
+    @property
+    def needs(self) -> Needs:
+        """Two pixels for each convolution, and the radius of the largest kernel."""
+        uses = frozenset({"albedo", "normal", "depth"})
+        return Needs(uses=uses, reach=2 * len(self.layers) + max(SIDES) // 2)
+
+    def maps(self, frame: Frame) -> tuple[Tensor, Tensor]:
+        """Importance ``(B, 6, H, W)`` and blending weights ``(B, 6, H, W)`` of sum 1."""
+        lit = frame.color if frame.albedo is None else remodulate(frame.color, frame.albedo)
+        x = self.input_of(frame, lit.clamp_min(_DARKEST) ** _GAMMA)
+        for layer in self.layers[:-1]:
+            x = F.leaky_relu(layer(x), _SLOPE)
+        importance, blend = self.layers[-1](x).chunk(2, 1)
+        return importance, torch.softmax(blend, 1)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        others = carried(frame)
+        x = frame.color if others is None else torch.cat([frame.color, others], 1)
+        importance, blend = self.maps(frame)
+        out = torch.zeros_like(x)
+        for side, m, share in zip(SIDES, importance.split(1, 1), blend.to(x.dtype).split(1, 1), strict=True):
+            out = torch.addcmul(out, share, importance_filter(x, m, kernel_size=side))
+        return answered(frame, out[:, :3], None if others is None else out[:, 3:]), None
+
+
+@register_model(
+    "wskp", "kernels of shared weights, 3x3 to 13x13, as in its public code", kind="kernel", paper="Fan et al. 2021"
+)
+def wskp(
+    width: int = 14,
+    layers: int = 6,
+    *,
+    alpha_min: float = 0.2,
+    position_limit: float = POSITION_LIMIT,
+    normal_limit: float = NORMAL_LIMIT,
+) -> Model:
+    """Kernel prediction with shared weights, behind the published accumulation.
+
+    Args:
+        width: channels between the convolutions.
+        layers: convolutions, 6, or the 3 of the smaller network of the public code.
+        alpha_min: smallest weight of the current frame in the accumulation.
+        position_limit: see :func:`mcdenoise.ops.reproject`.
+        normal_limit: likewise for normals.
+
+    Raises:
+        InputError: there are fewer than two layers.
+    """
+    return as_published(WskpNetwork(width, layers), alpha_min, position_limit, normal_limit)

@@ -1,0 +1,119 @@
+"""Kernels that are decoded from a map of importance: weighted means over a window, without a tensor of weights."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._module import module_of
+from mcdenoise.ops._window import accumulator_dtype
+
+
+def _check_size(kernel_size: int) -> None:
+    if kernel_size < 3 or kernel_size % 2 == 0:
+        raise ValueError(f"kernel_size: expected odd and at least 3, found {kernel_size}")
+
+
+def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) -> Tensor:
+    """Average over a window with weights that one map of importance gives to all pixels: softmax of the map over it.
+
+    ``out[p] = sum_q exp(m[q]) image[q] / sum_q exp(m[q])`` over the ``q`` of the ``K x K`` window around ``p`` that are
+    inside the image, with the importance ``m``: the quotient of two box filters. ``m`` plus a constant is the same map.
+
+    No exponential overflows and no window loses all its weights, whatever the map: a window is put together of pairs of
+    disjoint windows, of which each has its largest importance ``M``, its sum of ``exp(m - M)``, which is at least 1,
+    and its mean. Windows of 2, 4, 8, ... pixels along one axis, then along the other, give any size: the cost grows
+    with ``log K``, and no tensor has ``K * K`` channels.
+
+    Args:
+        image: ``(B, C, H, W)``, any unit and range.
+        importance: ``(B, 1, H, W)`` ``m``, the logarithm of what each pixel is worth, finite, up to 1e30.
+        kernel_size: odd ``K``, at least 3.
+
+    Returns:
+        ``(B, C, H, W)`` in the dtype of ``image``. Half precision is computed in float32. Between the smallest and the
+            largest pixel of the window, to rounding.
+
+    Raises:
+        TypeError: an argument is no floating-point tensor.
+        ValueError: shapes disagree, or ``K`` is not odd and at least 3.
+
+    Differentiable in ``image`` and ``importance``, to any order.
+
+    Source: Fan et al. 2021, "Real-time Monte Carlo denoising with weight sharing kernel prediction network",
+    where a kernel is decoded from the importance of the pixels under it; the public code exponentiates the map itself,
+    which overflows. The pairs are those of the online softmax, Milakov and Gimelshein 2018.
+
+    Example:
+        >>> image = torch.arange(5.0).reshape(1, 1, 1, 5)
+        >>> importance_filter(image, torch.zeros(1, 1, 1, 5), kernel_size=3).flatten().tolist()
+        [0.5, 1.0, 2.0, 3.0, 3.5]
+        >>> importance_filter(image, 1e4 * image, kernel_size=3).flatten().tolist()
+        [1.0, 2.0, 3.0, 4.0, 4.0]
+    """
+    check_shapes(image=(image, "B C H W"), importance=(importance, "B 1 H W"))
+    _check_size(kernel_size)
+    if image.numel() == 0:
+        return image
+    dtype = torch.promote_types(accumulator_dtype(image.dtype), accumulator_dtype(importance.dtype))
+    logarithm = importance.to(dtype)
+    top = logarithm.detach()
+    window = _Window(top, torch.exp(logarithm - top), image.to(dtype))
+    for axis in (-1, -2):
+        window = _along(window, axis, kernel_size)
+    return window.mean.to(image.dtype)
+
+
+ImportanceFilter = module_of("ImportanceFilter", importance_filter, _check_size)
+
+
+class _Window(NamedTuple):
+    """Of the window at each pixel.
+
+    Args:
+        top: ``(B, 1, H, W)`` largest importance ``M``, without a derivative: the result does not depend on it.
+        weight: ``(B, 1, H, W)`` sum of ``exp(m - M)``.
+        mean: ``(B, C, H, W)`` of the image.
+    """
+
+    top: Tensor
+    weight: Tensor
+    mean: Tensor
+
+    def part(self, axis: int, start: int, length: int) -> _Window:
+        """From one pixel on along an axis."""
+        return _Window(*(each.narrow(axis, start, length) for each in self))
+
+    def joined(self, other: _Window) -> _Window:
+        """With another window that has no pixel in common with it."""
+        top = torch.maximum(self.top, other.top)
+        own, others = self.weight * torch.exp(self.top - top), other.weight * torch.exp(other.top - top)
+        weight = own + others
+        # Not by the difference of the means: the one with hardly any weight may be a lamp. A sum that is divided in the
+        # end would leave the range where a mean does not.
+        mean = torch.addcmul(own / weight * self.mean, others / weight, other.mean)
+        return _Window(top, weight, mean)
+
+
+def _along(window: _Window, axis: int, kernel_size: int) -> _Window:
+    """Windows of as many pixels along an axis, of those inside the image, by the binary digits of the number."""
+    length, radius = window.top.shape[axis], kernel_size // 2
+    margin = (radius, radius) if axis == -1 else (0, 0, radius, radius)
+    # What is outside is worth nothing beside anything, and two such windows something, lest there be a 0 / 0.
+    worthless = torch.finfo(window.top.dtype).min
+    top, weight = F.pad(window.top, margin, value=worthless), F.pad(window.weight, margin, value=1.0)
+    level = _Window(top, weight, F.pad(window.mean, margin))
+    # The number is odd: the windows of one pixel are the first.
+    found, covered, size = level.part(axis, 0, length), 1, 1
+    while 2 * size <= kernel_size:
+        available = level.top.shape[axis] - size
+        level = level.part(axis, 0, available).joined(level.part(axis, size, available))
+        size *= 2
+        if kernel_size & size:
+            found = found.joined(level.part(axis, covered, length))
+            covered += size
+    return found
