@@ -22,9 +22,9 @@ from mcdenoise.models.with_oidn import OIDN, OIDN_CLEAN, WithOidn
 
 @register_model("oidn_pyramid", kind="peer", paper="after Zheng et al. 2021", requires="pyoidn")
 def oidn_pyramid(
-    *,
-    width: int = 32,
+    width: int = 16,
     kernel_size: int = 5,
+    *,
     quality: Quality = "high",
     threads: int | None = None,
     history: float = 10.0,
