@@ -16,7 +16,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Output
 from mcdenoise.models._journal import journal, note
-from mcdenoise.nn.inputs import features_of, guides_of, image_statistics
+from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.ops import cross_bilateral_filter, downsample, upsample
 
 # What is in none of the layers that were asked for; a name that nobody gives to a layer.
@@ -122,9 +122,8 @@ def fractions(frame: Frame, image: Tensor) -> Mapping[str, Tensor]:
         ``(B, 3, H, W)`` of each layer, means of its pixels.
     """
     frame = frame.replace(statistics={**frame.statistics, **image_statistics(frame)})
-    albedo, (normal, depth) = features_of(frame)[0], guides_of(frame)
     logarithm = torch.log1p(image.clamp_min(0) * frame.statistics["exposure"])
-    features = zip((albedo, normal, depth, logarithm), _FALLOFFS, strict=True)
+    features = zip((*unit_features_of(frame), logarithm), _FALLOFFS, strict=True)
     guide = torch.cat([feature.to(logarithm.dtype) * falloff**0.5 for feature, falloff in features], 1)
     fine = torch.cat(list(frame.layers.values()), 1)
     half = downsample(guide)

@@ -31,7 +31,7 @@ Layers and alpha are fitted and accumulated as the color is, and cut off below 0
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -41,17 +41,15 @@ from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
 from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import (
-    Accumulated,
     is_still,
     motion_to_previous,
     motion_unless_still,
     surface_before,
 )
 from mcdenoise.models.antialiased import Antialiased
-from mcdenoise.models.cascaded import NORMAL_LIMIT, POSITION_LIMIT
-from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.ops import Surface, block_regression, reproject
 from mcdenoise.ops.regression import BLOCK, RIDGE
 
@@ -193,16 +191,7 @@ def bmfr(
         block: see :func:`mcdenoise.ops.block_regression`.
         ridge: likewise.
     """
-    limits: dict[str, Any] = {"position_limit": position_limit, "normal_limit": normal_limit}
-    model: Model = Demodulated(
-        Accumulated(
-            Bmfr(block=block, second_alpha=second_alpha, ridge=ridge, **limits),
-            alpha_min=alpha_min,
-            rule="bmfr",
-            firefly_limit=math.inf,
-            specular_length=math.inf,
-            lag_threshold=math.inf,
-            **limits,
-        )
-    )
+    limits = {"position_limit": position_limit, "normal_limit": normal_limit}
+    fit = Bmfr(block=block, second_alpha=second_alpha, ridge=ridge, **limits)
+    model = as_published(fit, alpha_min, position_limit, normal_limit)
     return Antialiased(model, alpha=taa_alpha) if taa else model

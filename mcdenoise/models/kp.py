@@ -17,7 +17,9 @@ from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
 from mcdenoise.models._registry import register_model
+from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.mrkp import Backbone, with_glorot
+from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import cross_bilateral_filter
 
 
@@ -73,4 +75,4 @@ def kp(
         position_limit: see :func:`mcdenoise.ops.reproject`.
         normal_limit: likewise for normals.
     """
-    return as_published(KpNetwork(width, kernel_size), alpha_min, position_limit, normal_limit)
+    return as_published(Exposed(Tiled(KpNetwork(width, kernel_size))), alpha_min, position_limit, normal_limit)

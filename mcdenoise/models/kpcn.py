@@ -43,13 +43,11 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.accumulated import Accumulated
-from mcdenoise.models.cascaded import NORMAL_LIMIT, POSITION_LIMIT
-from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.inputs import features_of, guides_of, image_statistics
+from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.ops import cross_bilateral_filter, demodulate, luminance_moments, moments_variance
 
 PUBLISHED: Mapping[str, Any] = {"width": 100, "layers": 9, "kernel_size": 21}
@@ -144,7 +142,7 @@ def _seen(image: Tensor, frame: Frame) -> Tensor:
     """What a branch sees, ``(B, 27, H, W)``."""
     moments = luminance_moments(image.clamp_max(_BRIGHTEST))
     variance = moments_variance(moments, frame.normal, frame.depth, kernel_size=_WINDOW)
-    features = torch.cat([features_of(frame)[0], *guides_of(frame)], 1)
+    features = torch.cat(unit_features_of(frame), 1)
     varying = torch.cat([moments[:, :1].to(image.dtype), features], 1)
     across, down = (varying.diff(dim=dim) for dim in (-1, -2))
     # The last pixel of a row or column has nothing to differ from.
@@ -177,16 +175,5 @@ def kpcn(
         position_limit: see :func:`mcdenoise.models.cascaded.cascaded`.
         normal_limit: likewise.
     """
-    return Demodulated(
-        Accumulated(
-            Exposed(Tiled(KpcnNetwork(width, layers, kernel_size))),
-            alpha_min=alpha_min,
-            rule="bmfr",
-            position_limit=position_limit,
-            normal_limit=normal_limit,
-            firefly_limit=float("inf"),
-            specular_length=float("inf"),
-            lag_threshold=float("inf"),
-            also=("diffuse", "specular"),
-        )
-    )
+    network = Exposed(Tiled(KpcnNetwork(width, layers, kernel_size)))
+    return as_published(network, alpha_min, position_limit, normal_limit, also=("diffuse", "specular"))

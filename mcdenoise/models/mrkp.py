@@ -28,6 +28,8 @@ from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
 from mcdenoise.models._registry import register_model
+from mcdenoise.models.exposed import Exposed
+from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import downsample, kernel_conv
 from mcdenoise.ops._window import accumulator_dtype, corner
 
@@ -184,4 +186,4 @@ def mrkp(
         position_limit: see :func:`mcdenoise.ops.reproject`.
         normal_limit: likewise for normals.
     """
-    return as_published(MrkpNetwork(width, kernel_size), alpha_min, position_limit, normal_limit)
+    return as_published(Exposed(Tiled(MrkpNetwork(width, kernel_size))), alpha_min, position_limit, normal_limit)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import LARGEST_RADIANCE, Frame
-from mcdenoise.nn.inputs import features_of, guides_of
+from mcdenoise.nn.inputs import unit_features_of
 from mcdenoise.ops._window import corner, up_to_multiple
 
 # Logarithm of the radiance 3, albedo 3, normal 3, depth 1, and one over the number of frames that it is a mean of.
@@ -61,7 +61,7 @@ def samples_input(frame: Frame, samples: Tensor) -> Tensor:
         accumulated color one over its length.
     """
     batch, count, _, height, width = samples.shape
-    features = torch.cat([features_of(frame)[0], *guides_of(frame)], 1).to(samples.dtype)
+    features = torch.cat(unit_features_of(frame), 1).to(samples.dtype)
     fresh = torch.ones_like(samples[:, :, :1])
     if frame.length is not None:
         fresh = torch.cat([fresh[:, 1:], 1 / frame.length[:, None].to(samples.dtype)], 1)
