@@ -41,19 +41,27 @@ def carried(frame: Frame) -> Tensor | None:
     return torch.cat(images, 1) if images else None
 
 
+def with_carried(frame: Frame) -> Tensor:
+    """The color with :func:`carried` behind it, ``(B, 3 + 3 L + 1, H, W)``: what goes through the same kernels."""
+    others = carried(frame)
+    return frame.color if others is None else torch.cat([frame.color, others], 1)
+
+
 def alpha_of(frame: Frame) -> Tensor | None:
     """The alpha of a frame if it is to be denoised."""
     return frame.alpha if frame.hints.alpha else None
 
 
-def answered(frame: Frame, image: Tensor, filtered: Tensor | None) -> Output:
+def answered(frame: Frame, image: Tensor, filtered: Tensor | None = None) -> Output:
     """A method's output with what its kernels made of :func:`carried`.
 
     Args:
         frame: that the method was given.
-        image: ``(B, 3, H, W)`` its result.
+        image: ``(B, 3, H, W)`` its result; or that of :func:`with_carried`, which has the next behind it.
         filtered: ``(B, 3 L + 1, H, W)``; ``None`` where nothing was carried, or there was no kernel for it.
     """
+    if filtered is None and image.shape[1] > 3:
+        image, filtered = image[:, :3], image[:, 3:]
     if filtered is None:
         return Output(image)
     parts = iter(filtered.split(3, 1))

@@ -38,7 +38,7 @@ from torch import Tensor, nn
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.recurrent import from_before, to_be_kept
@@ -88,8 +88,7 @@ class Anf(nn.Module):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.with_depth()
-        others = carried(frame)
-        light = frame.color if others is None else torch.cat([frame.color, others.to(frame.color.dtype)], 1)
+        light = with_carried(frame).to(frame.color.dtype)
         embedded = self.embedded(frame).to(light.dtype)
         sizes = [light.shape[1], light.shape[1], embedded.shape[1], FEATURES]
         with timed("accumulate", light.device):
@@ -118,7 +117,7 @@ class Anf(nn.Module):
                     dilation=1 << k,
                 )
         kept = to_be_kept(frame, torch.cat([image, mean, embedded_mean, features], 1))
-        return answered(frame, image[:, :3], None if others is None else image[:, 3:]), kept
+        return answered(frame, image), kept
 
     def embedded(self, frame: Frame) -> Tensor:
         """The mean embedding of the samples of each pixel, ``(B, width, H, W)``."""

@@ -40,7 +40,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import (
@@ -120,18 +120,17 @@ class Bmfr(nn.Module):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         history: History | None = state
-        color, others = frame.color, carried(frame)
+        color = frame.color
         number = torch.zeros_like(color[:, :1, :1, :1]) if history is None else history.number
         with timed("fit", color.device):
-            images = self._fitted(frame, color if others is None else torch.cat([color, others], 1), number)
+            images = self._fitted(frame, with_carried(frame), number)
             fitted = images[:, :3]
         if history is not None:
             with timed("accumulate again", color.device):
                 images = self._accumulated(frame, images, history)
         surface = Surface(frame.position, frame.normal)
         after = History(images, surface, frame.view_projection, (number + 1) % len(_OFFSETS))
-        output = answered(frame, images[:, :3], None if others is None else images[:, 3:])
-        return output._replace(stages={"fitted": fitted}), after
+        return answered(frame, images)._replace(stages={"fitted": fitted}), after
 
     def _fitted(self, frame: Frame, images: Tensor, number: Tensor) -> Tensor:
         """Secs. 3.2 to 3.4, at the places of the blocks of this frame."""

@@ -9,12 +9,11 @@ first frame; 15 was not measured. What the network sees, and what it wears, is a
 
 from __future__ import annotations
 
-import torch
 from torch import nn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.exposed import Exposed
@@ -44,12 +43,10 @@ class KpNetwork(TenChannels):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        others = carried(frame)
-        x = frame.color if others is None else torch.cat([frame.color, others], 1)
         logits = self.head(self.unet(self.input_of(frame, frame.color))[0])
         # Without guides it is the filter with the softmax of the logits, and holds no tensor of weights besides.
-        filtered = cross_bilateral_filter(x, logits, [], [], normalize="softmax")
-        return answered(frame, filtered[:, :3], None if others is None else filtered[:, 3:]), None
+        filtered = cross_bilateral_filter(with_carried(frame), logits, [], [], normalize="softmax")
+        return answered(frame, filtered), None
 
 
 @register_model(

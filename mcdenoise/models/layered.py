@@ -124,7 +124,7 @@ class LayeredNetwork(nn.Module):
                 alpha = torch.sigmoid(alphas[:, number : number + 1])
                 image = image + seen_through * alpha * mean
                 seen_through = seen_through * (1 - alpha)
-        return answered(frame, image[:, :3], None if others is None else image[:, 3:]), None
+        return answered(frame, image), None
 
 
 @register_model(

@@ -25,13 +25,13 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import downsample, kernel_conv
-from mcdenoise.ops._window import accumulator_dtype, corner
+from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
 
 LEVELS, SCALES = 5, 3
 # Beside the sum of a kernel's weights.
@@ -75,8 +75,7 @@ class Backbone(nn.Module):
     def forward(self, x: Tensor) -> list[Tensor]:
         """Features ``(B, 2 * width, ceil(H / s), ceil(W / s))`` for ``s`` = 1, 2, 4."""
         height, width = x.shape[-2:]
-        sides = [(side + self.multiple - 1) // self.multiple * self.multiple for side in (height, width)]
-        x = F.pad(x, (0, sides[1] - width, 0, sides[0] - height), mode="replicate")
+        x = up_to_multiple(x, self.multiple, mode="replicate")
         skips = []
         for convolution in self.encoder:
             skips.append(F.relu(convolution(x)))
@@ -122,17 +121,17 @@ class MrkpNetwork(TenChannels):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        others, dtype = carried(frame), accumulator_dtype(frame.color.dtype)
-        n = frame.color if others is None else torch.cat([frame.color, others], 1)
+        dtype = accumulator_dtype(frame.color.dtype)
         levels = self.unet(self.input_of(frame, frame.color))
-        scales = list(itertools.accumulate(range(SCALES), lambda x, _: downsample(x), initial=n.to(dtype)))
+        scales = list(
+            itertools.accumulate(range(SCALES), lambda x, _: downsample(x), initial=with_carried(frame).to(dtype))
+        )
         blended = scales.pop()  # what is coarsest is not filtered
         for n, level, head in zip(reversed(scales), reversed(levels), reversed(self.heads), strict=True):
             predicted = F.relu(head(level).to(dtype))
             kernel, alpha = predicted.split([self.taps, 1], 1)
             blended = _blend(_filter(n, kernel), blended, alpha)
-        blended = blended.clamp_min(0).to(frame.color.dtype)
-        return answered(frame, blended[:, :3], None if others is None else blended[:, 3:]), None
+        return answered(frame, blended.clamp_min(0).to(frame.color.dtype)), None
 
 
 def _filter(image: Tensor, kernel: Tensor) -> Tensor:

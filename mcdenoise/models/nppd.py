@@ -55,7 +55,7 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import is_still, motion_unless_still
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.ops import kernel_splat, learned_upsample, pyramid_partition, reproject
-from mcdenoise.ops._window import corner
+from mcdenoise.ops._window import corner, up_to_multiple
 
 Backbone = Literal["convunet", "convunext"]
 
@@ -269,9 +269,7 @@ class Nppd(nn.Module):
     def _weights(self, seen: Tensor) -> tuple[dict[str, Tensor], list[dict[str, Tensor]]]:
         """What the network predicts at the finest scale, and at each coarser one."""
         height, width = seen.shape[-2:]
-        multiple = self.network.multiple
-        below, right = ((side + multiple - 1) // multiple * multiple - side for side in (height, width))
-        predicted = self.network(F.pad(seen, (0, right, 0, below), mode="replicate"))
+        predicted = self.network(up_to_multiple(seen, self.network.multiple, mode="replicate"))
         found = []
         for level, weights in enumerate(predicted):
             side = 1 << level

@@ -106,7 +106,7 @@ class SbmcNetwork(nn.Module):
                 # Of all samples so far, by the weights that arrived: a sum that no exponential overflows.
                 mean = torch.lerp(mean, splat, torch.sigmoid(weight - total).to(mean.dtype))
                 total = torch.logaddexp(total, weight)
-        return answered(frame, mean[:, :3], None if others is None else mean[:, 3:]), None
+        return answered(frame, mean), None
 
 
 @register_model(

@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, displayed
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.exposed import Exposed
@@ -103,13 +103,12 @@ class WskpNetwork(TenChannels):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        others = carried(frame)
-        x = frame.color if others is None else torch.cat([frame.color, others], 1)
+        x = with_carried(frame)
         importance, blend = self.maps(frame)
         out = torch.zeros_like(x)
-        for side, m, share in zip(SIDES, importance.split(1, 1), blend.to(x.dtype).split(1, 1), strict=True):
-            out = torch.addcmul(out, share, importance_filter(x, m, kernel_size=side))
-        return answered(frame, out[:, :3], None if others is None else out[:, 3:]), None
+        for side, m, weight in zip(SIDES, importance.split(1, 1), blend.to(x.dtype).split(1, 1), strict=True):
+            out = torch.addcmul(out, weight, importance_filter(x, m, kernel_size=side))
+        return answered(frame, out), None
 
 
 @register_model(
