@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model
 from mcdenoise.models.accumulated import Accumulated
@@ -45,6 +46,12 @@ def as_published(
             also=also,
         )
     )
+
+
+def check_odd(kernel_size: int) -> None:
+    """``InputError`` for a kernel without a centre."""
+    if kernel_size < 1 or kernel_size % 2 == 0:
+        raise InputError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
 
 
 class TenChannels(nn.Module):

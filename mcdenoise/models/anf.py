@@ -19,7 +19,7 @@ From a public re-implementation (Luciferbobo/SSR) come three filters, 8 features
 - a frame without samples has one a pixel, its color; those of a frame differ in nothing but their radiance;
 - typical radiance is brought to 0.5 for the network (:func:`mcdenoise.nn.auto_exposure`); the filters are linear in it;
 - the U-Net: four levels of 32 channels (:class:`mcdenoise.nn.UNet`);
-- the albedo is divided out before, as of all methods here;
+- the albedo is divided out before, as of most methods here;
 - where nothing shows the same surface (:func:`mcdenoise.ops.reproject`), ``lambda`` and the weights in time are 0;
   where only some of the taps do, less;
 - layers and alpha are filtered, and accumulated, with the radiance.

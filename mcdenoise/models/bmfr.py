@@ -133,7 +133,7 @@ class Bmfr(nn.Module):
         return answered(frame, images)._replace(stages={"fitted": fitted}), after
 
     def _fitted(self, frame: Frame, images: Tensor, number: Tensor) -> Tensor:
-        """Secs. 3.2 to 3.4, at the places of the blocks of this frame."""
+        """Fitted by the blocks of this frame, none below zero."""
         assert frame.normal is not None
         assert frame.position is not None
         features = torch.cat([frame.normal, frame.position], 1)
@@ -147,7 +147,7 @@ class Bmfr(nn.Module):
         return torch.cat(fits).clamp_min(0)
 
     def _accumulated(self, frame: Frame, images: Tensor, history: History) -> Tensor:
-        """Sec. 3.5: with the result before, at the taps and with the length of the first accumulation."""
+        """With the result before, at the taps and with the length of the first accumulation."""
         if motion_to_previous(frame, history.view_projection) is None:
             return images
         motion = motion_unless_still(frame, history.view_projection, is_still(frame, history.view_projection))

@@ -14,7 +14,7 @@ from torch import nn
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, check_odd
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.mrkp import Backbone, with_glorot
@@ -28,10 +28,14 @@ class KpNetwork(TenChannels):
     Args:
         width: channels of every convolution, 48.
         kernel_size: k of the kernels, odd.
+
+    Raises:
+        InputError: a setting is out of its range.
     """
 
     def __init__(self, width: int, kernel_size: int) -> None:
         super().__init__()
+        check_odd(kernel_size)
         self.unet, self._radius = Backbone(10, width), kernel_size // 2
         self.head = with_glorot(nn.Conv2d(self.unet.out_channels, kernel_size**2, 3, padding=1))
 

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, check_odd
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
@@ -101,11 +101,15 @@ class MrkpNetwork(TenChannels):
 
     Args:
         width: channels of every convolution, 48.
-        kernel_size: 5.
+        kernel_size: k of the kernels, odd, 5.
+
+    Raises:
+        InputError: a setting is out of its range.
     """
 
     def __init__(self, width: int = 48, kernel_size: int = 5) -> None:
         super().__init__()
+        check_odd(kernel_size)
         self.unet, self.taps, self._radius = Backbone(10, width), kernel_size**2, kernel_size // 2
         channels = self.taps + 1
         self.heads = nn.ModuleList(
@@ -143,7 +147,7 @@ def _filter(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def _blend(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
-    """``fine - alpha U D fine + alpha U coarse`` (Vogels, Eq. 4); of layers a mean, which stays between both."""
+    """``fine - alpha U D fine + alpha U coarse`` (the paper's Eq. 2); of layers a mean, which stays between both."""
     height, width = fine.shape[-2:]
     color = fine[:, :3] + alpha * aligned(coarse[:, :3] - downsample(fine[:, :3]), height, width)
     if fine.shape[1] == 3:

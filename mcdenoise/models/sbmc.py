@@ -18,8 +18,8 @@ color is the one sample of a pixel.** What is different here:
   one over its length. The authors denoise single images with their albedo; :class:`SbmcNetwork` alone does;
 - typical radiance is brought to 0.5 first (:class:`mcdenoise.models.Exposed`): otherwise the logarithm that the network
   sees, and so the result, depends on the unit of radiance;
-- convolutions are padded with zeros, where the authors crop the border;
-- the losses are those of the trainer; the authors train on a relative error of tone-mapped radiance.
+- convolutions are padded with zeros and nothing is cropped; the authors crop a kernel's radius off the result;
+- the losses are those of the trainer.
 """
 
 from __future__ import annotations
@@ -30,11 +30,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
@@ -69,8 +68,7 @@ class SbmcNetwork(nn.Module):
 
     def __init__(self, width: int, rounds: int, convolutions: int, kernel_size: int) -> None:
         super().__init__()
-        if kernel_size < 1 or kernel_size % 2 == 0:
-            raise InputError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
+        check_odd(kernel_size)
         self.embedding = SampleEmbedding(CHANNELS, width, rounds, convolutions)
         self.kernel = chain([2 * width, width, width, kernel_size**2], linear=True)
         self._reach = rounds * LeakyUNet.reach(convolutions) + kernel_size // 2
