@@ -47,6 +47,7 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
+from mcdenoise.nn.unet import bytes_of
 from mcdenoise.ops import cross_bilateral_filter, demodulate, luminance_moments, moments_variance
 
 PUBLISHED: Mapping[str, Any] = {"width": 100, "layers": 9, "kernel_size": 21}
@@ -111,7 +112,7 @@ class KpcnNetwork(nn.Module):
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: features, logits and weights, and buffers."""
-        return self._live * (2 if bfloat16 else 4) + 54 * 4
+        return bytes_of(self._live, bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

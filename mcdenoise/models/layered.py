@@ -52,6 +52,7 @@ from mcdenoise.nn.samples import (
     samples_of,
     with_context,
 )
+from mcdenoise.nn.unet import bytes_of
 from mcdenoise.ops import cross_bilateral_filter
 
 LAYERS = 2
@@ -95,7 +96,7 @@ class LayeredNetwork(nn.Module):
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: embeddings, logits, weights and buffers."""
-        return self._live * (2 if bfloat16 else 4) + 54 * 4
+        return bytes_of(self._live, bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
@@ -127,7 +128,7 @@ class LayeredNetwork(nn.Module):
 
 @register_model(
     "layered",
-    "filters samples in two layers, by the paper alone, small, with a history",
+    "filters samples in two layers, re-implemented, small, with a history",
     kind="kernel",
     paper="Munkberg and Hasselgren 2020",
 )

@@ -48,6 +48,7 @@ from mcdenoise.nn.samples import (
     samples_of,
     with_context,
 )
+from mcdenoise.nn.unet import bytes_of
 from mcdenoise.ops import softmax_splat
 
 PUBLISHED: Mapping[str, Any] = {"width": 128, "rounds": 3, "convolutions": 3, "kernel_size": 21}
@@ -87,7 +88,7 @@ class SbmcNetwork(nn.Module):
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: embeddings, logits, weights and buffers."""
-        return self._live * (2 if bfloat16 else 4) + 54 * 4
+        return bytes_of(self._live, bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
