@@ -43,6 +43,7 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.recurrent import from_before, to_be_kept
 from mcdenoise.nn.inputs import features_of, image_statistics
+from mcdenoise.nn.samples import samples_of
 from mcdenoise.nn.unet import Head, UNet
 from mcdenoise.ops import affinity_filter
 from mcdenoise.ops._steps.network import normalized_depth
@@ -125,7 +126,7 @@ class Anf(nn.Module):
         near, typical = statistics["depth_scale"].split(1, 1)
         albedo, normal, depth = features_of(frame)
         shared = torch.cat([albedo, normal, normalized_depth(depth, near, typical)], 1).to(frame.color.dtype)
-        radiance = frame.color[:, None] if frame.samples is None else frame.samples[:, :, :3].to(frame.color.dtype)
+        radiance = samples_of(frame).to(frame.color.dtype)
         total: Tensor | None = None
         count = radiance.shape[1]
         for sample in range(count):

@@ -32,7 +32,7 @@ def samples_of(frame: Frame) -> Tensor:
     color (one with ``frame.length``) is one more, which stands for the history.
 
     Returns:
-        ``(B, S, 3, H, W)`` in the unit of ``frame.color``, from 0 to 1e16.
+        ``(B, S, 3, H, W)`` in the unit of ``frame.color``, from 0 to 1e16; not-a-number counts as 0.
 
     Raises:
         InputError: samples have less than three channels.
@@ -45,7 +45,8 @@ def samples_of(frame: Frame) -> Tensor:
             f"buffer 'samples': expected (B, S, C, H, W) with at least 3 channels, found {tuple(frame.samples.shape)}; "
             "the first three are radiance"
         )
-    light = frame.samples[:, :, :3].clamp(0, LARGEST_RADIANCE)
+    # Of samples nobody has looked at every value.
+    light = frame.samples[:, :, :3].nan_to_num(0).clamp(0, LARGEST_RADIANCE)
     return light if frame.length is None else torch.cat([light, color.to(light.dtype)], 1)
 
 
