@@ -3,7 +3,7 @@
 from mcdenoise.models._adapter import FromBuffers, as_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._journal import Journal, Stage, listening, note, summarize, timed
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, carried, with_carried
 from mcdenoise.models._overview import ModelOverview, overview
 from mcdenoise.models._registry import build_model, find_model, list_models, register_model
 from mcdenoise.models._weights import create_model, describe_weights, load_weights, pretrained_models, save_weights
@@ -59,4 +59,5 @@ __all__ = [
     "save_weights",
     "summarize",
     "timed",
+    "with_carried",
 ]

@@ -16,7 +16,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Output
 from mcdenoise.models._journal import journal, note
-from mcdenoise.nn.inputs import features_of, guides_of, image_statistics
+from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.ops import cross_bilateral_filter, downsample, upsample
 
 # What is in none of the layers that were asked for; a name that nobody gives to a layer.
@@ -41,19 +41,27 @@ def carried(frame: Frame) -> Tensor | None:
     return torch.cat(images, 1) if images else None
 
 
+def with_carried(frame: Frame) -> Tensor:
+    """The color with :func:`carried` behind it, ``(B, 3 + 3 L + 1, H, W)``: what goes through the same kernels."""
+    others = carried(frame)
+    return frame.color if others is None else torch.cat([frame.color, others], 1)
+
+
 def alpha_of(frame: Frame) -> Tensor | None:
     """The alpha of a frame if it is to be denoised."""
     return frame.alpha if frame.hints.alpha else None
 
 
-def answered(frame: Frame, image: Tensor, filtered: Tensor | None) -> Output:
+def answered(frame: Frame, image: Tensor, filtered: Tensor | None = None) -> Output:
     """A method's output with what its kernels made of :func:`carried`.
 
     Args:
         frame: that the method was given.
-        image: ``(B, 3, H, W)`` its result.
+        image: ``(B, 3, H, W)`` its result; or that of :func:`with_carried`, which has the next behind it.
         filtered: ``(B, 3 L + 1, H, W)``; ``None`` where nothing was carried, or there was no kernel for it.
     """
+    if filtered is None and image.shape[1] > 3:
+        image, filtered = image[:, :3], image[:, 3:]
     if filtered is None:
         return Output(image)
     parts = iter(filtered.split(3, 1))
@@ -122,9 +130,8 @@ def fractions(frame: Frame, image: Tensor) -> Mapping[str, Tensor]:
         ``(B, 3, H, W)`` of each layer, means of its pixels.
     """
     frame = frame.replace(statistics={**frame.statistics, **image_statistics(frame)})
-    albedo, (normal, depth) = features_of(frame)[0], guides_of(frame)
     logarithm = torch.log1p(image.clamp_min(0) * frame.statistics["exposure"])
-    features = zip((albedo, normal, depth, logarithm), _FALLOFFS, strict=True)
+    features = zip((*unit_features_of(frame), logarithm), _FALLOFFS, strict=True)
     guide = torch.cat([feature.to(logarithm.dtype) * falloff**0.5 for feature, falloff in features], 1)
     fine = torch.cat(list(frame.layers.values()), 1)
     half = downsample(guide)

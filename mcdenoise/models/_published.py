@@ -1,37 +1,41 @@
-"""What the kernel-predicting networks of the paper's comparison wear, and see of a frame, as `cascaded` does."""
+"""What the methods of the paper's comparison have in common: the accumulation before them, and what networks see."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 
+from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
-from mcdenoise.models.exposed import Exposed
-from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.inputs import features_of, image_statistics
-from mcdenoise.ops._steps.network import normalized_depth
+from mcdenoise.nn.inputs import image_statistics, unit_features_of
+from mcdenoise.ops import remodulate
 
 # Of the BMFR scene "classroom", squared, in scene units (its world is in metres).
 POSITION_LIMIT, NORMAL_LIMIT = 0.01, 1.0
+# Darker radiance counts as this before the power, whose derivative at zero is infinite.
+_DARKEST = 1e-6
 
 
-def as_published(network: Model, alpha_min: float, position_limit: float, normal_limit: float) -> Model:
-    """A network on demodulated radiance that is accumulated by the published rule (Koskela et al. 2019).
+def as_published(
+    method: Model, alpha_min: float, position_limit: float, normal_limit: float, *, also: Sequence[str] = ()
+) -> Model:
+    """A method on demodulated radiance that is accumulated by the published rule (Koskela et al. 2019), and no more.
 
     Args:
-        network: without a state.
+        method: any.
         alpha_min: smallest weight of the current frame in the accumulation.
         position_limit: squared distance in scene units below which two points are one.
         normal_limit: likewise for normals.
+        also: see :class:`mcdenoise.models.Accumulated`.
     """
     return Demodulated(
         Accumulated(
-            Exposed(Tiled(network)),
+            method,
             alpha_min=alpha_min,
             rule="bmfr",
             position_limit=position_limit,
@@ -39,8 +43,15 @@ def as_published(network: Model, alpha_min: float, position_limit: float, normal
             firefly_limit=float("inf"),
             specular_length=float("inf"),
             lag_threshold=float("inf"),
+            also=also,
         )
     )
+
+
+def check_odd(kernel_size: int) -> None:
+    """``InputError`` for a kernel without a centre."""
+    if kernel_size < 1 or kernel_size % 2 == 0:
+        raise InputError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
 
 
 class TenChannels(nn.Module):
@@ -50,8 +61,16 @@ class TenChannels(nn.Module):
         """The depth scale of the whole image."""
         return image_statistics(frame)
 
+    def features(self, frame: Frame) -> list[Tensor]:
+        """Albedo, normal and depth, normalised to the range from 0 to 1 (Sec. 4.2 of the paper)."""
+        return unit_features_of(frame.replace(statistics=frame.statistics or self.statistics(frame)))
+
     def input_of(self, frame: Frame, image: Tensor) -> Tensor:
         """The image, albedo, ``normal / 2 + 1 / 2`` and depth, ``(B, 10, H, W)``."""
-        albedo, normal, depth = features_of(frame)
-        near, typical = (frame.statistics or self.statistics(frame))["depth_scale"].split(1, 1)
-        return torch.cat([image, albedo, normal * 0.5 + 0.5, normalized_depth(depth, near, typical)], 1)
+        return torch.cat([image, *self.features(frame)], 1)
+
+
+def displayed(frame: Frame) -> Tensor:
+    """Demodulated radiance with its albedo, as a display shows it: ``max(x, 1e-6)^(1 / 2.2)``, ``(B, 3, H, W)``."""
+    lit = frame.color if frame.albedo is None else remodulate(frame.color, frame.albedo)
+    return lit.clamp_min(_DARKEST).pow(1 / 2.2)

@@ -19,7 +19,7 @@ From a public re-implementation (Luciferbobo/SSR) come three filters, 8 features
 - a frame without samples has one a pixel, its color; those of a frame differ in nothing but their radiance;
 - typical radiance is brought to 0.5 for the network (:func:`mcdenoise.nn.auto_exposure`); the filters are linear in it;
 - the U-Net: four levels of 32 channels (:class:`mcdenoise.nn.UNet`);
-- the albedo is divided out before, as of all methods here;
+- the albedo is divided out before, as of most methods here;
 - where nothing shows the same surface (:func:`mcdenoise.ops.reproject`), ``lambda`` and the weights in time are 0;
   where only some of the taps do, less;
 - layers and alpha are filtered, and accumulated, with the radiance.
@@ -38,11 +38,12 @@ from torch import Tensor, nn
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.recurrent import from_before, to_be_kept
 from mcdenoise.nn.inputs import features_of, image_statistics
+from mcdenoise.nn.samples import samples_of
 from mcdenoise.nn.unet import Head, UNet
 from mcdenoise.ops import affinity_filter
 from mcdenoise.ops._steps.network import normalized_depth
@@ -88,8 +89,7 @@ class Anf(nn.Module):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.with_depth()
-        others = carried(frame)
-        light = frame.color if others is None else torch.cat([frame.color, others.to(frame.color.dtype)], 1)
+        light = with_carried(frame).to(frame.color.dtype)
         embedded = self.embedded(frame).to(light.dtype)
         sizes = [light.shape[1], light.shape[1], embedded.shape[1], FEATURES]
         with timed("accumulate", light.device):
@@ -118,7 +118,7 @@ class Anf(nn.Module):
                     dilation=1 << k,
                 )
         kept = to_be_kept(frame, torch.cat([image, mean, embedded_mean, features], 1))
-        return answered(frame, image[:, :3], None if others is None else image[:, 3:]), kept
+        return answered(frame, image), kept
 
     def embedded(self, frame: Frame) -> Tensor:
         """The mean embedding of the samples of each pixel, ``(B, width, H, W)``."""
@@ -126,7 +126,7 @@ class Anf(nn.Module):
         near, typical = statistics["depth_scale"].split(1, 1)
         albedo, normal, depth = features_of(frame)
         shared = torch.cat([albedo, normal, normalized_depth(depth, near, typical)], 1).to(frame.color.dtype)
-        radiance = frame.color[:, None] if frame.samples is None else frame.samples[:, :, :3].to(frame.color.dtype)
+        radiance = samples_of(frame).to(frame.color.dtype)
         total: Tensor | None = None
         count = radiance.shape[1]
         for sample in range(count):

@@ -2,7 +2,7 @@
 
 Schied et al. 2018, "Gradient Estimation for Real-Time Adaptive Temporal Filtering", Proceedings of the ACM on Computer
 Graphics and Interactive Techniques 1(2). What it has in common with SVGF is :class:`mcdenoise.models.svgf.Svgf`: it
-differs in the weight of the current frame (Sec. 4.4),
+differs in the weight of the current frame,
 
 ``alpha' = (1 - lambda) alpha + lambda`` with ``lambda = min(1, |Delta| / max(l))`` of
 :func:`mcdenoise.ops.temporal_gradient`.
@@ -127,7 +127,7 @@ class Asvgf(Svgf):
         )
 
     def _blend(self, frame: Frame, entering: Tensor, history: History, motion: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Sec. 4.4: light and moments with as much of their history as still holds, and its length."""
+        """Light and moments with as much of their history as still holds, and its length."""
         both, length = super()._blend(frame, entering, history, motion)
         change = self.changed(frame, history, motion).to(both.dtype)
         # (1 - lambda) (alpha c + (1 - alpha) h) + lambda c.

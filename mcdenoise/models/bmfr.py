@@ -31,7 +31,7 @@ Layers and alpha are fitted and accumulated as the color is, and cut off below 0
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -40,18 +40,16 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import (
-    Accumulated,
     is_still,
     motion_to_previous,
     motion_unless_still,
     surface_before,
 )
 from mcdenoise.models.antialiased import Antialiased
-from mcdenoise.models.cascaded import NORMAL_LIMIT, POSITION_LIMIT
-from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.ops import Surface, block_regression, reproject
 from mcdenoise.ops.regression import BLOCK, RIDGE
 
@@ -122,21 +120,20 @@ class Bmfr(nn.Module):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         history: History | None = state
-        color, others = frame.color, carried(frame)
+        color = frame.color
         number = torch.zeros_like(color[:, :1, :1, :1]) if history is None else history.number
         with timed("fit", color.device):
-            images = self._fitted(frame, color if others is None else torch.cat([color, others], 1), number)
+            images = self._fitted(frame, with_carried(frame), number)
             fitted = images[:, :3]
         if history is not None:
             with timed("accumulate again", color.device):
                 images = self._accumulated(frame, images, history)
         surface = Surface(frame.position, frame.normal)
         after = History(images, surface, frame.view_projection, (number + 1) % len(_OFFSETS))
-        output = answered(frame, images[:, :3], None if others is None else images[:, 3:])
-        return output._replace(stages={"fitted": fitted}), after
+        return answered(frame, images)._replace(stages={"fitted": fitted}), after
 
     def _fitted(self, frame: Frame, images: Tensor, number: Tensor) -> Tensor:
-        """Secs. 3.2 to 3.4, at the places of the blocks of this frame."""
+        """Fitted by the blocks of this frame, none below zero."""
         assert frame.normal is not None
         assert frame.position is not None
         features = torch.cat([frame.normal, frame.position], 1)
@@ -150,7 +147,7 @@ class Bmfr(nn.Module):
         return torch.cat(fits).clamp_min(0)
 
     def _accumulated(self, frame: Frame, images: Tensor, history: History) -> Tensor:
-        """Sec. 3.5: with the result before, at the taps and with the length of the first accumulation."""
+        """With the result before, at the taps and with the length of the first accumulation."""
         if motion_to_previous(frame, history.view_projection) is None:
             return images
         motion = motion_unless_still(frame, history.view_projection, is_still(frame, history.view_projection))
@@ -193,16 +190,7 @@ def bmfr(
         block: see :func:`mcdenoise.ops.block_regression`.
         ridge: likewise.
     """
-    limits: dict[str, Any] = {"position_limit": position_limit, "normal_limit": normal_limit}
-    model: Model = Demodulated(
-        Accumulated(
-            Bmfr(block=block, second_alpha=second_alpha, ridge=ridge, **limits),
-            alpha_min=alpha_min,
-            rule="bmfr",
-            firefly_limit=math.inf,
-            specular_length=math.inf,
-            lag_threshold=math.inf,
-            **limits,
-        )
-    )
+    limits = {"position_limit": position_limit, "normal_limit": normal_limit}
+    fit = Bmfr(block=block, second_alpha=second_alpha, ridge=ridge, **limits)
+    model = as_published(fit, alpha_min, position_limit, normal_limit)
     return Antialiased(model, alpha=taa_alpha) if taa else model

@@ -15,7 +15,7 @@ The paper is doi:10.1007/s00371-023-02951-6; equation numbers are its own. What 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -26,27 +26,22 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
-from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.fusion import FusionModule
-from mcdenoise.nn.inputs import features_of, image_statistics
 from mcdenoise.nn.unet import Head, UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
-from mcdenoise.ops._steps.network import normalized_depth
 
 Normalize = Literal["softmax", "none"]
 
-# The published limits of the BMFR scene "classroom", squared, in scene units (its world is in metres).
-POSITION_LIMIT, NORMAL_LIMIT = 0.01, 1.0
 LEVELS = 4  # of the U-Net
 
 
-class _Network(nn.Module):
+class _Network(TenChannels):
     """The U-Net of Fig. 2, and a head and a fusion module at the scales of its last three decoder layers."""
 
     def __init__(self, width: int, channels: int, radius: int) -> None:
@@ -65,20 +60,9 @@ class _Network(nn.Module):
         reach = max(ways) + sum(1 << scale for scale in range(self.unet.scales - 1))
         return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple)
 
-    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """The depth scale of the whole image."""
-        return image_statistics(frame)
-
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`."""
         return self.unet.bytes_per_pixel(bfloat16=bfloat16)
-
-    def features(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        """Auxiliary features f, normalised to the range from 0 to 1 (Sec. 4.2)."""
-        albedo, normal, depth = features_of(frame)
-        statistics = frame.statistics or self.statistics(frame)
-        near, typical = statistics["depth_scale"].split(1, 1)
-        return albedo, normal * 0.5 + 0.5, normalized_depth(depth, near, typical)
 
     def fuse(self, images: list[Tensor]) -> Tensor:
         """The scales of an image, finest first, in one."""
@@ -109,8 +93,7 @@ class PixelNetwork(_Network):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        features = self.features(frame)
-        levels = self.unet(torch.cat([frame.color, *features], 1))
+        levels = self.unet(self.input_of(frame, frame.color))
         images = [head(level, level.shape[-2:]) for head, level in zip(self.heads, levels, strict=True)]
         return Output(self.fuse([image.to(frame.color.dtype) for image in images])), None  #                    Eq. 1
 
@@ -204,15 +187,4 @@ def cascaded(
     ]
     networks[-1] = _NonNegative(networks[-1])
     chain = Chain(**dict(zip(("initial", "final")[-len(networks) :], networks, strict=True)))
-    return Demodulated(
-        Accumulated(
-            Exposed(chain),
-            alpha_min=alpha_min,
-            rule="bmfr",
-            position_limit=position_limit,
-            normal_limit=normal_limit,
-            firefly_limit=float("inf"),
-            specular_length=float("inf"),
-            lag_threshold=float("inf"),
-        )
-    )
+    return as_published(Exposed(chain), alpha_min, position_limit, normal_limit)

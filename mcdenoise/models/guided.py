@@ -9,13 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-import torch
 from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
@@ -72,9 +71,9 @@ class Guided(nn.Module):
 
         guide, size = guide_of(frame, DEPTH_SCALE), 2 * self.radius + 1
         # The linear functions of all images in one: their coefficients are of the same guides.
-        images = frame.color if (others := carried(frame)) is None else torch.cat([frame.color, others], 1)
+        images = with_carried(frame)
         blurred: Tensor = guided_blur(guide, images, size, self.eps, border_type="replicate", separable=True)
-        return answered(frame, blurred[:, :3].clamp_min(0), None if others is None else blurred[:, 3:]), None
+        return answered(frame, blurred.clamp_min(0)), None
 
 
 @register_model("guided", kind="filter", paper="He et al. 2010")

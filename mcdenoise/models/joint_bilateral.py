@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
@@ -77,7 +77,7 @@ class JointBilateral(nn.Module):
         from kornia.filters import joint_bilateral_blur
 
         size, sigma_space = 2 * self.radius + 1, (self.sigma_space, self.sigma_space)
-        images = frame.color if (others := carried(frame)) is None else torch.cat([frame.color, others], 1)
+        images = with_carried(frame)
         blurred: Tensor = joint_bilateral_blur(
             images,
             guide_of(frame, DEPTH_SCALE),
@@ -87,7 +87,7 @@ class JointBilateral(nn.Module):
             border_type="replicate",
             color_distance_type="l2",
         )
-        return answered(frame, blurred[:, :3], None if others is None else blurred[:, 3:]), None
+        return answered(frame, blurred), None
 
 
 def guide_of(frame: Frame, depth_weight: float) -> Tensor:

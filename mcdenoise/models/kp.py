@@ -9,15 +9,16 @@ first frame; 15 was not measured. What the network sees, and what it wears, is a
 
 from __future__ import annotations
 
-import torch
 from torch import nn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
+from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, check_odd
 from mcdenoise.models._registry import register_model
+from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.mrkp import Backbone, with_glorot
+from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import cross_bilateral_filter
 
 
@@ -27,10 +28,14 @@ class KpNetwork(TenChannels):
     Args:
         width: channels of every convolution, 48.
         kernel_size: k of the kernels, odd.
+
+    Raises:
+        InputError: a setting is out of its range.
     """
 
     def __init__(self, width: int, kernel_size: int) -> None:
         super().__init__()
+        check_odd(kernel_size)
         self.unet, self._radius = Backbone(10, width), kernel_size // 2
         self.head = with_glorot(nn.Conv2d(self.unet.out_channels, kernel_size**2, 3, padding=1))
 
@@ -42,12 +47,10 @@ class KpNetwork(TenChannels):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        others = carried(frame)
-        x = frame.color if others is None else torch.cat([frame.color, others], 1)
         logits = self.head(self.unet(self.input_of(frame, frame.color))[0])
         # Without guides it is the filter with the softmax of the logits, and holds no tensor of weights besides.
-        filtered = cross_bilateral_filter(x, logits, [], [], normalize="softmax")
-        return answered(frame, filtered[:, :3], None if others is None else filtered[:, 3:]), None
+        filtered = cross_bilateral_filter(with_carried(frame), logits, [], [], normalize="softmax")
+        return answered(frame, filtered), None
 
 
 @register_model(
@@ -73,4 +76,4 @@ def kp(
         position_limit: see :func:`mcdenoise.ops.reproject`.
         normal_limit: likewise for normals.
     """
-    return as_published(KpNetwork(width, kernel_size), alpha_min, position_limit, normal_limit)
+    return as_published(Exposed(Tiled(KpNetwork(width, kernel_size))), alpha_min, position_limit, normal_limit)

@@ -1,13 +1,12 @@
 """KPCN, the kernel-predicting convolutional network: one network for diffuse light, and one for specular light.
 
 Bako et al. 2017, "Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings", ACM Transactions on
-Graphics (SIGGRAPH). Equation numbers are its own. ``PUBLISHED`` are its sizes: nine 5x5 convolutions of 100 channels
-and kernels of 21x21, with the 27 input channels of the re-implementation that Gharbi et al. 2019 published, 2.92
-million parameters a branch; training them takes a GPU. The default is smaller, for a CPU.
+Graphics (SIGGRAPH). ``PUBLISHED`` are its sizes: nine 5x5 convolutions of 100 channels and kernels of 21x21, with the
+27 input channels of the re-implementation that Gharbi et al. 2019 published, 2.92 million parameters a branch; training
+them takes a GPU. The default is smaller, for a CPU.
 
 - Diffuse light is filtered without its albedo, specular light as ``log(1 + s)``, and the result is ``albedo diffuse +
-  exp(specular) - 1``, to which ``emission``, which has no noise, is added where the frame has it. The authors' diffuse
-  light is all that is not specular, with emission in it.
+  exp(specular) - 1``, to which ``emission``, which has no noise, is added where the frame has it.
 - **A frame with color only**: renderers that do not tell the two apart give no ``diffuse`` and ``specular``. Then the
   color, without its albedo, is what the diffuse branch filters, and there is no specular light: that branch is not
   computed, and does not learn.
@@ -15,14 +14,14 @@ million parameters a branch; training them takes a GPU. The default is smaller, 
 What is taken where the paper or its re-implementation leaves something open, and what is different here:
 
 - the 27 channels: the image, albedo, normal and depth (10), the horizontal and vertical differences of the image's
-  luminance, albedo, normal and depth (16), and ``log(1 + variance)`` of the image (1). The paper has variances of every
-  feature from its renderer. Here that of the image is estimated from the 7x7 pixels of the same surface around, for
-  frames of one sample have none, and one of several is that of the color and not of its parts;
+  luminance, albedo, normal and depth (16), and ``log(1 + variance)`` of the image (1). The variance is estimated from
+  the 7x7 pixels of the same surface around, for frames of one sample have none, and one of several is that of the color
+  and not of its parts;
 - convolutions are padded with zeros, where the authors crop the border;
 - taps of a kernel that lie outside the image have no weight;
 - typical radiance is brought to 0.5 first (:class:`mcdenoise.models.Exposed`): otherwise the logarithm, and so the
   result, depends on the unit of radiance;
-- depth in [0, 1]: ``d / (d + typical depth)``; the authors scale it by the largest;
+- depth in [0, 1]: ``d / (d + typical depth)``;
 - the authors denoise single images of many samples. Here light is accumulated over frames by the rule of
   :mod:`mcdenoise.models.cascaded`, as for all methods that are compared; ``alpha_min=1`` is a single image;
 - the authors train each branch with an L1 loss of its own, and both together afterwards; here the losses of the trainer
@@ -43,13 +42,12 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.accumulated import Accumulated
-from mcdenoise.models.cascaded import NORMAL_LIMIT, POSITION_LIMIT
-from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.inputs import features_of, guides_of, image_statistics
+from mcdenoise.nn.inputs import image_statistics, unit_features_of
+from mcdenoise.nn.unet import bytes_of
 from mcdenoise.ops import cross_bilateral_filter, demodulate, luminance_moments, moments_variance
 
 PUBLISHED: Mapping[str, Any] = {"width": 100, "layers": 9, "kernel_size": 21}
@@ -73,7 +71,7 @@ class _Branch(nn.Sequential):
         """An image ``(B, 3, H, W)`` with the kernels that are predicted for it, and others with the same kernels."""
         logits = self(_seen(image, frame))
         together = image if others is None else torch.cat([image, others], 1)
-        found = cross_bilateral_filter(together, logits, border="renormalize")  #                       Eqs. 8 and 9
+        found = cross_bilateral_filter(together, logits, border="renormalize")
         return found[:, :3], None if others is None else found[:, 3:]
 
 
@@ -95,8 +93,7 @@ class KpcnNetwork(nn.Module):
             raise InputError(f"width: expected at least 1, found {width}")
         if layers < 2:
             raise InputError(f"layers: expected at least 2, found {layers}")
-        if kernel_size < 1 or kernel_size % 2 == 0:
-            raise InputError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
+        check_odd(kernel_size)
         self.diffuse, self.specular = (_Branch(width, layers, kernel_size) for _ in range(2))
         # What a result depends on: convolutions, the variance with the slope of the depth at its taps, and the kernel.
         self._reach = layers * (_CONVOLUTION // 2) + _WINDOW // 2 + 1 + kernel_size // 2
@@ -115,7 +112,7 @@ class KpcnNetwork(nn.Module):
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: features, logits and weights, and buffers."""
-        return self._live * (2 if bfloat16 else 4) + 54 * 4
+        return bytes_of(self._live, bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
@@ -144,7 +141,7 @@ def _seen(image: Tensor, frame: Frame) -> Tensor:
     """What a branch sees, ``(B, 27, H, W)``."""
     moments = luminance_moments(image.clamp_max(_BRIGHTEST))
     variance = moments_variance(moments, frame.normal, frame.depth, kernel_size=_WINDOW)
-    features = torch.cat([features_of(frame)[0], *guides_of(frame)], 1)
+    features = torch.cat(unit_features_of(frame), 1)
     varying = torch.cat([moments[:, :1].to(image.dtype), features], 1)
     across, down = (varying.diff(dim=dim) for dim in (-1, -2))
     # The last pixel of a row or column has nothing to differ from.
@@ -177,16 +174,5 @@ def kpcn(
         position_limit: see :func:`mcdenoise.models.cascaded.cascaded`.
         normal_limit: likewise.
     """
-    return Demodulated(
-        Accumulated(
-            Exposed(Tiled(KpcnNetwork(width, layers, kernel_size))),
-            alpha_min=alpha_min,
-            rule="bmfr",
-            position_limit=position_limit,
-            normal_limit=normal_limit,
-            firefly_limit=float("inf"),
-            specular_length=float("inf"),
-            lag_threshold=float("inf"),
-            also=("diffuse", "specular"),
-        )
-    )
+    network = Exposed(Tiled(KpcnNetwork(width, layers, kernel_size)))
+    return as_published(network, alpha_min, position_limit, normal_limit, also=("diffuse", "specular"))

@@ -1,15 +1,15 @@
 """Layer embeddings: samples are put into two layers, which are filtered apart and composited.
 
-Munkberg and Hasselgren 2020, "Neural Denoising with Layer Embeddings", Computer Graphics Forum (EGSR). There is no
-public code. As in their paper,
+Munkberg and Hasselgren 2020, "Neural Denoising with Layer Embeddings", Computer Graphics Forum (EGSR). No public code
+was found to compare with: this is a re-implementation of its idea.
 
-- each sample is put into the layers softly, by weights that a network predicts for it and that sum to one, so that a
-  firefly or what is seen through glass need not be averaged with the rest of its pixel;
-- each layer is filtered with kernels of its own, so that the cost hardly grows with the number of samples;
-- the filtered layers are composited front to back, ``sum_l a_l prod_{j < l} (1 - a_j) F_l``, with alpha that a network
+- Each sample is put into the layers softly, by weights that a network predicts for it and that sum to one, so that a
+  firefly or what is seen through glass need not be averaged with the rest of its pixel.
+- Each layer is filtered with kernels of its own, so that the cost hardly grows with the number of samples.
+- The filtered layers are composited front to back, ``sum_l a_l prod_{j < l} (1 - a_j) F_l``, with alpha that a network
   predicts; the last layer's is one.
 
-What is taken here, where the paper's text does not say or no code shows it:
+What is taken here:
 
 - the embedding of samples is one round of that of SBMC (:class:`mcdenoise.nn.samples.SampleEmbedding`): a chain of
   three 1x1 convolutions on each sample, and the context of its pixel by a U-Net;
@@ -33,14 +33,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.accumulated import Accumulated
-from mcdenoise.models.cascaded import NORMAL_LIMIT, POSITION_LIMIT
-from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics
@@ -55,6 +52,7 @@ from mcdenoise.nn.samples import (
     samples_of,
     with_context,
 )
+from mcdenoise.nn.unet import bytes_of
 from mcdenoise.ops import cross_bilateral_filter
 
 LAYERS = 2
@@ -76,8 +74,7 @@ class LayeredNetwork(nn.Module):
 
     def __init__(self, width: int, convolutions: int, kernel_size: int) -> None:
         super().__init__()
-        if kernel_size < 1 or kernel_size % 2 == 0:
-            raise InputError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
+        check_odd(kernel_size)
         self.taps = kernel_size**2
         self.embedding = SampleEmbedding(CHANNELS, width, 1, convolutions)
         self.partition = chain([2 * width, width, LAYERS], linear=True)
@@ -99,7 +96,7 @@ class LayeredNetwork(nn.Module):
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: embeddings, logits, weights and buffers."""
-        return self._live * (2 if bfloat16 else 4) + 54 * 4
+        return bytes_of(self._live, bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
@@ -126,12 +123,12 @@ class LayeredNetwork(nn.Module):
                 alpha = torch.sigmoid(alphas[:, number : number + 1])
                 image = image + seen_through * alpha * mean
                 seen_through = seen_through * (1 - alpha)
-        return answered(frame, image[:, :3], None if others is None else image[:, 3:]), None
+        return answered(frame, image), None
 
 
 @register_model(
     "layered",
-    "filters samples in two layers, by the paper alone, small, with a history",
+    "filters samples in two layers, re-implemented, small, with a history",
     kind="kernel",
     paper="Munkberg and Hasselgren 2020",
 )
@@ -154,15 +151,5 @@ def layered(
         position_limit: see :func:`mcdenoise.models.cascaded.cascaded`.
         normal_limit: likewise.
     """
-    return Demodulated(
-        Accumulated(
-            Exposed(Tiled(LayeredNetwork(width, convolutions, kernel_size))),
-            alpha_min=alpha_min,
-            rule="bmfr",
-            position_limit=position_limit,
-            normal_limit=normal_limit,
-            firefly_limit=float("inf"),
-            specular_length=float("inf"),
-            lag_threshold=float("inf"),
-        )
-    )
+    network = Exposed(Tiled(LayeredNetwork(width, convolutions, kernel_size)))
+    return as_published(network, alpha_min, position_limit, normal_limit)

@@ -25,11 +25,13 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
+from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, check_odd
 from mcdenoise.models._registry import register_model
+from mcdenoise.models.exposed import Exposed
+from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import downsample, kernel_conv
-from mcdenoise.ops._window import accumulator_dtype, corner
+from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
 
 LEVELS, SCALES = 5, 3
 # Beside the sum of a kernel's weights.
@@ -73,8 +75,7 @@ class Backbone(nn.Module):
     def forward(self, x: Tensor) -> list[Tensor]:
         """Features ``(B, 2 * width, ceil(H / s), ceil(W / s))`` for ``s`` = 1, 2, 4."""
         height, width = x.shape[-2:]
-        sides = [(side + self.multiple - 1) // self.multiple * self.multiple for side in (height, width)]
-        x = F.pad(x, (0, sides[1] - width, 0, sides[0] - height), mode="replicate")
+        x = up_to_multiple(x, self.multiple, mode="replicate")
         skips = []
         for convolution in self.encoder:
             skips.append(F.relu(convolution(x)))
@@ -100,11 +101,15 @@ class MrkpNetwork(TenChannels):
 
     Args:
         width: channels of every convolution, 48.
-        kernel_size: 5.
+        kernel_size: k of the kernels, odd, 5.
+
+    Raises:
+        InputError: a setting is out of its range.
     """
 
     def __init__(self, width: int = 48, kernel_size: int = 5) -> None:
         super().__init__()
+        check_odd(kernel_size)
         self.unet, self.taps, self._radius = Backbone(10, width), kernel_size**2, kernel_size // 2
         channels = self.taps + 1
         self.heads = nn.ModuleList(
@@ -120,17 +125,17 @@ class MrkpNetwork(TenChannels):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        others, dtype = carried(frame), accumulator_dtype(frame.color.dtype)
-        n = frame.color if others is None else torch.cat([frame.color, others], 1)
+        dtype = accumulator_dtype(frame.color.dtype)
         levels = self.unet(self.input_of(frame, frame.color))
-        scales = list(itertools.accumulate(range(SCALES), lambda x, _: downsample(x), initial=n.to(dtype)))
+        scales = list(
+            itertools.accumulate(range(SCALES), lambda x, _: downsample(x), initial=with_carried(frame).to(dtype))
+        )
         blended = scales.pop()  # what is coarsest is not filtered
         for n, level, head in zip(reversed(scales), reversed(levels), reversed(self.heads), strict=True):
             predicted = F.relu(head(level).to(dtype))
             kernel, alpha = predicted.split([self.taps, 1], 1)
             blended = _blend(_filter(n, kernel), blended, alpha)
-        blended = blended.clamp_min(0).to(frame.color.dtype)
-        return answered(frame, blended[:, :3], None if others is None else blended[:, 3:]), None
+        return answered(frame, blended.clamp_min(0).to(frame.color.dtype)), None
 
 
 def _filter(image: Tensor, kernel: Tensor) -> Tensor:
@@ -142,7 +147,7 @@ def _filter(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def _blend(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
-    """``fine - alpha U D fine + alpha U coarse`` (Vogels, Eq. 4); of layers a mean, which stays between both."""
+    """``fine - alpha U D fine + alpha U coarse`` (the paper's Eq. 2); of layers a mean, which stays between both."""
     height, width = fine.shape[-2:]
     color = fine[:, :3] + alpha * aligned(coarse[:, :3] - downsample(fine[:, :3]), height, width)
     if fine.shape[1] == 3:
@@ -184,4 +189,4 @@ def mrkp(
         position_limit: see :func:`mcdenoise.ops.reproject`.
         normal_limit: likewise for normals.
     """
-    return as_published(MrkpNetwork(width, kernel_size), alpha_min, position_limit, normal_limit)
+    return as_published(Exposed(Tiled(MrkpNetwork(width, kernel_size))), alpha_min, position_limit, normal_limit)

@@ -30,7 +30,7 @@ Left open, or otherwise here:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -41,26 +41,22 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
 from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, displayed
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.accumulated import Accumulated
-from mcdenoise.models.cascaded import NORMAL_LIMIT, POSITION_LIMIT
-from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.inputs import features_of, guides_of, image_statistics
-from mcdenoise.ops import grid_slice, grid_splat, remodulate
+from mcdenoise.ops import grid_slice, grid_splat
 
 # s_s in pixels and 256 / s_r bins of the grids, whose guides these are in order.
 GRIDS = ((4, 64), (8, 32), (16, 16))
 _INPUTS, _FIRST, _GROWTH, _OUTPUTS, _SLOPE = 10, 20, 5, 5, 0.2
-_DARKEST = 1e-6
 # Of a derivative in a guide, in training.
 _LARGEST = 100.0
 # Peak of the network and of the finest grid, in float32; 920 were measured, with the frame.
 _BYTES_PER_PIXEL = 1100
 
 
-class NeuralBilateralGrid(nn.Module):
+class NeuralBilateralGrid(TenChannels):
     """The network, its three grids, and their sum.
 
     Args:
@@ -87,20 +83,13 @@ class NeuralBilateralGrid(nn.Module):
         reach = 2 * (2 + len(self.dense)) + 2 * coarsest
         return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=coarsest)
 
-    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """The depth scale of the whole image."""
-        return image_statistics(frame)
-
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`; grids are in float32 anyway."""
         return _BYTES_PER_PIXEL
 
     def predicted(self, frame: Frame) -> Tensor:
         """Three guides and two weights ``(B, 5, H, W)`` in [0, 1]."""
-        frame = frame if frame.statistics else frame.replace(statistics=self.statistics(frame))
-        albedo = features_of(frame)[0]
-        shown = remodulate(frame.color, albedo).clamp_min(_DARKEST).pow(1 / 2.2)
-        x = F.leaky_relu(self.first(torch.cat([shown, albedo, *guides_of(frame)], 1)), _SLOPE)
+        x = F.leaky_relu(self.first(self.input_of(frame, displayed(frame))), _SLOPE)
         for layer in self.dense:
             x = F.leaky_relu(torch.cat([x, layer(x)], 1), _SLOPE)
         return torch.sigmoid(self.last(x)).to(frame.color.dtype)
@@ -166,15 +155,4 @@ def nbgd(
             :func:`mcdenoise.ops.reproject`.
         normal_limit: likewise for normals.
     """
-    return Demodulated(
-        Accumulated(
-            Exposed(Tiled(NeuralBilateralGrid(layers))),
-            alpha_min=alpha_min,
-            rule="bmfr",
-            position_limit=position_limit,
-            normal_limit=normal_limit,
-            firefly_limit=float("inf"),
-            specular_length=float("inf"),
-            lag_threshold=float("inf"),
-        )
-    )
+    return as_published(Exposed(Tiled(NeuralBilateralGrid(layers))), alpha_min, position_limit, normal_limit)

@@ -47,15 +47,16 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import LARGEST_RADIANCE, MOTION, Frame, tells_motion
+from mcdenoise.frame import MOTION, Frame, tells_motion
 from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._journal import journal, timed
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import is_still, motion_unless_still
 from mcdenoise.nn.inputs import features_of, normalize_depth
+from mcdenoise.nn.samples import samples_of
 from mcdenoise.ops import kernel_splat, learned_upsample, pyramid_partition, reproject
-from mcdenoise.ops._window import corner
+from mcdenoise.ops._window import corner, up_to_multiple
 
 Backbone = Literal["convunet", "convunext"]
 
@@ -256,9 +257,7 @@ class Nppd(nn.Module):
 
     def _encoded(self, frame: Frame, dtype: torch.dtype) -> Tensor:
         """Features of the samples, averaged."""
-        samples = frame.color[:, None] if frame.samples is None else frame.samples[:, :, :3]
-        # Of samples nobody has looked at every value.
-        samples = samples.to(dtype).nan_to_num(0).clamp(0, LARGEST_RADIANCE)
+        samples = samples_of(frame).to(dtype)
         albedo, normal, depth = features_of(frame)
         pixel = torch.cat([normalize_depth(depth), normal, albedo], 1).to(dtype)
         count = samples.shape[1]
@@ -269,9 +268,7 @@ class Nppd(nn.Module):
     def _weights(self, seen: Tensor) -> tuple[dict[str, Tensor], list[dict[str, Tensor]]]:
         """What the network predicts at the finest scale, and at each coarser one."""
         height, width = seen.shape[-2:]
-        multiple = self.network.multiple
-        below, right = ((side + multiple - 1) // multiple * multiple - side for side in (height, width))
-        predicted = self.network(F.pad(seen, (0, right, 0, below), mode="replicate"))
+        predicted = self.network(up_to_multiple(seen, self.network.multiple, mode="replicate"))
         found = []
         for level, weights in enumerate(predicted):
             side = 1 << level

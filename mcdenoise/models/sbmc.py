@@ -18,8 +18,8 @@ color is the one sample of a pixel.** What is different here:
   one over its length. The authors denoise single images with their albedo; :class:`SbmcNetwork` alone does;
 - typical radiance is brought to 0.5 first (:class:`mcdenoise.models.Exposed`): otherwise the logarithm that the network
   sees, and so the result, depends on the unit of radiance;
-- convolutions are padded with zeros, where the authors crop the border;
-- the losses are those of the trainer; the authors train on a relative error of tone-mapped radiance.
+- convolutions are padded with zeros and nothing is cropped; the authors crop a kernel's radius off the result;
+- the losses are those of the trainer.
 """
 
 from __future__ import annotations
@@ -30,14 +30,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.accumulated import Accumulated
-from mcdenoise.models.cascaded import NORMAL_LIMIT, POSITION_LIMIT
-from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics
@@ -51,6 +48,7 @@ from mcdenoise.nn.samples import (
     samples_of,
     with_context,
 )
+from mcdenoise.nn.unet import bytes_of
 from mcdenoise.ops import softmax_splat
 
 PUBLISHED: Mapping[str, Any] = {"width": 128, "rounds": 3, "convolutions": 3, "kernel_size": 21}
@@ -71,8 +69,7 @@ class SbmcNetwork(nn.Module):
 
     def __init__(self, width: int, rounds: int, convolutions: int, kernel_size: int) -> None:
         super().__init__()
-        if kernel_size < 1 or kernel_size % 2 == 0:
-            raise InputError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
+        check_odd(kernel_size)
         self.embedding = SampleEmbedding(CHANNELS, width, rounds, convolutions)
         self.kernel = chain([2 * width, width, width, kernel_size**2], linear=True)
         self._reach = rounds * LeakyUNet.reach(convolutions) + kernel_size // 2
@@ -91,7 +88,7 @@ class SbmcNetwork(nn.Module):
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: embeddings, logits, weights and buffers."""
-        return self._live * (2 if bfloat16 else 4) + 54 * 4
+        return bytes_of(self._live, bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
@@ -108,7 +105,7 @@ class SbmcNetwork(nn.Module):
                 # Of all samples so far, by the weights that arrived: a sum that no exponential overflows.
                 mean = torch.lerp(mean, splat, torch.sigmoid(weight - total).to(mean.dtype))
                 total = torch.logaddexp(total, weight)
-        return answered(frame, mean[:, :3], None if others is None else mean[:, 3:]), None
+        return answered(frame, mean), None
 
 
 @register_model(
@@ -138,15 +135,5 @@ def sbmc(
         position_limit: see :func:`mcdenoise.models.cascaded.cascaded`.
         normal_limit: likewise.
     """
-    return Demodulated(
-        Accumulated(
-            Exposed(Tiled(SbmcNetwork(width, rounds, convolutions, kernel_size))),
-            alpha_min=alpha_min,
-            rule="bmfr",
-            position_limit=position_limit,
-            normal_limit=normal_limit,
-            firefly_limit=float("inf"),
-            specular_length=float("inf"),
-            lag_threshold=float("inf"),
-        )
-    )
+    network = Exposed(Tiled(SbmcNetwork(width, rounds, convolutions, kernel_size)))
+    return as_published(network, alpha_min, position_limit, normal_limit)

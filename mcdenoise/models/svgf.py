@@ -19,7 +19,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import journal, timed
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import motion_to_previous, surface_before
 from mcdenoise.models.demodulated import Demodulated
@@ -113,14 +113,13 @@ class Svgf(nn.Module):
                 kept = filtered if level == 0 else kept
         surface = Surface(frame.position, normal, depth)
         after = History(kept, moments, length, surface, frame.view_projection)
-        output = answered(frame, filtered[:, :3], filtered[:, 3:] if light.shape[1] > 3 else None)
+        output = answered(frame, filtered)
         return output._replace(stages={"accumulated": light[:, :3]}), after
 
     def _accumulate(self, frame: Frame, history: History | None) -> tuple[Tensor, Tensor, Tensor]:
         """Sec. 4.1: light, moments and length with the history, where there is one."""
-        color, others = frame.color, carried(frame)
-        light = color if others is None else torch.cat([color, others], 1)
-        entering = torch.cat([light, luminance_moments(color.clamp_max(BRIGHTEST)).to(light.dtype)], 1)
+        light = with_carried(frame)
+        entering = torch.cat([light, luminance_moments(frame.color.clamp_max(BRIGHTEST)).to(light.dtype)], 1)
         reset, motion = "first frame", None
         if history is not None:
             motion = motion_to_previous(frame, history.view_projection)

@@ -28,15 +28,15 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
+from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, displayed
 from mcdenoise.models._registry import register_model
-from mcdenoise.ops import importance_filter, remodulate
+from mcdenoise.models.exposed import Exposed
+from mcdenoise.models.tiled import Tiled
+from mcdenoise.ops import importance_filter
 
 SIDES = (3, 5, 7, 9, 11, 13)
-_SLOPE, _GAMMA = 0.1, 1 / 2.2
-# Darker radiance counts as this before the power, whose derivative at zero is infinite.
-_DARKEST = 1e-6
+_SLOPE = 0.1
 
 
 class Reparameterized(nn.Module):
@@ -95,8 +95,7 @@ class WskpNetwork(TenChannels):
 
     def maps(self, frame: Frame) -> tuple[Tensor, Tensor]:
         """Importance ``(B, 6, H, W)`` and blending weights ``(B, 6, H, W)`` of sum 1."""
-        lit = frame.color if frame.albedo is None else remodulate(frame.color, frame.albedo)
-        x = self.input_of(frame, lit.clamp_min(_DARKEST) ** _GAMMA)
+        x = self.input_of(frame, displayed(frame))
         for layer in self.layers[:-1]:
             x = F.leaky_relu(layer(x), _SLOPE)
         importance, blend = self.layers[-1](x).chunk(2, 1)
@@ -104,13 +103,12 @@ class WskpNetwork(TenChannels):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        others = carried(frame)
-        x = frame.color if others is None else torch.cat([frame.color, others], 1)
+        x = with_carried(frame)
         importance, blend = self.maps(frame)
         out = torch.zeros_like(x)
-        for side, m, share in zip(SIDES, importance.split(1, 1), blend.to(x.dtype).split(1, 1), strict=True):
-            out = torch.addcmul(out, share, importance_filter(x, m, kernel_size=side))
-        return answered(frame, out[:, :3], None if others is None else out[:, 3:]), None
+        for side, m, weight in zip(SIDES, importance.split(1, 1), blend.to(x.dtype).split(1, 1), strict=True):
+            out = torch.addcmul(out, weight, importance_filter(x, m, kernel_size=side))
+        return answered(frame, out), None
 
 
 @register_model(
@@ -136,4 +134,4 @@ def wskp(
     Raises:
         InputError: there are fewer than two layers.
     """
-    return as_published(WskpNetwork(width, layers), alpha_min, position_limit, normal_limit)
+    return as_published(Exposed(Tiled(WskpNetwork(width, layers))), alpha_min, position_limit, normal_limit)

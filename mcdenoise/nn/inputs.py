@@ -106,3 +106,8 @@ def guides_of(frame: Frame) -> list[Tensor]:
     _, normal, depth = features_of(frame)
     near, typical = frame.statistics["depth_scale"].split(1, 1)
     return list(network_guides(normal, depth, (near, typical)).split([3, 1], 1))
+
+
+def unit_features_of(frame: Frame) -> list[Tensor]:
+    """Albedo, normal and depth in [0, 1], of a frame with the statistics of :func:`image_statistics`."""
+    return [features_of(frame)[0], *guides_of(frame)]

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import LARGEST_RADIANCE, Frame
-from mcdenoise.nn.inputs import features_of, guides_of
+from mcdenoise.nn.inputs import unit_features_of
 from mcdenoise.ops._window import corner, up_to_multiple
 
 # Logarithm of the radiance 3, albedo 3, normal 3, depth 1, and one over the number of frames that it is a mean of.
@@ -32,7 +32,7 @@ def samples_of(frame: Frame) -> Tensor:
     color (one with ``frame.length``) is one more, which stands for the history.
 
     Returns:
-        ``(B, S, 3, H, W)`` in the unit of ``frame.color``, from 0 to 1e16.
+        ``(B, S, 3, H, W)`` in the unit of ``frame.color``, from 0 to 1e16; not-a-number counts as 0.
 
     Raises:
         InputError: samples have less than three channels.
@@ -45,7 +45,8 @@ def samples_of(frame: Frame) -> Tensor:
             f"buffer 'samples': expected (B, S, C, H, W) with at least 3 channels, found {tuple(frame.samples.shape)}; "
             "the first three are radiance"
         )
-    light = frame.samples[:, :, :3].clamp(0, LARGEST_RADIANCE)
+    # Of samples nobody has looked at every value.
+    light = frame.samples[:, :, :3].nan_to_num(0).clamp(0, LARGEST_RADIANCE)
     return light if frame.length is None else torch.cat([light, color.to(light.dtype)], 1)
 
 
@@ -61,7 +62,7 @@ def samples_input(frame: Frame, samples: Tensor) -> Tensor:
         accumulated color one over its length.
     """
     batch, count, _, height, width = samples.shape
-    features = torch.cat([features_of(frame)[0], *guides_of(frame)], 1).to(samples.dtype)
+    features = torch.cat(unit_features_of(frame), 1).to(samples.dtype)
     fresh = torch.ones_like(samples[:, :, :1])
     if frame.length is not None:
         fresh = torch.cat([fresh[:, 1:], 1 / frame.length[:, None].to(samples.dtype)], 1)

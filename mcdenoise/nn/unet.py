@@ -76,7 +76,7 @@ class UNet(nn.Module):
         Args:
             bfloat16: whether convolutions are in bfloat16, else in float32.
         """
-        return _LIVE_WIDTHS * self.widths[0] * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
+        return bytes_of(_LIVE_WIDTHS * self.widths[0], bfloat16=bfloat16)
 
     def forward(self, x: Tensor, coarse: Sequence[Tensor] = ()) -> list[Tensor]:
         """Features at each of the scales.
@@ -140,6 +140,16 @@ class Head(nn.Conv2d):
         """
         predicted = super().forward(features)
         return predicted if self.side == 1 else corner(F.pixel_shuffle(predicted, self.side), *size)
+
+
+def bytes_of(live: float, *, bfloat16: bool) -> float:
+    """Memory that each pixel of an image takes, with images and features around a network, which are in float32.
+
+    Args:
+        live: numbers that the network holds for each pixel, at its peak.
+        bfloat16: whether these are in bfloat16, else in float32.
+    """
+    return live * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
 
 
 def _padded(x: Tensor, size: Sequence[int]) -> Tensor:

@@ -69,10 +69,10 @@ def shifted(padded: Tensor, radius: int, dy: int, dx: int, height: int, width: i
     return padded.narrow(-2, radius + dy, height).narrow(-1, radius + dx, width)
 
 
-def up_to_multiple(image: Tensor, side: int) -> Tensor:
-    """``(..., H, W)`` with zeros after it, up to whole multiples of ``side``."""
+def up_to_multiple(image: Tensor, side: int, mode: Literal["constant", "replicate"] = "constant") -> Tensor:
+    """``(..., H, W)`` with zeros after it, or its edge repeated, up to whole multiples of ``side``."""
     right, below = ((size + side - 1) // side * side - size for size in (image.shape[-1], image.shape[-2]))
-    return F.pad(image, (0, right, 0, below))
+    return F.pad(image, (0, right, 0, below), mode=mode)
 
 
 def corner(image: Tensor, height: int, width: int) -> Tensor:

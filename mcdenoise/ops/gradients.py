@@ -75,7 +75,7 @@ def temporal_gradient(
     Differentiable in all images, to any order, where ``current`` and ``previous`` differ, no depths within reach are
     equal, and the result is neither 0 nor 1.
 
-    Source: Schied et al. 2018 (A-SVGF), Secs. 4.2 to 4.4; the noise of the change is ours.
+    Source: Schied et al. 2018 (A-SVGF); the noise of the change is ours.
 
     Example:
         >>> lit = torch.rand(1, 1, 9, 9, generator=torch.Generator().manual_seed(0))

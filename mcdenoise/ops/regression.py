@@ -66,7 +66,7 @@ def block_regression(
 
     Differentiable in ``image``, to any order, and in ``features``, where none is 0 throughout a block.
 
-    Source: Koskela et al. 2019 (BMFR), Secs. 3.2 to 3.4. There the features are made independent of one another by
+    Source: Koskela et al. 2019 (BMFR). There the features are made independent of one another by
     noise of a uniform distribution of +-0.01 that is drawn for every frame; on average that adds ``n 1e-4 / 3`` to the
     diagonal of the normal equations. Here it is a ridge, so that the same frame gives the same image.
 

@@ -40,7 +40,7 @@ def softmax_splat(image: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
 
     Differentiable in ``image`` and ``logits``, to any order.
 
-    Source: Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network", Sec. 4; the
+    Source: Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network"; the
     running maximum over samples is that of their published code.
 
     Example:

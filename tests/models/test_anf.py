@@ -114,6 +114,17 @@ def test_samples_that_are_all_the_color_are_as_none_and_their_order_says_nothing
     assert not torch.allclose(*embedded, rtol=1e-3)
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -2.0])
+@torch.no_grad()
+def test_a_broken_sample_breaks_nothing(value: float) -> None:
+    model = small("anf")
+    frame = whole_frame(model, 9, 8)
+    assert frame.samples is not None
+    samples = frame.samples.clone()
+    samples[0, 1, 2, 3, 4] = value
+    assert model(frame.replace(samples=samples))[0].image.isfinite().all()
+
+
 def test_the_albedo_is_divided_out_of_samples() -> None:
     class Sees(nn.Module):
         needs = Anf(4).needs

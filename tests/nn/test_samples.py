@@ -129,9 +129,9 @@ def test_a_history_is_one_more_sample() -> None:
 
 
 def test_samples_that_are_no_radiance() -> None:
-    samples = torch.tensor([-1.0, 2.0, torch.inf]).reshape(1, 1, 3, 1, 1)
+    samples = torch.tensor([-1.0, 2.0, torch.inf, torch.nan, -torch.inf, 0.5]).reshape(1, 2, 3, 1, 1)
     found = samples_of(Frame(torch.ones(1, 3, 1, 1), samples=samples))
-    assert found.flatten().tolist() == pytest.approx([0, 2, LARGEST_RADIANCE])
+    assert found.flatten().tolist() == pytest.approx([0, 2, LARGEST_RADIANCE, 0, 0, 0.5])
     with pytest.raises(
         InputError, match=r"buffer 'samples': expected \(B, S, C, H, W\) with at least 3 channels, found"
     ):

@@ -1,0 +1,53 @@
+"""What the methods of the paper's comparison have in common."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models import Accumulated, create_model, parts_of
+from mcdenoise.models._published import TenChannels, displayed
+
+WEARERS = ["bmfr", "cascaded", "kp", "kpcn", "layered", "mrkp", "nbgd", "sbmc", "wskp"]
+
+
+@pytest.mark.parametrize("name", WEARERS)
+def test_all_are_given_the_same_accumulation(name: str) -> None:
+    (accumulated,) = parts_of(create_model(name, alpha_min=0.3, normal_limit=0.25), Accumulated)
+    assert (accumulated.rule, accumulated.alpha_min) == ("bmfr", 0.3)
+    assert (accumulated.position_limit, accumulated.normal_limit) == (0.01, 0.25)
+    # The published accumulation looks for no fireflies, mirrors or changes of light.
+    assert accumulated.firefly_limit == accumulated.specular_length == accumulated.lag_threshold == math.inf
+    assert accumulated.also == (("diffuse", "specular") if name == "kpcn" else ())
+
+
+@pytest.mark.parametrize("name", ["kp", "kpcn", "layered", "mrkp", "sbmc"])
+@pytest.mark.parametrize("kernel_size", [0, 4, -3])
+def test_a_kernel_without_a_centre_is_refused(name: str, kernel_size: int) -> None:
+    with pytest.raises(InputError, match=f"^kernel_size: expected odd and at least 1, found {kernel_size}$"):
+        create_model(name, kernel_size=kernel_size)
+
+
+def test_the_ten_channels() -> None:
+    image, albedo = torch.rand(2, 3, 4, 5), torch.rand(2, 3, 4, 5)
+    normal, depth = torch.rand(2, 3, 4, 5) * 2 - 1, torch.full((2, 1, 4, 5), 7.0)
+    depth[:, :, 0] = torch.inf
+    seen = TenChannels().input_of(Frame(image, albedo=albedo, normal=normal, depth=depth), 2 * image)
+    # What is hit is all at the typical depth.
+    near = torch.where(torch.isinf(depth), 1.0, 0.5)
+    torch.testing.assert_close(seen, torch.cat([2 * image, albedo, (normal + 1) / 2, near], 1))
+
+
+def test_what_a_display_shows() -> None:
+    albedo, light = torch.full((1, 3, 1, 2), 0.25), torch.tensor([0.0, 4.0]).expand(1, 3, 1, 2).clone()
+    light.requires_grad_()
+    shown = displayed(Frame(light, albedo=albedo))
+    torch.testing.assert_close(shown[0, 0, 0], torch.tensor([1e-6 ** (1 / 2.2), 1.0]))
+    # Of black the power has no finite slope; of one it is 1 / 2.2.
+    (slope,) = torch.autograd.grad(shown.sum(), light)
+    torch.testing.assert_close(slope[0, 0, 0], torch.tensor([0.0, 0.25 / 2.2]))
+    torch.testing.assert_close(displayed(Frame(light.detach())), light.detach().clamp_min(1e-6) ** (1 / 2.2))
