@@ -48,7 +48,7 @@ def _checks(model: str, dtype: torch.dtype) -> Iterator[Check]:
     # Shots without something that a model cannot do without are no shots for it.
     buffers = denoiser.model.needs.buffers
     for name, frames in _shots(dtype).items():
-        if buffers <= frames[0].buffers:
+        if all(buffers <= frame.buffers for frame in frames):
             yield _valid(denoiser, name, frames, dtype)
     if not buffers <= _frame(0, dtype).buffers:
         return
