@@ -88,6 +88,13 @@ def test_composed_denoiser_is_a_method_of_every_command(small_sequence: Path, tm
     assert json.loads((tmp_path / "out" / "denoise.json").read_text())["model"] == "compose_denoiser.py:method"
 
 
+def test_a_method_composed_of_two_learns(small_sequence: Path) -> None:
+    lines = run("compose_zoo.py", small_sequence, "--steps", "60", "--crop", "16").splitlines()
+    assert [line.split()[0] for line in lines] == ["noisy", "accumulated", "untrained", "trained"]
+    found = [float(re.search(r"SMAPE ([\d.]+)", line)[1]) for line in lines]  # type: ignore[index]
+    assert found[3] < min(found[:3])
+
+
 def test_denoise_sequence_writes_every_frame(small_sequence: Path, weights: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     printed = run("denoise_sequence.py", small_sequence, out, "--weights", weights, "--device", "cpu")
