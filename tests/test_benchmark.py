@@ -485,7 +485,9 @@ def test_some_methods_in_some_precisions() -> None:
     (accumulated,) = (part for part in denoiser.model.modules() if isinstance(part, Accumulated))
     assert accumulated.alpha_min == 0.2
     # What is named twice is there once.
-    assert len(choose_methods("accumulated,cascaded_v2_micro,pretrained", precisions="float32")) == 2 + 4
+    assert len(choose_methods("accumulated,cascaded_v2_micro,pretrained", precisions="float32")) == (
+        2 + len(pretrained_models())
+    )
 
 
 def threaded(*, threads: int = 1) -> Model:

@@ -26,7 +26,7 @@ _THRESHOLD, _SIGMAS, _LARGEST_ERROR = 1 / 3, 3.0, 0.15
 # (measured on 132 shots of Mitsuba and Cycles: 0.82 to 1.14), less where samples count in several (0.41 to 0.80 on 34
 # through Gaussian, Mitchell and tent filters). The difference, in parts of the mean, that a noisy pixel has at least,
 # and that half of the pixels have: edges and textures of references had up to 0.035.
-_SPREAD, _NOISE, _LEAST_NOISY, _TYPICAL_NOISE = 0.78, 0.02, 200, 0.04
+_SPREAD, _NOISE, _LEAST_NOISY, _TYPICAL_NOISE = 0.78, 0.02, 4000, 0.04
 # By how much one reading has to be nearer to the reference than the other.
 _NEARER = 1.5
 _LARGEST_MOTION = 1e5
