@@ -60,9 +60,10 @@ def _overview(name: str, *, pretrained: bool) -> ModelOverview:
     # Imports Triton where it is installed, which takes a fifth of a second.
     from torch.utils.flop_counter import FlopCounterMode
 
-    entry = find_model(name)
-    listed = partial(ModelOverview, name, entry.description, entry.kind, entry.paper)
+    listed = partial(ModelOverview, name, "", "other", "")
     try:
+        entry = find_model(name)
+        listed = partial(ModelOverview, name, entry.description, entry.kind, entry.paper)
         model = build_model(name)
     except InputError as error:
         return listed(reason=str(error))

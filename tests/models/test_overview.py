@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import get_args
 
 import pytest
 
 from mcdenoise.cli.models import models
-from mcdenoise.models import list_models, overview, pretrained_models, register_model
+from mcdenoise.models import _registry, list_models, overview, pretrained_models, register_model
 from mcdenoise.models._registry import Kind
 from mcdenoise.models.oidn_open import archive_of_library
 
@@ -61,3 +62,11 @@ def test_a_model_without_its_package_is_listed_with_the_reason(
 def test_a_kind_that_is_none_is_refused() -> None:
     with pytest.raises(ValueError, match=r"kind: expected one of kernel, pixel, .*, found 'magic'"):
         register_model("mine", kind="magic")  # type: ignore[arg-type]
+
+
+def test_a_package_that_cannot_be_loaded_is_listed_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    point = EntryPoint("theirs", "no_such_package:factory", "mcdenoise.models")
+    monkeypatch.setattr(_registry, "_installed", lambda: {"theirs": point})
+    (entry,) = (entry for entry in overview() if entry.name == "theirs")
+    assert (entry.kind, entry.weights) == ("other", "none")
+    assert "its package offers it and cannot load it" in entry.reason
