@@ -338,8 +338,22 @@ def motion_to_previous(frame: Frame, previous_view_projection: Tensor | None) ->
     return motion_from_position(position, previous_view_projection)
 
 
-def motion_unless_still(frame: Frame, previous_view_projection: Tensor | None, still: bool | Tensor) -> Tensor | None:
-    """Motion as :func:`motion_to_previous` has it, where :func:`is_still` says that something moves; else ``None``."""
+def has_motion(frame: Frame, previous_view_projection: Tensor | None) -> bool:
+    """Whether a frame tells where its pixels were in the frame before, without computing it."""
+    return tells_motion(frame.buffers) and (frame.motion is not None or previous_view_projection is not None)
+
+
+def motion_unless_still(
+    frame: Frame, previous_view_projection: Tensor | None, still: bool | Tensor | None = None
+) -> Tensor | None:
+    """Motion as :func:`motion_to_previous` has it where something moves; else ``None``.
+
+    Args:
+        frame: the current frame.
+        previous_view_projection: see :func:`motion_to_previous`.
+        still: what :func:`is_still` says, if that is known already.
+    """
+    still = is_still(frame, previous_view_projection) if still is None else still
     if isinstance(still, Tensor):
         motion = motion_to_previous(frame, previous_view_projection)
         return None if motion is None else torch.where(still, 0, motion)

@@ -16,7 +16,7 @@ from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.accumulated import is_still, motion_to_previous, motion_unless_still
+from mcdenoise.models.accumulated import has_motion, motion_unless_still
 from mcdenoise.ops import reproject
 
 _GAMMA = 2.2
@@ -78,9 +78,9 @@ class Antialiased(Wrapper):
             return output._replace(image=_unmapped(result), stages=stages), after
 
     def _blended(self, image: Tensor, before: Shown, frame: Frame) -> Tensor:
-        if motion_to_previous(frame, before.view_projection) is None:
+        if not has_motion(frame, before.view_projection):
             return image
-        motion = motion_unless_still(frame, before.view_projection, is_still(frame, before.view_projection))
+        motion = motion_unless_still(frame, before.view_projection)
         previous, weight = reproject(before.image, motion)
         low, high = _range(_to_ycocg(image))
         clamped = torch.minimum(torch.maximum(_to_ycocg(previous), low), high)

@@ -43,12 +43,7 @@ from mcdenoise.models._journal import timed
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.accumulated import (
-    is_still,
-    motion_to_previous,
-    motion_unless_still,
-    surface_before,
-)
+from mcdenoise.models.accumulated import has_motion, motion_unless_still, surface_before
 from mcdenoise.models.antialiased import Antialiased
 from mcdenoise.ops import Surface, block_regression, reproject
 from mcdenoise.ops.regression import BLOCK, RIDGE
@@ -148,9 +143,9 @@ class Bmfr(nn.Module):
 
     def _accumulated(self, frame: Frame, images: Tensor, history: History) -> Tensor:
         """With the result before, at the taps and with the length of the first accumulation."""
-        if motion_to_previous(frame, history.view_projection) is None:
+        if not has_motion(frame, history.view_projection):
             return images
-        motion = motion_unless_still(frame, history.view_projection, is_still(frame, history.view_projection))
+        motion = motion_unless_still(frame, history.view_projection)
         surface = surface_before(frame)._replace(depth=None)
         limits = {"position_limit": self.position_limit, "normal_limit": self.normal_limit}
         before, weight = reproject(history.images, motion, surface, history.surface, rule="bmfr", **limits)

@@ -47,12 +47,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import MOTION, Frame, tells_motion
+from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._journal import journal, timed
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.accumulated import is_still, motion_unless_still
+from mcdenoise.models.accumulated import has_motion, motion_unless_still
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.nn.samples import samples_of
 from mcdenoise.ops import kernel_splat, learned_upsample, pyramid_partition, reproject
@@ -243,13 +243,13 @@ class Nppd(nn.Module):
         reset, motion = "first frame", None
         if before is not None:
             alike = before.radiance.shape == radiance.shape and before.radiance.device == radiance.device
-            known = tells_motion(frame.buffers) and (frame.motion is not None or before.view_projection is not None)
+            known = has_motion(frame, before.view_projection)
             reset = "size change" if not alike else "" if known else "no motion"
         if (found := journal()) is not None:
             found.reset = reset
         if reset or before is None:
             return list(radiance.new_zeros(len(radiance), sum(channels), *frame.size).split(channels, 1))
-        motion = motion_unless_still(frame, before.view_projection, is_still(frame, before.view_projection))
+        motion = motion_unless_still(frame, before.view_projection)
         warped, weight = reproject(torch.cat(before[:3], 1).to(radiance.dtype), motion)
         if found is not None:
             found.history = float(weight.detach().mean())

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mcdenoise.frame import MOTION, Frame, tells_motion
+from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._journal import journal, note, timed
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.accumulated import comparable, is_still, motion_unless_still, surface_before
+from mcdenoise.models.accumulated import comparable, has_motion, motion_unless_still, surface_before
 from mcdenoise.ops import Surface, demodulate, remodulate, reproject
 
 # The image of the frame before at the places of this one, and how much of each of its pixels shows the same surface.
@@ -105,10 +105,10 @@ def from_before(frame: Frame, before: Before | None, channels: int) -> tuple[Ten
     if before.image.shape != nothing[0].shape or before.image.device != frame.color.device:
         _report("size change", 0.0)
         return nothing
-    if not tells_motion(frame.buffers) or (frame.motion is None and before.view_projection is None):
+    if not has_motion(frame, before.view_projection):
         _report("no motion", 0.0)
         return nothing
-    motion = motion_unless_still(frame, before.view_projection, is_still(frame, before.view_projection))
+    motion = motion_unless_still(frame, before.view_projection)
     found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
     weight = weight * before.weight
     _report("", float(weight.detach().mean()) if journal() is not None else 0.0)
