@@ -45,6 +45,7 @@ from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.exposed import Exposed
+from mcdenoise.models.svgf import BRIGHTEST
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.nn.unet import bytes_of
@@ -53,8 +54,6 @@ from mcdenoise.ops import cross_bilateral_filter, demodulate, luminance_moments,
 PUBLISHED: Mapping[str, Any] = {"width": 100, "layers": 9, "kernel_size": 21}
 CHANNELS = 27
 _CONVOLUTION, _WINDOW = 5, 7  # sides, in pixels
-# Brighter light counts as this in the variance: float32 holds the square.
-_BRIGHTEST = 1e18
 
 
 class _Branch(nn.Sequential):
@@ -139,7 +138,7 @@ class KpcnNetwork(nn.Module):
 
 def _seen(image: Tensor, frame: Frame) -> Tensor:
     """What a branch sees, ``(B, 27, H, W)``."""
-    moments = luminance_moments(image.clamp_max(_BRIGHTEST))
+    moments = luminance_moments(image.clamp_max(BRIGHTEST))
     variance = moments_variance(moments, frame.normal, frame.depth, kernel_size=_WINDOW)
     features = torch.cat(unit_features_of(frame), 1)
     varying = torch.cat([moments[:, :1].to(image.dtype), features], 1)

@@ -40,7 +40,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, displayed
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.exposed import Exposed
@@ -101,12 +101,11 @@ class NeuralBilateralGrid(TenChannels):
         with timed("filter", frame.color.device):
             if self.training:
                 guides = [_limited(guide) for guide in guides]
-            light, others = frame.color, carried(frame)
-            light = light if others is None else torch.cat([light, others], 1)
+            light = with_carried(frame)
             smooth = [_smoothed(light, *each) for each in zip(guides, GRIDS, strict=True)]
             weights = [first, second, 1 - first - second]
             image = _sum(weights, [each[:, :3] for each in smooth]).clamp_min(0)
-            if others is None:
+            if light.shape[1] == 3:
                 return Output(image), None
             # Layers and alpha need a mean, of no negative weights.
             weights = [weight.clamp_min(0) for weight in weights]
