@@ -221,18 +221,6 @@ def test_it_learns(small_sequence: Path, tmp_path: Path, monkeypatch: pytest.Mon
     assert reports[-1].loss < 0.8 * reports[0].loss
 
 
-def test_a_gradient_reaches_the_first_of_three_frames() -> None:
-    model, state = small("anf"), None
-    colors = []
-    for seed in range(3):
-        frame = whole_frame(model, 16, 16, seed=seed)
-        colors.append(frame.color.requires_grad_())
-        output, state = model(frame, state)
-    (gradient,) = torch.autograd.grad(output.image.sum(), colors[:1])
-    assert torch.isfinite(gradient).all()
-    assert gradient.any()
-
-
 @pytest.mark.slow
 def test_it_is_one_graph_with_its_state(tmp_path: Path) -> None:
     exported = export_model(small("anf"), tmp_path / "anf.pt2")

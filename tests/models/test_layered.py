@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from toys import frame_of, refused
+from toys import refused, sampled
 
-from mcdenoise.frame import Frame, Hints
-from mcdenoise.models import Demodulated, Exposed, Tiled, create_model, overview, parts_of
+from mcdenoise.frame import Frame
+from mcdenoise.models import create_model, overview
 from mcdenoise.models.layered import LayeredNetwork
 from mcdenoise.nn.samples import samples_input
 
@@ -24,13 +23,6 @@ def drawn(width: int = 4, convolutions: int = 1, kernel_size: int = 3) -> Layere
     for parameter in network.parameters():
         nn.init.normal_(parameter, std=0.4)
     return network
-
-
-def frame(height: int, width: int, samples: int = 3, **buffers: Any) -> Frame:
-    generator = torch.Generator().manual_seed(5)
-    light = 4 * torch.rand(1, samples, 3, height, width, generator=generator).square()
-    given = frame_of(height, width, **({"samples": light} if samples else {}), **buffers)
-    return (given.replace(color=light.mean(1)) if samples else given).to(torch.float64)
 
 
 def chained(x: Tensor, layers: nn.Sequential) -> Tensor:
@@ -83,7 +75,7 @@ def composited(network: LayeredNetwork, given: Frame, samples: Tensor) -> Tensor
 @pytest.mark.parametrize("kernel_size", [1, 5])
 @torch.no_grad()
 def test_the_layers_written_out(kernel_size: int) -> None:
-    network, given = drawn(kernel_size=kernel_size), frame(5, 6)
+    network, given = drawn(kernel_size=kernel_size), sampled(5, 6)
     assert given.samples is not None
     output, state = network(given)
     torch.testing.assert_close(output.image, composited(network, given, given.samples), rtol=1e-9, atol=1e-9)
@@ -92,14 +84,14 @@ def test_the_layers_written_out(kernel_size: int) -> None:
 
 @torch.no_grad()
 def test_without_samples_the_color_is_one() -> None:
-    network, given = drawn(), frame(5, 6, samples=0)
+    network, given = drawn(), sampled(5, 6, samples=0)
     expected = composited(network, given, given.color[:, None])
     torch.testing.assert_close(network(given)[0].image, expected, rtol=1e-9, atol=1e-9)
 
 
 @torch.no_grad()
 def test_a_history_is_one_more_sample() -> None:
-    network, given = drawn(), frame(5, 6).replace(length=torch.full((1, 1, 5, 6), 3.0).double())
+    network, given = drawn(), sampled(5, 6).replace(length=torch.full((1, 1, 5, 6), 3.0).double())
     assert given.samples is not None
     given = given.replace(color=2 * given.color)
     expected = composited(network, given, torch.cat([given.samples, given.color[:, None]], 1))
@@ -109,7 +101,7 @@ def test_a_history_is_one_more_sample() -> None:
 @torch.no_grad()
 def test_a_firefly_in_the_layer_behind_is_not_seen() -> None:
     """Where bright samples are behind and the front is opaque, the image is as without them, up to the least weight."""
-    network, given = drawn(), frame(5, 6)
+    network, given = drawn(), sampled(5, 6)
     assert given.samples is not None
     samples = given.samples.clone()
     samples[:, 0, :, 2, 3] = 1e3
@@ -131,36 +123,6 @@ def test_a_firefly_in_the_layer_behind_is_not_seen() -> None:
     assert samples.mean(1)[..., 1:4, 2:5].mean() > 1e3 / 27
 
 
-@torch.no_grad()
-def test_light_without_noise_comes_back() -> None:
-    """The whole model: albedo and exposure of samples and color are undone, and alphas sum to one."""
-    given = frame(9, 8).to(torch.float32)
-    assert given.albedo is not None
-    light = 2 * given.albedo.clamp_min(0.04)
-    samples = light[:, None].repeat(1, 3, 1, 1, 1)
-    output, _ = create_model("layered", width=4)(given.replace(color=light, samples=samples))
-    torch.testing.assert_close(output.image, light, rtol=1e-4, atol=1e-4)
-
-
-@torch.no_grad()
-def test_tiles_change_nothing() -> None:
-    network, given = drawn(), frame(20, 150)
-    given = given.replace(statistics=network.statistics(given))
-    whole, tiled = network(given)[0].image, Tiled(network, side=32)(given)[0].image
-    torch.testing.assert_close(tiled, whole, rtol=1e-12, atol=1e-12)
-
-
-@torch.no_grad()
-def test_layers_of_light_and_alpha_go_where_the_samples_go() -> None:
-    network, given = drawn(), frame(5, 6, samples=1)
-    layers = {"half": given.color / 2, "rest": given.color / 2}
-    alpha = torch.ones_like(given.color[:, :1])
-    output, _ = network(given.replace(layers=layers, alpha=alpha, hints=Hints(alpha=True)))
-    for layer in output.layers.values():
-        torch.testing.assert_close(layer, output.image / 2)
-    torch.testing.assert_close(output.alpha, alpha)
-
-
 def test_the_default_is_small() -> None:
     """From the sizes of the layers: chains, two U-Nets, and what a pixel without samples costs."""
     (entry,) = (entry for entry in overview() if entry.name == "layered")
@@ -176,11 +138,6 @@ def test_the_default_is_small() -> None:
     assert entry.parameters == sum(a * b + b for a, b in flat) + sum(9 * a * b + b for a, b, _ in unets)
     macs = sum(a * b for a, b in flat) + sum(9 * a * b / 4**level for a, b, level in unets)
     assert entry.kmacs_per_pixel == pytest.approx(macs / 1e3)
-
-
-def test_what_it_wears() -> None:
-    model = create_model("layered")
-    assert [len(list(parts_of(model, kind))) for kind in (Demodulated, Exposed, Tiled)] == [1, 1, 1]
 
 
 @pytest.mark.parametrize(("setting", "value"), [("width", 0), ("convolutions", 0), ("kernel_size", 4)])

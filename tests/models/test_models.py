@@ -240,6 +240,19 @@ def test_a_gradient_goes_through_the_state(name: str) -> None:
 # The register
 
 
+@pytest.mark.parametrize("name", ["anf", "rae"])
+def test_a_gradient_reaches_the_first_of_three_frames(name: str) -> None:
+    model, state = small(name), None
+    colors = []
+    for seed in range(3):
+        frame = whole_frame(model, 16, 16, seed=seed)
+        colors.append(frame.color.requires_grad_())
+        output, state = model(frame, state)
+    (gradient,) = torch.autograd.grad(output.image.sum(), colors[:1])
+    assert torch.isfinite(gradient).all()
+    assert gradient.any()
+
+
 def test_the_register() -> None:
     assert {"cascaded", *FAMILY} <= set(MODELS)
     assert sorted(MODELS) == MODELS

@@ -48,6 +48,14 @@ def frame_of(height: int, width: int, batch: int = 1, seed: int = 0, **buffers: 
     return Frame(color.square() * 4, **(defaults | buffers))
 
 
+def sampled(height: int, width: int, samples: int = 3) -> Frame:
+    """A frame in float64 with so many samples a pixel, whose mean is its color; with 0 it has none."""
+    generator = torch.Generator().manual_seed(5)
+    light = 4 * torch.rand(1, samples, 3, height, width, generator=generator).square()
+    given = frame_of(height, width, **({"samples": light} if samples else {}))
+    return (given.replace(color=light.mean(1)) if samples else given).to(torch.float64)
+
+
 def still(color: Tensor, **buffers: Any) -> Frame:
     """A frame of a scene in which nothing moves."""
     return Frame(color=color, **{"motion": torch.zeros_like(color[:, :2]), **buffers})

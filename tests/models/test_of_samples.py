@@ -1,0 +1,69 @@
+"""What methods of single samples have in common: light without noise, tiles, layers, and what they wear."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import nn
+from toys import sampled
+
+from mcdenoise.frame import Hints
+from mcdenoise.models import Demodulated, Exposed, Tiled, create_model, parts_of
+from mcdenoise.models.layered import LayeredNetwork
+from mcdenoise.models.sbmc import SbmcNetwork
+
+NETWORKS: dict[str, Callable[[], LayeredNetwork | SbmcNetwork]] = {
+    "layered": lambda: LayeredNetwork(4, 1, 3),
+    "sbmc": lambda: SbmcNetwork(4, 2, 1, 3),
+}
+both = pytest.mark.parametrize("name", NETWORKS)
+
+
+def drawn(name: str) -> LayeredNetwork | SbmcNetwork:
+    """With weights in float64 of which every part of the equations is felt."""
+    torch.manual_seed(3)
+    network = NETWORKS[name]().double()
+    for parameter in network.parameters():
+        nn.init.normal_(parameter, std=0.4)
+    return network
+
+
+@both
+@torch.no_grad()
+def test_light_without_noise_comes_back(name: str) -> None:
+    """The whole model: albedo and exposure of samples and color are undone, and alphas sum to one."""
+    given = sampled(9, 8).to(torch.float32)
+    assert given.albedo is not None
+    light = 2 * given.albedo.clamp_min(0.04)
+    samples = light[:, None].repeat(1, 3, 1, 1, 1)
+    output, _ = create_model(name, width=4)(given.replace(color=light, samples=samples))
+    torch.testing.assert_close(output.image, light, rtol=1e-4, atol=1e-4)
+
+
+@both
+@torch.no_grad()
+def test_tiles_change_nothing(name: str) -> None:
+    network, given = drawn(name), sampled(20, 300)
+    given = given.replace(statistics=network.statistics(given))
+    whole, tiled = network(given)[0].image, Tiled(network, side=32)(given)[0].image
+    torch.testing.assert_close(tiled, whole, rtol=1e-12, atol=1e-12)
+
+
+@both
+@torch.no_grad()
+def test_layers_of_light_and_alpha_go_where_the_samples_go(name: str) -> None:
+    network, given = drawn(name), sampled(5, 6, samples=1)
+    layers = {"half": given.color / 2, "rest": given.color / 2}
+    alpha = torch.ones_like(given.color[:, :1])
+    output, _ = network(given.replace(layers=layers, alpha=alpha, hints=Hints(alpha=True)))
+    for layer in output.layers.values():
+        torch.testing.assert_close(layer, output.image / 2)
+    torch.testing.assert_close(output.alpha, alpha)
+
+
+@both
+def test_what_it_wears(name: str) -> None:
+    model = create_model(name)
+    assert [len(list(parts_of(model, kind))) for kind in (Demodulated, Exposed, Tiled)] == [1, 1, 1]
