@@ -1,55 +1,32 @@
-"""Which scenes are trained on when one is held out, and which variants of the network the paper compares."""
+"""What the tables compare, and which scenes are trained on when one is held out.
+
+The methods and the budget that all of them are trained with are in `recipes/zoo.toml` and `recipes/ablations.toml`.
+"""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 Split = Literal["grouped", "paper"]
 
-SCENES = ("classroom", "living-room", "san-miguel", "sponza", "sponza-glossy", "sponza-moving-light")
-
-
-MODEL = "cascaded"
-
-
-@dataclass(frozen=True)
-class Variant:
-    """A network of the paper's tables and how it is trained: all with the accumulation of ``cascaded``.
-
-    Args:
-        settings: of the constructor of ``cascaded``.
-        temporal_loss: whether it is trained with the temporal loss.
-    """
-
-    settings: str
-    temporal_loss: bool = True
-
-    @property
-    def folder(self) -> str:
-        """Where its runs are."""
-        name = self.settings.replace("=", "-").replace(",", "-")
-        return name if self.temporal_loss else f"{name}-without-temporal-loss"
-
-
-# By the names of the paper's Tables 3 and 4: BWA is the bilateral weight adjustment, TL the temporal loss. One network
-# alone is wider, and so about as large as two.
-VARIANTS = {
-    "K": Variant("cascade=K,width=64"),
-    "P": Variant("cascade=P,width=64"),
-    "K+P": Variant("cascade=K+P"),
-    "K+K": Variant("cascade=K+K"),
-    "P+K": Variant("cascade=P+K"),
-    "P+K without BWA": Variant("cascade=P+K,bilateral=false"),
-    "P+K without TL": Variant("cascade=P+K", temporal_loss=False),
-}
+RECIPES = Path(__file__).parents[2] / "recipes"
+# Of Table 1 by their names there, with those of their runs: the paper's rivals, its own, and what else there is.
+RIVALS = {"NBGD": "nbgd", "RAE (for ONND)": "rae", "KP": "kp", "MRKP": "mrkp", "WSKP": "wskp"}
+OWN = {"P+K": "cascaded"}
+OTHERS = {"KPCN": "kpcn", "SBMC": "sbmc", "layered": "layered", "ANF": "anf", "NPPD": "nppd"}
+# Without weights, and so by their own names.
+FILTERS = {"SVGF": "svgf", "A-SVGF": "asvgf", "BMFR": "bmfr", "joint bilateral": "joint_bilateral"}
+# Of Tables 3 and 4: BWA is the bilateral weight adjustment, TL the temporal loss.
+ORDERS = ("K", "P", "K+P", "K+K", "P+K")
+PARTS = {"P+K without BWA": "P+K-without-BWA", "P+K without TL": "P+K-without-TL", "P+K": "P+K"}
 
 
 def geometry(scene: str, scenes: Iterable[str]) -> str:
     """The scene that another one is a version of: ``sponza`` of ``sponza-glossy``, if both are there.
 
     Example:
-        >>> geometry("sponza-glossy", SCENES), geometry("san-miguel", SCENES)
+        >>> scenes = ("san-miguel", "sponza", "sponza-glossy")
+        >>> geometry("sponza-glossy", scenes), geometry("san-miguel", scenes)
         ('sponza', 'san-miguel')
     """
     return min((other for other in scenes if scene == other or scene.startswith(f"{other}-")), key=len)
@@ -62,8 +39,8 @@ def training_scenes(held_out: str, scenes: Iterable[str], split: Split) -> list[
     walls it has seen; ``"grouped"`` holds out every version of the scene.
 
     Example:
-        >>> training_scenes("sponza", SCENES, "grouped")
-        ['classroom', 'living-room', 'san-miguel']
+        >>> training_scenes("sponza", ("san-miguel", "sponza", "sponza-glossy"), "grouped")
+        ['san-miguel']
     """
     scenes = list(scenes)
     if split == "paper":
@@ -72,7 +49,12 @@ def training_scenes(held_out: str, scenes: Iterable[str], split: Split) -> list[
     return [scene for scene in scenes if geometry(scene, scenes) != own]
 
 
-def run_folder(runs: Path, split: Split, variant: Variant, held_out: str, scenes: Iterable[str]) -> Path:
-    """Where the run is whose weights have not seen a scene; versions that are held out together share one."""
+def fold_folder(runs: Path, split: Split, held_out: str, scenes: Iterable[str]) -> Path:
+    """Where the runs are that have not seen a scene; versions that are held out together share one."""
     fold = held_out if split == "paper" else geometry(held_out, scenes)
-    return runs / split / variant.folder / f"without-{fold}"
+    return runs / f"folds-{split}" / f"without-{fold}"
+
+
+def scenes_of(dataset: Path) -> list[str]:
+    """The folders of a dataset, each a scene."""
+    return sorted(path.name for path in dataset.iterdir() if path.is_dir())

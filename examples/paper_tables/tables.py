@@ -1,210 +1,284 @@
 """Print the paper's Tables 1 to 4 for what is there: scenes, trained networks, peers. What is not there says why.
 
-    python examples/paper_tables/tables.py DATASET --runs RUNS
-    python examples/paper_tables/tables.py DATASET --runs RUNS --tables 2 3 --split paper --markdown
+    python examples/paper_tables/tables.py DATASET
+    python examples/paper_tables/tables.py DATASET --runs RUNS --tables 3 4 --markdown
 
-DATASET is a folder with a sequence in the BMFR layout for each scene, RUNS what train_folds.py wrote. Table 1 is PSNR
-and SSIM of each method on each scene, Table 2 milliseconds at 1280x720, Table 3 the order of the networks (K, P, K+P,
-K+K, P+K), Table 4 bilateral weights (BWA) and temporal loss (TL) on and off. PSNR and SSIM are given by two protocols:
-"strict" (sRGB curve, data range 1) and "meng2020", by which the published figures on this dataset seem to have been
-made. Each network is tested on scenes it has not been trained on, and on frames accumulated as those it was trained on;
-"accumulated" is that input of all of them. OIDN gets the noisy frames, and is told that features are clean.
+DATASET is a folder with a sequence in the BMFR layout for each scene.
+
+Table 1 is PSNR and SSIM of each method on each scene; Table 2 milliseconds of networks and filters at 1280x720; Table 3
+the order of the networks (K, P, K+P, K+K, P+K); Table 4 bilateral weights (BWA) and temporal loss (TL) on and off.
+Below each stands which of the paper's claims holds here. PSNR and SSIM are given by two protocols: "strict" (sRGB
+curve, data range 1) and "meng2020", by which the published figures on this dataset seem to have been made.
+
+Networks are those of RUNS, or else, in Table 1, the shipped ones:
+
+    mcdenoise train --recipe recipes/zoo.toml -o RUNS/zoo               Table 1, trained on random scenes
+    mcdenoise train --recipe recipes/ablations.toml -o RUNS/ablations   Tables 3 and 4, likewise, three seeds of each
+    python examples/paper_tables/train_folds.py DATASET -o RUNS         Tables 3 and 4, leaving one scene out
+
+All of a table are trained alike, and get frames accumulated by the same rule with alpha 0.2: "accumulated". OIDN gets
+the noisy frames, and is told that features are clean.
 """
 
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean, median, quantiles
-from typing import get_args
+from typing import Any, get_args
 
 import torch
-from folds import MODEL, SCENES, VARIANTS, Split, run_folder
+from folds import FILTERS, ORDERS, OTHERS, OWN, PARTS, RIVALS, Split, fold_folder, scenes_of
 from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import check_references
 from mcdenoise.metrics import PROTOCOLS
-from mcdenoise.models import Model, Output, create_model, parts_of
+from mcdenoise.models import Output, create_model, describe_weights, parts_of, pretrained_models
 from mcdenoise.models.accumulated import Accumulated
-from mcdenoise.train.config import parse_settings
 
 PROTOCOL_NAMES = ("strict", "meng2020")
-# What the paper compares with and this package has not.
-ABSENT = {
-    "NBGD": "not in the zoo: Meng et al. 2020, neural bilateral grid",
-    "ONND": "not in the zoo: the closed denoiser of OptiX 5.1, which needs an NVIDIA GPU",
-    "KP": "not in the zoo: a kernel-predicting network of Bako et al. 2017",
-    "MRKP": "not in the zoo: its multi-resolution form by Meng et al.",
-    "WSKP": "not in the zoo: Fan et al. 2021, weight sharing",
-}
+SEEDS = (1, 2, 3)
 Errors = dict[str, float]  # by "protocol metric"
 
 
 @dataclass
-class Footnotes:
-    """Reasons for empty cells, each told once."""
+class Table:
+    """Rows of cells, the reasons of empty ones, each told once, and what follows from the numbers."""
 
+    rows: list[list[str]]
     reasons: list[str] = field(default_factory=list)
+    claims: list[str] = field(default_factory=list)
 
-    def empty(self, reason: str) -> str:
-        """An empty cell with the number of its reason."""
-        if reason not in self.reasons:
-            self.reasons.append(reason)
-        return f"- [{self.reasons.index(reason) + 1}]"
+    def cells(self, errors: Errors | str) -> list[str]:
+        """PSNR and SSIM by each protocol, or one empty cell for each."""
+        if isinstance(errors, str):
+            if errors not in self.reasons:
+                self.reasons.append(errors)
+            return [f"- [{self.reasons.index(errors) + 1}]"] * len(PROTOCOL_NAMES)
+        return [f"{errors[f'{name} PSNR']:.2f} / {errors[f'{name} SSIM']:.4f}" for name in PROTOCOL_NAMES]
+
+    def claim(self, text: str, better: Errors | str, worse: Errors | str) -> None:
+        """Say whether one is better than the other in strict PSNR."""
+        if isinstance(better, str) or isinstance(worse, str):
+            return
+        difference = better["strict PSNR"] - worse["strict PSNR"]
+        self.claims.append(f"{text}: {'holds' if difference > 0 else 'does not hold'} ({difference:+.2f} dB)")
 
 
 class Measured:
-    """Errors of methods on scenes, measured when they are asked for, each once."""
+    """Errors of networks on scenes, measured when they are asked for, each once."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
-        self._known: dict[tuple[str, str], Errors | str] = {}
+        self._known: dict[tuple[str, str], dict[str, Errors]] = {}
 
-    def errors(self, method: str, scene: str) -> Errors | str:
+    def errors(self, scene: str, model: str, weights: Path | None = None, *, image: str = "") -> Errors | str:
         """Mean errors over the frames of a scene, or why there are none.
 
         Args:
-            method: a name in VARIANTS, with ", initial" for the result of the first network; ``noisy``,
-                ``accumulated`` or ``OIDN``.
             scene: of the dataset.
+            model: a name of the zoo.
+            weights: of the model; its own by default.
+            image: a stage, in place of the result.
         """
-        if (method, scene) not in self._known:
-            for name, found in self._measure(method.removesuffix(", initial"), scene).items():
-                self._known[name, scene] = found
-        return self._known[method, scene]
+        key = (scene, f"{model} {weights}")
+        try:
+            if key not in self._known:
+                self._known[key] = self._score(scene, self._denoiser(model, weights))
+            return self._known[key].get(image, f"{model} has no stage {image}")
+        except InputError as error:
+            return str(error)
 
-    def average(self, method: str) -> Errors | str:
-        """Mean over the scenes; the reason of the first scene that has none."""
-        found = [self.errors(method, scene) for scene in self.options.scenes]
-        known = [errors for errors in found if not isinstance(errors, str)]
-        if len(known) < len(found):
-            return next(errors for errors in found if isinstance(errors, str))
+    def average(self, found: Iterable[Errors | str]) -> Errors | str:
+        """Mean, or the first reason why there is none."""
+        every = list(found)
+        for each in every:
+            if isinstance(each, str):
+                return each
+        known = [each for each in every if not isinstance(each, str)]
         return {name: mean(errors[name] for errors in known) for name in known[0]}
 
-    def _measure(self, method: str, scene: str) -> dict[str, Errors | str]:
-        try:
-            return dict(self._score(scene, self._denoiser(method, scene), method))
-        except InputError as error:
-            return dict.fromkeys((method, f"{method}, initial"), str(error))
-
-    def _denoiser(self, method: str, scene: str) -> Denoiser:
-        if method == "OIDN":
+    def _denoiser(self, model: str, weights: Path | None) -> Denoiser:
+        if model == "oidn":
             return Denoiser("oidn", quality="high", auxiliary="clean", source="raw")
-        if method not in VARIANTS:
+        if model == "accumulated":
             # Nothing but what all networks are given.
-            return Denoiser(create_model(MODEL, width=4))
-        run = run_folder(self.options.runs, self.options.split, VARIANTS[method], scene, self.options.scenes)
-        weights = run / f"{MODEL}.safetensors"
-        if not weights.exists():
-            raise InputError(f"not trained: no {weights.relative_to(self.options.runs)}; run train_folds.py")
-        return Denoiser(MODEL, weights=weights)
+            return Denoiser(create_model("cascaded", width=4))
+        if weights is None or weights.exists():
+            return Denoiser(model, weights=weights)
+        raise InputError(f"not trained: no {weights.relative_to(self.options.runs)}")
 
-    def _score(self, scene: str, denoiser: Denoiser, method: str) -> Iterable[tuple[str, Errors]]:
+    def _score(self, scene: str, denoiser: Denoiser) -> dict[str, Errors]:
         folder = self.options.dataset / scene
         if not folder.is_dir():
             raise InputError(f"no such scene in DATASET: {scene}")
         sequence = open_sequence(folder, self.options.frames)
         check_references(sequence)
-        values: dict[str, dict[str, list[float]]] = {}
+        values: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
         for number in sequence.numbers:
             frame = sequence.frame(number)
-            images = pick(denoiser.output(frame), method)
+            output = denoiser.output(frame)
             if frame.reference is None:
                 continue
-            for name, image in images.items():
+            for name, image in images_of(output).items():
                 for protocol in PROTOCOL_NAMES:
                     for metric in ("PSNR", "SSIM"):
                         value = PROTOCOLS[protocol].metrics[metric].function(image, frame.reference)
-                        values.setdefault(name, {}).setdefault(f"{protocol} {metric}", []).append(float(value))
-        return ((name, {key: mean(own) for key, own in found.items()}) for name, found in values.items())
+                        values[name][f"{protocol} {metric}"].append(float(value))
+        return {name: {key: mean(own) for key, own in found.items()} for name, found in values.items()}
 
 
-def pick(output: Output, method: str) -> dict[str, Tensor]:
-    """The images that count, by name: the result, or what a network was given; and that of the first network."""
-    stages = output.stages
-    images = {method: stages[method] if method in ("noisy", "accumulated") else output.image}
-    return images | ({f"{method}, initial": stages["initial"]} if "initial" in stages and method in VARIANTS else {})
+def images_of(output: Output) -> dict[str, Tensor]:
+    """The result, under the empty name, and the stages that tables show."""
+    shown = {name: output.stages[name] for name in ("noisy", "accumulated", "initial") if name in output.stages}
+    return {"": output.image, **shown}
 
 
-def cell(errors: Errors | str, notes: Footnotes) -> list[str]:
-    """PSNR and SSIM by each protocol, or one empty cell for each."""
-    if isinstance(errors, str):
-        return [notes.empty(errors)] * len(PROTOCOL_NAMES)
-    return [f"{errors[f'{name} PSNR']:.2f} / {errors[f'{name} SSIM']:.4f}" for name in PROTOCOL_NAMES]
+def weights_of(run: Path, model: str) -> Path:
+    """The weights of a run."""
+    return run / f"{model}.safetensors"
 
 
-def table_1(measured: Measured, notes: Footnotes) -> list[list[str]]:
-    methods = ["noisy", "accumulated", *ABSENT, "OIDN", "P+K, initial", "P+K"]
-    rows = [["method", "protocol", *measured.options.scenes, "average"]]
-    for method in methods:
-        if method in ABSENT:
-            cells = [cell(ABSENT[method], notes)] * (len(measured.options.scenes) + 1)
-        else:
-            cells = [cell(measured.errors(method, scene), notes) for scene in measured.options.scenes]
-            cells.append(cell(measured.average(method), notes))
-        for i, protocol in enumerate(PROTOCOL_NAMES):
-            rows.append([method, protocol, *(own[i] for own in cells)])
-    return rows
+def table_1(measured: Measured) -> Table:
+    options = measured.options
+    found = Table([["method", "protocol", *options.scenes, "average"]])
+
+    def of(model: str, image: str = "") -> list[Errors | str]:
+        weights = None
+        if model in (*RIVALS.values(), *OWN.values(), *OTHERS.values()):
+            own = weights_of(options.runs / "zoo" / model, model)
+            weights = own if own.exists() or model not in pretrained_models() else None
+        return [measured.errors(scene, model, weights, image=image) for scene in options.scenes]
+
+    every = {"noisy": of("accumulated", "noisy"), "accumulated": of("accumulated", "accumulated")}
+    every |= {name: of(model) for name, model in RIVALS.items()}
+    every |= {"P+K, initial": of("cascaded", "initial"), "P+K": of("cascaded")}
+    every |= {name: of(model) for name, model in {**OTHERS, **FILTERS, "OIDN": "oidn"}.items()}
+    averages = {name: measured.average(errors) for name, errors in every.items()}
+    for name, errors in every.items():
+        cells = [found.cells(each) for each in [*errors, averages[name]]]
+        found.rows += [[name, protocol, *(own[i] for own in cells)] for i, protocol in enumerate(PROTOCOL_NAMES)]
+    for name in RIVALS:
+        found.claim(f"P+K is ahead of {name} in the mean", averages["P+K"], averages[name])
+    found.claim("the final image is ahead of the initial one in the mean", averages["P+K"], averages["P+K, initial"])
+    for scene, final, initial in zip(options.scenes, every["P+K"], every["P+K, initial"], strict=True):
+        found.claim(f"the final image is ahead of the initial one in {scene}", final, initial)
+    return found
 
 
-def table_2(measured: Measured, notes: Footnotes) -> list[list[str]]:
-    """The networks alone, on noise: the time does not depend on what is seen, nor on the weights."""
+def table_2(measured: Measured) -> Table:
+    """What is behind the accumulation, on noise: the time does not depend on what is seen, nor on the weights."""
     rounds, size = measured.options.rounds, (720, 1280)
     torch.manual_seed(0)
     channels = {"color": 3, "albedo": 3, "normal": 3, "depth": 1}
     frame = Frame(**{name: torch.rand(1, count, *size) for name, count in channels.items()})
-    models: dict[str, Model] = {}
-    for name in ("K", "P", "K+P", "K+K", "P+K"):
-        model = create_model(MODEL, **parse_settings("settings", VARIANTS[name].settings))
-        models[name] = next(parts_of(model, Accumulated)).inner
-        models[name].to(memory_format=torch.channels_last)
-    absent = dict(ABSENT)
-    try:
-        models["OIDN"] = create_model(
-            "oidn", quality="high", auxiliary="clean", source="raw", threads=torch.get_num_threads()
+    found = Table([["method", "milliseconds at 1280x720", "quartiles", "convolutions", "all else"]])
+    models: dict[str, Any] = {}
+    for name, (model, settings) in _timed().items():
+        try:
+            made: Any = create_model(model, **settings)
+        except InputError as error:
+            found.reasons.append(f"{name}: {error}")
+            continue
+        models[name] = next((part.inner for part in parts_of(made, Accumulated)), made)
+        if isinstance(made, torch.nn.Module):
+            made.eval().to(memory_format=torch.channels_last)
+    times: dict[str, list[float]] = {name: [] for name in models}
+    with torch.inference_mode():
+        for _ in range(rounds + 1):
+            for name, model in models.items():
+                start = time.perf_counter()
+                model(frame)
+                times[name].append((time.perf_counter() - start) * 1e3)
+        for name, model in models.items():
+            lower, _, upper = quantiles(times[name][1:], n=4)
+            middle = median(times[name][1:])
+            part = _convolutions(model, frame)
+            parts = ["-", "-"] if name == "OIDN" else [f"{part * middle:.0f}", f"{(1 - part) * middle:.0f}"]
+            found.rows.append([name, f"{middle:.0f}", f"{lower:.0f} .. {upper:.0f}", *parts])
+    return found
+
+
+def _timed() -> dict[str, tuple[str, dict[str, Any]]]:
+    zoo: dict[str, tuple[str, dict[str, Any]]] = {
+        name: (model, {}) for name, model in {**RIVALS, **OTHERS, **FILTERS}.items() if name != "BMFR"
+    }
+    orders = {name: ("cascaded", {"cascade": name, "width": 40 if "+" in name else 64}) for name in ORDERS}
+    quiet = {"quality": "high", "auxiliary": "clean", "source": "raw", "threads": torch.get_num_threads()}
+    return {**orders, **zoo, "OIDN": ("oidn", quiet)}
+
+
+def _convolutions(model: Any, frame: Frame) -> float:
+    """The fraction of the time of one frame that convolutions take."""
+    with profile(activities=[ProfilerActivity.CPU]) as seen:
+        model(frame)
+    events = seen.key_averages()
+    whole = sum(event.self_cpu_time_total for event in events)
+    return sum(event.self_cpu_time_total for event in events if "convolution" in event.key) / whole if whole else 0.0
+
+
+def ablation(measured: Measured, variants: dict[str, str]) -> tuple[Table, dict[str, Errors | str]]:
+    """Rows of variants: trained on random scenes with three seeds, and leaving one scene out."""
+    options = measured.options
+    columns = [f"{kind}, {name} PSNR / SSIM" for kind in ("random scenes", "one left out") for name in PROTOCOL_NAMES]
+    found = Table([["network", "parameters", columns[0], "seeds, PSNR", *columns[1:]]])
+    averages: dict[str, Errors | str] = {}
+    for name, run in variants.items():
+        seeds = [list(_seed(measured, options.runs / "ablations" / f"{run}-{seed}")) for seed in SEEDS]
+        folds = [
+            measured.errors(scene, "cascaded", weights_of(fold / f"{run}-{SEEDS[0]}", "cascaded"))
+            for scene in options.held_out
+            for fold in [fold_folder(options.runs, options.split, scene, options.scenes)]
+        ]
+        means = [measured.average(own) for own in seeds]
+        averages[name] = measured.average(means)
+        each = sorted(own["strict PSNR"] for own in means if not isinstance(own, str))
+        spread = f"{each[0]:.2f} .. {each[-1]:.2f}" if len(each) == len(SEEDS) else "-"
+        strict, meng = found.cells(averages[name])
+        found.rows.append(
+            [name, _parameters(options.runs, run), strict, spread, meng, *found.cells(measured.average(folds))]
         )
-    except InputError as error:
-        absent["OIDN"] = str(error)
-    calls: dict[str, Callable[[], object]] = {name: lambda model=model: model(frame) for name, model in models.items()}
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(rounds + 1):
-        for name, call in calls.items():
-            start = time.perf_counter()
-            with torch.no_grad():
-                call()
-            times[name].append((time.perf_counter() - start) * 1e3)
-    rows = [["method", "milliseconds at 1280x720", "quartiles"]]
-    for name, own in times.items():
-        lower, _, upper = quantiles(own[1:], n=4)
-        rows.append([name, f"{median(own[1:]):.1f}", f"{lower:.1f} .. {upper:.1f}"])
-    return rows + [[name, notes.empty(reason), ""] for name, reason in absent.items()]
+    return found, averages
 
 
-def ablation(measured: Measured, notes: Footnotes, names: Iterable[str]) -> list[list[str]]:
-    rows = [["network", "parameters", *(f"{name} PSNR / SSIM" for name in PROTOCOL_NAMES)]]
-    for name in names:
-        model = create_model(MODEL, **parse_settings("settings", VARIANTS[name].settings))
-        parameters = sum(own.numel() for own in model.parameters())
-        rows.append([name, f"{parameters:,}", *cell(measured.average(name), notes)])
-    return rows
+def _seed(measured: Measured, run: Path) -> Iterator[Errors | str]:
+    for scene in measured.options.scenes:
+        yield measured.errors(scene, "cascaded", weights_of(run, "cascaded"))
 
 
-def table_3(measured: Measured, notes: Footnotes) -> list[list[str]]:
-    return ablation(measured, notes, ("K", "P", "K+P", "K+K", "P+K"))
+def _parameters(runs: Path, run: str) -> str:
+    weights = weights_of(runs / "ablations" / f"{run}-{SEEDS[0]}", "cascaded")
+    if not weights.exists():
+        return "-"
+    model: Any = create_model("cascaded", **describe_weights(weights)["settings"])
+    return f"{sum(own.numel() for own in model.parameters()):,}"
 
 
-def table_4(measured: Measured, notes: Footnotes) -> list[list[str]]:
-    return ablation(measured, notes, ("P+K without BWA", "P+K without TL", "P+K"))
+def table_3(measured: Measured) -> Table:
+    found, averages = ablation(measured, {name: name for name in ORDERS})
+    for name in ORDERS[:-1]:
+        found.claim(f"P+K is ahead of {name}", averages["P+K"], averages[name])
+    found.claim("P is ahead of K", averages["P"], averages["K"])
+    return found
 
 
-TABLES = {
+def table_4(measured: Measured) -> Table:
+    found, averages = ablation(measured, PARTS)
+    found.claim("bilateral weights help", averages["P+K"], averages["P+K without BWA"])
+    found.claim("the temporal loss helps", averages["P+K"], averages["P+K without TL"])
+    return found
+
+
+TABLES: dict[int, tuple[str, Callable[[Measured], Table]]] = {
     1: ("PSNR / SSIM of each method on each scene", table_1),
-    2: ("Time of the networks alone", table_2),
+    2: ("Time of networks and filters, without accumulation", table_2),
     3: ("Order of the networks, mean over the scenes", table_3),
     4: ("Bilateral weights and temporal loss, mean over the scenes", table_4),
 }
@@ -221,10 +295,11 @@ def show(rows: list[list[str]], markdown: bool) -> str:
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the scenes' folders")
-    parser.add_argument("--runs", type=Path, required=True, metavar="RUNS", help="what train_folds.py wrote")
+    parser.add_argument("--runs", type=Path, default=Path("runs"), metavar="RUNS", help="what was trained")
     parser.add_argument("--tables", type=int, nargs="+", choices=TABLES, default=list(TABLES))
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), metavar="NAME", help="of the dataset; its six")
-    parser.add_argument("--split", choices=get_args(Split), default="grouped", help="what is held out, see folds.py")
+    parser.add_argument("--scenes", nargs="+", metavar="NAME", help="of the dataset; all by default")
+    parser.add_argument("--held-out", nargs="+", metavar="NAME", help="scenes with a fold; all by default")
+    parser.add_argument("--split", choices=get_args(Split), default="grouped", help="of the folds, see folds.py")
     parser.add_argument("--frames", metavar="NUMBERS", help="which frames to use, such as 0-15; all by default")
     parser.add_argument("--rounds", type=int, default=5, help="of Table 2")
     parser.add_argument("--threads", type=int, metavar="N", help="of the networks and of OIDN")
@@ -240,17 +315,20 @@ def main() -> None:
             raise InputError(f"--{name}: expected at least {lowest}, found {value}")
     if not options.dataset.is_dir():
         raise InputError(f"{options.dataset}: expected a folder of scenes, found none")
+    options.scenes = options.scenes or scenes_of(options.dataset)
+    options.held_out = options.held_out or options.scenes
     if options.threads:
         torch.set_num_threads(options.threads)
     measured = Measured(options)
     for number in options.tables:
         title, make = TABLES[number]
-        notes = Footnotes()
-        rows = make(measured, notes)
-        print(f"Table {number}. {title}; split: {options.split}.\n\n{show(rows, options.markdown)}\n")
-        for i, reason in enumerate(notes.reasons, 1):
+        found = make(measured)
+        print(f"Table {number}. {title}.\n\n{show(found.rows, options.markdown)}\n")
+        for i, reason in enumerate(found.reasons, 1):
             print(f"[{i}] {reason}")
-        print()
+        for claim in found.claims:
+            print(f"- {claim}")
+        print(flush=True)
 
 
 if __name__ == "__main__":

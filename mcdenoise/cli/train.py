@@ -18,7 +18,7 @@ from mcdenoise.cli._options import Out
 from mcdenoise.cli._output import warn
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
-from mcdenoise.train import Progress, Recipe, Rendering, RunFolder, TrainConfig, is_first_process
+from mcdenoise.train import Progress, Recipe, Rendering, Run, RunFolder, TrainConfig, is_first_process
 from mcdenoise.train import train as run
 
 
@@ -27,6 +27,7 @@ def train(
     out: Out,
     config: tyro.conf.OmitArgPrefixes[TrainConfig],
     recipe: Path | None = None,
+    runs: list[str] = [],  # noqa: B006 - tyro reads it
     data: Path | None = None,
     validation: list[Path] = [],  # noqa: B006 - tyro reads it
     cache: Path | None = None,
@@ -42,6 +43,8 @@ def train(
         out: folder of the run: checkpoint, log, TensorBoard events, and at the end the weights.
         config: what to train.
         recipe: TOML file that says all this, and how the sequences are generated, which are rendered first.
+        runs: of a recipe of several, the names of those to train; each has a folder of its name in the output. All by
+            default.
         data: folder of what a recipe renders, which several may share; OUT/data by default.
         validation: folders of sequences that are used for nothing but validation.
         cache: folder of the decoded sequences, which several runs may share; OUT/cache by default.
@@ -51,7 +54,7 @@ def train(
         credits: authors and licences of the training scenes, stored with the weights.
     """
     keep_heap()
-    console, followed = Console(stderr=True), None
+    console, todo = Console(stderr=True), [Run("", config, None, "")]
     if recipe is not None:
         changed = [each.name for each in dataclasses.fields(config) if getattr(config, each.name) != each.default]
         others: dict[str, object] = {"SEQUENCES": sequences, "--validation": validation, "--credits": credits}
@@ -60,35 +63,41 @@ def train(
         for name in [*given, *(f"--{name.replace('_', '-')}" for name in changed)]:
             raise InputError(f"{name}: expected none beside --recipe, which says what is trained, found one")
         followed = Recipe.read(recipe, options_of("generate"))
-        config, credits = followed.config, followed.credits
+        todo, credits = followed.chosen(runs), followed.credits
         # Before anything is rendered for a run that the folder is not of.
-        RunFolder(out).check(config=dataclasses.asdict(config))
+        for each in todo:
+            RunFolder(out / each.name).check(config=dataclasses.asdict(each.config))
         sequences, validation = _make_data(followed, data or out / "data")
-    elif data is not None:
-        raise InputError("--data: expected a --recipe that says what is rendered to it, found none")
+    else:
+        for name, value in {"--data": data, "--runs": runs}.items():
+            if value:
+                raise InputError(f"{name}: expected a --recipe that says what it is, found none")
 
     def report(progress: Progress) -> None:
         scores = "".join(f"  validation {name} {value:.4f}" for name, value in progress.validation.items())
         line = f"step {progress.step}  loss {progress.loss:.4f}  {progress.seconds:.0f} s{scores}"
         console.print(line, soft_wrap=True)
 
-    weights = run(
-        config,
-        sequences,
-        out,
-        validation=validation,
-        cache=cache,
-        initial_weights=initial_weights,
-        accelerator=accelerator,
-        checkpoint_every=checkpoint_every,
-        credits=credits,
-        recipe=followed.sha256 if followed else "",
-        report=report,
-    )
-    if is_first_process():
-        if followed:
-            _print_errors(RunFolder(out).errors(), followed.expected)
-        print(weights)
+    for one in todo:
+        if one.name:
+            console.print(f"{one.name}:", soft_wrap=True)
+        weights = run(
+            one.config,
+            sequences,
+            out / one.name,
+            validation=validation,
+            cache=cache or out / "cache",
+            initial_weights=initial_weights,
+            accelerator=accelerator,
+            checkpoint_every=checkpoint_every,
+            credits=credits,
+            recipe=one.sha256,
+            report=report,
+        )
+        if is_first_process():
+            if recipe is not None:
+                _print_errors(RunFolder(out / one.name).errors(), one.expected)
+            print(weights)
 
 
 def options_of(command: str) -> set[str]:

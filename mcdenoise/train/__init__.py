@@ -3,7 +3,7 @@
 from mcdenoise.train.config import Schedule, TrainConfig
 from mcdenoise.train.devices import is_first_process
 from mcdenoise.train.loop import Progress, train
-from mcdenoise.train.recipe import Recipe, Rendering
+from mcdenoise.train.recipe import Recipe, Rendering, Run
 from mcdenoise.train.references import clean_references
 from mcdenoise.train.run_folder import RunFolder
 from mcdenoise.train.unroll import unroll
@@ -12,6 +12,7 @@ __all__ = [
     "Progress",
     "Recipe",
     "Rendering",
+    "Run",
     "RunFolder",
     "Schedule",
     "TrainConfig",

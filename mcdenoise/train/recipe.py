@@ -6,14 +6,21 @@
     [[data]]            # options of `mcdenoise generate`; clean_references = true if they are to be cleaned
     [[validation]]      # likewise
     [expected]          # smape and tolerance: the error on the validation frames, and how far above it a run may end
+
+A recipe of several runs on the same data has a table for each of them besides::
+
+    [[run]]             # name; fields of TrainConfig that are others than in [train]; expected = {smape=..., tolerance=...}
+                        # seeds = [1, 2] makes two runs of it, NAME-1 and NAME-2
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 import tomllib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -25,8 +32,11 @@ from mcdenoise.train.cache import locked
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.references import clean_references
 
-_TABLES = ("train", "data", "validation", "expected")
+_TABLES = ("train", "data", "validation", "expected", "run")
+_BOUND = {"smape": float, "tolerance": float}
 _CLEAN = "clean_references"
+# Of a run: it is a folder's, too.
+_NAME = re.compile(r"[A-Za-z0-9+_-]{1,64}")
 _NO_PIXELS = ("workers", "threads", "blender_python")
 
 
@@ -85,24 +95,37 @@ class Rendering:
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """What a recipe says.
+class Run:
+    """One training run of a recipe.
 
     Args:
+        name: of its folder; empty for the only run of a recipe, whose folder is that of the recipe.
         config: what is trained.
-        data: what it is trained on.
-        validation: what is used for nothing but validation.
-        credits: authors and licences of the training scenes.
         expected: SMAPE at the end, and how far above it a run may end; ``None`` if the recipe does not say.
         sha256: of all that decides what is computed.
     """
 
+    name: str
     config: TrainConfig
+    expected: tuple[float, float] | None
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a recipe says.
+
+    Args:
+        runs: what is trained, at least one run.
+        data: what each is trained on.
+        validation: what is used for nothing but validation.
+        credits: authors and licences of the training scenes.
+    """
+
+    runs: list[Run]
     data: list[Rendering]
     validation: list[Rendering]
     credits: str
-    expected: tuple[float, float] | None
-    sha256: str
 
     @staticmethod
     def read(path: Path, options: Collection[str]) -> Recipe:
@@ -116,28 +139,81 @@ class Recipe:
             InputError: it cannot be read, a key is unknown, or a value is none that can be trained with.
         """
         content = _parse(path)
-        kinds = {field.name: type(field.default) for field in fields(TrainConfig)} | {"credits": str}
-        settings = _checked(f"{path}: [train]", content.get("train", {}), kinds)
-        credits = settings.pop("credits", "")
+        kinds = {field.name: type(field.default) for field in fields(TrainConfig)}
+        common = _checked(f"{path}: [train]", content.get("train", {}), {**kinds, "credits": str})
         made = {name: _renderings(path, name, content.get(name, []), options) for name in ("data", "validation")}
-        bound = {"smape": float, "tolerance": float}
-        expected = _checked(f"{path}: [expected]", content.get("expected", {}), bound)
-        if expected and expected.keys() != bound.keys():
-            raise InputError(f"{path}: [expected]: expected smape and tolerance, found {', '.join(expected)} alone")
         if not made["data"]:
             raise InputError(f"{path}: expected at least one table [[data]] to render and train on, found none")
-        config = TrainConfig(**settings)
-        try:
-            # What would fail after hours of rendering.
-            check_config(config, 1)
-            create_model(config.model, **config.model_settings)
-            if any(rendering.clean for each in made.values() for rendering in each):
+        rendered = [[(r.sha256, r.clean) for r in each] for each in made.values()]
+        runs = []
+        for where, own in _run_tables(path, content, kinds):
+            name, expected = own.pop("name", ""), _expected(where, own.pop("expected", {}))
+            settings = common | own
+            sha256 = _digest([settings or None, *rendered])
+            config = TrainConfig(**{key: value for key, value in settings.items() if key != "credits"})
+            with _at(where):
+                # What would fail after hours of rendering.
+                check_config(config, 1)
+                create_model(config.model, **config.model_settings)
+            runs.append(Run(name, config, expected, sha256))
+        if any(rendering.clean for each in made.values() for rendering in each):
+            with _at(str(path)):
                 create_model("oidn")
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
-        computed = [content.get("train"), *([(r.sha256, r.clean) for r in each] for each in made.values())]
-        bounds = (float(expected["smape"]), float(expected["tolerance"])) if expected else None
-        return Recipe(config, made["data"], made["validation"], credits, bounds, _digest(computed))
+        return Recipe(runs, made["data"], made["validation"], common.get("credits", ""))
+
+    def chosen(self, names: Collection[str]) -> list[Run]:
+        """The runs of some names, in the order of the recipe; all where none is named.
+
+        Raises:
+            InputError: the recipe has no run of a name.
+        """
+        known = [run.name for run in self.runs]
+        for name in names:
+            if name not in known:
+                found = ", ".join(filter(None, known)) or "a single run without a name"
+                raise InputError(f"--runs: expected names of the recipe's runs ({found}), found '{name}'")
+        return [run for run in self.runs if not names or run.name in names]
+
+
+def _run_tables(path: Path, content: dict[str, Any], kinds: Mapping[str, type]) -> list[tuple[str, dict[str, Any]]]:
+    """Where each run of a recipe is described, and how it differs from the others."""
+    tables = content.get("run", [])
+    if not isinstance(tables, list):
+        raise InputError(f"{path}: expected tables [[run]], found [run]")
+    if not tables:
+        return [(str(path), {"expected": content.get("expected", {})})]
+    if "expected" in content:
+        raise InputError(f"{path}: expected what is expected in each [[run]], found [expected]")
+    found: list[tuple[str, dict[str, Any]]] = []
+    for number, table in enumerate(tables, start=1):
+        where = f"{path}: [[run]] {number}"
+        own = _checked(where, table, {**kinds, "name": str, "expected": dict, "seeds": list})
+        name, seeds = own.get("name", ""), own.pop("seeds", None)
+        if seeds is not None and not (seeds and all(type(seed) is int for seed in seeds)):
+            raise InputError(f"{where}: seeds: expected a list of whole numbers, found {seeds}")
+        every = [own] if seeds is None else [{**own, "name": f"{name}-{seed}", "seed": seed} for seed in seeds]
+        for each in every:
+            if not _NAME.fullmatch(name) or each["name"] in (other["name"] for _, other in found):
+                raise InputError(
+                    f"{where}: name: expected letters, digits, '+', '-' and '_', each name once, found '{each['name']}'"
+                )
+            found.append((where, each))
+    return found
+
+
+def _expected(where: str, table: Any) -> tuple[float, float] | None:
+    expected = _checked(f"{where}: [expected]", table, _BOUND)
+    if expected and expected.keys() != _BOUND.keys():
+        raise InputError(f"{where}: [expected]: expected smape and tolerance, found {', '.join(expected)} alone")
+    return (float(expected["smape"]), float(expected["tolerance"])) if expected else None
+
+
+@contextmanager
+def _at(where: str) -> Iterator[None]:
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def _parse(path: Path) -> dict[str, Any]:

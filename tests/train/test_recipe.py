@@ -137,7 +137,7 @@ def test_the_recipes_can_be_read(recipe: Path) -> None:
     assert found.data
     assert found.validation
     # Of what is shipped it is known.
-    assert found.expected is not None or found.config.model not in pretrained_models()
+    assert all(run.expected is not None or run.config.model not in pretrained_models() for run in found.runs)
 
 
 def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
@@ -147,14 +147,15 @@ def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
     path.write_text(block)
     found = Recipe.read(path, options_of("generate"))
     assert [rendering.clean for rendering in (*found.data, *found.validation)] == [True, False, False]
-    assert (found.config.steps, found.expected, found.credits) == (5000, (0.093, 0.005), "random*: CC0")
+    (one,) = found.runs
+    assert (one.name, one.config.steps, one.expected, found.credits) == ("", 5000, (0.093, 0.005), "random*: CC0")
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ("[train]", "[train", "expected a recipe in TOML, found: "),
-        ("[train]", "[training]", "unknown key 'training'; known are data, expected, train, validation"),
+        ("[train]", "[training]", "unknown key 'training'; known are data, expected, run, train, validation"),
         ("[train]", "[train]\nseeds = 1", "[train]: unknown key 'seeds'; known are batch, credits, crop, "),
         ("steps = 12", 'steps = "12"', "[train]: steps: expected a value of type int, found '12'"),
         ("steps = 12", "steps = true", "[train]: steps: expected a value of type int, found True"),
@@ -172,6 +173,15 @@ def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
         ('size = "48x48"\nrealisations = 2', "size = 48", "[[data]] 1: --size: expected WIDTHxHEIGHT"),
         ("tolerance = 0.01", "", "[expected]: expected smape and tolerance, found smape alone"),
         ("tolerance = 0.01", "psnr = 30", "[expected]: unknown key 'psnr'; known are smape, tolerance"),
+        ("[expected]", "[run]\n[expected]", "expected tables [[run]], found [run]"),
+        ("[expected]", "[[run]]\nname = 'a'\n[expected]", "expected what is expected in each [[run]], found [expected]"),
+        ("[expected]", "[[run]]\nsteps = 'many'\n[run.expected]", "[[run]] 1: steps: expected a value of type int"),
+        ("[expected]", "[[run]]\n[run.expected]", "[[run]] 1: name: expected letters, digits"),
+        ("[expected]", "[[run]]\nname = 'a/b'\n[run.expected]", "[[run]] 1: name: expected letters, digits"),
+        ("[expected]", "[[run]]\nname = 'a'\n[[run]]\nname = 'a'\n[run.expected]", "each name once, found 'a'"),
+        ("[expected]", "[[run]]\nname = 'a'\nseeds = [1, 1]\n[run.expected]", "each name once, found 'a-1'"),
+        ("[expected]", "[[run]]\nname = 'a'\nseeds = []\n[run.expected]", "seeds: expected a list of whole numbers"),
+        ("[expected]", "[[run]]\nname = 'a'\nsteps = 0\n[run.expected]", "[[run]] 1: steps: expected at least 1"),
     ],
 )
 def test_bad_recipes(tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, message: str) -> None:
@@ -183,6 +193,52 @@ def test_bad_recipes(tmp_path: Path, capsys: pytest.CaptureFixture[str], old: st
     assert message in said
     assert said.count("\n") == 1
     assert not list(tmp_path.rglob("*.exr"))
+
+
+def test_runs_on_the_same_data(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = renderings(trained / "data")
+    bound = "{ smape = 0.2, tolerance = 0.1 }"
+    runs = f"""
+[[run]]
+name = "as-it-was"
+
+[[run]]
+name = "K"
+model = "cascaded"
+width = 4
+settings = "cascade=K"
+steps = 1
+seeds = [4, 5]
+expected = {bound}
+
+[[run]]
+name = "other-loss"
+loss = "l1_display"
+steps = 2
+"""
+    recipe = tmp_path / "runs.toml"
+    recipe.write_text(TINY.read_text().partition("[expected]")[0] + runs)
+    out = tmp_path / "out"
+    assert follow(recipe, out, "--data", trained / "data", "--runs", "K-5", "other-loss") == 0
+    assert sorted(path.name for path in out.iterdir()) == ["K-5", "cache", "other-loss"]
+    assert renderings(trained / "data") == before
+    config = json.loads((out / "other-loss" / "config.json").read_text())
+    assert (config["loss"], config["steps"], config["width"]) == ("l1_display", 2, 8)
+    about = describe_weights(out / "K-5" / "cascaded.safetensors")
+    assert (about["settings"]["cascade"], json.loads((out / "K-5" / "config.json").read_text())["seed"]) == ("K", 5)
+    said = capsys.readouterr().out
+    # What is expected is said of the run that says it.
+    assert said.count("expected a smape of at most") == said.count("0.2 + 0.1") == 1
+    # What a run does not say for itself is what all have in common: it is the recipe of one run.
+    assert follow(recipe, out, "--data", trained / "data", "--runs", "as-it-was") == 0
+    assert describe_weights(out / "as-it-was" / WEIGHTS)["sha256"] == describe_weights(trained / WEIGHTS)["sha256"]
+    assert describe_weights(out / "as-it-was" / WEIGHTS)["recipe"] == describe_weights(trained / WEIGHTS)["recipe"]
+    capsys.readouterr()
+    assert follow(recipe, out, "--runs", "P") == 2
+    expected = "--runs: expected names of the recipe's runs (as-it-was, K-4, K-5, other-loss), found 'P'"
+    assert expected in capsys.readouterr().err
+    assert follow(TINY, tmp_path / "run", "--runs", "K") == 2
+    assert "(a single run without a name), found 'K'" in capsys.readouterr().err
 
 
 def test_a_recipe_without_data(tmp_path: Path) -> None:
@@ -205,10 +261,11 @@ def test_nothing_beside_a_recipe_says_what_is_trained(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_place_of_data_needs_a_recipe(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("option", ["--data", "--runs"])
+def test_what_is_of_a_recipe_needs_one(capsys: pytest.CaptureFixture[str], option: str) -> None:
     with pytest.raises(SystemExit):
-        main(["train", "somewhere", "-o", "out", "--data", "data"])
-    assert "--data: expected a --recipe" in capsys.readouterr().err
+        main(["train", "somewhere", "-o", "out", option, "data"])
+    assert f"{option}: expected a --recipe" in capsys.readouterr().err
 
 
 def test_the_same_options_have_the_same_place(tmp_path: Path) -> None:
