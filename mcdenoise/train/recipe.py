@@ -9,7 +9,7 @@
 
 A recipe of several runs on the same data has a table for each of them besides::
 
-    [[run]]             # name; fields of TrainConfig that are others than in [train]; expected = {smape=..., tolerance=...}
+    [[run]]             # name; fields of TrainConfig that differ from [train]; expected = {smape=..., tolerance=...};
                         # seeds = [1, 2] makes two runs of it, NAME-1 and NAME-2
 """
 
@@ -192,11 +192,11 @@ def _run_tables(path: Path, content: dict[str, Any], kinds: Mapping[str, type]) 
         if seeds is not None and not (seeds and all(type(seed) is int for seed in seeds)):
             raise InputError(f"{where}: seeds: expected a list of whole numbers, found {seeds}")
         every = [own] if seeds is None else [{**own, "name": f"{name}-{seed}", "seed": seed} for seed in seeds]
+        if not _NAME.fullmatch(name):
+            raise InputError(f"{where}: name: expected letters, digits, '+', '-' and '_', found '{name}'")
         for each in every:
-            if not _NAME.fullmatch(name) or each["name"] in (other["name"] for _, other in found):
-                raise InputError(
-                    f"{where}: name: expected letters, digits, '+', '-' and '_', each name once, found '{each['name']}'"
-                )
+            if each["name"] in (other["name"] for _, other in found):
+                raise InputError(f"{where}: name: expected each name once, found '{each['name']}' again")
             found.append((where, each))
     return found
 
