@@ -6,7 +6,14 @@ from mcdenoise.models._journal import Journal, Stage, listening, note, summarize
 from mcdenoise.models._layers import answered, carried, with_carried
 from mcdenoise.models._overview import ModelOverview, overview
 from mcdenoise.models._registry import build_model, find_model, list_models, register_model
-from mcdenoise.models._weights import create_model, describe_weights, load_weights, pretrained_models, save_weights
+from mcdenoise.models._weights import (
+    compared_models,
+    create_model,
+    describe_weights,
+    load_weights,
+    pretrained_models,
+    save_weights,
+)
 from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
@@ -44,6 +51,7 @@ __all__ = [
     "as_model",
     "build_model",
     "carried",
+    "compared_models",
     "create_model",
     "describe_weights",
     "find_model",

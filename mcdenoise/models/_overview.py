@@ -12,7 +12,7 @@ from torch import nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.models._registry import Kind, build_model, find_model, list_models
-from mcdenoise.models._weights import pretrained_models
+from mcdenoise.models._weights import compared_models, pretrained_models
 
 _SIDE = 64  # a multiple of every model's padding, so that no padded pixel is counted
 
@@ -29,7 +29,8 @@ class ModelOverview:
         parameters: number of weights.
         kmacs_per_pixel: thousands of multiply-adds a pixel in convolutions, which are nearly all of a network's work;
             ``None`` for what is no network, whose work is elsewhere.
-        weights: "shipped"; "its own", which it finds by itself; "to train"; or "none" where there are none.
+        weights: "shipped"; "compared", shipped to be compared with others alone; "its own", which it finds by itself;
+            "to train"; or "none" where there are none.
         needs: names of the buffers that it cannot do without.
         uses: names of those that it is better with.
         trainable: whether it learns.
@@ -51,12 +52,12 @@ class ModelOverview:
 
 def overview() -> list[ModelOverview]:
     """An entry for every registered model, by kind and then by name; one that cannot be made says why."""
-    shipped = pretrained_models()
-    entries = [_overview(name, pretrained=name in shipped) for name in list_models()]
+    weights = dict.fromkeys(compared_models(), "compared") | dict.fromkeys(pretrained_models(), "shipped")
+    entries = [_overview(name, weights.get(name, "")) for name in list_models()]
     return sorted(entries, key=lambda entry: get_args(Kind).index(entry.kind))
 
 
-def _overview(name: str, *, pretrained: bool) -> ModelOverview:
+def _overview(name: str, weights: str) -> ModelOverview:
     # Imports Triton where it is installed, which takes a fifth of a second.
     from torch.utils.flop_counter import FlopCounterMode
 
@@ -69,7 +70,7 @@ def _overview(name: str, *, pretrained: bool) -> ModelOverview:
         return listed(reason=str(error))
     needs, macs = model.needs, None
     parameters = sum(each.numel() for each in model.parameters()) if isinstance(model, nn.Module) else 0
-    weights = "shipped" if pretrained else "to train" if needs.trainable else "its own"
+    weights = weights or ("to train" if needs.trainable else "its own")
     if parameters:
         # The counter knows torch's convolutions, not those that are fused where nobody asks for derivatives.
         with FlopCounterMode(display=False) as counter, torch.enable_grad():

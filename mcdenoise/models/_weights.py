@@ -17,6 +17,8 @@ from mcdenoise.models._interface import Model
 from mcdenoise.models._registry import build_model, find_model
 
 _SHIPPED = Path(__file__).parent / "weights"
+# Of methods that are there to be compared: all trained alike, and shortly.
+_COMPARED = _SHIPPED / "compared"
 
 
 def create_model(name: str, *, pretrained: bool = False, weights: Path | str | None = None, **settings: Any) -> Model:
@@ -37,19 +39,28 @@ def create_model(name: str, *, pretrained: bool = False, weights: Path | str | N
     """
     if weights is not None:
         return load_weights(Path(weights), name, **settings)
-    shipped = _SHIPPED / f"{name}.safetensors"
-    if pretrained and shipped.is_file():
-        return load_weights(shipped, name, **settings)
+    for folder in (_SHIPPED, _COMPARED):
+        shipped = folder / f"{name}.safetensors"
+        if pretrained and shipped.is_file():
+            return load_weights(shipped, name, **settings)
     model = build_model(name, **settings)
     if pretrained and model.needs.trainable and ":" not in name:
-        have = ", ".join(pretrained_models()) or "none"
+        have = ", ".join([*pretrained_models(), *compared_models()]) or "none"
         raise InputError(f"model '{name}': expected shipped weights, found them only for: {have}; train it first")
     return model.eval() if isinstance(model, nn.Module) else model
 
 
 def pretrained_models() -> list[str]:
-    """Names of the models that have shipped weights, and whose packages are installed, sorted."""
+    """Names of the models that have shipped weights to denoise with, and whose packages are installed, sorted."""
     return sorted(path.stem for path in _SHIPPED.glob("*.safetensors") if find_model(path.stem).installed)
+
+
+def compared_models() -> list[str]:
+    """Names of the models that have shipped weights for comparison alone, sorted.
+
+    They are trained alike by ``recipes/zoo.toml``, for some minutes each, to be compared with one another.
+    """
+    return sorted(path.stem for path in _COMPARED.glob("*.safetensors"))
 
 
 def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:

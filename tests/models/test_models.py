@@ -26,6 +26,7 @@ from mcdenoise.models import (
     Needs,
     Output,
     as_model,
+    compared_models,
     create_model,
     describe_weights,
     find_model,
@@ -509,7 +510,7 @@ def test_files_that_are_no_weights_are_refused(weights: Path, tmp_path: Path) ->
 
 
 def test_a_model_without_shipped_weights_says_so() -> None:
-    for name in set(TRAINABLE) - set(pretrained_models()):
+    for name in set(TRAINABLE) - set(pretrained_models()) - set(compared_models()):
         message = refused(lambda name=name: create_model(name, pretrained=True))
         assert f"model '{name}': expected shipped weights" in message
     assert "expected one of" in refused(lambda: create_model("nothing", pretrained=True))
@@ -532,10 +533,12 @@ def test_the_cascades_have_weights() -> None:
     assert set(FAMILY) <= set(pretrained_models())
 
 
-@pytest.mark.parametrize("name", pretrained_models())
-def test_the_shipped_weights(name: str) -> None:
+@pytest.mark.parametrize("file", sorted(SHIPPED.rglob("*.safetensors")), ids=lambda file: file.stem)
+def test_the_shipped_weights(file: Path) -> None:
+    name, about = file.stem, describe_weights(file)
+    if not find_model(name).installed:
+        pytest.skip(f"{name} needs a package that is not installed")
     model = create_model(name, pretrained=True)
-    about = describe_weights(SHIPPED / f"{name}.safetensors")
     assert about["licence"] == "Apache-2.0"
     assert int(about["steps"]) == json.loads(about["config"])["steps"]
     assert all(len(part["commit"]) == 40 for part in json.loads(about["commits"]))
@@ -556,6 +559,19 @@ def test_what_the_cascades_were_trained_on(name: str) -> None:
     assert not own & {"random9000", "random9002"}
 
 
+def test_what_is_compared_was_trained_alike() -> None:
+    about = {name: describe_weights(SHIPPED / "compared" / f"{name}.safetensors") for name in compared_models()}
+    assert not set(about) & set(pretrained_models())
+    own = {"model", "loss", "temporal_weight"}
+    configs = [json.loads(each["config"]) for each in about.values()]
+    assert all(
+        {k: v for k, v in each.items() if k not in own} == {k: v for k, v in configs[0].items() if k not in own}
+        for each in configs
+    )
+    for key in ("data", "initial_weights"):
+        assert len({each[key] for each in about.values()}) == 1
+
+
 def test_overview() -> None:
     entries = {entry.name: entry for entry in overview()}
     assert sorted(entries) == list_models()
@@ -570,6 +586,7 @@ def test_overview() -> None:
         assert entry.description
         assert "\n" not in entry.description
         assert (entry.weights == "shipped") is (name in pretrained_models())
+        assert (entry.weights == "compared") is (name in compared_models())
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
