@@ -28,10 +28,9 @@ from numpy.typing import NDArray
 from mcdenoise import ops
 from mcdenoise.benchmark.machine import describe_machine, fix_threads
 from mcdenoise.data.files import write_text
-from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
-from mcdenoise.models import DEFAULT, create_model
+from mcdenoise.models import DEFAULT, Precision, create_model
 from mcdenoise.train import TrainConfig
 from mcdenoise.train.cache import Shot
 from mcdenoise.train.clips import ClipSampler

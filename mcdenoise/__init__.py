@@ -1,13 +1,41 @@
 """Interactive Monte Carlo denoising you can open up: differentiable operators, and denoisers assembled from them."""
 
-from importlib.metadata import version
+from __future__ import annotations
 
-from mcdenoise import ops
-from mcdenoise.denoiser import Denoiser, denoise
-from mcdenoise.errors import InputError
-from mcdenoise.frame import Frame
-from mcdenoise.models import create_model, list_models
+import importlib
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mcdenoise import ops
+    from mcdenoise.denoiser import Denoiser, denoise
+    from mcdenoise.errors import InputError
+    from mcdenoise.frame import Frame
+    from mcdenoise.models import create_model, list_models
 
 __version__ = version("mcdenoise")
 
 __all__ = ["Denoiser", "Frame", "InputError", "create_model", "denoise", "list_models", "ops"]
+
+_PAGES = {
+    "Denoiser": "denoiser",
+    "Frame": "frame",
+    "InputError": "errors",
+    "create_model": "models",
+    "denoise": "denoiser",
+    "list_models": "models",
+}
+
+
+def __getattr__(name: str) -> Any:
+    # torch is imported by whoever uses it first: a command first decides how its threads wait, which cannot be changed
+    # later, and what needs no torch starts at once.
+    if name == "ops":
+        return importlib.import_module("mcdenoise.ops")
+    if name not in _PAGES:
+        raise AttributeError(f"module 'mcdenoise' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"mcdenoise.{_PAGES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -17,10 +17,10 @@ import torch
 from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.data import Sequence
 from mcdenoise.data.files import write_text
-from mcdenoise.denoiser import PRECISIONS, Denoiser, Precision
+from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import pretrained_models
+from mcdenoise.models import PRECISIONS, Precision, pretrained_models
 from mcdenoise.results import Results
 
 _ROUNDS = 3

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -16,15 +16,15 @@ from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
-from mcdenoise.models import DEFAULT, Journal, Model, Output, State, create_model, listening, timed
+from mcdenoise.models import DEFAULT, Journal, Model, Output, State, create_model, fastest_precision, listening, timed
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
 from mcdenoise.models._journal import clock
 from mcdenoise.models._layers import REST, alpha_of, closed, completed, opened
 from mcdenoise.models._memory import Division, Frames
+from mcdenoise.models._precision import Chosen
 
-Precision = Literal["float32", "bfloat16"]
-PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
+AskedPrecision = Literal["auto", "float32", "bfloat16"]
 
 
 @dataclass
@@ -32,11 +32,13 @@ class FrameReport(Journal):
     """What happened to one frame.
 
     Args:
+        precision: why the convolutions run in the precision that they run in.
         replaced_pixels: pixels of the noisy color that were NaN, infinite, negative or above 1e16.
         missing: buffers that the method is better with and the frame has not.
         beside: milliseconds of what is done while another frame is denoised: read, write.
     """
 
+    precision: str = ""
     replaced_pixels: int = 0
     missing: list[str] = field(default_factory=list)
     beside: dict[str, float] = field(default_factory=dict)
@@ -52,8 +54,10 @@ class Denoiser:
             to the device, made channels-last and put into evaluation mode.
         weights: a safetensors file of other weights for a model given by name.
         device: where to run; frames may come from anywhere and images stay here.
-        precision: ``"bfloat16"`` runs convolutions in bfloat16, which is about twice as fast on processors that have
-            it; everything else stays in float32.
+        precision: of convolutions; everything else stays in float32. ``"bfloat16"`` is about twice as fast on
+            processors that compute with it. ``"auto"`` takes it for a model of the zoo that learns, where it pays on
+            this machine (see :func:`mcdenoise.models.fastest_precision`), and float32 otherwise: for a model of yours,
+            and where ``differentiable``. The attribute ``precision`` is the one that runs, the report says why.
         keep_all: skip nothing, whether a scene needs it or not.
         tile: compute tiles of at most so many pixels a side, a multiple of 32 from 64 on. The result is that of the
             whole image, up to the rounding of convolutions; the margins that tiles share cost time. By default they are
@@ -88,7 +92,7 @@ class Denoiser:
         *,
         weights: Path | str | None = None,
         device: torch.device | str = "cpu",
-        precision: Precision = "float32",
+        precision: AskedPrecision = "auto",
         keep_all: bool = False,
         tile: int | None = None,
         max_memory: float | None = None,
@@ -97,9 +101,11 @@ class Denoiser:
         **settings: Any,
     ) -> None:
         self.device = _device(device)
-        if precision not in PRECISIONS:
-            raise InputError(f"precision: expected one of {', '.join(PRECISIONS)}, found '{precision}'")
-        self.precision, self.keep_all, self.differentiable, self.alpha = precision, keep_all, differentiable, alpha
+        known = get_args(AskedPrecision)
+        if precision not in known:
+            raise InputError(f"precision: expected one of {', '.join(known)}, found '{precision}'")
+        self.keep_all, self.differentiable, self.alpha = keep_all, differentiable, alpha
+        of_zoo = isinstance(model, str) and ":" not in model
         if isinstance(model, str):
             model = create_model(model, pretrained=weights is None, weights=weights, **settings)
         elif settings or weights is not None:
@@ -110,12 +116,21 @@ class Denoiser:
             # Channels-last convolutions are about 1.5 times faster on a CPU.
             model.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
         self.model = as_model(model)
+        self.precision, self._why_precision = self._chosen(precision, of_zoo=of_zoo)
         self.report = FrameReport()
         # Set by who never writes into a frame again that was handed over: then nothing of it is copied.
         self.frames_stay = False
-        bfloat16 = precision == "bfloat16"
-        self._tiles = Division(self.model, tile, max_memory, self.device, bfloat16=bfloat16)
+        self._tiles = Division(self.model, tile, max_memory, self.device, bfloat16=self.precision == "bfloat16")
         self.reset()
+
+    def _chosen(self, asked: AskedPrecision, *, of_zoo: bool) -> Chosen:
+        if asked != "auto":
+            return Chosen(asked, "asked for")
+        if self.differentiable:
+            return Chosen("float32", "derivatives are wanted")
+        if not of_zoo:
+            return Chosen("float32", "what bfloat16 rounds in a model of your own is for you to judge")
+        return fastest_precision(self.device) if self.model.needs.trainable else Chosen("float32", "nothing is learnt")
 
     def reset(
         self,
@@ -196,7 +211,7 @@ class Denoiser:
         return self._step(frame, stages=stages)
 
     def _step(self, frame: Frame, *, stages: bool) -> Output:
-        self.report = report = FrameReport()
+        self.report = report = FrameReport(precision=self._why_precision)
         bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
         with listening(report), nullcontext() if self.differentiable else torch.no_grad():
             with timed("validate", self.device):
@@ -270,7 +285,7 @@ def denoise(
     depth: ArrayLike | None = None,
     model: str | Model | nn.Module = DEFAULT,
     device: torch.device | str = "cpu",
-    precision: Precision = "float32",
+    precision: AskedPrecision = "auto",
     extra: Mapping[str, ArrayLike] | None = None,
     **others: Any,
 ) -> NDArray[np.float32]:

@@ -232,7 +232,7 @@ def differences(exported: Exported, model: Model, sequence: Sequence, frames: in
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(str(exported.path), options, providers=["CPUExecutionProvider"])
     # A graph decides nothing by what a scene has, so nothing may be skipped beside it.
-    denoiser = Denoiser(model, keep_all=True)
+    denoiser = Denoiser(model, precision="float32", keep_all=True)
     step = Step(denoiser.model, names)
     state: dict[str, Any] = {}
     for number in sequence.numbers[:frames]:

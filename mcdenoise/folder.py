@@ -63,6 +63,11 @@ class SequenceReport:
         return next((report.tiles for report in self.frames.values()), "")
 
     @property
+    def precision(self) -> str:
+        """Why the convolutions ran in the precision that they ran in."""
+        return next((report.precision for report in self.frames.values()), "")
+
+    @property
     def plan(self) -> list[dict[str, Any]]:
         """For each stage whether it was kept, how much of it was skipped, and why, see :func:`summarize`."""
         read = Stage("read", 0.0, self.reading)
@@ -311,6 +316,7 @@ def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> 
         "versions": {name: version(name) for name in ("mcdenoise", "torch", "kornia")},
         "device": str(denoiser.device),
         "precision": denoiser.precision,
+        "precision_reason": report.precision,
         "threads": torch.get_num_threads(),
         "sequence": {"name": sequence.name, "layout": sequence.layout, "size": list(sequence.size)},
         "read": [row._asdict() for row in sequence.table],

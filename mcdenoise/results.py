@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from mcdenoise.data.files import write_text
-from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
+from mcdenoise.models import Precision
 
 FILE = "results.json"
 OPS_FILE = "ops.json"

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.frame import Frame
 
 HEIGHT, WIDTH, FRAMES = 20, 24, 4
+
+# The same on every processor, where a test does not ask for another; for the processes that tests start, too.
+os.environ["MCDENOISE_PRECISION"] = "float32"
 
 
 @pytest.fixture(scope="session")

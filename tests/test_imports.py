@@ -34,6 +34,7 @@ TOOLS = REPORTS | {"budget", "demo", "export", "preview", "suite", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),
+    "threads": set(),
     "own": {"errors"},
     "commit": set(),
     "ops": set(),
@@ -51,11 +52,11 @@ ALLOWED: dict[str, set[str]] = {
     "folder": LIBRARY,
     "check": LIBRARY | {"methods", "own"},
     "evaluate": LIBRARY | {"folder"},
-    "results": SIGNAL | {"data", "denoiser"},
+    "results": SIGNAL | {"data", "models"},
     "report": LIBRARY | {"evaluate", "results"},
     "benchmark": LIBRARY | {"check", "commit", "evaluate", "methods", "results"},
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"commit", "results"}),
-    "cli": LIBRARY | TOOLS | {"heap"},
+    "cli": LIBRARY | TOOLS | {"heap", "threads"},
     "__main__": {"cli"},
     # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.
     "": LIBRARY,

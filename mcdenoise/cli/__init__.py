@@ -14,6 +14,7 @@ from typing import Any
 import tyro
 
 from mcdenoise.errors import InputError
+from mcdenoise.threads import wait_passively
 
 Command = Callable[..., int | None]
 
@@ -60,6 +61,7 @@ def main(arguments: list[str] | None = None) -> None:
     if name not in COMMANDS:
         print(f"mcdenoise: unknown command '{name}'; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(2)
+    wait_passively()
     try:
         status = parse(name, rest)()
     except InputError as error:

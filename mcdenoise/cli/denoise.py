@@ -12,7 +12,7 @@ import torch
 from mcdenoise.cli._options import Flag, Inputs, Json, Layers, Map, Out, check_threads
 from mcdenoise.cli._output import print_times, progress_bar, stages, warn, write_json
 from mcdenoise.cli.inspect import open_inputs, print_sequence
-from mcdenoise.denoiser import Precision
+from mcdenoise.denoiser import AskedPrecision
 from mcdenoise.errors import InputError
 from mcdenoise.folder import denoise_sequence
 from mcdenoise.frame import MOTION
@@ -30,7 +30,7 @@ def denoise(
     frames: str | None = None,
     device: str = "cpu",
     threads: int | None = None,
-    precision: Precision = "float32",
+    precision: AskedPrecision = "auto",
     map: Map = (),
     color_without_albedo: Flag = False,
     color_with_albedo: Flag = False,
@@ -66,7 +66,8 @@ def denoise(
         frames: which frames, such as 0-59,70; all by default.
         device: cpu or cuda.
         threads: CPU threads; torch's choice by default.
-        precision: of the network's convolutions; bfloat16 is faster on processors that have it.
+        precision: of the network's convolutions; auto takes bfloat16 where the processor has it and it is faster, which
+            is measured once on each machine.
         map: layer of a buffer whose name does not tell, such as albedo=RGBA.diff; 'motion=' for none.
         color_without_albedo: the noisy color was divided by the albedo, which is multiplied back.
         color_with_albedo: it was not; by default its values tell, and if they do not, it was not.
@@ -164,6 +165,7 @@ def denoise(
     if report.replaced_pixels:
         print(f"replaced {report.replaced_pixels} NaN, infinite, negative or absurdly bright pixels of the noisy color")
     print(f"  tiles: {report.tiles}")
+    print(f"  precision: {denoiser.precision}, {report.precision}")
     print_times(report.milliseconds)
     print(f"{'beside that' if denoiser.has_room_ahead else 'of the waiting'}: {stages(report.beside)}")
     absent = {name for done in report.frames.values() for name in done.missing}

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.denoiser import Denoiser, Precision
+from mcdenoise.denoiser import AskedPrecision, Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import DEFAULT, Model
@@ -103,7 +103,7 @@ class MitsubaDenoiser:
         *,
         model: str | Model | nn.Module = DEFAULT,
         device: torch.device | str | None = None,
-        precision: Precision = "float32",
+        precision: AskedPrecision = "auto",
         **settings: Any,
     ) -> None:
         self._mi, self._dr = _import("mitsuba"), _import("drjit")

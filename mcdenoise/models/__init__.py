@@ -5,6 +5,7 @@ from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._journal import Journal, Stage, listening, note, summarize, timed
 from mcdenoise.models._layers import answered, carried, with_carried
 from mcdenoise.models._overview import ModelOverview, overview
+from mcdenoise.models._precision import PRECISIONS, Precision, fastest_precision
 from mcdenoise.models._registry import build_model, find_model, list_models, register_model
 from mcdenoise.models._weights import (
     compared_models,
@@ -28,6 +29,7 @@ DEFAULT = "cascaded_v2"
 
 __all__ = [
     "DEFAULT",
+    "PRECISIONS",
     "TOLERANCE",
     "Accumulated",
     "Chain",
@@ -40,6 +42,7 @@ __all__ = [
     "ModelOverview",
     "Needs",
     "Output",
+    "Precision",
     "Recurrent",
     "Region",
     "Skipping",
@@ -54,6 +57,7 @@ __all__ = [
     "compared_models",
     "create_model",
     "describe_weights",
+    "fastest_precision",
     "find_model",
     "list_models",
     "listening",

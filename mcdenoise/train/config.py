@@ -8,9 +8,8 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
-from mcdenoise.models import DEFAULT
+from mcdenoise.models import DEFAULT, Precision
 from mcdenoise.train.losses import Loss
 
 Schedule = Literal["constant", "cosine"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
-from mcdenoise.denoiser import Precision
 from mcdenoise.errors import InputError
+from mcdenoise.models import Precision
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from mcdenoise.check.stability._check import DTYPES, Check, name_of
 from mcdenoise.check.stability._models import ALLOWED, EXPOSURES, relative_change
-from mcdenoise.denoiser import Denoiser, Precision
+from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, replace_invalid
 from mcdenoise.methods import parse_method
-from mcdenoise.models import DEFAULT, Output
+from mcdenoise.models import DEFAULT, Output, Precision
 from mcdenoise.models.with_oidn import OIDN, OIDN_CLEAN
 
 FRAMES = 3

@@ -1,0 +1,124 @@
+"""In which precision convolutions run where nobody asks for one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from mcdenoise import Denoiser, Frame, InputError, denoise
+from mcdenoise.models import _precision, fastest_precision
+from mcdenoise.models._precision import ENVIRONMENT, _machine, _measured
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the ratio of this machine will be kept, of a user who has never measured one; the processor has bfloat16."""
+    monkeypatch.delenv(ENVIRONMENT)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(_precision, "_has_bfloat16", lambda device: True)
+    return tmp_path / "mcdenoise" / "precision.json"
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Ratios that the next measurements find; what is left has not been measured."""
+    ratios: list[float] = []
+    monkeypatch.setattr(_precision, "_measured", lambda device: ratios.pop(0))
+    return ratios
+
+
+@pytest.mark.parametrize(
+    ("ratio", "expected"), [(2.0, "bfloat16"), (1.2, "bfloat16"), (1.19, "float32"), (0.3, "float32")]
+)
+def test_what_pays(measured: list[float], ratio: float, expected: str) -> None:
+    measured.append(ratio)
+    chosen = fastest_precision(CPU)
+    assert chosen.precision == expected
+    assert f"takes {1 / ratio:.2f} of the time" in chosen.reason
+
+
+def test_a_processor_without_bfloat16_is_not_measured(monkeypatch: pytest.MonkeyPatch, measured: list[float]) -> None:
+    monkeypatch.setattr(_precision, "_has_bfloat16", lambda device: False)
+    assert fastest_precision(CPU) == ("float32", "the processor has no bfloat16")
+
+
+def test_a_measurement_is_kept_for_the_machine_that_made_it(
+    cache: Path, measured: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured += [2.0, 1.0, 3.0]
+    for _ in range(3):
+        assert fastest_precision(CPU).precision == "bfloat16"
+    # Another processor, another version of torch.
+    monkeypatch.setattr(_precision, "_machine", lambda device: "another")
+    assert fastest_precision(CPU).precision == "float32"
+    assert json.loads(cache.read_text()) == {_machine(CPU): 2.0, "another": 1.0}
+    assert list(cache.parent.iterdir()) == [cache]
+    assert measured == [3.0]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"[2.0]", b'"text"', b"\xff", b"[" * 100_000, "own", '{"KEY": NaN}', '{"KEY": -1}', '{"KEY": "x"}'],
+)
+def test_a_damaged_cache_is_measured_again(cache: Path, measured: list[float], content: bytes | str) -> None:
+    cache.parent.mkdir()
+    whole = content if isinstance(content, bytes) else content.replace("KEY", _machine(CPU)).encode()
+    cache.write_bytes(whole)
+    measured.append(2.0)
+    assert fastest_precision(CPU).precision == fastest_precision(CPU).precision == "bfloat16"
+    assert json.loads(cache.read_text())[_machine(CPU)] == 2.0
+
+
+def test_no_room_for_the_cache(tmp_path: Path, measured: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    measured += [2.0, 2.0]
+    assert fastest_precision(CPU).precision == fastest_precision(CPU).precision == "bfloat16"
+    assert not measured
+
+
+def test_what_the_user_has_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    for precision in ("float32", "bfloat16"):
+        monkeypatch.setenv(ENVIRONMENT, precision)
+        assert fastest_precision(CPU).precision == precision
+    monkeypatch.setenv(ENVIRONMENT, "int4")
+    with pytest.raises(InputError, match="MCDENOISE_PRECISION: expected one of float32, bfloat16, found 'int4'"):
+        fastest_precision(CPU)
+
+
+def test_measuring_draws_none_of_the_callers_random_numbers() -> None:
+    before = torch.get_rng_state()
+    assert 0.01 < _measured(CPU) < 100
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_who_gets_it(measured: list[float]) -> None:
+    measured.append(2.0)
+    assert Denoiser("cascaded_v2_micro").precision == "bfloat16"
+    # Nobody has looked at what it does to these.
+    for others in (
+        Denoiser("cascaded_v2_micro", differentiable=True),
+        Denoiser("joint_bilateral"),
+        Denoiser(torch.nn.Conv2d(3, 3, 1)),
+        Denoiser("cascaded_v2_micro", precision="float32"),
+    ):
+        assert others.precision == "float32"
+    with pytest.raises(InputError, match="precision: expected one of auto, float32, bfloat16, found 'int8'"):
+        Denoiser("cascaded_v2_micro", precision="int8")  # type: ignore[arg-type]
+
+
+def test_the_report_says_why_and_the_image_is_that_of_the_precision(measured: list[float]) -> None:
+    measured.append(2.0)
+    frame = Frame(color=torch.rand(1, 3, 24, 32))
+    chosen, asked = Denoiser("cascaded_v2_micro"), Denoiser("cascaded_v2_micro", precision="bfloat16")
+    image = chosen(frame)
+    assert torch.equal(image, asked(frame))
+    assert chosen.report.precision == "a convolution in bfloat16 takes 0.50 of the time in float32 here"
+    assert asked.report.precision == "asked for"
+    array = denoise(frame.color[0].numpy(), layout="CHW", model="cascaded_v2_micro")
+    assert torch.equal(torch.from_numpy(array), image[0])

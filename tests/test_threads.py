@@ -1,0 +1,59 @@
+"""How the threads of commands wait."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+SAID = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
+
+
+def policies(**own: str) -> dict[str, str]:
+    """What OpenMP is told in a process that runs a command."""
+    environment = {name: value for name, value in os.environ.items() if name not in SAID}
+    environment |= {"OMP_DISPLAY_ENV": "VERBOSE", **own}
+    command = [sys.executable, "-m", "mcdenoise", "evaluate", "--help"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return dict(re.findall(r"(OMP_WAIT_POLICY|GOMP_SPINCOUNT) *= *'(\w+)'", done.stderr))
+
+
+def test_the_threads_of_commands_wait_without_spinning() -> None:
+    found = policies()
+    if not found:
+        pytest.skip("this torch has an OpenMP that does not tell its settings")
+    assert found["OMP_WAIT_POLICY"] == "PASSIVE"
+    assert found.get("GOMP_SPINCOUNT", "0") == "0"
+
+
+def test_what_the_user_has_said_of_it_is_kept() -> None:
+    if not policies(OMP_WAIT_POLICY="ACTIVE"):
+        pytest.skip("this torch has an OpenMP that does not tell its settings")
+    assert policies(OMP_WAIT_POLICY="ACTIVE")["OMP_WAIT_POLICY"] == "ACTIVE"
+    assert policies(GOMP_SPINCOUNT="7").get("GOMP_SPINCOUNT", "7") == "7"
+
+
+def test_the_package_alone_imports_no_torch() -> None:
+    code = """
+import os, sys
+import mcdenoise
+from mcdenoise.cli import main
+assert "torch" not in sys.modules
+assert "OMP_WAIT_POLICY" not in os.environ, "the library decides nothing"
+assert set(mcdenoise.__all__) <= set(dir(mcdenoise))
+for name in mcdenoise.__all__:
+    assert getattr(mcdenoise, name).__name__.rpartition(".")[2] == name
+assert "torch" in sys.modules
+"""
+    environment = {name: value for name, value in os.environ.items() if name not in SAID}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+
+
+def test_the_package_has_no_other_names() -> None:
+    import mcdenoise
+
+    with pytest.raises(AttributeError, match="module 'mcdenoise' has no attribute 'denoiserr'"):
+        _ = mcdenoise.denoiserr
