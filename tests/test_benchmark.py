@@ -273,6 +273,50 @@ def test_nothing_is_left_of_a_run_that_is_interrupted(small_sequence: Path, out:
     assert sorted(out.parent.iterdir()) == before
 
 
+def test_cores_are_kept_busy_while_times_are_measured(small_sequence: Path, out: Path) -> None:
+    def slowly(frame: Frame) -> Tensor:
+        time.sleep(0.2)
+        return frame.color
+
+    def run(busy: int) -> tuple[Results, float]:
+        before = os.times().children_user
+        settings = Settings(rounds=1, busy=busy, memory=False)
+        results = run_benchmark(
+            [open_sequence(small_sequence, "0-1")], [scripted("A", slowly)], out / str(busy), settings
+        )
+        return results, os.times().children_user - before
+
+    out.mkdir()
+    quiet, alone = run(0)
+    noted, beside = run(2)
+    # Others start processes, too, which do next to nothing.
+    assert beside > alone + 0.1
+    assert (quiet.notes, noted.notes) == ([], ["measured beside 2 processes, each of which keeps a core busy"])
+
+
+def test_no_core_stays_busy_when_the_benchmark_is_killed() -> None:
+    code = (
+        "import os, subprocess\n"
+        "from mcdenoise.benchmark.machine import busy_cores\n"
+        "started = []\n"
+        "popen = subprocess.Popen\n"
+        "subprocess.Popen = lambda *a, **k: started.append(popen(*a, **k)) or started[-1]\n"
+        "with busy_cores(1):\n"
+        "    print(started[0].pid, flush=True)\n"
+        "    os._exit(9)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert done.returncode == 9
+    deadline = time.monotonic() + 20
+    while True:
+        try:
+            os.kill(int(done.stdout), 0)
+        except ProcessLookupError:
+            break
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
 def test_temporal_errors_are_of_neighbours_and_what_is_not_finite_is_skipped() -> None:
     errors = Errors()
     reference = torch.full((1, 3, 16, 16), 0.25)

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -66,6 +70,22 @@ def fix_threads(threads: int) -> None:
     torch.set_num_threads(threads)
     oiio.attribute("threads", threads)
     oiio.attribute("exr_threads", threads)
+
+
+@contextmanager
+def busy_cores(count: int) -> Iterator[None]:
+    """Keep cores busy meanwhile, as a renderer beside this process does: a process for each, which never waits."""
+    # One that is left over, whatever became of this process, ends by itself.
+    code = f"import os\nwhile os.getppid() == {os.getpid()}:\n    sum(range(100_000))"
+    started: list[subprocess.Popen[bytes]] = []
+    try:
+        for _ in range(count):
+            started.append(subprocess.Popen([sys.executable, "-I", "-S", "-c", code]))
+        yield
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
 
 
 def describe_machine(device: str) -> Machine:

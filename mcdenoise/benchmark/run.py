@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from mcdenoise.benchmark.machine import Stopwatch, check_device, describe_machine, fix_threads
+from mcdenoise.benchmark.machine import Stopwatch, busy_cores, check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.memory import Peaks
 from mcdenoise.benchmark.methods import Timed, make_method, one_line
 from mcdenoise.benchmark.scoring import Errors
@@ -43,6 +43,7 @@ class Settings:
     Args:
         rounds: how often each method denoises each frame, and an image of each size, without warming up; with 0, errors
             are all that is measured.
+        busy: cores that other processes keep busy while times are measured.
         threads: of torch, of methods that do not ask torch, and of reading and writing EXRs.
         device: ``"cpu"`` or ``"cuda"``.
         sizes: widths and heights for the cost over pixels, see :func:`mcdenoise.benchmark.parse_sizes`.
@@ -58,6 +59,7 @@ class Settings:
     """
 
     rounds: int = 3
+    busy: int = 0
     threads: int = 1
     device: str = "cpu"
     sizes: tuple[Size, ...] = ()
@@ -69,7 +71,7 @@ class Settings:
     command: str = ""
 
     def __post_init__(self) -> None:
-        for name, least in (("rounds", 0), ("threads", 1), ("pictures", 0), ("flip_every", 1)):
+        for name, least in (("rounds", 0), ("busy", 0), ("threads", 1), ("pictures", 0), ("flip_every", 1)):
             if getattr(self, name) < least:
                 option = name.replace("_", "-")
                 raise InputError(f"--{option}: expected at least {least}, found {getattr(self, name)}")
@@ -133,15 +135,19 @@ def run_benchmark(
             skipped |= run.errors.skipped
             scenes.append(scene)
             cells += own
-        costs, fits = measure_sizes(
-            [method for method in made.methods if method.model != _NOTHING],
-            made.denoisers,
-            sizes,
-            rounds=settings.rounds,
-            threads=settings.threads,
-            device=settings.device,
-            on_step=step,
-        )
+        with busy_cores(settings.busy if sizes else 0):
+            costs, fits = measure_sizes(
+                [method for method in made.methods if method.model != _NOTHING],
+                made.denoisers,
+                sizes,
+                rounds=settings.rounds,
+                threads=settings.threads,
+                device=settings.device,
+                on_step=step,
+            )
+        notes = [f"{name} is skipped where it cannot be computed: {reason}" for name, reason in skipped.items()]
+        if settings.busy:
+            notes.insert(0, f"measured beside {settings.busy} processes, each of which keeps a core busy")
         results = Results(
             command=settings.command,
             created=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -152,7 +158,7 @@ def run_benchmark(
             cells=cells,
             costs=costs,
             fits=fits,
-            notes=[f"{name} is skipped where it cannot be computed: {reason}" for name, reason in skipped.items()],
+            notes=notes,
         )
         results.write(folder)
         write_csv(results, folder)
@@ -213,8 +219,9 @@ class _SceneRun:
         """The scene, and a cell for each method that is not missing."""
         try:
             self._warm_up(on_step)
-            for _ in range(self._settings.rounds):
-                self._round(on_step)
+            with busy_cores(self._settings.busy):
+                for _ in range(self._settings.rounds):
+                    self._round(on_step)
         except InputError as error:
             # A frame cannot be read: nobody has seen the whole scene.
             reason = one_line(error)

@@ -30,6 +30,7 @@ def benchmark(
     frames: str | None = None,
     rounds: int | None = None,
     threads: int | None = None,
+    busy: int = 0,
     device: str = "cpu",
     sizes: str = SIZES,
     pictures: int = 4,
@@ -64,6 +65,7 @@ def benchmark(
         frames: which frames of each sequence, such as 0-59,70; all by default.
         rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.
         threads: CPU threads of all methods; torch's choice by default.
+        busy: cores that other processes keep busy while times are measured, as a renderer beside a denoiser does.
         device: cpu or cuda.
         sizes: of images of which only the cost is measured, such as 1280x720,3840x2160, or none.
         pictures: of how many frames of each scene images are kept.
@@ -125,6 +127,7 @@ def benchmark(
     settings = Settings(
         rounds=rounds,
         threads=threads,
+        busy=busy,
         device=device,
         sizes=tuple(parse_sizes(sizes)),
         pictures=pictures,
@@ -138,6 +141,7 @@ def benchmark(
             frames=frames,
             rounds=rounds,
             threads=threads,
+            busy=busy or None,
             device=device,
             sizes=sizes,
             pictures=pictures,
