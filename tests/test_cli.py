@@ -21,6 +21,7 @@ from mcdenoise.cli import COMMANDS, load_command, main
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.models import create_model, list_models, pretrained_models, save_weights
+from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
 from mcdenoise.train import TrainConfig
 
 RGB = ["R", "G", "B"]
@@ -462,6 +463,30 @@ def test_models(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> Non
     for entry in entries:
         parameters = f"{entry['parameters']:,}" if entry["parameters"] else "-"
         assert re.search(rf"\b{entry['name']} .* {parameters} ", text)
+    assert "SMAPE" not in text
+
+
+def test_models_with_what_a_benchmark_measured(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
+    names = ("cascaded_v2_micro", "noisy", "cascaded_v2_tiny")
+    methods = [Method(name, "fixed", name, name) for name in names]
+    methods.append(Method("other", "fixed", "other", "cascaded_v2_small", weights="mine.safetensors"))
+    cells = [
+        Cell(scene, method.name, {"SMAPE": error}, computing=Spread(ms, ms, ms, 3))
+        for method in methods
+        for scene, error, ms in (("a", 0.04, 100.0), ("b", 0.06, 300.0))
+    ]
+    # One of its scenes is missing.
+    cells.remove(next(cell for cell in cells if cell.method == "cascaded_v2_tiny"))
+    scenes = [Scene(name, 4, 4, [0], [0]) for name in ("a", "b")]
+    Results("", "", Machine("", 1, 1.0, "cpu", 1, ""), 1, scenes, methods, cells).write(tmp_path)
+    status, text, _ = run("models", "--results", tmp_path)
+    assert status == 0
+    rows = {
+        cells[1]: cells for line in text.splitlines() if len(cells := [part.strip() for part in line.split("│")]) > 3
+    }
+    assert rows["cascaded_v2_micro"][8:10] == rows["noisy"][8:10] == ["0.0500", "200.0"]
+    assert rows["cascaded_v2_tiny"][8:10] == rows["cascaded_v2_small"][8:10] == ["-", "-"]
+    assert run("models", "--results", tmp_path / "nothing")[0] == 2
 
 
 def test_ops(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:

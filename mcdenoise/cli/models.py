@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
+from statistics import mean
 
 from rich.markup import escape
 from rich.table import Table
@@ -10,21 +12,27 @@ from rich.table import Table
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import show, write_json
 from mcdenoise.models import overview
+from mcdenoise.results import Results
 
+_MEASURED = ("SMAPE", "ms a frame")
 # What tells motion: a model takes whichever of it there is.
 _MOTION = {"motion", "position", "previous_position", "view_projection"}
 
 
-def models(json: Json = None) -> None:
+def models(results: Path | None = None, json: Json = None) -> None:
     """List the models by kind: their paper, what they need and use, weights, parameters, and operations per pixel.
 
     A model uses `motion` if it takes motion, or positions with cameras, or whichever of them there is.
 
     Args:
+        results: folder of a finished `mcdenoise benchmark`, for columns of error and run time: means over its scenes
+            of those models that it measured as they are shipped.
         json: write the list to this file too.
     """
     entries = overview()
-    columns = ("model", "paper", "needs", "uses", "weights", "parameters", "kMAC per pixel", "what")
+    measured = _measured(Results.read(results)) if results else {}
+    columns = ("model", "paper", "needs", "uses", "weights", "parameters", "kMAC per pixel")
+    columns = (*columns, *(_MEASURED if results else ()), "what")
     for kind in dict.fromkeys(entry.kind for entry in entries):
         table = Table(*columns, title=kind, title_justify="left")
         for entry in (each for each in entries if each.kind == kind):
@@ -37,7 +45,20 @@ def models(json: Json = None) -> None:
                 "not available" if entry.reason else entry.weights if entry.weights != "none" else "-",
                 f"{entry.parameters:,}" if entry.parameters else "-",
                 "-" if entry.kmacs_per_pixel is None else f"{entry.kmacs_per_pixel:.1f}",
+                *(measured.get(entry.name, ("-", "-")) if results else ()),
                 escape(entry.reason or entry.description),
             )
         show(table)
     write_json(json, [asdict(entry) for entry in entries])
+
+
+def _measured(results: Results) -> dict[str, tuple[str, str]]:
+    """SMAPE and milliseconds of each model, where every scene has both."""
+    found = {}
+    for method in results.methods:
+        cells = [cell for cell in results.cells if cell.method == method.name == method.model]
+        errors = [cell.errors["SMAPE"] for cell in cells if "SMAPE" in cell.errors]
+        times = [cell.computing.median for cell in cells if cell.computing]
+        if errors and len(errors) == len(times) == len(results.scenes):
+            found[method.name] = (f"{mean(errors):.4f}", f"{mean(times):.1f}")
+    return found
