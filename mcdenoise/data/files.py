@@ -3,20 +3,35 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mcdenoise.errors import InputError
 
+try:
+    import fcntl
+except ImportError:
+    # A system without such locks: what is left over there stays.
+    fcntl = None  # type: ignore[assignment]
+
+# What is being written has names that nothing else has, and is locked by whoever writes it.
+_PREFIX, _MARK = ".mcdenoise-", ".tmp"
+_YOUNG = 1.0  # seconds
+# Folders in which this process has looked for what others left over.
+_swept: set[str] = set()
+
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Give a temporary path beside ``path`` to write to, and rename it to ``path`` if the block succeeds.
 
-    A reader of ``path`` sees the old file or the whole new one; if the block fails or is interrupted, the temporary
-    file is removed.
+    A reader of ``path`` sees the old file or the whole new one, also after a power cut; if the block fails or is
+    interrupted, the temporary file is removed, and if the process is killed, the next one that writes to the folder
+    removes it. Several processes, on whatever machines, may write to one folder.
 
     Args:
         path: the file to be written. Its folder must exist.
@@ -39,15 +54,22 @@ def atomic_path(path: Path) -> Iterator[Path]:
     target = Path(os.path.realpath(path))
     if os.path.lexists(target) and not os.path.isfile(path):
         raise InputError(f"{path}: expected a file to write, found a folder or a device; choose another path")
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp{target.suffix}")
+    temporary = target.with_name(f"{_PREFIX}{secrets.token_hex(8)}{_MARK}{target.suffix[:64]}")
+    handle = -1
     try:
         with _writing(path):
+            _sweep(target.parent)
+            handle = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+            _lock(handle)
             yield temporary
+            _to_disk(temporary)
             os.replace(temporary, target)
     finally:
         # Gone already after a successful rename; a folder that refuses this refused the file too.
         with suppress(OSError):
             os.unlink(temporary)
+        with suppress(OSError):
+            os.close(handle)
 
 
 @contextmanager
@@ -67,15 +89,21 @@ def new_folder(path: Path) -> Iterator[Path]:
     """
     if os.path.lexists(path):
         raise InputError(f"{path}: expected nothing there yet, found something; choose a new folder, or remove it")
-    temporary = path.absolute().with_name(f".{path.absolute().name}.{os.getpid()}.tmp")
+    temporary = path.absolute().with_name(f"{_PREFIX}{secrets.token_hex(8)}{_MARK}")
+    handle = -1
     try:
         with _writing(path):
             temporary.mkdir(parents=True)
+            handle = os.open(temporary, os.O_RDONLY)
+            _lock(handle)
+            _sweep(temporary.parent)
             yield temporary
             # Over a folder that has come meanwhile, unless it is empty, this fails.
             os.rename(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        with suppress(OSError):
+            os.close(handle)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -90,6 +118,54 @@ def write_text(path: Path, text: str) -> None:
     """
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def _lock(handle: int) -> bool:
+    """Hold an open file or folder until it is closed, or the process ends; false if another process holds it."""
+    if fcntl is None:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        # Held, or on a file system without locks.
+        return False
+    return True
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what processes left over in a folder that were killed while they wrote: nobody holds it any more."""
+    if (place := os.path.realpath(folder)) in _swept:
+        return
+    _swept.add(place)
+    with suppress(OSError), os.scandir(place) as entries:
+        for entry in entries:
+            ours = entry.name.startswith(_PREFIX) and _MARK in entry.name
+            # What another process has only just made it may not hold yet.
+            if ours and abs(time.time() - entry.stat(follow_symlinks=False).st_mtime) > _YOUNG:
+                _remove_unless_held(entry.path)
+
+
+def _remove_unless_held(path: str) -> None:
+    with suppress(OSError):
+        # Opened in this way a pipe of the same name would not wait for anybody.
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+        try:
+            if _lock(handle):
+                if os.path.isdir(path):
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    os.unlink(path)
+        finally:
+            os.close(handle)
+
+
+def _to_disk(path: Path) -> None:
+    """Wait until what was written is on the disk: without that, a power cut after the renaming leaves an empty file."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 @contextmanager

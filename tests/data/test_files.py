@@ -1,0 +1,123 @@
+"""Files and folders that are whole under their final names, whatever happens while they are written."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mcdenoise.data import files
+from mcdenoise.data.files import atomic_path, new_folder, write_text
+from mcdenoise.errors import InputError
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and locks")
+
+STUCK = """
+import sys, time
+from pathlib import Path
+from mcdenoise.data.files import atomic_path, new_folder
+with {how}(Path(sys.argv[1])) as temporary:
+    (temporary / "half" if temporary.is_dir() else temporary).write_text("half of it")
+    print("writing", flush=True)
+    time.sleep(600)
+"""
+
+
+def stuck(how: str, path: Path) -> subprocess.Popen[str]:
+    """A process in the middle of writing."""
+    command = [sys.executable, "-c", STUCK.format(how=how), str(path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "writing\n"
+    return process
+
+
+def end(process: subprocess.Popen[str]) -> None:
+    with process:
+        process.kill()
+
+
+def age(folder: Path) -> None:
+    """Let everything in a folder be of an hour ago."""
+    for path in folder.iterdir():
+        os.utime(path, (time.time() - 3600,) * 2)
+
+
+@pytest.mark.parametrize("how", ["atomic_path", "new_folder"])
+def test_what_a_killed_process_left_over_is_removed_by_the_next_and_nothing_else(tmp_path: Path, how: str) -> None:
+    others = [".mcdenoise", ".mcdenoise-mine", ".file.tmp", "file.tmp"]
+    for name in others:
+        (tmp_path / name).write_text("somebody's")
+    (tmp_path / ".mcdenoise-link.tmp").symlink_to(tmp_path / "file.tmp")
+    os.mkfifo(tmp_path / ".mcdenoise-pipe.tmp")
+    killed, alive = stuck(how, tmp_path / "killed"), stuck(how, tmp_path / "alive")
+    try:
+        end(killed)
+        hidden = {path for path in tmp_path.iterdir() if len(path.name) > 25}
+        assert len(hidden) == 2
+        age(tmp_path)
+        files._swept.clear()
+        write_text(tmp_path / "whole.txt", "text")
+        left = {path.name for path in tmp_path.iterdir()} - {".mcdenoise-link.tmp", *others, "whole.txt"}
+        # That of the process that still writes.
+        assert len(left) == 1
+        assert left < {path.name for path in hidden}
+        assert (tmp_path / "file.tmp").read_text() == "somebody's"
+    finally:
+        end(alive)
+
+
+def test_what_has_only_just_been_made_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / ".mcdenoise-0123.tmp").write_text("not locked yet")
+    files._swept.clear()
+    write_text(tmp_path / "whole.txt", "text")
+    assert (tmp_path / ".mcdenoise-0123.tmp").exists()
+
+
+def test_two_that_write_the_same_do_not_meet(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    # Process numbers are no help: two containers may have the same ones.
+    with atomic_path(path) as first, atomic_path(path) as second:
+        assert first != second
+        first.write_text("first")
+        second.write_text("second")
+    assert path.read_text() == "first"
+    with new_folder(tmp_path / "a") as one, new_folder(tmp_path / "b") as other:
+        assert one != other
+
+
+@pytest.mark.parametrize("suffix", ["", ".txt", "." + "x" * 100])
+def test_long_names(tmp_path: Path, suffix: str) -> None:
+    name = "n" * (255 - len(suffix)) + suffix
+    write_text(tmp_path / name, "text")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    with pytest.raises(InputError, match="cannot be written"):
+        write_text(tmp_path / f"n{name}", "text")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_file_has_the_permissions_of_one_that_is_written_plainly(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_text(tmp_path / "ours", "text")
+        (tmp_path / "plain").write_text("text")
+    finally:
+        os.umask(before)
+    ours, plain = (stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("ours", "plain"))
+    assert ours == plain == 0o640
+
+
+def test_what_was_written_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (done.append("fsync"), fsync(handle)))
+    monkeypatch.setattr(os, "replace", lambda *paths: (done.append("replace"), replace(*paths)))
+    write_text(tmp_path / "file.txt", "text")
+    assert done == ["fsync", "replace"]
