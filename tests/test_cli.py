@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -137,13 +138,14 @@ def test_help_on_the_frames_of_a_shot(run: Callable[..., tuple[int, str, str]], 
     assert ("'shot_%04d.exr'" in text) is (command == "denoise")
 
 
-def test_summary_and_version(run: Callable[..., tuple[int, str, str]], capsys: pytest.CaptureFixture[str]) -> None:
+def test_summary_and_version(run: Callable[..., tuple[int, str, str]]) -> None:
     status, text, _ = run("--help")
     assert status == 0
     assert all(re.search(rf"^  {command} +[A-Z].*\.$", text, re.MULTILINE) for command in COMMANDS)
     assert run()[0] == 2
-    main(["--version"])
-    assert re.fullmatch(r"\d+\.\d+\.\d+\S*\n", capsys.readouterr().out)
+    status, text, _ = run("--version")
+    assert status == 0
+    assert re.fullmatch(r"\d+\.\d+\.\d+\S*\n", text)
 
 
 # Bad usage
@@ -411,6 +413,41 @@ def test_something_in_the_way_of_the_output(refused: Callable[..., str], denoise
     (out / "denoised0.exr").mkdir(parents=True)
     assert "denoised0.exr: expected a file to write, found a folder" in refused(*denoise)
     assert [path.name for path in out.iterdir()] == ["denoised0.exr"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["inspect", "--help"]])
+def test_a_standard_output_that_is_full_is_told_in_a_line(arguments: list[str]) -> None:
+    command = [sys.executable, "-m", "mcdenoise", *arguments]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "standard output: cannot be written (No space left on device)" in done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX pipes")
+def test_work_goes_on_where_nobody_reads_what_is_printed(small_sequence: Path, tmp_path: Path) -> None:
+    # Unbuffered, so that the first line already meets the closed pipe.
+    options = ["--model", "joint_bilateral", "--frames", "0-1", "-o", str(tmp_path / "out")]
+    command = [sys.executable, "-u", "-m", "mcdenoise", "denoise", str(small_sequence), *options]
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "out" / "denoised1.exr").exists()
+    assert json.loads((tmp_path / "out" / "denoise.json").read_text())["frames"].keys() == {"0", "1"}
+
+
+def test_names_that_the_standard_output_cannot_show(small_sequence: Path, tmp_path: Path) -> None:
+    shot = tmp_path / "Müller, 映画"
+    small_sequence.rename(shot)
+    command = [sys.executable, "-m", "mcdenoise", "inspect", str(shot)]
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "M\\xfcller, \\u6620\\u753b" in done.stdout
 
 
 def test_json_that_cannot_be_written(refused: Callable[..., str], tmp_path: Path) -> None:

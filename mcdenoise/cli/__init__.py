@@ -13,6 +13,7 @@ from typing import Any
 
 import tyro
 
+from mcdenoise.cli._stdout import forgiving_stdout
 from mcdenoise.errors import InputError
 from mcdenoise.threads import wait_passively
 
@@ -49,28 +50,37 @@ commands:
 def main(arguments: list[str] | None = None) -> None:
     """Run a command; exit status 0, 1 where a check failed, 2 for bad usage or bad input."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(_summary())
-        sys.exit(0 if arguments else 2)
-    if arguments[0] == "--version":
-        from importlib.metadata import version
-
-        print(version("mcdenoise"))
-        return
-    name, rest = arguments[0], arguments[1:]
-    if name not in COMMANDS:
-        print(f"mcdenoise: unknown command '{name}'; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
-        sys.exit(2)
-    wait_passively()
+    name = arguments[0] if arguments and arguments[0] in COMMANDS else ""
     try:
-        status = parse(name, rest)()
+        with forgiving_stdout():
+            status = _run(name, arguments)
     except InputError as error:
-        print(f"mcdenoise {name}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"mcdenoise{f' {name}' if name else ''}: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print(f"mcdenoise {name}: interrupted; finished files are kept", file=sys.stderr)
         sys.exit(130)
-    sys.exit(status or 0)
+    sys.exit(status)
+
+
+def _run(name: str, arguments: list[str]) -> int:
+    """Run a command, or say what there is; the exit status."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_summary())
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(version("mcdenoise"))
+        return 0
+    if not name:
+        raise InputError(f"unknown command '{arguments[0]}'; expected one of {', '.join(COMMANDS)}")
+    wait_passively()
+    try:
+        return parse(name, arguments[1:])() or 0
+    except SystemExit as stop:
+        # Help was asked for.
+        return int(stop.code or 0)
 
 
 def load_command(name: str) -> Command:

@@ -36,7 +36,7 @@ _CAMERA = frozenset({"position", "view_projection"})
 # The files that a reader of sequences looks at, and where they are in a sequence's folder.
 _SUFFIXES = {".exr", ".h", ".json"}
 _PLACES = ("*", "realisation*/*", "inputs/*", "inputs/realisation*/*")
-_FORMAT = 4
+_FORMAT = 5
 
 Array: TypeAlias = NDArray[Any]
 # First frame (an index) and realisation of the noise: each has a color of its own.
@@ -319,7 +319,8 @@ def _build(folder: Path, plan: _Plan) -> None:
     for file in list(features):
         # One frame that half precision cannot hold makes all of them single.
         np.save(folder / file, np.concatenate(features.pop(file)), allow_pickle=False)
-    (folder / "about.json").write_text(json.dumps({"sha256": digest.hexdigest()}) + "\n")
+    checksums = {path.name: _checksum(path) for path in sorted(folder.iterdir())}
+    (folder / "about.json").write_text(json.dumps({"sha256": digest.hexdigest(), "files": checksums}) + "\n")
 
 
 def _read(sequence: Sequence, number: int, realisation: int, digest: Any) -> Frame:
@@ -370,11 +371,18 @@ def _feature_name(name: str, realisation: int | None = None) -> str:
     return f"{name}.npy" if realisation is None else f"{name}-{realisation}.npy"
 
 
+def _checksum(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
-    """Map the arrays; ``None`` where there are none, or not those of this sequence."""
+    """Map the arrays; ``None`` where there are none, or not those of this sequence, or a bit of them has changed."""
     sequence = plan.sequence
     try:
         about = json.loads((folder / "about.json").read_text())
+        if any(_checksum(folder / name) != checksum for name, checksum in about["files"].items()):
+            return None
         features = _map_features(folder, plan.shared, None, sequence)
         noisy = [_map_features(folder, plan.own, k, sequence) for k in range(plan.realisations)] if plan.own else []
         shots = []
@@ -386,7 +394,7 @@ def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
             own = tuple({name: feature[first:] for name, feature in each.items()} for each in noisy)
             shots.append(Shot(tuple(colors), later, plan.front.demodulates, own, plan.front.parts))
         return CachedSequence(shots, str(about["sha256"]))
-    except (OSError, EOFError, ValueError, KeyError, TypeError):
+    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 

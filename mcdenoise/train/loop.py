@@ -136,7 +136,7 @@ def train(
         return weights
     # The source tree may change while the run goes on, and between its parts.
     provenance.append({"first_step": first, "commit": source_commit()})
-    with _writing(out):
+    with _writing(out), run.held() if fabric.is_global_zero else nullcontext():
         _run(trainer, data, run, first, provenance, checkpoint_every, report)
         if fabric.is_global_zero:
             about = about_weights(settled, identity, config.steps, provenance)

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import io
 import json
 import math
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +19,8 @@ import torch
 
 from mcdenoise.data.files import atomic_path, write_text
 from mcdenoise.errors import InputError
+
+_SEAL = 32  # bytes of a SHA-256
 
 # Steps from ``first_step`` on were computed by the source tree of ``commit``.
 Provenance = list[dict[str, Any]]
@@ -62,9 +70,27 @@ class RunFolder:
             path = self.out / f"{name}.json"
             if not path.exists():
                 write_text(path, _json(content))
-        # What a killed process was writing.
-        for left in self.out.glob(f".{self._checkpoint.name}.*"):
-            left.unlink(missing_ok=True)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Have the folder for oneself; that ends with the process, however that ends.
+
+        Raises:
+            InputError: another process has it, which the message names.
+        """
+        with (self.out / ".lock").open("a+", encoding="utf-8") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.seek(0)
+                raise InputError(
+                    f"{self.out}: expected a folder that no other training writes to, found {file.read(200).strip()}; "
+                    "wait for it, or choose another folder"
+                ) from error
+            file.truncate(0)
+            file.write(f"process {os.getpid()} of {platform.node()} at work in it")
+            file.flush()
+            yield
 
     def save(self, step: int, provenance: Provenance, *parts: Any) -> None:
         """Replace the checkpoint: the number of steps done, and the states of model, optimizer and scheduler.
@@ -76,8 +102,9 @@ class RunFolder:
         content = io.BytesIO()
         torch.save({"step": step, "provenance": provenance, "parts": states}, content)
         # Not by torch itself, which does not say that a disk is full in a way that could be told from other failures.
-        with atomic_path(self._checkpoint) as temporary:
-            temporary.write_bytes(content.getbuffer())
+        with atomic_path(self._checkpoint) as temporary, temporary.open("wb") as file:
+            file.write(content.getbuffer())
+            file.write(_sealed(content.getbuffer()))
 
     def load(self, *parts: Any) -> tuple[int, Provenance]:
         """Restore what :meth:`save` saved; zero steps without a checkpoint.
@@ -88,13 +115,17 @@ class RunFolder:
         if not self._checkpoint.exists():
             return 0, []
         try:
-            saved = torch.load(self._checkpoint, map_location="cpu", weights_only=True)
+            content = memoryview(self._checkpoint.read_bytes())
+            content, seal = content[:-_SEAL], content[-_SEAL:]
+            if seal != _sealed(content):
+                raise ValueError("expected the checksum of the content behind it, found another")
+            saved = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
             for part, state in zip(parts, saved["parts"], strict=True):
                 part.load_state_dict(state)
             return int(saved["step"]), list(saved["provenance"])
         except Exception as error:
             raise InputError(
-                f"{self._checkpoint}: expected a checkpoint of this run, found one that cannot be loaded; "
+                f"{self._checkpoint}: expected a checkpoint of this run, found one that is damaged or of another; "
                 "remove it to start again"
             ) from error
 
@@ -131,6 +162,11 @@ class RunFolder:
     @property
     def _checkpoint(self) -> Path:
         return self.out / "checkpoint.pt"
+
+
+def _sealed(content: memoryview) -> bytes:
+    """The checksum of a checkpoint, which stands behind it: one flipped bit would train other weights."""
+    return hashlib.sha256(content).digest()
 
 
 def _last_step(line: str) -> float:

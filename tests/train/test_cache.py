@@ -383,6 +383,25 @@ def test_a_damaged_cache_is_made_again(small_sequence: Path, tmp_path: Path, nam
     assert path.read_bytes() == content
 
 
+def test_no_flipped_bit_of_the_cache_is_trained_on(
+    small_sequence: Path, tmp_path: Path, reads: list[tuple[int, int]]
+) -> None:
+    opened(small_sequence, tmp_path / "cache")
+    frames = len(reads)
+    arrays = sorted((tmp_path / "cache").rglob("*.npy"))
+    assert len(arrays) > 3
+    for number, path in enumerate(arrays):
+        whole = path.read_bytes()
+        damaged = bytearray(whole)
+        bit = int(np.random.default_rng(number).integers(8 * len(whole)))
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        opened(small_sequence, tmp_path / "cache")
+        # Decoded again, from the frames.
+        assert len(reads) == frames * (number + 2)
+        assert path.read_bytes() == whole
+
+
 def test_a_pickle_is_never_loaded(small_sequence: Path, tmp_path: Path) -> None:
     whole = pixels(opened(small_sequence, tmp_path / "cache"))
     path = next((tmp_path / "cache").rglob("depth.npy"))
@@ -488,4 +507,4 @@ def test_the_checksum_is_that_of_the_images(small_sequence: Path, tmp_path: Path
     first = opened(small_sequence, tmp_path / "cache").sha256
     assert opened(small_sequence, tmp_path / "cache", front=Front(), firsts=[0]).sha256 == first
     about = json.loads(next((tmp_path / "cache").rglob("about.json")).read_text())
-    assert about == {"sha256": first}
+    assert about["sha256"] == first

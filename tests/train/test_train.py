@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 import json
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -31,7 +33,7 @@ from mcdenoise.models import DEFAULT, CoarseToFine, Demodulated, create_model, d
 pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
 pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
 
-from mcdenoise.train import Progress, TrainConfig, train
+from mcdenoise.train import Progress, RunFolder, TrainConfig, train
 from mcdenoise.train.clips import Clip, ClipSampler
 from mcdenoise.train.data import DataFolders, TrainingData
 from mcdenoise.train.front import split
@@ -143,7 +145,15 @@ def test_what_a_run_leaves(small_sequence: Path, tmp_path: Path) -> None:
     weights = train(TrainConfig(**SMALL), [small_sequence], run, checkpoint_every=2, credits="A. Painter, CC0")
     assert weights == run / f"{DEFAULT}.safetensors"
     names = {path.name for path in run.iterdir() if not path.name.startswith("events.")}
-    assert names == {"cache", f"{DEFAULT}.safetensors", "checkpoint.pt", "config.json", "data.json", "log.jsonl"}
+    assert names == {
+        ".lock",
+        "cache",
+        f"{DEFAULT}.safetensors",
+        "checkpoint.pt",
+        "config.json",
+        "data.json",
+        "log.jsonl",
+    }
     assert any(path.name.startswith("events.out.tfevents") for path in run.iterdir())
 
     config = json.loads((run / "config.json").read_text())
@@ -251,7 +261,10 @@ def test_the_log_of_a_stopped_run_has_every_step_once(small_sequence: Path, tmp_
     # As if the last checkpoint had been that of step 2.
     saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
     saved["step"] = 2
-    torch.save(saved, tmp_path / "run" / "checkpoint.pt")
+    content = io.BytesIO()
+    torch.save(saved, content)
+    sealed = content.getvalue() + hashlib.sha256(content.getvalue()).digest()
+    (tmp_path / "run" / "checkpoint.pt").write_bytes(sealed)
     train(config, [small_sequence], tmp_path / "run", checkpoint_every=2)
     entries = [json.loads(line) for line in log.read_text().splitlines()]
     assert [entry.get("step", entry.get("first_step")) for entry in entries] == [0, 2, 2, 4, 6]
@@ -363,12 +376,13 @@ def test_a_run_killed_while_it_saves_keeps_the_checkpoint_before(small_sequence:
     command = [sys.executable, "-c", textwrap.dedent(code), str(small_sequence), str(run)]
     assert subprocess.run(command, env=ONE_THREAD, check=False).returncode == -signal.SIGKILL
     assert torch.load(run / "checkpoint.pt", weights_only=True)["step"] == 1
-    assert list(run.glob(".checkpoint*"))
+    (left,) = run.glob(".mcdenoise*")
+    os.utime(left, (0, 0))
     config = TrainConfig(**{**SMALL, "steps": 3})
     resumed = train(config, [small_sequence], run, checkpoint_every=1)
     whole = train(config, [small_sequence], tmp_path / "whole", checkpoint_every=1)
     assert describe_weights(resumed)["sha256"] == describe_weights(whole)["sha256"]
-    assert not list(run.glob(".*"))
+    assert not left.exists()
 
 
 def test_two_processes_learn_what_one_does(small_sequence: Path, tmp_path: Path) -> None:
@@ -438,6 +452,37 @@ def test_a_damaged_checkpoint_is_refused(small_sequence: Path, tmp_path: Path, c
     assert "remove it" in message
 
 
+def test_no_flipped_bit_of_a_checkpoint_is_trained_on(small_sequence: Path, tmp_path: Path) -> None:
+    config, run = TrainConfig(**{**SMALL, "steps": 1}), tmp_path / "run"
+    train(config, [small_sequence], run)
+    content = (run / "checkpoint.pt").read_bytes()
+    folder, parts = RunFolder(run), [torch.nn.Linear(1, 1)]
+    for bit in np.random.default_rng(0).integers(8 * len(content), size=200):
+        damaged = bytearray(content)
+        damaged[bit // 8] ^= 1 << bit % 8
+        (run / "checkpoint.pt").write_bytes(damaged)
+        assert "found one that is damaged" in refused(lambda: folder.load(*parts))
+
+
+def test_two_trainings_do_not_share_a_folder(small_sequence: Path, tmp_path: Path) -> None:
+    config, run, messages = TrainConfig(**{**SMALL, "steps": 2}), tmp_path / "run", []
+
+    def again(progress: Progress) -> None:
+        if not messages:
+            log = (run / "log.jsonl").read_bytes()
+            messages.append(refused(lambda: train(config, [small_sequence], run, checkpoint_every=1)))
+            assert (run / "log.jsonl").read_bytes() == log
+
+    train(config, [small_sequence], run, checkpoint_every=1, report=again)
+    assert messages == [
+        f"{run}: expected a folder that no other training writes to, found process {os.getpid()} of "
+        f"{platform.node()} at work in it; wait for it, or choose another folder"
+    ]
+    # It is free again.
+    (run / f"{DEFAULT}.safetensors").unlink()
+    train(config, [small_sequence], run, checkpoint_every=1)
+
+
 def test_a_checkpoint_of_another_architecture_is_refused(small_sequence: Path, tmp_path: Path) -> None:
     config = TrainConfig(**{**SMALL, "steps": 1})
     train(config, [small_sequence], tmp_path / "run")
@@ -470,7 +515,7 @@ def test_a_full_disk_keeps_the_checkpoint_before(small_sequence: Path, tmp_path:
     assert result.stdout.startswith(f"{run / 'checkpoint.pt'}: cannot be written (File too large)")
     assert result.stdout.count("\n") == 1
     assert torch.load(run / "checkpoint.pt", weights_only=True)["step"] == 2
-    assert not list(run.glob(".*"))
+    assert not list(run.glob(".mcdenoise*"))
     resumed = train(TrainConfig(**SMALL), [small_sequence], run, checkpoint_every=2)
     whole = train(TrainConfig(**SMALL), [small_sequence], tmp_path / "whole")
     assert describe_weights(resumed)["sha256"] == describe_weights(whole)["sha256"]
