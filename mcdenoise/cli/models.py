@@ -12,7 +12,6 @@ from rich.table import Table
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import show, write_json
 from mcdenoise.models import overview
-from mcdenoise.results import Results
 
 _MEASURED = ("SMAPE", "ms a frame")
 # What tells motion: a model takes whichever of it there is.
@@ -30,7 +29,7 @@ def models(results: Path | None = None, json: Json = None) -> None:
         json: write the list to this file too.
     """
     entries = overview()
-    measured = _measured(Results.read(results)) if results else {}
+    measured = _measured(results) if results else {}
     columns = ("model", "paper", "needs", "uses", "weights", "parameters", "kMAC per pixel")
     columns = (*columns, *(_MEASURED if results else ()), "what")
     for kind in dict.fromkeys(entry.kind for entry in entries):
@@ -52,9 +51,12 @@ def models(results: Path | None = None, json: Json = None) -> None:
     write_json(json, [asdict(entry) for entry in entries])
 
 
-def _measured(results: Results) -> dict[str, tuple[str, str]]:
-    """SMAPE and milliseconds of each model, where every scene has both."""
-    found = {}
+def _measured(folder: Path) -> dict[str, tuple[str, str]]:
+    """SMAPE and milliseconds of each model, where every scene of a benchmark has both."""
+    # Here because it brings the readers of files, which take their time to load.
+    from mcdenoise.results import Results
+
+    results, found = Results.read(folder), {}
     for method in results.methods:
         cells = [cell for cell in results.cells if cell.method == method.name == method.model]
         errors = [cell.errors["SMAPE"] for cell in cells if "SMAPE" in cell.errors]
