@@ -242,5 +242,8 @@ def test_the_command_line_loads_the_chosen_command_alone() -> None:
 
 def test_importing_is_quick() -> None:
     # Processor time, because others may use the machine; torch and kornia are not ours to shorten.
-    code = "import kornia, torch, time\nstart = time.process_time()\nfrom mcdenoise import *\nprint(time.process_time() - start)"
+    code = (
+        "import kornia, torch, time\nstart = time.process_time()\n"
+        "from mcdenoise import *\nprint(time.process_time() - start)"
+    )
     assert float(python(code)) < SECONDS

@@ -45,6 +45,7 @@ from mcdenoise.models.accumulated import Accumulated
 
 PROTOCOL_NAMES = ("strict", "meng2020")
 SEEDS = (1, 2, 3)
+KINDS = ("random scenes", "four times the steps", "one left out")
 Errors = dict[str, float]  # by "protocol metric"
 
 
@@ -225,9 +226,9 @@ def _convolutions(model: Any, frame: Frame) -> float:
 
 
 def ablation(measured: Measured, variants: dict[str, str]) -> tuple[Table, dict[str, Errors | str]]:
-    """Rows of variants: trained on random scenes with three seeds, and leaving one scene out."""
+    """Rows of variants: trained on random scenes with three seeds, longer, and leaving one scene out."""
     options = measured.options
-    columns = [f"{kind}, {name} PSNR / SSIM" for kind in ("random scenes", "one left out") for name in PROTOCOL_NAMES]
+    columns = [f"{kind}, {name} PSNR / SSIM" for kind in KINDS for name in PROTOCOL_NAMES]
     found = Table([["network", "parameters", columns[0], "seeds, PSNR", *columns[1:]]])
     averages: dict[str, Errors | str] = {}
     for name, run in variants.items():
@@ -241,10 +242,11 @@ def ablation(measured: Measured, variants: dict[str, str]) -> tuple[Table, dict[
         averages[name] = measured.average(means)
         each = sorted(own["strict PSNR"] for own in means if not isinstance(own, str))
         spread = f"{each[0]:.2f} .. {each[-1]:.2f}" if len(each) == len(SEEDS) else "-"
-        strict, meng = found.cells(averages[name])
-        found.rows.append(
-            [name, _parameters(options.runs, run), strict, spread, meng, *found.cells(measured.average(folds))]
-        )
+        longer = measured.average(_seed(measured, options.runs / "ablations" / f"{run}-longer"))
+        strict, *others = [
+            cell for errors in (averages[name], longer, measured.average(folds)) for cell in found.cells(errors)
+        ]
+        found.rows.append([name, _parameters(options.runs, run), strict, spread, *others])
     return found, averages
 
 
