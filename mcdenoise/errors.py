@@ -20,6 +20,10 @@ class InputError(ValueError):
         super().__init__(text)
 
 
+class MissingBufferError(InputError):
+    """A frame lacks a buffer that a method cannot do without."""
+
+
 def printable(text: str) -> str:
     r"""The text without what a terminal would obey and without line breaks: such characters are spelled out.
 

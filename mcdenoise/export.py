@@ -21,6 +21,7 @@ from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame, Hints
 from mcdenoise.models import Model, State
+from mcdenoise.models._contract import check_needs
 
 Format = Literal["onnx", "torch"]
 SUFFIXES: dict[Format, str] = {"onnx": ".onnx", "torch": ".pt2"}
@@ -50,8 +51,7 @@ class Step(nn.Module):
         self.model = model
         self.given = tuple(name for name in [*BUFFERS, "view_projection"] if name in buffers)
         self.given += tuple(sorted(set(buffers) - set(self.given)))
-        if absent := sorted(model.needs.buffers - set(self.given)):
-            raise InputError(f"buffer '{absent[0]}': the model needs it, found only {', '.join(self.given)}")
+        check_needs(model.needs, self.given)
         self.axes = _axes(self._example, self.given)
         # The structure is that of a state after the first frame, which a graph keeps from then on.
         small, large = self._state_of(_SIZE, _BATCH), self._state_of(_OTHER_SIZE, _OTHER_BATCH)

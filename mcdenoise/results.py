@@ -146,6 +146,7 @@ class Cell:
             all of it, so that the stages may add up to a little less.
         plan: what was skipped of the scene and why, see :func:`mcdenoise.models.summarize`.
         on_the_way: errors of the images on the way to the result, by stage, where they were asked for.
+        lacking: whether the failure is that the scene has not what the method needs, which is the fault of neither.
     """
 
     scene: str
@@ -159,6 +160,12 @@ class Cell:
     computing: Spread | None = None
     plan: list[dict[str, Any]] = field(default_factory=list)
     on_the_way: dict[str, dict[str, float]] = field(default_factory=dict)
+    lacking: bool = False
+
+    @property
+    def reason(self) -> str:
+        """Why nothing else is known; empty if more is."""
+        return self.failure and f"{'skipped' if self.lacking else 'failed'}: {self.failure}"
 
 
 @dataclass(frozen=True)
@@ -251,8 +258,8 @@ class Results:
 
     @property
     def failed(self) -> bool:
-        """Whether a method failed on a scene."""
-        return any(one.failure for one in self.cells)
+        """Whether a method failed on a scene that has what it needs."""
+        return any(one.failure and not one.lacking for one in self.cells)
 
     def cell(self, scene: str, method: str) -> Cell | None:
         """What is known of a method on a scene."""

@@ -50,6 +50,7 @@ from mcdenoise.models import (
     Needs,
     Output,
     create_model,
+    list_models,
     pretrained_models,
     save_weights,
 )
@@ -447,6 +448,39 @@ def test_a_model_that_fails_is_a_row_and_exit_status_1(
     assert f"failed: plane, {wild.method}: {wild.failure}\n" in printed
 
 
+def demanding() -> Any:
+    return lambda color, hit_distance: color
+
+
+def test_a_method_that_needs_what_a_scene_has_not_is_skipped_there(
+    small_sequence: Path, out: Path, run: Callable[..., Any]
+) -> None:
+    """One line says what is missing and which methods would do, and the others are compared."""
+    for path in (small_sequence / "inputs").glob("shading_normal*"):
+        path.unlink()
+    models = f"svgf,asvgf,{__name__}:demanding,guided"
+    status, printed, errors = run(
+        *(small_sequence, "-o", out, "--models", models, "--frames", "0-1", "--rounds", 1, "--sizes", "none")
+    )
+    assert (status, errors) == (0, "")
+    results = Results.read(out)
+    assert not results.failed
+    lacking = {cell.method: cell.failure for cell in results.cells if cell.lacking}
+    assert list(lacking) == ["svgf", "asvgf", f"{__name__}:demanding"]
+    assert lacking["svgf"] == lacking["asvgf"]
+    assert lacking["svgf"].startswith("buffer 'normal': the model needs it, found only albedo, color, depth, position")
+    assert "or take a model that does without: accumulated, " in lacking["svgf"]
+    assert [cell.method for cell in results.cells if cell.errors] == ["noisy", "accumulated", "guided"]
+    for method, failure in lacking.items():
+        assert f"skipped: plane, {method}: {failure}\n" in printed
+    assert not (out / "images" / "plane" / "svgf").exists()
+    page = (out / "index.html").read_text()
+    assert "skipped: buffer &#39;normal&#39;: the model needs it" in page
+    # Whatever else goes wrong is a failure.
+    assert Results.read(out).cells[2].reason == f"skipped: {lacking['svgf']}"
+    assert Cell("plane", "svgf", failure="out of luck").reason == "failed: out of luck"
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -514,6 +548,44 @@ def test_what_is_compared_by_default() -> None:
     assert len(trained) == 2 * len(pretrained_models())
     assert {"svgf", "joint_bilateral", "oidn"} <= {method.model for method in methods if method.kind == "fixed"}
     assert {method.settings["quality"] for method in methods if method.model == "oidn"} == {"fast", "balanced", "high"}
+
+
+def test_all_is_every_model_there_is() -> None:
+    """What has no weights is there as missing, and one line says so of all of them."""
+    methods = choose_methods("all", precisions="float32")
+    assert {method.model for method in methods} == set(list_models())
+    assert len({method.name for method in methods}) == len(methods)
+    untrained = {name for name in set(list_models()) - set(pretrained_models()) if create_model(name).needs.trainable}
+    assert {method.name for method in methods if method.missing} == untrained
+    reasons = {method.missing for method in methods if method.missing}
+    assert len(reasons) == 1
+    assert reasons.pop().startswith("expected shipped weights, found them only for: cascaded_v2")
+    default = [method.name for method in choose_methods(precisions="float32")]
+    assert [method.name for method in methods if method.name in default] == default
+
+
+def test_every_model_there_is_on_two_scenes(small_sequence: Path, out: Path, tmp_path: Path) -> None:
+    """None fails, whatever its weights are; what a scene has not is said of those that need it."""
+    poor = tmp_path / "poor"
+    shutil.copytree(small_sequence, poor)
+    for stem in ("shading_normal", "world_position"):
+        for path in (poor / "inputs").glob(f"{stem}*"):
+            path.unlink()
+    spellings = []
+    for name in list_models():
+        model, path = create_model(name), tmp_path / f"{name}.safetensors"
+        untrained = model.needs.trainable and name not in pretrained_models()
+        if untrained:
+            path.write_bytes(save_weights(model, name, {}, {}))
+        spellings.append(str(path) if untrained else name)
+    methods = choose_methods(",".join(spellings), precisions="float32")
+    assert {method.name for method in methods} == set(list_models())
+    sequences = [open_sequence(folder, "0-1") for folder in (small_sequence, poor)]
+    results = run_benchmark(sequences, methods, out, Settings(rounds=0, metrics=("SMAPE",), pictures=0, memory=False))
+    assert not [cell for cell in results.cells if cell.failure and not cell.lacking]
+    assert len(results.cells) == 2 * len(list_models())
+    lacking = {(cell.scene, cell.method) for cell in results.cells if cell.lacking}
+    assert lacking == {("poor", name) for name in ("asvgf", "bmfr", "oidn_open", "svgf")}
 
 
 def test_some_methods_in_some_precisions() -> None:

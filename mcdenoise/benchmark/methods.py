@@ -15,12 +15,12 @@ from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.methods import Spelling, parse_method, split_methods
-from mcdenoise.models import PRECISIONS, Output, Skipping, parts_of, pretrained_models
+from mcdenoise.models import PRECISIONS, Output, Skipping, list_models, parts_of, pretrained_models
 from mcdenoise.nn import FusionModule, LogFusion, UNet
 from mcdenoise.results import KEEP_ALL, Kind, Method
 
 BASELINES = ("noisy", "accumulated")
-PRETRAINED = "pretrained"
+PRETRAINED, ALL = "pretrained", "all"
 # What is compared by default: filters in a narrow and a wide setting, other denoisers, and all shipped weights.
 COMPARED = (
     "joint_bilateral(sigma_color=0.1, sigma_space=1.5),joint_bilateral(sigma_color=0.2, sigma_space=4.0),svgf,"
@@ -108,14 +108,15 @@ def choose_methods(
 
     Args:
         names: spellings of methods separated by commas, see :func:`mcdenoise.methods.split_methods`; ``"pretrained"``
-            stands for all models with shipped weights, ``"all"`` (or ``None``) for :data:`COMPARED`, ``"none"`` for
-            none.
+            stands for all models with shipped weights, ``None`` for :data:`COMPARED`, ``"all"`` for these and every
+            other model there is, ``"none"`` for none.
         precisions: of the convolutions of what learns, separated by commas: ``float32``, ``bfloat16``.
         keep_all: have each method that skips what a scene does not need twice, the second time skipping nothing.
         baselines: methods that are there in any case, first.
 
     Returns:
-        The methods; one whose package is not installed, and one of ``"all"`` that cannot be had, is there as missing.
+        The methods; one whose package is not installed, and one that was not named and has no weights, is there as
+        missing.
 
     Raises:
         InputError: a method or precision is unknown, or a model has no weights.
@@ -124,8 +125,8 @@ def choose_methods(
     for name in chosen:
         if name not in PRECISIONS:
             raise InputError(f"--precisions: expected some of {', '.join(PRECISIONS)}, found '{name}'")
-    everything = names is None or names == "all"
-    text = COMPARED if names is None or names == "all" else names
+    named = names not in (None, ALL)
+    text = COMPARED if names is None else _everything() if names == ALL else names
     methods: list[Method] = []
     for spelt in [*baselines, *(split_methods(text) if text != "none" else ())]:
         for one in pretrained_models() if spelt == PRETRAINED else [spelt]:
@@ -137,12 +138,20 @@ def choose_methods(
             try:
                 model = spelling.denoiser().model
             except InputError as error:
-                if not (everything or one in BASELINES or isinstance(error.__cause__, ImportError)):
+                if named and one not in BASELINES and not isinstance(error.__cause__, ImportError):
                     raise
-                methods.append(replace(method, missing=str(error)))
+                # What several lack for the same reason is told in one line.
+                methods.append(replace(method, missing=str(error).removeprefix(f"model '{one}': ")))
                 continue
             methods += _variants(method, model, chosen, keep_all)
     return _with_folders(methods)
+
+
+def _everything() -> str:
+    """The spellings that are compared by default, and the names of all other models."""
+    known = {parse_method(each).model for each in split_methods(COMPARED) if each != PRETRAINED}
+    known |= {*pretrained_models(), *BASELINES}
+    return ",".join([COMPARED, *(name for name in list_models() if name not in known)])
 
 
 def one_line(error: BaseException) -> str:

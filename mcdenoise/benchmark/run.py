@@ -23,7 +23,7 @@ from mcdenoise.benchmark.tables import write_csv
 from mcdenoise.data import Sequence, open_sequence, write_exr
 from mcdenoise.data.files import new_folder
 from mcdenoise.data.sequences import with_unique_names
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.evaluate import USUAL, check_references, reference_noise
 from mcdenoise.frame import Frame
 from mcdenoise.models import Output, Stage, summarize
@@ -106,8 +106,8 @@ def run_benchmark(
         on_step: called with the number of steps done, and that of all of them.
 
     Returns:
-        What is in ``results.json``. A method that fails on a scene has a cell that says why; a scene whose files cannot
-        be read fails for all methods.
+        What is in ``results.json``. A method that fails on a scene, or is skipped there because the scene has not what
+        it needs, has a cell that says why; a scene whose files cannot be read fails for all methods.
 
     Raises:
         InputError: a sequence has no references, there is something at ``out``, or it cannot be written to.
@@ -199,6 +199,7 @@ class _SceneRun:
         self.errors = Errors(settings.metrics, settings.flip_every)
         self._sequence, self._made, self._settings = sequence, made, settings
         self._failures = dict(made.failures)
+        self._lacking: set[str] = set()
         self._folder, self._written = folder, folder / ".written.exr"
         self._watch = Stopwatch(settings.device)
         self._times: dict[str, dict[str, list[float]]] = {method.name: {} for method in made.methods}
@@ -225,7 +226,7 @@ class _SceneRun:
         except InputError as error:
             # A frame cannot be read: nobody has seen the whole scene.
             reason = one_line(error)
-            self._failures = {method.name: reason for method in self._made.methods}
+            self._failures, self._lacking = {method.name: reason for method in self._made.methods}, set()
             self._scene = replace(self._scene, pictures=[])
             shutil.rmtree(self._folder / IMAGES / self._scene.name, ignore_errors=True)
         finally:
@@ -307,6 +308,8 @@ class _SceneRun:
             yield
         except Exception as error:  # whatever a method fails with: the others go on
             self._failures[name] = one_line(error)
+            if isinstance(error, MissingBufferError):
+                self._lacking.add(name)
 
     def _keep(self, folder: str, number: int, image: Tensor) -> None:
         path = self._folder / IMAGES / self._scene.name / folder / f"{number}.exr"
@@ -322,7 +325,7 @@ class _SceneRun:
         name = method.name
         if name in self._failures:
             shutil.rmtree(self._folder / IMAGES / self._scene.name / method.folder, ignore_errors=True)
-            return Cell(self._scene.name, name, failure=self._failures[name])
+            return Cell(self._scene.name, name, failure=self._failures[name], lacking=name in self._lacking)
         cell = Cell(
             self._scene.name,
             name,

@@ -99,7 +99,11 @@ def skipped_rows(results: Results) -> list[dict[str, str]]:
 
 def remarks(results: Results) -> list[str]:
     """What to print below: what failed, what is missing, what was not computed, each with its reason."""
-    lines = [f"failed: {cell.scene}, {cell.method}: {cell.failure}" for cell in results.cells if cell.failure]
+    lines = [
+        f"{'skipped' if cell.lacking else 'failed'}: {cell.scene}, {cell.method}: {cell.failure}"
+        for cell in results.cells
+        if cell.failure
+    ]
     lines += [
         f"not tried: {one.method}, {one.width}x{one.height}: {one.failure}" for one in results.costs if one.failure
     ]

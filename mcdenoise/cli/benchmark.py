@@ -47,8 +47,8 @@ def benchmark(
     """Measure error against run time: any methods and doing nothing, on the same frames, taking turns.
 
     Writes OUT/index.html, the report, with its plots, results.json, results.csv and images; OUT must not exist.
-    Exit status 1 if a method failed on a scene. With --ops, measures the operators instead: time, error, and how
-    near they come to a copy.
+    Exit status 1 if a method failed on a scene; one that needs a buffer which the scene has not is skipped there.
+    With --ops, measures the operators instead: time, error, and how near they come to a copy.
 
     With --suite wild, renders frames that no training uses, by Mitsuba and by Blender's Cycles, to the folder of --data
     where they are missing, and compares --models with OIDN's best setting of each: OUT/suite.md, suite.json and
@@ -58,9 +58,9 @@ def benchmark(
         sequences: folders of sequences with references.
         out: folder to make; needed except with --ops.
         models: names separated by commas, see `mcdenoise models`, with settings if need be, several at once such as
-            "oidn(quality=fast|high)"; weights files; file.py:factory; "pretrained" for all with shipped weights; "all",
-            the default, for these, filters, and other denoisers; or none. Doing nothing and accumulation alone are
-            always there.
+            "oidn(quality=fast|high)"; weights files; file.py:factory; "pretrained" for all with shipped weights; "all"
+            for every name there is, saying which have no weights yet; or none. By default those with shipped weights,
+            filters, and other denoisers. Doing nothing and accumulation alone are always there.
         precisions: of the convolutions of models that learn: float32, bfloat16, or both.
         frames: which frames of each sequence, such as 0-59,70; all by default.
         rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.

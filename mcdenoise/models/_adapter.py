@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 
@@ -51,7 +51,16 @@ class FromBuffers(nn.Module):
         return self._needs
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
-        """See :class:`mcdenoise.models.Model`."""
+        """See :class:`mcdenoise.models.Model`.
+
+        Raises:
+            MissingBufferError: the frame lacks a buffer that the function takes.
+        """
+        if absent := self._needs.missing(frame):
+            raise MissingBufferError(
+                f"buffer '{absent[0]}': {_name(self.function)} takes it, found only "
+                f"{', '.join(sorted(frame.buffers))}; render it, or give that argument a default value"
+            )
         named = {name: frame.buffer(name) for name in sorted(self._needs.buffers | self._needs.uses)}
         result = self.function(**{name: image for name, image in named.items() if image is not None})
         if isinstance(result, Output):

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Collection
 from typing import Any
 
+import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Output, State
+from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._registry import build_model, find_model, list_models
+from mcdenoise.models._weights import pretrained_models
 
 
 def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...]) -> tuple[Output, State]:
@@ -50,16 +55,52 @@ def absent_buffers(model: Model, frame: Frame) -> list[str]:
     """Buffers that a method is better with and the frame has not, sorted.
 
     Raises:
-        InputError: the frame lacks one that the method needs.
+        MissingBufferError: the frame lacks one that the method needs.
     """
     needs = model.needs
-    if absent := needs.missing(frame):
-        raise InputError(
-            f"buffer '{absent[0]}': the model needs it, found only {', '.join(sorted(frame.buffers))}; render it, "
-            "or take another model, see `mcdenoise models`"
-        )
+    check_needs(needs, frame.buffers)
     missing = needs.uses - frame.buffers - {"previous_position", "position", "view_projection"}
     return sorted(missing - ({"motion"} if {"position", "view_projection"} <= frame.buffers else frozenset()))
+
+
+def check_needs(needs: Needs, given: Collection[str]) -> None:
+    """See that a frame has what a method cannot do without.
+
+    Args:
+        needs: of the method.
+        given: names of the buffers of the frame.
+
+    Raises:
+        MissingBufferError: it has not; the message says what is missing, and which methods would do.
+    """
+    if needs.buffers <= set(given):
+        return
+    absent, found = sorted(needs.buffers - set(given)), ", ".join(sorted(given))
+    what, it = ("buffer", "it") if len(absent) == 1 else ("buffers", "them")
+    others = ", ".join(name for name, wanted in _ready().items() if wanted <= set(given))
+    instead = f"a model that does without: {others}" if others else "another model, see `mcdenoise models`"
+    raise MissingBufferError(
+        f"{what} {', '.join(map(repr, absent))}: the model needs {it}, found only {found or 'none'}; render {it}, or "
+        f"take {instead}"
+    )
+
+
+@functools.cache
+def _ready() -> dict[str, frozenset[str]]:
+    """What each method needs that can be had at once: with weights, or without any to be trained."""
+    found = {}
+    shipped = pretrained_models()
+    # Networks are drawn at random, which must not show in what the caller draws.
+    with torch.random.fork_rng(devices=[]):
+        for name in list_models():
+            try:
+                needs = build_model(name).needs if find_model(name).installed else None
+            except Exception:  # whatever another package's model fails with: it is not offered
+                continue
+            # What reaches no other pixel does not denoise.
+            if needs is not None and needs.reach != 0 and (name in shipped or not needs.trainable):
+                found[name] = needs.buffers
+    return found
 
 
 def owned(tree: Any, others: Any) -> Any:

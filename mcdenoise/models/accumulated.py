@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +16,7 @@ from mcdenoise.frame import MOTION, RADIANCE, Frame, tells_motion
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import Journal, journal, note, timed
 from mcdenoise.models._layers import alpha_of, completed
+from mcdenoise.models._state import ADVICE, own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops import Surface, clamp_fireflies, motion_from_position
 from mcdenoise.ops._steps.history import (
@@ -48,10 +49,14 @@ ALBEDO_HISTORY = "albedo_history"
 _NO_WAY = "no motion, and no position with a previous camera"
 
 
+_Carried: TypeAlias = tuple[Tensor | None, ...]
+
+
 class History(NamedTuple):
     """What is kept of a shot.
 
-    All of it zeros is the history of no frame, so that a graph that takes a history can begin with that.
+    All of it zeros is the history of no frame, so that a graph that takes a history can begin with that. It is of the
+    radiance alone: methods that accumulate by the same settings may go on with one another's.
 
     Args:
         color: ``(B, 3, H, W)``; where lag is looked for ``(B, 9, H, W)``, see
@@ -61,7 +66,7 @@ class History(NamedTuple):
         view_projection: ``(B, 4, 4)`` by which camera.
         limit: ``(B, 1, 1, 1)`` of the fireflies of this shot, see :func:`mcdenoise.ops.clamp_fireflies`.
         carried: of each layer, then of the alpha, then of each buffer that is accumulated as well, the channels of
-            ``color`` that are no compressed radiance.
+            ``color`` that are no compressed radiance; ``None`` of a buffer that the frame had not.
     """
 
     color: Tensor
@@ -69,7 +74,7 @@ class History(NamedTuple):
     surface: Surface
     view_projection: Tensor | None
     limit: Tensor
-    carried: tuple[Tensor, ...] = ()
+    carried: _Carried = ()
 
 
 class Accumulated(Wrapper):
@@ -77,8 +82,9 @@ class Accumulated(Wrapper):
 
     The method sees the accumulated radiance as ``color``, that of the frame alone as ``current``, and the ``length`` of
     the history; whether nothing moves, as ``hints.still``; and no state at the beginning of a shot. A shot ends at a
-    cut (less than 5 % of the pixels find their surface in the previous frame), when the image's size changes, and where
-    a frame says nothing of motion. The accumulated image is the stage ``accumulated``.
+    cut (less than 5 % of the pixels find their surface in the previous frame), when the image's size changes, where a
+    frame says nothing of motion, and where it lacks a buffer of ``also`` that the one before has, or the other way
+    round. The accumulated image is the stage ``accumulated``.
 
     Motion is the frame's own where it has one, else that of its previous positions (its positions, where it has none)
     seen from the previous camera. Where positions and cameras say that nothing moved, the motion is zero, not the
@@ -159,7 +165,9 @@ class Accumulated(Wrapper):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        history, inner = (None, None) if state is None else state
+        kept, inner = own_pair(state, "accumulated")
+        channels = RECENT.stop if math.isfinite(self.lag_threshold) else COLOR.stop
+        history = own_state(kept, History, frame, channels=channels)
         with timed("accumulate", frame.color.device):
             accumulated, history, inner = self._accumulate(frame.with_depth(), history, inner)
         del frame
@@ -173,7 +181,7 @@ class Accumulated(Wrapper):
         """The frame with its history, the history for the next one, and the state that the method inside may have."""
         compiling = torch.compiler.is_compiling()
         can_move = tells_motion(frame.buffers)
-        reset = "" if history is None else _misfit(history, frame)
+        reset = "" if history is None else _misfit(history, frame) or self._other_buffers(history, frame)
         surfaces = (frame, frame if history is None else history.surface)
         if self.rule == "bmfr" and any(each.position is None or each.normal is None for each in surfaces):
             reset = reset or "no position and normal, which the rule compares"
@@ -186,7 +194,7 @@ class Accumulated(Wrapper):
             limit = torch.where(limit > 0, limit, self._chosen(frame.color))
         entering = incoming(frame.color, None, limit, compared=compared)
         seen = lights(entering[:, MEAN]) if compared else None
-        carried: tuple[Tensor, ...] = ()
+        carried: _Carried = ()
         still: bool | Tensor = False
         if not reset and history is not None:
             still = is_still(frame, history.view_projection)
@@ -194,10 +202,14 @@ class Accumulated(Wrapper):
             cut = kept.mean() < CUT_FRACTION
             if (found := journal()) is not None:
                 found.history = float(kept.mean())
-            if not compiling and not cut:
+            if compiling or not cut:
                 carried = self._blend_carried(frame, entering, seen, history, still)
             if compiling:
                 color = torch.where(cut, without_history(entering), color)
+                carried = tuple(
+                    None if part is None or old is None else torch.where(cut, part, old)
+                    for part, old in zip(self._first(frame, entering), carried, strict=True)
+                )
                 length = torch.where(cut, 1, length)
                 limit = torch.where(cut, 0, limit)
                 inner = pytree.tree_map_only(Tensor, lambda tensor: torch.where(cut, 0, tensor), inner)
@@ -209,9 +221,7 @@ class Accumulated(Wrapper):
                     limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
         if reset:
             color, length = without_history(entering), torch.ones_like(entering[:, :1])
-            carried = tuple(
-                torch.cat([part, part], 1) if compared else part for part in self._entering(frame, entering)
-            )
+            carried = self._first(frame, entering)
             inner, still = None, False
         if (found := journal()) is not None:
             self._report(found, frame, reset, still=bool(still), can_move=can_move, keeps=keeps)
@@ -226,16 +236,26 @@ class Accumulated(Wrapper):
         seen_inside = {"color": color[:, COLOR], "current": current, "length": length, "statistics": {}}
         return self._with_carried(frame.replace(**seen_inside, hints=hints), carried), after, inner
 
+    def _first(self, frame: Frame, entering: Tensor) -> _Carried:
+        """Layers and alpha of the frame, and what is accumulated as well, without histories."""
+        parts = self._entering(frame, entering)
+        # With what is compared for lag, each has its recent mean behind it.
+        twice = entering.shape[1] > COLOR.stop
+        return tuple(torch.cat([part, part], 1) if twice and part is not None else part for part in parts)
+
     def _blend_carried(
         self, frame: Frame, entering: Tensor, seen: Tensor | None, history: History, still: bool | Tensor
-    ) -> tuple[Tensor, ...]:
+    ) -> _Carried:
         """Layers and alpha of the frame, and what is accumulated as well, with their histories.
 
         Each goes through the blend in the place of the color, which decides nothing: its compressed radiance does.
         """
         decisive = entering[:, COLOR.stop :]
-        blended = []
+        blended: list[Tensor | None] = []
         for part, before in zip(self._entering(frame, entering), history.carried, strict=True):
+            if part is None or before is None:
+                blended.append(None)
+                continue
             previous = [before[:, COLOR], history.color[:, MEAN.start : SQUARE.stop], before[:, COLOR.stop :]]
             previous = [*previous, history.color[:, RECENT_MEAN]] if decisive.shape[1] else previous
             together = torch.cat([part, decisive], 1), torch.cat(previous, 1)
@@ -269,32 +289,47 @@ class Accumulated(Wrapper):
             lag_threshold=self.lag_threshold,
         )
 
-    def _entering(self, frame: Frame, entering: Tensor) -> list[Tensor]:
+    def _entering(self, frame: Frame, entering: Tensor) -> list[Tensor | None]:
         """What has a history beside the color, ``(B, 3, H, W)`` each, as it enters it: layers without fireflies."""
-        parts = list(frame.layers.values())
+        parts: list[Tensor | None] = list(frame.layers.values())
         if parts:
             lit = frame.color > 0
             scale = torch.where(lit, entering[:, COLOR] / torch.where(lit, frame.color, 1), 1)
-            parts = [part * scale for part in parts]
+            parts = [part * scale for part in frame.layers.values()]
         if (alpha := alpha_of(frame)) is not None:
             parts.append(alpha.expand(-1, COLOR.stop, -1, -1))
-        buffers = (frame.buffer(name) for name in self._found(frame))
-        parts += [buffer for buffer in buffers if buffer is not None]
-        return [part.to(entering.dtype) for part in parts]
+        parts += [frame.buffer(name) for name in self.also]
+        return [None if part is None else part.to(entering.dtype) for part in parts]
 
-    def _with_carried(self, frame: Frame, carried: tuple[Tensor, ...]) -> Frame:
+    def _with_carried(self, frame: Frame, carried: _Carried) -> Frame:
         """The frame with the layers, the alpha and the buffers of its history."""
         if not carried:
             return frame
-        parts = iter(carried)
-        layers = {name: next(parts)[:, COLOR] for name in frame.layers}
-        alpha = frame.alpha if alpha_of(frame) is None else next(parts)[:, :1]
-        also = {ALBEDO_HISTORY if name == "albedo" else name: next(parts)[:, COLOR] for name in self._found(frame)}
+        alpha = alpha_of(frame)
+        names = (*frame.layers, *(() if alpha is None else ("alpha",)), *self.also)
+        found = [(name, part) for name, part in zip(names, carried, strict=True) if part is not None]
+        layers = {name: part[:, COLOR] for name, part in found[: len(frame.layers)]}
+        rest = found[len(frame.layers) :]
+        alpha = frame.alpha if alpha is None else rest.pop(0)[1][:, :1]
+        also = {ALBEDO_HISTORY if name == "albedo" else name: part[:, COLOR] for name, part in rest}
         own = {name: also.pop(name) for name in RADIANCE if name in also}
         return frame.replace(layers=layers, alpha=alpha, extra={**frame.extra, **also}, **own)
 
-    def _found(self, frame: Frame) -> list[str]:
-        return [name for name in self.also if frame.buffer(name) is not None]
+    def _other_buffers(self, history: History, frame: Frame) -> str:
+        """Why what has a history beside the color cannot go on; empty if it can.
+
+        Raises:
+            InputError: that is of another method, or of other layers.
+        """
+        before, now = len(history.carried), len(frame.layers) + (alpha_of(frame) is not None) + len(self.also)
+        if before != now:
+            raise InputError(
+                f"state: expected what accumulated keeps of {now} images beside the color, found it of {before}: of "
+                f"another method or other layers; {ADVICE}"
+            )
+        there = [frame.buffer(name) is not None for name in self.also]
+        same = there == [part is not None for part in history.carried[now - len(there) :]]
+        return "" if same else "other buffers than in the frame before"
 
     def _chosen(self, color: Tensor) -> Tensor:
         """The limit of the fireflies of each image of a shot that begins with this frame."""
@@ -402,7 +437,7 @@ def _thinned(image: Tensor) -> Tensor:
 
 def _misfit(history: History, frame: Frame) -> str:
     """Why a history cannot be that of a frame; empty if it can."""
-    if history.length.shape != frame.color[:, :1].shape or history.length.device != frame.color.device:
+    if history.length.shape != frame.color[:, :1].shape:
         return "size change"
     return _NO_WAY if frame.motion is None and history.view_projection is None else ""
 

@@ -93,7 +93,7 @@ class Anf(nn.Module):
         embedded = self.embedded(frame).to(light.dtype)
         sizes = [light.shape[1], light.shape[1], embedded.shape[1], FEATURES]
         with timed("accumulate", light.device):
-            found, known = from_before(frame, state, channels=sum(sizes))
+            found, known = from_before(frame, state, channels=sum(sizes), keeper="anf")
             result_before, mean_before, embedded_before, features_before = found.split(sizes, 1)
 
         unet_input = torch.cat([embedded, embedded_before], 1)

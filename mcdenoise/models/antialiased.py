@@ -15,6 +15,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
+from mcdenoise.models._state import own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import has_motion, motion_unless_still
 from mcdenoise.ops import reproject
@@ -66,12 +67,13 @@ class Antialiased(Wrapper):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        inner, before = (None, None) if state is None else state
+        inner, shown = own_pair(state, "antialiased")
+        before = own_state(shown, Shown, frame)
         output, inner = self.inner(frame, inner)
         with timed("antialias", frame.color.device):
             image = _mapped(output.image)
             result = image
-            if before is not None and before.image.shape == image.shape and before.image.device == image.device:
+            if before is not None and before.image.shape == image.shape:
                 result = self._blended(image, before, frame)
             after = inner, Shown(result, frame.view_projection)
             stages = {**output.stages, "denoised": output.image}

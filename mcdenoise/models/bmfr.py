@@ -38,11 +38,13 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
+from mcdenoise.models._contract import check_needs
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published
 from mcdenoise.models._registry import register_model
+from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import has_motion, motion_unless_still, surface_before
 from mcdenoise.models.antialiased import Antialiased
 from mcdenoise.ops import Surface, block_regression, reproject
@@ -114,11 +116,12 @@ class Bmfr(nn.Module):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        history: History | None = state
-        color = frame.color
+        check_needs(self.needs, frame.buffers)
+        color, light = frame.color, with_carried(frame)
+        history = own_state(state, History, frame, channels=light.shape[1])
         number = torch.zeros_like(color[:, :1, :1, :1]) if history is None else history.number
         with timed("fit", color.device):
-            images = self._fitted(frame, with_carried(frame), number)
+            images = self._fitted(frame, light, number)
             fitted = images[:, :3]
         if history is not None:
             with timed("accumulate again", color.device):

@@ -12,6 +12,7 @@ from mcdenoise.frame import Frame, Skip
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._layers import completed
+from mcdenoise.models._state import own_parts
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.exposed import Exposed
 
@@ -59,7 +60,7 @@ class Chain(nn.Module):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        states: dict[str, Any] = dict.fromkeys(self._names) if state is None else dict(state)
+        states: dict[str, Any] = own_parts(state, self._names)
         stages: dict[str, Tensor] = {}
         last, skip = self._names[-1], frame.skip
         for name in self._names:

@@ -118,24 +118,35 @@ class MrkpNetwork(TenChannels):
 
     @property
     def needs(self) -> Needs:
-        """A pixel for each head, the radius of each filter, and two for each step up, at their scales."""
-        own = ((1 + self._radius) << (SCALES - 1)) + sum(4 << scale for scale in range(SCALES))
-        reach = self.unet.reach() + own
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple)
+        """See :func:`reach_of`."""
+        return Needs(
+            uses=frozenset({"albedo", "normal", "depth"}), reach=reach_of(self._radius), stride=self.unet.multiple
+        )
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         dtype = accumulator_dtype(frame.color.dtype)
         levels = self.unet(self.input_of(frame, frame.color))
-        scales = list(
-            itertools.accumulate(range(SCALES), lambda x, _: downsample(x), initial=with_carried(frame).to(dtype))
-        )
-        blended = scales.pop()  # what is coarsest is not filtered
+        *scales, blended = scales_of(with_carried(frame).to(dtype))  # what is coarsest is not filtered
         for n, level, head in zip(reversed(scales), reversed(levels), reversed(self.heads), strict=True):
             predicted = F.relu(head(level).to(dtype))
             kernel, alpha = predicted.split([self.taps, 1], 1)
-            blended = _blend(_filter(n, kernel), blended, alpha)
+            blended = blend_scales(_filter(n, kernel), blended, alpha)
         return answered(frame, blended.clamp_min(0).to(frame.color.dtype)), None
+
+
+def reach_of(radius: int) -> int:
+    """How far from a pixel its result depends on the image where a filter of this radius runs at each scale.
+
+    Beside the features, a pixel for each head, the radius, and two for each step up, at their scales.
+    """
+    own = ((1 + radius) << (SCALES - 1)) + sum(4 << scale for scale in range(SCALES))
+    return Backbone.reach() + own
+
+
+def scales_of(image: Tensor) -> list[Tensor]:
+    """The image, and its means over squares of 2, 4 and 8 pixels."""
+    return list(itertools.accumulate(range(SCALES), lambda x, _: downsample(x), initial=image))
 
 
 def _filter(image: Tensor, kernel: Tensor) -> Tensor:
@@ -146,7 +157,7 @@ def _filter(image: Tensor, kernel: Tensor) -> Tensor:
     return total / (weight + _EPSILON)
 
 
-def _blend(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
+def blend_scales(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     """``fine - alpha U D fine + alpha U coarse`` (the paper's Eq. 2); of layers a mean, which stays between both."""
     height, width = fine.shape[-2:]
     color = fine[:, :3] + alpha * aligned(coarse[:, :3] - downsample(fine[:, :3]), height, width)

@@ -52,6 +52,7 @@ from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._journal import journal, timed
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
+from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import has_motion, motion_unless_still
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.nn.samples import samples_of
@@ -218,6 +219,7 @@ class Nppd(nn.Module):
         radiance, others = frame.color.to(dtype), carried(frame)
         if others is not None:
             radiance = torch.cat([radiance, others.to(dtype), torch.ones_like(radiance[:, :1])], 1)
+        state = own_state(state, History, frame, channels=radiance.shape[1])
         device = frame.color.device
         with timed("accumulate", device):
             mean_before, image_before, features_before = self._warped(frame, state, radiance)  #                     1.
@@ -242,7 +244,7 @@ class Nppd(nn.Module):
         channels = [radiance.shape[1], radiance.shape[1], FEATURES]
         reset, motion = "first frame", None
         if before is not None:
-            alike = before.radiance.shape == radiance.shape and before.radiance.device == radiance.device
+            alike = before.radiance.shape == radiance.shape
             known = has_motion(frame, before.view_projection)
             reset = "size change" if not alike else "" if known else "no motion"
         if (found := journal()) is not None:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
+from mcdenoise.models._contract import check_needs
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
 from mcdenoise.models._registry import register_model
@@ -55,6 +56,7 @@ class OidnOpen(nn.Module):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
+        check_needs(self.needs, frame.buffers)
         assert frame.albedo is not None
         assert frame.normal is not None
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]

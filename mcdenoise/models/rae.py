@@ -41,6 +41,7 @@ from mcdenoise.frame import MOTION, Frame, tells_motion
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import journal
 from mcdenoise.models._registry import register_model
+from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import CUT_FRACTION
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
@@ -111,7 +112,8 @@ class Rae(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.with_depth()
         color = frame.color
-        x, hidden = input_of(frame), _recalled(frame, state)
+        memory = own_state(state, Memory, frame, channels=self.encoder[0].entry.out_channels)
+        x, hidden = input_of(frame), _recalled(frame, memory)
         found: list[Tensor] = []
         for stage, before in zip(self.encoder, hidden, strict=False):
             x = stage(x, before)
@@ -162,7 +164,7 @@ def _recalled(frame: Frame, memory: Memory | None) -> list[Tensor | None]:
     """The hidden states that this frame may see."""
     nothing: list[Tensor | None] = [None] * (STAGES + 1)
     fits = memory is not None and memory.before.image.shape == frame.color[:, :1].shape
-    if memory is None or not fits or memory.before.image.device != frame.color.device:
+    if memory is None or not fits:
         if (found := journal()) is not None:
             found.reset = "first frame" if memory is None else "size change"
         return nothing

@@ -10,6 +10,7 @@ from torch import Tensor
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._journal import journal, note, timed
+from mcdenoise.models._state import own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import comparable, has_motion, motion_unless_still, surface_before
 from mcdenoise.ops import Surface, demodulate, remodulate, reproject
@@ -86,23 +87,28 @@ def to_be_kept(frame: Frame, image: Tensor) -> Before | None:
     return Before(image, torch.ones_like(image[:, :1, :1, :1]), surface, frame.view_projection)
 
 
-def from_before(frame: Frame, before: Before | None, channels: int) -> tuple[Tensor, Tensor]:
+def from_before(frame: Frame, state: State, channels: int, keeper: str = "recurrent") -> tuple[Tensor, Tensor]:
     """What was kept of the frame before, at the places of this one.
 
     Args:
         frame: with a depth, if it has what tells one (:meth:`mcdenoise.frame.Frame.with_depth`).
-        before: by :func:`to_be_kept`.
+        state: by :func:`to_be_kept`, or ``None``.
         channels: of the image that is kept.
+        keeper: the method, for messages.
 
     Returns:
         ``(B, channels, H, W)`` image, and ``(B, 1, H, W)`` in [0, 1] how much of it shows the same surface; zeros of a
         first frame, of another size than the one before, and where nothing tells motion.
+
+    Raises:
+        InputError: the state is that of another method.
     """
+    before = own_state(state, Before, frame, channels=channels, keeper=keeper)
     nothing = frame.color.new_zeros(frame.color.shape[0], channels, *frame.size), torch.zeros_like(frame.color[:, :1])
     if before is None:
         _report("first frame", 0.0)
         return nothing
-    if before.image.shape != nothing[0].shape or before.image.device != frame.color.device:
+    if before.image.shape != nothing[0].shape:
         _report("size change", 0.0)
         return nothing
     if not has_motion(frame, before.view_projection):

@@ -16,6 +16,7 @@ from mcdenoise.models._interface import Model, Output, State
 from mcdenoise.models._journal import note, timed
 from mcdenoise.models._layers import alpha_of, completed
 from mcdenoise.models._noise_free import noise_free
+from mcdenoise.models._state import own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.tiled import TILE
 from mcdenoise.ops._window import corner
@@ -90,7 +91,8 @@ class Skipping(Wrapper):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        before, inner = (None, None) if state is None else state
+        remembered, inner = own_pair(state, "skipping")
+        before = own_state(remembered, Remembered, frame)
         current = frame.color if frame.current is None else frame.current
         still = frame.hints.still and self.tolerance > 0 and not frame.hints.keep_all
         # The color of a tile may have converged while light goes from one of its layers to another.

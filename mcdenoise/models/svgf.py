@@ -17,10 +17,12 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
+from mcdenoise.models._contract import check_needs
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import journal, timed
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
+from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import motion_to_previous, surface_before
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.ops import Surface, accumulate, atrous, luminance_moments, moments_variance
@@ -90,7 +92,8 @@ class Svgf(nn.Module):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        history: History | None = state
+        check_needs(self.needs, frame.buffers)
+        history = own_state(state, History, frame, channels=with_carried(frame).shape[1])
         normal, depth = frame.normal, frame.depth
         with timed("accumulate", frame.color.device):
             light, moments, length = self._accumulate(frame, history)
@@ -123,7 +126,7 @@ class Svgf(nn.Module):
         reset, motion = "first frame", None
         if history is not None:
             motion = motion_to_previous(frame, history.view_projection)
-            alike = history.length.shape == light[:, :1].shape and history.length.device == light.device
+            alike = history.length.shape == light[:, :1].shape
             reset = "size change" if not alike else "" if motion is not None else "no motion"
         if (found := journal()) is not None:
             found.reset = reset

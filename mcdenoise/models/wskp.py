@@ -3,8 +3,13 @@
 Fan et al. 2021, "Real-time Monte Carlo denoising with weight sharing kernel prediction network". This is the network of
 the public code for the BMFR data: six 5x5 convolutions of 14 channels without biases, LeakyReLU 0.1 between them, and
 12 channels at the end: six maps of importance for kernels of sides 3, 5, 7, 9, 11, 13 at one scale, and six of blending
-weights, of which a softmax is taken. The paper instead describes a U-Net with three maps for each of several scales
-and kernels of sides 3, 5 and 7, which is not here.
+weights, of which a softmax is taken.
+
+Fan's paper instead describes a U-Net that predicts at several scales. That is `wskp_unet`, as far as it is known: by
+the comparison of doi:10.1007/s00371-023-02951-6 it has the backbone of `mrkp`, and each scale three maps for kernels
+of sides 3, 5 and 7. All else is a guess here: three scales, at each of which the kernels are blended as above, by a
+softmax of three more maps; scales blended as in `mrkp`, by one more channel behind a ReLU, the coarsest unfiltered; and
+a backbone of plain convolutions, as wide as that of `mrkp`. Nothing public has its sizes or its weights.
 
 Each convolution is trained as the sum of one of 5x5, one of 3x3, one of 1x1 and, but for the first and last, the
 identity (RepVGG, Ding et al. 2021). These are merged into one 5x5 kernel before it is applied, in training too: the sum
@@ -32,10 +37,12 @@ from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, displayed
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.exposed import Exposed
+from mcdenoise.models.mrkp import SCALES, Backbone, blend_scales, reach_of, scales_of, with_glorot
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import importance_filter
 
 SIDES = (3, 5, 7, 9, 11, 13)
+SIDES_OF_SCALE = (3, 5, 7)
 _SLOPE = 0.1
 
 
@@ -103,12 +110,53 @@ class WskpNetwork(TenChannels):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        x = with_carried(frame)
-        importance, blend = self.maps(frame)
-        out = torch.zeros_like(x)
-        for side, m, weight in zip(SIDES, importance.split(1, 1), blend.to(x.dtype).split(1, 1), strict=True):
-            out = torch.addcmul(out, weight, importance_filter(x, m, kernel_size=side))
-        return answered(frame, out), None
+        return answered(frame, filtered(with_carried(frame), *self.maps(frame), SIDES)), None
+
+
+class WskpUNet(TenChannels):
+    """Predicts maps of importance and how to blend at three scales, filters each, and blends from coarse to fine.
+
+    Args:
+        width: channels of every convolution, 48.
+    """
+
+    def __init__(self, width: int = 48) -> None:
+        super().__init__()
+        self.unet, self.kernels = Backbone(10, width), len(SIDES_OF_SCALE)
+        self.heads = nn.ModuleList(
+            with_glorot(nn.Conv2d(self.unet.out_channels, 2 * self.kernels + 1, 3, padding=1)) for _ in range(SCALES)
+        )
+
+    @property
+    def needs(self) -> Needs:
+        """See :func:`mcdenoise.models.mrkp.reach_of`."""
+        reach = reach_of(max(SIDES_OF_SCALE) // 2)
+        return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        levels = self.unet(self.input_of(frame, displayed(frame)))
+        *scales, result = scales_of(with_carried(frame))
+        for n, level, head in zip(reversed(scales), reversed(levels), reversed(self.heads), strict=True):
+            importance, blend, alpha = head(level).split([self.kernels, self.kernels, 1], 1)
+            d = filtered(n, importance, torch.softmax(blend, 1), SIDES_OF_SCALE)
+            result = blend_scales(d, result, F.relu(alpha).to(n.dtype))
+        return answered(frame, result.clamp_min(0)), None
+
+
+def filtered(image: Tensor, importance: Tensor, blend: Tensor, sides: Sequence[int]) -> Tensor:
+    """The blend of what filters by maps of importance give, ``sum_i blend_i box_i(exp(m_i) c) / box_i(exp(m_i))``.
+
+    Args:
+        image: ``(B, C, H, W)``.
+        importance: ``(B, N, H, W)`` logarithms, a map for each filter.
+        blend: ``(B, N, H, W)`` of sum 1.
+        sides: of the windows, N of them.
+    """
+    out = torch.zeros_like(image)
+    for side, m, weight in zip(sides, importance.split(1, 1), blend.to(image.dtype).split(1, 1), strict=True):
+        out = torch.addcmul(out, weight, importance_filter(image, m, kernel_size=side))
+    return out
 
 
 @register_model(
@@ -135,3 +183,27 @@ def wskp(
         InputError: there are fewer than two layers.
     """
     return as_published(Exposed(Tiled(WskpNetwork(width, layers))), alpha_min, position_limit, normal_limit)
+
+
+@register_model(
+    "wskp_unet",
+    "kernels of shared weights at three scales of a U-Net, partly guessed",
+    kind="kernel",
+    paper="Fan et al. 2021",
+)
+def wskp_unet(
+    width: int = 48,
+    *,
+    alpha_min: float = 0.2,
+    position_limit: float = POSITION_LIMIT,
+    normal_limit: float = NORMAL_LIMIT,
+) -> Model:
+    """Kernel prediction with shared weights at several scales, behind the published accumulation.
+
+    Args:
+        width: channels of every convolution.
+        alpha_min: smallest weight of the current frame in the accumulation.
+        position_limit: see :func:`mcdenoise.ops.reproject`.
+        normal_limit: likewise for normals.
+    """
+    return as_published(Exposed(Tiled(WskpUNet(width))), alpha_min, position_limit, normal_limit)

@@ -151,7 +151,7 @@ def _numbered(results: Results) -> Iterable[tuple[int, Method]]:
 def _row(results: Results, number: int, method: Method, scene: str) -> Row:
     cell = results.cell(scene, method.name)
     if method.missing or cell is None or cell.failure:
-        failed = f"failed: {cell.failure}" if cell and cell.failure else "not measured"
+        failed = cell.reason if cell and cell.failure else "not measured"
         return Row(method, number, reason=f"missing: {method.missing}" if method.missing else failed)
     milliseconds = None if cell.computing is None else _range(cell.computing)
     # What only hands its input on takes no time worth a place on a logarithmic axis.

@@ -1,4 +1,4 @@
-"""WSKP against its equations, written out in float64, and the merging of its branches."""
+"""WSKP and its U-Net against their equations, written out in float64, and the merging of branches."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
-from test_cascaded import frame_of_doubles
+from test_cascaded import frame_of_doubles, halved
+from test_mrkp import copied, features
 from torch import Tensor, nn
 from toys import refused
 
+from mcdenoise.frame import Frame
 from mcdenoise.models import Tiled, create_model, parts_of
-from mcdenoise.models.wskp import Reparameterized, WskpNetwork
+from mcdenoise.models.mrkp import Backbone
+from mcdenoise.models.wskp import Reparameterized, WskpNetwork, WskpUNet
 
 SIZE = (5, 6)
 
@@ -58,12 +61,15 @@ def test_parameters_and_products_of_the_deployed_network(layers: int, expected: 
     assert [layer.identity for layer in network.layers] == [False, *[True] * (layers - 2), False]
 
 
-@torch.no_grad()
-def test_it_is_its_equations() -> None:
-    network, frame = drawn(WskpNetwork(5, 3)), frame_of_doubles(*SIZE)
+def bright_frame() -> Frame:
+    """No albedo so dark that it is not divided out."""
+    frame = frame_of_doubles(*SIZE)
     assert frame.albedo is not None
-    # None so dark that it is not divided out.
-    frame = frame.replace(albedo=0.2 + 0.8 * frame.albedo)
+    return frame.replace(albedo=0.2 + 0.8 * frame.albedo)
+
+
+def seen(frame: Frame) -> Tensor:
+    """What the networks are given."""
     assert frame.albedo is not None
     assert frame.normal is not None
     assert frame.depth is not None
@@ -71,29 +77,68 @@ def test_it_is_its_equations() -> None:
     typical = torch.exp(torch.log(frame.depth[hit]).mean())
     depth = torch.where(hit, frame.depth / (frame.depth + typical), 1)
     lit = (frame.color * frame.albedo) ** (1 / 2.2)
-    x = torch.cat([lit, frame.albedo, frame.normal * 0.5 + 0.5, depth], 1)
-    for number, layer in enumerate(network.layers):
-        x = branches(layer, x)
-        x = torch.where(x > 0, x, 0.1 * x) if number < 2 else x
-    maps, expected = x[0].tolist(), torch.zeros_like(frame.color)
-    height, width = SIZE
+    return torch.cat([lit, frame.albedo, frame.normal * 0.5 + 0.5, depth], 1)
+
+
+def filtered(image: Tensor, maps: Tensor, radii: tuple[int, ...]) -> Tensor:
+    """``sum_i softmax(a)_i sum_q exp(m_i(q)) c(q) / sum_q exp(m_i(q))`` over the taps q inside, in loops."""
+    number, (height, width) = len(radii), image.shape[-2:]
+    rows, out = maps[0].tolist(), torch.zeros_like(image)
     for y in range(height):
-        for x0 in range(width):
-            blend = [math.exp(maps[6 + i][y][x0]) for i in range(6)]
-            for i, radius in enumerate((1, 2, 3, 4, 5, 6)):
+        for x in range(width):
+            blend = [math.exp(rows[number + i][y][x]) for i in range(number)]
+            for i, radius in enumerate(radii):
                 total, weights = torch.zeros(3, dtype=torch.float64), 0.0
                 for row in range(max(0, y - radius), min(height, y + radius + 1)):
-                    for column in range(max(0, x0 - radius), min(width, x0 + radius + 1)):
-                        weight = math.exp(maps[i][row][column])
-                        total += weight * frame.color[0, :, row, column]
+                    for column in range(max(0, x - radius), min(width, x + radius + 1)):
+                        weight = math.exp(rows[i][row][column])
+                        total += weight * image[0, :, row, column]
                         weights += weight
-                expected[0, :, y, x0] += blend[i] / sum(blend) * total / weights
-    torch.testing.assert_close(network(frame)[0].image, expected)
+                out[0, :, y, x] += blend[i] / sum(blend) * total / weights
+    return out
 
 
 @torch.no_grad()
-def test_tiles_give_the_image() -> None:
-    network, frame = drawn(WskpNetwork(4, 4)), frame_of_doubles(9, 100)
+def test_it_is_its_equations() -> None:
+    network, frame = drawn(WskpNetwork(5, 3)), bright_frame()
+    x = seen(frame)
+    for number, layer in enumerate(network.layers):
+        x = branches(layer, x)
+        x = torch.where(x > 0, x, 0.1 * x) if number < 2 else x
+    torch.testing.assert_close(network(frame)[0].image, filtered(frame.color, x, (1, 2, 3, 4, 5, 6)))
+
+
+@torch.no_grad()
+def test_the_unet_is_its_equations() -> None:
+    network, frame = drawn(WskpUNet(4)), bright_frame()
+    for head in network.heads:
+        head.bias[-1] += 1  # lest the ReLU hides the coarser scales
+    levels = features(network.unet, seen(frame))
+    scales = [frame.color, halved(frame.color), halved(halved(frame.color))]
+    out = halved(scales[-1])
+    for n, level, head in zip(scales[::-1], levels[::-1], list(network.heads)[::-1], strict=True):
+        predicted = F.conv2d(level, head.weight, head.bias, padding=1)
+        d, alpha = filtered(n, predicted[:, :6], (1, 2, 3)), predicted[:, 6:].clamp_min(0)
+        assert (alpha > 0).any()
+        size = n.shape[-2:]
+        out = d - alpha * copied(halved(d), *size) + alpha * copied(out, *size)
+    torch.testing.assert_close(network(frame)[0].image, out.clamp_min(0))
+
+
+def test_the_unet_has_the_backbone_of_mrkp_and_seven_channels_a_scale() -> None:
+    network = next(parts_of(create_model("wskp_unet"), Tiled)).inner
+    assert isinstance(network, WskpUNet)
+    assert isinstance(network.unet, Backbone)
+    backbone, heads = (sum(p.numel() for p in part.parameters()) for part in (network.unet, network.heads))
+    # That of MRKP without its three heads of 26 channels.
+    assert backbone == 341_838 - 3 * (96 * 9 + 1) * 26
+    assert heads == 3 * (96 * 9 + 1) * 7
+
+
+@pytest.mark.parametrize(("network", "width"), [(WskpNetwork(4, 4), 100), (WskpUNet(4), 480)], ids=["wskp", "unet"])
+@torch.no_grad()
+def test_tiles_give_the_image(network: nn.Module, width: int) -> None:
+    network, frame = drawn(network), frame_of_doubles(9, width)
     frame = frame.replace(statistics=network.statistics(frame))
     torch.testing.assert_close(Tiled(network, side=32)(frame)[0].image, network(frame)[0].image)
 

@@ -1,0 +1,127 @@
+"""Whether a state that a method is handed is its own, said in one line before anything is computed of it."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import State
+
+_Kind = TypeVar("_Kind", bound=tuple[Any, ...])
+ADVICE = "hand a method what it returned for the frame before, or None at the beginning of a shot"
+
+
+def own_state(
+    state: State, kind: type[_Kind], frame: Frame, *, channels: int | None = None, keeper: str = ""
+) -> _Kind | None:
+    """The state as what a method keeps, or ``None`` where it is that.
+
+    Another size of the image is no error but the beginning of a shot, which is the method's own business.
+
+    Args:
+        state: that the method was handed.
+        kind: named tuple of what the method keeps, in the file of the method. Its first tensor is of the precision in
+            which frames are computed.
+        frame: that it was handed with.
+        channels: of that first tensor, where they are known.
+        keeper: the method, for the message; by default the file of the kind.
+
+    Raises:
+        InputError: the state is of another kind, device, batch, precision or number of channels.
+    """
+    if state is None:
+        return None
+    if type(state) is not kind:
+        expected = keeper or _file_of(kind)
+        raise InputError(f"state: expected what {expected} keeps of a frame, found {_described(state)}; {ADVICE}")
+    # Graphs are made with a state of their own, for any batch.
+    if not torch.compiler.is_compiling():
+        _check_tensors(state, keeper or _file_of(kind), frame, channels)
+    return state
+
+
+def own_pair(state: State, keeper: str) -> tuple[State, State]:
+    """The two parts of a state: what a wrapper keeps, and what the method inside keeps.
+
+    Args:
+        state: that the wrapper was handed; ``None`` stands for two parts that are ``None``.
+        keeper: the wrapper, for the message.
+
+    Raises:
+        InputError: it is no such pair.
+    """
+    if state is None:
+        return None, None
+    if type(state) not in (tuple, list) or len(state) != 2:
+        raise InputError(
+            f"state: expected what {keeper} keeps of a frame and what the method inside keeps, found "
+            f"{_described(state)}; {ADVICE}"
+        )
+    return state[0], state[1]
+
+
+def own_parts(state: State, names: tuple[str, ...]) -> dict[str, State]:
+    """The parts of a state by name; ``None`` stands for parts that are ``None``.
+
+    Raises:
+        InputError: there are not these parts.
+    """
+    if state is None:
+        return dict.fromkeys(names)
+    if not isinstance(state, dict) or set(state) != set(names):
+        wanted = ", ".join(names)
+        raise InputError(f"state: expected what each of {wanted} keeps of a frame, found {_described(state)}; {ADVICE}")
+    return dict(state)
+
+
+def _check_tensors(state: State, keeper: str, frame: Frame, channels: int | None) -> None:
+    color = frame.color
+    tensors = [leaf for leaf in pytree.tree_leaves(state) if leaf is not None]
+    for leaf in tensors:
+        if not isinstance(leaf, Tensor):
+            raise InputError(f"state: expected tensors in what {keeper} keeps, found {type(leaf).__name__}; {ADVICE}")
+        if leaf.device != color.device:
+            raise InputError(
+                f"state: expected what {keeper} keeps on {color.device} like 'color', found it on {leaf.device}; "
+                "move one to the other"
+            )
+        if leaf.shape[:1] != color.shape[:1]:
+            found = len(leaf) if leaf.dim() else "none"
+            raise InputError(
+                f"state: expected what {keeper} keeps of a batch of {len(color)} like 'color', found it of {found}; "
+                "reset the denoiser, or begin with None"
+            )
+    if not tensors:
+        raise InputError(f"state: expected what {keeper} keeps of a frame, found it without a tensor; {ADVICE}")
+    first = tensors[0]
+    if (first.dtype == torch.float64) != (color.dtype == torch.float64):
+        raise InputError(
+            f"state: expected what {keeper} keeps of frames of {color.dtype}, found it of frames of {first.dtype}; "
+            "convert one to the other"
+        )
+    if channels is not None and first.shape[1] != channels:
+        raise InputError(
+            f"state: expected what {keeper} keeps in {channels} channels, found {first.shape[1]}: of another method, "
+            f"other settings or other layers; {ADVICE}"
+        )
+
+
+def _file_of(kind: type) -> str:
+    """The file of the method, such as "svgf"."""
+    return kind.__module__.rpartition(".")[2]
+
+
+def _described(state: State) -> str:
+    """Whose state it is, as far as it tells."""
+    if isinstance(state, dict):
+        return f"what each of {', '.join(map(str, state)) or 'nothing'} keeps"
+    if isinstance(state, tuple | list) and not hasattr(state, "_fields"):
+        return f"({', '.join(map(_described, state))})"
+    if state is None or not hasattr(state, "_fields"):
+        return "None" if state is None else type(state).__name__
+    return f"what {_file_of(type(state))} keeps"
