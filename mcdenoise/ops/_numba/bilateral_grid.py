@@ -250,8 +250,8 @@ def _place(places: Any, weights: Any, slopes: Any, where: Any, b: int, y: int) -
         value = guide[x]
         inner = zero if value < zero else one if value > one else value
         position = inner * where.scale + where.offset
-        # A NaN has a place, and its weights are NaN.
-        w = np.floor(position) if position == position else zero
+        # A NaN is in the first bin, and its weights are NaN.
+        w = np.floor(position) if position == position else -one
         places[x] = (where.columns[x] + 1) * (where.bins + 2) + np.int64(w) + 1
         first = position - w
         second = first - one
