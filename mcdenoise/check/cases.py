@@ -23,11 +23,12 @@ from mcdenoise.check.case import Case, Inputs, Kind, Op, map_tensors
 from mcdenoise.check.case import normal as _normal
 from mcdenoise.check.case import radiance as _radiance
 from mcdenoise.check.case import uniform as _uniform
+from mcdenoise.ops._grid import cells_of
 from mcdenoise.ops.affinity import AffinityFilter, affinity_filter
 from mcdenoise.ops.atrous import Atrous, atrous
 from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
 from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
-from mcdenoise.ops.bilateral_grid import GridSlice, GridSplat, cells_of, grid_slice, grid_splat
+from mcdenoise.ops.bilateral_grid import GridSlice, GridSplat, grid_slice, grid_splat
 from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
 from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
 from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample

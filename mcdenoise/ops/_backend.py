@@ -38,13 +38,13 @@ def choose_backend(forms: Sequence[Backend], tensors: Sequence[Tensor], *, diffe
 
     Args:
         forms: what the op has fast forms in.
-        tensors: the arguments of the op, the first of them ``(B, C, H, W)``.
+        tensors: the arguments of the op, ``(B, C, H, W)`` or with other axes behind the second.
         differentiable: whether the fast forms have derivatives.
 
     Raises:
         ValueError: the backend of :func:`use` cannot run; the message says why.
     """
-    wanted, strict = _used or (_fastest(tensors[0] if tensors else None), False)
+    wanted, strict = _used or (_fastest(tensors), False)
     obstacle = _obstacle(wanted, tensors, differentiable, forms)
     if obstacle and strict:
         raise ValueError(f"backend: expected one that can run here, found {wanted!r}, which {obstacle}")
@@ -87,17 +87,18 @@ def one_backend(image: Tensor) -> Iterator[None]:
     Args:
         image: ``(B, C, H, W)``.
     """
-    with nullcontext() if _used is not None else use(_fastest(image), strict=False):
+    with nullcontext() if _used is not None else use(_fastest([image]), strict=False):
         yield
 
 
-def _fastest(image: Tensor | None) -> Backend:
-    """What to take for an image if nothing is in its way."""
-    if image is None or torch.compiler.is_exporting():
+def _fastest(images: Sequence[Tensor]) -> Backend:
+    """What to take for images, of which the largest counts, if nothing is in its way."""
+    if not images or torch.compiler.is_exporting():
         return "torch"
-    if image.device.type == "cuda":
+    if images[0].device.type == "cuda":
         return "triton"
-    return "torch" if image.shape[0] * image.shape[-2] * image.shape[-1] < _FEW_PIXELS else "numba"
+    pixels = max(image.shape[:1].numel() * image.shape[2:].numel() for image in images)
+    return "torch" if pixels < _FEW_PIXELS else "numba"
 
 
 def _obstacle(backend: Backend, tensors: Sequence[Tensor], differentiable: bool, forms: Sequence[Backend]) -> str:

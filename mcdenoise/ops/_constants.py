@@ -33,3 +33,11 @@ EVEN, BRIGHTER, LIGHT_WINDOW = 0.03, 1.2, 9
 BLOCK, DARK = 8, 1e-3
 # The least number that a depth counts as, and how many near depths away the scene ends.
 SHORTEST, FARTHEST = 1e-30, 1e4
+
+# Weight of a pixel in its own mean, at least: where it is like none of its neighbours it stays as it is, and nothing is
+# divided by 0. Differences of features beyond the other count as that, so that no square overflows.
+LEAST_CENTER, FARTHEST_FEATURE = 1e-6, 1e15
+
+# A guide of [0, 1] is a value of 0 to 255, whose 256 steps are divided among the bins of a grid. |x| of its tents is
+# sqrt(x^2 + the other): it has a derivative at 0.
+GUIDE_STEPS, TENT_ROUNDING = 256, 1e-8

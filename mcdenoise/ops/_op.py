@@ -110,14 +110,23 @@ _load._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def _differentiate(operator: Operator, gradients: Callable[..., Any], plain: Callable[..., Any]) -> None:
-    """Give an operator its gradients, and gradients of those by way of the plain form."""
+    """Give an operator its gradients, and gradients of those by way of the plain form.
 
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    Of several results the first has derivatives, and the others have none.
+    """
+
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor | tuple[Tensor, ...]) -> None:
+        if isinstance(output, tuple):
+            ctx.mark_non_differentiable(*output[1:])
         leaves, ctx.structure = pytree.tree_flatten(inputs)
         ctx.others = [None if isinstance(leaf, Tensor) else leaf for leaf in leaves]
         ctx.save_for_backward(*(leaf if isinstance(leaf, Tensor) else None for leaf in leaves))
 
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
+    def first(*tensors: Tensor | None, arguments: Callable[..., Any]) -> Tensor:
+        results: Any = plain(**dict(zip(inspect.signature(plain).parameters, arguments(tensors), strict=True)))
+        return cast(Tensor, results if isinstance(results, Tensor) else results[0])
+
+    def backward(ctx: Any, gradient: Tensor, *_: None) -> tuple[Any, ...]:
         tensors = ctx.saved_tensors
         needed = ctx.needs_input_grad
 
@@ -127,13 +136,8 @@ def _differentiate(operator: Operator, gradients: Callable[..., Any], plain: Cal
 
         if not torch.is_grad_enabled():
             return tuple(gradients(needed, gradient, *arguments(tensors)))
-        names = inspect.signature(plain).parameters
-        wanted = _plain_gradients(
-            lambda *tensors: plain(**dict(zip(names, arguments(tensors), strict=True))),
-            tensors,
-            pytree.tree_leaves(needed),
-            gradient,
-        )
+        function = functools.partial(first, arguments=arguments)
+        wanted = _plain_gradients(function, tensors, pytree.tree_leaves(needed), gradient)
         return tuple(pytree.tree_unflatten(wanted, ctx.structure))
 
     operator.register_autograd(backward, setup_context=setup_context)

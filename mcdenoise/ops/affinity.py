@@ -9,15 +9,53 @@ from torch import Tensor
 
 from mcdenoise.ops._autograd import Function
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._constants import FARTHEST_FEATURE, LEAST_CENTER
 from mcdenoise.ops._module import module_of
+from mcdenoise.ops._op import op
 from mcdenoise.ops._window import accumulator_dtype, offsets, pad, shifted
 
-# Of a pixel in its own mean: where it is like none of its neighbours it stays as it is, and nothing is divided by 0.
-LEAST_CENTER = 1e-6
-# Differences of features beyond this count as this, so that no square overflows; the weight is 0 long before.
-_FARTHEST = 1e15
+
+def _check_settings(kernel_size: int, dilation: int) -> None:
+    if kernel_size < 1 or kernel_size % 2 == 0:
+        raise ValueError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
+    if dilation < 1:
+        raise ValueError(f"dilation: expected at least 1, found {dilation}")
 
 
+def _check(
+    image: Tensor,
+    features: Tensor,
+    bandwidth: Tensor,
+    center: Tensor,
+    previous: Tensor | None = None,
+    previous_features: Tensor | None = None,
+    previous_bandwidth: Tensor | None = None,
+    previous_weight: Tensor | None = None,
+    *,
+    kernel_size: int = 7,
+    dilation: int = 1,
+) -> None:
+    _check_settings(kernel_size, dilation)
+    arguments = {
+        "image": (image, "B C H W"),
+        "features": (features, "B F H W"),
+        "bandwidth": (bandwidth, "B 1 H W"),
+        "center": (center, "B 1 H W"),
+    }
+    layouts = {
+        "previous": (previous, "B C H W"),
+        "previous_features": (previous_features, "B F H W"),
+        "previous_bandwidth": (previous_bandwidth, "B 1 H W"),
+        "previous_weight": (previous_weight, "B 1 H W"),
+    }
+    given = {name: (each, layout) for name, (each, layout) in layouts.items() if each is not None}
+    check_shapes(**arguments, **given)
+    if given and len(given) < len(layouts):
+        absent = next(name for name in layouts if name not in given)
+        raise ValueError(f"{absent}: expected with {next(iter(given))}, found None")
+
+
+@op("numba", check=_check, differentiable=True)
 def affinity_filter(
     image: Tensor,
     features: Tensor,
@@ -76,9 +114,6 @@ def affinity_filter(
         >>> affinity_filter(image, features, one, one).flatten().tolist()
         [0.5, 0.5, 5.5, 5.5]
     """
-    _check_settings(kernel_size, dilation)
-    temporal = (previous, previous_features, previous_bandwidth, previous_weight)
-    _check(image, features, bandwidth, center, temporal)
     if image.numel() == 0:
         return image
     dtype = accumulator_dtype(image.dtype)
@@ -87,43 +122,14 @@ def affinity_filter(
     values = torch.cat([values, torch.ones_like(own)], 1)
     sums = own.clamp_min(LEAST_CENTER) * values
     sums = sums + _affine(here, here, values, bandwidth, kernel_size, dilation, skip_center=True)
-    before, there, width, known = temporal
-    if before is not None and there is not None and width is not None and known is not None:
-        weighed = torch.cat([before.to(dtype) * known.to(dtype), known.to(dtype)], 1)
+    there, width, known = previous_features, previous_bandwidth, previous_weight
+    if previous is not None and there is not None and width is not None and known is not None:
+        weighed = torch.cat([previous.to(dtype) * known.to(dtype), known.to(dtype)], 1)
         sums = sums + _affine(here, there.to(dtype), weighed, width, kernel_size, dilation, skip_center=False)
     return (sums[:, :-1] / sums[:, -1:]).to(image.dtype)
 
 
-def _check_settings(kernel_size: int, dilation: int) -> None:
-    if kernel_size < 1 or kernel_size % 2 == 0:
-        raise ValueError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
-    if dilation < 1:
-        raise ValueError(f"dilation: expected at least 1, found {dilation}")
-
-
 AffinityFilter = module_of("AffinityFilter", affinity_filter, _check_settings)
-
-
-def _check(
-    image: Tensor, features: Tensor, bandwidth: Tensor, center: Tensor, temporal: tuple[Tensor | None, ...]
-) -> None:
-    arguments = {
-        "image": (image, "B C H W"),
-        "features": (features, "B F H W"),
-        "bandwidth": (bandwidth, "B 1 H W"),
-        "center": (center, "B 1 H W"),
-    }
-    layouts = {
-        "previous": "B C H W",
-        "previous_features": "B F H W",
-        "previous_bandwidth": "B 1 H W",
-        "previous_weight": "B 1 H W",
-    }
-    given = {name: (each, layouts[name]) for name, each in zip(layouts, temporal, strict=True) if each is not None}
-    check_shapes(**arguments, **given)
-    if given and len(given) < len(layouts):
-        absent = next(name for name in layouts if name not in given)
-        raise ValueError(f"{absent}: expected with {next(iter(given))}, found None")
 
 
 def _affine(
@@ -224,6 +230,6 @@ def tap_of(padded: Tensor, image: Tensor, dy: int, dx: int) -> Tensor:
 
 def affinity_of(here: Tensor, there: Tensor, bandwidth: Tensor, dy: int, dx: int) -> tuple[Tensor, Tensor, Tensor]:
     """Of the features here and at a tap: their difference, its square, and the weight."""
-    difference = (here - tap_of(there, here, dy, dx)).clamp(-_FARTHEST, _FARTHEST)
+    difference = (here - tap_of(there, here, dy, dx)).clamp(-FARTHEST_FEATURE, FARTHEST_FEATURE)
     distance = difference.square().sum(1, keepdim=True)
     return difference, distance, torch.exp(-bandwidth * distance)

@@ -6,16 +6,43 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._constants import GUIDE_STEPS
+from mcdenoise.ops._grid import cells_of, spatial_taps, tent
 from mcdenoise.ops._module import module_of
+from mcdenoise.ops._op import op
 from mcdenoise.ops._window import accumulator_dtype
 
 CELL, BINS = 8, 32
-# A guide of [0, 1] is a value of 0 to 255, whose 256 steps are divided among the bins.
-_STEPS = 256
-# |x| of the tent is sqrt(x^2 + _ROUNDING): it has a derivative at 0.
-_ROUNDING = 1e-8
 
 
+def _check_settings(cell: int, bins: int) -> None:
+    for name, value in (("cell", cell), ("bins", bins)):
+        if value < 1:
+            raise ValueError(f"{name}: expected at least 1, found {value}")
+
+
+def _check_cell(cell: int) -> None:
+    _check_settings(cell, 1)
+
+
+def _check_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BINS) -> None:
+    check_shapes(image=(image, "B C H W"), guide=(guide, "B 1 H W"))
+    _check_settings(cell, bins)
+
+
+def _check_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CELL) -> None:
+    sizes = check_shapes(grid=(grid, "B C rows columns bins"), filled=(filled, "B 1 rows columns bins"))
+    sizes |= check_shapes(grid=(grid, "B C rows columns bins"), guide=(guide, "B 1 H W"))
+    _check_settings(cell, sizes["bins"])
+    found, expected = (sizes["rows"], sizes["columns"]), (cells_of(sizes["H"], cell), cells_of(sizes["W"], cell))
+    if found != expected:
+        raise ValueError(
+            f"grid: expected {expected} rows and columns for a guide of {sizes['H'], sizes['W']} in cells of {cell}, "
+            f"found {found}"
+        )
+
+
+@op("numba", check=_check_splat, differentiable=True)
 def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BINS) -> tuple[Tensor, Tensor]:
     """Average an image in the cells of a bilateral grid: blocks of pixels, apart by the value of a guide.
 
@@ -58,10 +85,8 @@ def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BI
         >>> grid.flatten().tolist(), filled.flatten().tolist()
         ([1.0, 5.0], [1.0, 1.0])
     """
-    sizes = check_shapes(image=(image, "B C H W"), guide=(guide, "B 1 H W"))
-    _check_settings(cell, bins)
     dtype = accumulator_dtype(image.dtype)
-    rows, columns = cells_of(sizes["H"], cell), cells_of(sizes["W"], cell)
+    rows, columns = (cells_of(side, cell) for side in image.shape[-2:])
     index, weight = _taps(guide.to(dtype), cell, rows, columns, bins)
     values = torch.cat([image.to(dtype), torch.ones_like(guide, dtype=dtype)], 1)
     source = (values[:, :, None] * weight[:, None]).flatten(2)
@@ -73,6 +98,7 @@ def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BI
     return grid.to(image.dtype), filled.to(image.dtype)
 
 
+@op("numba", check=_check_slice, differentiable=True)
 def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CELL) -> Tensor:
     """Read an image out of a bilateral grid: at each pixel the mean of the eight cells around its place and its guide.
 
@@ -106,18 +132,8 @@ def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CELL)
         >>> bool((same - 2).abs().max() < 1e-6)
         True
     """
-    sizes = check_shapes(grid=(grid, "B C rows columns bins"), filled=(filled, "B 1 rows columns bins"))
-    sizes |= check_shapes(grid=(grid, "B C rows columns bins"), guide=(guide, "B 1 H W"))
-    _check_settings(cell, sizes["bins"])
-    rows, columns = sizes["rows"], sizes["columns"]
-    expected = cells_of(sizes["H"], cell), cells_of(sizes["W"], cell)
-    if (rows, columns) != expected:
-        raise ValueError(
-            f"grid: expected {expected} rows and columns for a guide of {sizes['H'], sizes['W']} in cells of {cell}, "
-            f"found {rows, columns}"
-        )
     dtype = accumulator_dtype(grid.dtype)
-    index, weight = _taps(guide.to(dtype), cell, rows, columns, sizes["bins"])
+    index, weight = _taps(guide.to(dtype), cell, *grid.shape[2:])
     known = filled.to(dtype)
     cells = torch.cat([grid.to(dtype) * known, known], 1).flatten(2)
     total = cells.new_zeros(())
@@ -125,14 +141,9 @@ def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CELL)
     for places, weights in zip(index.unflatten(1, (8, -1)).unbind(1), weight.flatten(2).unbind(1), strict=True):
         found = cells.gather(2, places[:, None].expand(-1, cells.shape[1], -1))
         total = total + found * weights[:, None]
-    total = total.unflatten(2, (sizes["H"], sizes["W"]))
+    total = total.unflatten(2, guide.shape[-2:])
     image: Tensor = total[:, :-1] / torch.where(total[:, -1:] > 0, total[:, -1:], 1)
     return image.to(grid.dtype)
-
-
-def cells_of(side: int, cell: int) -> int:
-    """How many cells of so many pixels a side of the image takes."""
-    return -(-side // cell)
 
 
 def _taps(guide: Tensor, cell: int, rows: int, columns: int, bins: int) -> tuple[Tensor, Tensor]:
@@ -142,40 +153,16 @@ def _taps(guide: Tensor, cell: int, rows: int, columns: int, bins: int) -> tuple
         ``(B, 8 H W)`` their places in a flattened grid, and ``(B, 8, H, W)`` their weights, 0 beyond the grid.
     """
     height, width = guide.shape[-2:]
-    v, row_weight = _spatial_taps(height, cell, rows, guide)
-    u, column_weight = _spatial_taps(width, cell, columns, guide)
-    position = guide[:, 0].clamp(0, 1) * ((_STEPS - 1) / _STEPS * bins) + (0.5 / _STEPS * bins - 0.5)
+    v, row_weight = spatial_taps(height, cell, guide)
+    u, column_weight = spatial_taps(width, cell, guide)
+    position = guide[:, 0].clamp(0, 1) * ((GUIDE_STEPS - 1) / GUIDE_STEPS * bins) + (0.5 / GUIDE_STEPS * bins - 0.5)
     first = position.floor()
     w = torch.stack([first, first + 1], 1)
-    bin_weight = _tent(position[:, None] - w) * ((w >= 0) & (w < bins))
-    place = (v[:, None, :, None] * columns + u[:, None, :]) * bins  # (2, 2, H, W)
+    bin_weight = tent(position[:, None] - w) * ((w >= 0) & (w < bins))
+    place = (v.clamp(0, rows - 1)[:, None, :, None] * columns + u.clamp(0, columns - 1)[:, None, :]) * bins
     index = w.long().clamp(0, bins - 1)[:, :, None, None] + place
     weight = bin_weight[:, :, None, None] * (row_weight[:, None, :, None] * column_weight[:, None, :])
     return index.flatten(1), weight.flatten(1, 3)
-
-
-def _spatial_taps(side: int, cell: int, count: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """``(2, side)`` the two cells whose centres are around each pixel, and their weights, 0 beyond the grid."""
-    # Twice the pixel's centre, in pixels: whole numbers, so that a distance is rounded once.
-    centre = 2 * torch.arange(side, device=like.device) + 1
-    first = torch.div(centre - cell, 2 * cell, rounding_mode="floor")
-    cells = torch.stack([first, first + 1])
-    distance = (centre - cell * (2 * cells + 1)).to(like.dtype) / (2 * cell)
-    return cells.clamp(0, count - 1), _tent(distance) * ((cells >= 0) & (cells < count))
-
-
-def _tent(distance: Tensor) -> Tensor:
-    return torch.relu(1 - torch.sqrt(distance.square() + _ROUNDING))
-
-
-def _check_settings(cell: int, bins: int) -> None:
-    for name, value in (("cell", cell), ("bins", bins)):
-        if value < 1:
-            raise ValueError(f"{name}: expected at least 1, found {value}")
-
-
-def _check_cell(cell: int) -> None:
-    _check_settings(cell, 1)
 
 
 GridSplat = module_of("GridSplat", grid_splat, _check_settings)

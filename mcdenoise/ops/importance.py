@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._module import module_of
+from mcdenoise.ops._op import op
 from mcdenoise.ops._window import accumulator_dtype
 
 
@@ -18,6 +19,12 @@ def _check_size(kernel_size: int) -> None:
         raise ValueError(f"kernel_size: expected odd and at least 3, found {kernel_size}")
 
 
+def _check(image: Tensor, importance: Tensor, *, kernel_size: int) -> None:
+    check_shapes(image=(image, "B C H W"), importance=(importance, "B 1 H W"))
+    _check_size(kernel_size)
+
+
+@op("numba", check=_check)
 def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) -> Tensor:
     """Average over a window with weights that one map of importance gives to all pixels: softmax of the map over it.
 
@@ -55,8 +62,6 @@ def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) ->
         >>> importance_filter(image, 1e4 * image, kernel_size=3).flatten().tolist()
         [1.0, 2.0, 3.0, 4.0, 4.0]
     """
-    check_shapes(image=(image, "B C H W"), importance=(importance, "B 1 H W"))
-    _check_size(kernel_size)
     if image.numel() == 0:
         return image
     dtype = torch.promote_types(accumulator_dtype(image.dtype), accumulator_dtype(importance.dtype))

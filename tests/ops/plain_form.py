@@ -43,11 +43,12 @@ def leaves_of(inputs: Inputs, case: Case) -> list[Tensor]:
 
 
 def outcomes(op: Op, case: Case, inputs: Inputs, backend: str) -> list[Tensor]:
-    """The result and, times a random upstream gradient, each derivative."""
+    """The results and, times a random upstream gradient, each derivative of the first."""
     leaves = leaves_of(inputs, case)
-    result = by(backend, op.function)(**inputs, **case.settings)
+    results = by(backend, op.function)(**inputs, **case.settings)
+    result, *others = (results,) if isinstance(results, Tensor) else results
     upstream = torch.randn(result.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    return [result.detach(), *torch.autograd.grad(result, leaves, upstream.to(result.dtype))]
+    return [result.detach(), *others, *torch.autograd.grad(result, leaves, upstream.to(result.dtype))]
 
 
 def assert_same(actual: list[Tensor], exact: list[Tensor], tolerance: float) -> None:

@@ -12,9 +12,7 @@ threads of our own, as many as torch uses: numba's would be a second OpenMP besi
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,10 +22,13 @@ from torch import Tensor
 from mcdenoise.ops._numba._runtime import (
     Source,
     add,
+    add_product,
     compiled,
     copy_row,
     exp,
+    flushing,
     load,
+    multiply,
     readable,
     rounded,
     share_rows,
@@ -37,8 +38,6 @@ from mcdenoise.ops._window import BORDERS, Border, accumulator_dtype, kernel_siz
 
 # Pixels whose weights are held at a time: 25 taps of 256 floats stay in the first-level cache.
 _CHUNK = 256
-_SMALLEST = sys.float_info.min
-_ORDINARY = 1e-15
 
 # Guides come in tuples of this length or a multiple of it, filled up with empty ones: each length is compiled anew.
 _GUIDES = 4
@@ -120,12 +119,10 @@ def derivatives(
             _filled_up([scale.numpy() for scale in of_scales], of_distance.numpy()),
             of_distance.numpy(),
         )
-
-        # Beside ordinary numbers they are nothing; of numbers that are all small they may be all there is.
-        flush = all(float(torch.stack(torch.aminmax(part)).abs().amax()) > _ORDINARY for part in (image, gradient))
+        flush = flushing(image, gradient)
 
         def run(b: int, first: int, last: int) -> None:
-            with _denormals_flushed() if flush else nullcontext():
+            with flush():
                 _backward(results, upstream, inputs, b, first, last)
 
         share_rows(image, run)
@@ -174,17 +171,6 @@ def _inputs(
 
 def _filled_up(values: list[Any], nothing: Any) -> tuple[Any, ...]:
     return (*values, *[nothing] * (-len(values) % _GUIDES or (0 if values else _GUIDES)))
-
-
-@contextmanager
-def _denormals_flushed() -> Iterator[None]:
-    """Numbers below the smallest normal one are 0 in this thread: small weights of small gradients take far longer."""
-    already = _SMALLEST / 2 == 0
-    torch.set_flush_denormal(True)
-    try:
-        yield
-    finally:
-        torch.set_flush_denormal(already)
 
 
 @compiled
@@ -337,7 +323,7 @@ def _weigh(
         inverse[:] = 0 if border == _RENORMALIZE else 1
         for t in range(taps if adjusted else 0):
             _exponential(factors[t, :n], top)
-            _multiply(weights[t, :n], factors[t, :n])
+            multiply(weights[t, :n], factors[t, :n])
             if border == _RENORMALIZE:
                 add(inverse, weights[t, :n])
     # A plain 1 would make this a division in float64.
@@ -379,18 +365,6 @@ def _maximum(total: Any, values: Any) -> None:
 
 
 @compiled
-def _multiply(values: Any, factors: Any) -> None:
-    for x in range(values.size):
-        values[x] *= factors[x]
-
-
-@compiled
-def _add_product(total: Any, a: Any, b: Any) -> None:
-    for x in range(total.size):
-        total[x] += a[x] * b[x]
-
-
-@compiled
 def _is_guided(inputs: Any) -> bool:
     return bool(_channels_of(inputs) > inputs.image[2] or inputs.distance[2] > 0)
 
@@ -428,9 +402,9 @@ def _forward(out: Any, inputs: Any, b: int, first: int, last: int) -> None:
                 start = x0 + t % kernel_size
                 neighbours = ring[(y + t // kernel_size - radius) % kernel_size]
                 for c in range(channels):
-                    _add_product(out[b, c, y, x0 : x0 + n], weights[t, :n], neighbours[c, start : start + n])
+                    add_product(out[b, c, y, x0 : x0 + n], weights[t, :n], neighbours[c, start : start + n])
             for c in range(channels):
-                _multiply(out[b, c, y, x0 : x0 + n], inverse[:n])
+                multiply(out[b, c, y, x0 : x0 + n], inverse[:n])
 
 
 @compiled
@@ -470,7 +444,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
             for c in range(channels):
                 start = b * strides[0] + c * strides[1] + y * strides[2] + x0 * strides[3]
                 copy_row(upstream[c, :n], gradient, start, strides[3])
-                _multiply(upstream[c, :n], scale)
+                multiply(upstream[c, :n], scale)
             # The slope of each weight; where weights are normalised, less what all of them share.
             shared[:] = 0
             for t in range(taps if with_slopes else 0):
@@ -478,11 +452,11 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
                 neighbours = ring[(y + t // kernel_size - radius) % kernel_size]
                 slopes[t, :n] = 0
                 for c in range(channels):
-                    _add_product(slopes[t, :n], upstream[c, :n], neighbours[c, start : start + n])
+                    add_product(slopes[t, :n], upstream[c, :n], neighbours[c, start : start + n])
                 if normalised:
-                    _add_product(shared, weights[t, :n], slopes[t, :n])
+                    add_product(shared, weights[t, :n], slopes[t, :n])
             if normalised:
-                _multiply(shared, scale)
+                multiply(shared, scale)
             for t in range(taps):
                 target = y + t // kernel_size - radius
                 if border == _REPLICATE:
@@ -491,7 +465,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
                 # No row but ours, and none beyond the image.
                 if first <= target < last:
                     for c in range(channels):
-                        _add_product(sums[target % kernel_size, c, start : start + n], weights[t, :n], upstream[c, :n])
+                        add_product(sums[target % kernel_size, c, start : start + n], weights[t, :n], upstream[c, :n])
                 if not with_slopes:
                     continue
                 slope, weight = slopes[t, :n], weights[t, :n]
@@ -499,11 +473,11 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
                     for x in range(n):
                         slope[x] -= shared[x]
                 if log_domain:
-                    _multiply(slope, weight)
+                    multiply(slope, weight)
                 else:
                     # The exponent's slope takes the weight's place.
-                    _multiply(weight, slope)
-                    _multiply(slope, factors[t, :n])
+                    multiply(weight, slope)
+                    multiply(slope, factors[t, :n])
             if not with_slopes:
                 continue
             if mine:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,8 @@ from torch import Tensor
 
 # A thread of its own for fewer pixels costs more than it saves.
 PIXELS_A_THREAD = 4096
+# What is no larger may be of numbers that are all small.
+_ORDINARY = 1e-15
 
 # A tensor as numba sees it: its memory from the first element on, strides in elements, and number of channels.
 Source = tuple[Any, tuple[int, ...], int]
@@ -86,6 +90,26 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
             other.result()
 
 
+def flushing(*images: Tensor) -> Callable[[], AbstractContextManager[None]]:
+    """Within what it makes, numbers below the smallest normal one are 0 in this thread, if all images are ordinary.
+
+    Small weights of small gradients take far longer than other numbers. Beside ordinary numbers they are nothing; of
+    numbers that are all small they may be all there is.
+    """
+    ordinary = all(float(torch.stack(torch.aminmax(image)).abs().amax()) > _ORDINARY for image in images)
+    return _denormals_flushed if ordinary else nullcontext
+
+
+@contextmanager
+def _denormals_flushed() -> Iterator[None]:
+    already = sys.float_info.min / 2 == 0
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(already)
+
+
 def load(value: Any) -> Any:
     """A number of a source, in the dtype of the sums."""
 
@@ -147,6 +171,18 @@ def read_row(row: Any, image: Any, b: int, c: int, y: int, x0: int) -> None:
 def add(total: Any, values: Any) -> None:
     for x in range(total.size):
         total[x] += values[x]
+
+
+@compiled
+def add_product(total: Any, a: Any, b: Any) -> None:
+    for x in range(total.size):
+        total[x] += a[x] * b[x]
+
+
+@compiled
+def multiply(values: Any, factors: Any) -> None:
+    for x in range(values.size):
+        values[x] *= factors[x]
 
 
 def exp(value: Any) -> Any:
