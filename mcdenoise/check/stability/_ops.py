@@ -125,6 +125,9 @@ class _Exact:
     bound: Tensor
 
 
+Known = dict[str, list[_Exact]]
+
+
 def select(names: Sequence[str] | None = None) -> list[Op]:
     """Ops by name, or functions of one's own, ``path/to/file.py:function``; all ops for ``None``.
 
@@ -132,7 +135,7 @@ def select(names: Sequence[str] | None = None) -> list[Op]:
         InputError: there is no such op or function, or nothing that it runs on.
     """
     # What is not of a batch cannot be tried many times at once.
-    every = OPS + tuple(step for step in STEPS if "weight" not in step.cases[0].inputs())
+    every = OPS + tuple(step for step in STEPS if step.batched)
     return list(every) if names is None else find_ops(names, every)
 
 
@@ -154,9 +157,10 @@ def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
     for dtype in dtypes:
         if not op.half and accumulator_dtype(dtype) != dtype:
             continue
+        known: list[Known] = [{} for _ in op.cases]
         for backend in backends(op):
-            for case in op.cases:
-                yield from check_case(op, case, dtype, backend)
+            for case, found in zip(op.cases, known, strict=True):
+                yield from check_case(op, case, dtype, backend, found)
         for pair in ADJOINTS:
             if op.name == pair[0]:
                 yield from _check_adjoint(op, next(other for other in OPS if other.name == pair[1]), dtype)
@@ -186,7 +190,9 @@ def check_stability(
     return list(check_op(op_of(function, inputs), dtypes))
 
 
-def check_case(op: Op, case: Case, dtype: torch.dtype, backend: Backend | None = None) -> list[Check]:
+def check_case(
+    op: Op, case: Case, dtype: torch.dtype, backend: Backend | None = None, known: Known | None = None
+) -> list[Check]:
     """Everything that must hold for an op on one case.
 
     Args:
@@ -194,6 +200,8 @@ def check_case(op: Op, case: Case, dtype: torch.dtype, backend: Backend | None =
         case: one of its cases.
         dtype: of the inputs.
         backend: see :func:`backends`.
+        known: what is exact in this case and dtype, which takes most of the time and is the same for every backend;
+            what is not yet in it is put there.
 
     Returns:
         One check of each kind that applies; a single one, ``"runs"``, where the backend refuses.
@@ -208,7 +216,8 @@ def check_case(op: Op, case: Case, dtype: torch.dtype, backend: Backend | None =
         passed = bool(backend) and "can run here" in str(error)
         message = in_one_line(error) if op.own else str(error)
         return [Check(op.name, case.name, name_of(dtype), backend or "", "runs", 0, 0, 0, passed, message)]
-    exact = _exact_results(trial, results)
+    known = {} if known is None else known
+    exact = _once(known, "forward", _exact_results, trial, results)
     checks = [_compare(trial, "forward", results, exact)]
     upstream = [_upstream(result) for result in results]
     leaves = [*trial.leaves, *upstream]
@@ -221,12 +230,20 @@ def check_case(op: Op, case: Case, dtype: torch.dtype, backend: Backend | None =
         if not isinstance(error, ValueError) or not backend or "can run here" not in str(error):
             raise
     else:
-        checks.append(_compare(trial, "gradient", gradients, _exact_gradients(trial, leaves, exact)))
+        true = _once(known, "gradient", _exact_gradients, trial, leaves, exact)
+        checks.append(_compare(trial, "gradient", gradients, true))
     if op.weights(case.settings):
         checks.append(_check_weights(trial, results[0]))
     if op.images and case.kind != "extreme":
-        checks += [_check_constant(trial), _check_exposure(trial, results[0])]
+        checks += [_check_constant(trial, known), _check_exposure(trial, results[0])]
     return checks
+
+
+def _once(known: Known, what: str, find: Callable[..., list[_Exact]], *arguments: Any) -> list[_Exact]:
+    """What is exact, found anew only where it is not known."""
+    if what not in known:
+        known[what] = find(*arguments)
+    return known[what]
 
 
 def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
@@ -238,7 +255,7 @@ def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
     rounding = trial.op.rounding(inputs, trial.case.settings)
     leaves = [leaf.double() for leaf in trial.leaves]
     magnitudes = _magnitudes(trial, leaves, rounding, dtype)
-    conditions = _conditions(trial.run, leaves, magnitudes, dtype, at_once=not trial.op.own)
+    conditions = _conditions(trial.run, leaves, magnitudes, dtype, at_once=trial.op.batched)
     return [
         _bounded(reference, condition + rounding.result, fan_in, dtype, result.dtype)
         for reference, result, (condition, fan_in) in zip(references, results, conditions, strict=True)
@@ -251,7 +268,7 @@ def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact])
     exact = [leaf.double() for leaf in leaves]
     magnitudes = _magnitudes(trial, exact[: len(trial.leaves)], rounding, trial.dtype)
     magnitudes += [leaf.abs() + torch.finfo(trial.dtype).tiny for leaf in exact[len(trial.leaves) :]]
-    conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype, at_once=not trial.op.own)
+    conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype, at_once=trial.op.batched)
     largest = max((leaf.abs().max().item() for leaf in exact[len(trial.leaves) :] if leaf.numel()), default=0.0)
     cancelling = _by_leaf(trial, [torch.zeros_like(leaf) for leaf in exact[: len(trial.leaves)]], rounding.gradients)
     # Where a result is infinite by right, so may its derivative be, or be nothing at all; elsewhere nothing excuses it.
@@ -384,14 +401,15 @@ def _check_weights(trial: _Trial, weights: Tensor) -> Check:
     return _found(trial, "weights", error / eps, allowed / eps, 1.0, message)
 
 
-def _check_constant(trial: _Trial) -> Check:
+def _check_constant(trial: _Trial, known: Known) -> Check:
     """The forward check once more, with constant images: a mean of equal numbers is that number."""
     inputs = dict(trial.inputs)
     for name in trial.images:
         inputs[name] = torch.full_like(_tensor(inputs[name]), _CONSTANT)
     constant = replace(trial, inputs=inputs)
     results = constant.run(constant.leaves)
-    return _compare(constant, "constant", results[:1], _exact_results(constant, results)[:1])
+    exact = _once(known, "constant", _exact_results, constant, results)
+    return _compare(constant, "constant", results[:1], exact[:1])
 
 
 def _check_exposure(trial: _Trial, result: Tensor) -> Check:
