@@ -28,6 +28,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
@@ -307,20 +308,24 @@ def _conditions(
     base = function(leaves)
     changing = function if at_once else _one_by_one(function, leaves)
     # Infinity is not rounded, and what is never negative is not moved below zero.
-    steps = [torch.where(size.isfinite(), step * size, 0).flatten().tolist() for size in magnitudes]
-    down = [((leaf != 0) | (leaf < 0).any()).flatten().tolist() for leaf in leaves]
+    up = [torch.where(size.isfinite(), step * size, 0).flatten() for size in magnitudes]
+    down = [move * ((leaf != 0) | (leaf < 0).any()).flatten() for move, leaf in zip(up, leaves, strict=True)]
     totals = [torch.zeros_like(result) for result in base]
     fans = [torch.zeros_like(result) for result in base]
-    places = [(i, j) for i, leaf in enumerate(leaves) for j in range(leaf.numel())]
-    for start in range(0, len(places), _AT_ONCE):
-        chosen = places[start : start + _AT_ONCE]
-        copies = [leaf.repeat(2 * len(chosen), *(1,) * (leaf.ndim - 1)) for leaf in leaves]
-        for k, (i, j) in enumerate(chosen):
-            flat = copies[i].reshape(2 * len(chosen), -1)
-            flat[2 * k, j] += steps[i][j]
-            flat[2 * k + 1, j] -= steps[i][j] * down[i][j]
+    starts = list(accumulate((leaf.numel() for leaf in leaves), initial=0))
+    for start in range(0, starts[-1], _AT_ONCE):
+        count = min(_AT_ONCE, starts[-1] - start)
+        copies = [leaf.repeat(2 * count, *(1,) * (leaf.ndim - 1)) for leaf in leaves]
+        for i, (first, end) in enumerate(pairwise(starts)):
+            # Those numbers of the leaf whose turn it is: each has two copies to itself.
+            numbers = torch.arange(max(start, first), max(start, first, min(start + count, end)))
+            if not len(numbers):
+                continue
+            copy, rows, columns = copies[i].view(2 * count, -1), 2 * (numbers - start), numbers - first
+            copy[rows, columns] += up[i][columns]
+            copy[rows + 1, columns] -= down[i][columns]
         for result, total, fan, changed in zip(base, totals, fans, changing(copies), strict=True):
-            both = changed.reshape(len(chosen), 2, *result.shape)
+            both = changed.reshape(count, 2, *result.shape)
             change = (both - result).abs()
             same = (both == result) | (both.isnan() & result.isnan()) | (change <= _NOISE * result.abs())
             larger = torch.where(same, 0, change.nan_to_num(nan=math.inf)).amax(1)
