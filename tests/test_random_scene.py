@@ -61,8 +61,10 @@ def entries(value: Any) -> Iterator[dict[str, Any]]:
             yield from entries(item)
 
 
+@functools.cache
 def moving_seed() -> int:
-    return next(seed for seed, made in zip(SEEDS, survey(), strict=True) if made.moves)
+    """The first; without the others, which take long and may be made in another process."""
+    return next(seed for seed in SEEDS if random_scene(seed, FRAMES).moves)
 
 
 # The same again

@@ -86,6 +86,8 @@ class Op:
         weights: whether, with these settings, the result is non-negative weights that sum to one over the channels.
         rounding: see :class:`Rounding`; of inputs and settings.
         half: whether it promises anything of inputs in half precision.
+        batched: whether all its tensors have the batch first, and it treats the images of a batch alike and alone, so
+            that many inputs can be tried at once.
         own: whether it is somebody's own function, see :mod:`mcdenoise.check.own`. Its only equation is itself in
             float64, so that its derivatives are proven wherever it is checked; it may treat the images of a batch
             together; and half precision is rounded between its steps.
@@ -100,6 +102,7 @@ class Op:
     weights: Callable[[dict[str, Any]], bool] = lambda settings: False
     rounding: Callable[[Inputs, dict[str, Any]], Rounding] = _no_more
     half: bool = True
+    batched: bool = True
     own: bool = False
 
     @property

@@ -98,7 +98,7 @@ def _op(name: str, function: Any, examples: Any) -> Op:
         raise InputError(f"function '{name}': expected a function of tensors, found {type(function).__name__}")
     called = _by_name(name, function)
     if examples is None:
-        return Op(called, called, _image_cases(name, function), own=True)
+        return Op(called, called, _image_cases(name, function), batched=False, own=True)
     given = examples if isinstance(examples, Mapping) else {"example": examples}
     if not given:
         raise InputError(f"function '{name}': expected example inputs by name, found none")
@@ -106,7 +106,13 @@ def _op(name: str, function: Any, examples: Any) -> Op:
         where = f"function '{name}', {case}"
         _check_tensors(where, tensors)
         _check_results(where, function, tensors)
-    return Op(called, called, tuple(_case(str(case), function, tensors) for case, tensors in given.items()), own=True)
+    return Op(
+        called,
+        called,
+        tuple(_case(str(case), function, tensors) for case, tensors in given.items()),
+        batched=False,
+        own=True,
+    )
 
 
 def _image_cases(name: str, function: Any) -> tuple[Case, ...]:

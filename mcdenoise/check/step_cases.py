@@ -231,7 +231,7 @@ STEPS: tuple[Op, ...] = tuple(
         Op(network.buffers_input, _of_buffers, _cases(_buffers_input, ("image", *_BUFFERS))),
         Op(network.network_guides, _network_guides, _cases(_guides, ("normal", "scale"))),
         Op(network.depth_scale, _depth_scale, _cases(lambda size, g: {"depth": _depth(size, g)}, ())),
-        # Its weights are of no batch, as the tests of stability take all tensors to be.
+        # Its weights are of no batch.
         Op(
             network.gated_fusion,
             _gated_fusion,
@@ -245,6 +245,7 @@ STEPS: tuple[Op, ...] = tuple(
                     {"logarithms": True},
                 ),
             ),
+            batched=False,
         ),
         Op(
             network.low_frequencies_of,

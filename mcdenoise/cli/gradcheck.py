@@ -19,7 +19,7 @@ def gradcheck(
     order: Literal[1, 2] = 2,
     json: Json = None,
 ) -> int:
-    """Check first and second derivatives of operators against finite differences, in float64, slow mode.
+    """Check first and second derivatives of operators against finite differences, in float64, number by number.
 
     A function of your own takes floating-point tensors. What it is tried on is a small tuple of tensors, or several by
     name, that its file gives as `function.example_inputs`, or as `inputs()` for all functions in it; without either,

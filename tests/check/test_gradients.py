@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -19,10 +21,40 @@ class _Wrong(torch.autograd.Function):
         return gradient
 
 
-def result_of(function: object) -> tuple[bool, str]:
-    case = Case("pixels", "ordinary", lambda g: {"image": uniform(g, 1, 1, 2, 2)}, ("image",))
-    op = Op(function, function, (case,))  # type: ignore[arg-type]
-    result = check_case(op, case)
+class _Forgetful(torch.autograd.Function):
+    """Right, but without a derivative of the gradient in the image."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor) -> Tensor:
+        ctx.save_for_backward(image)
+        return image * image
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (image,) = ctx.saved_tensors
+        return 2 * image.detach() * gradient
+
+
+class _Leaking(torch.autograd.Function):
+    """Right for one image, and of several each has a part of the others' gradients."""
+
+    @staticmethod
+    def forward(ctx: object, image: Tensor) -> Tensor:
+        return 2 * image
+
+    @staticmethod
+    def backward(ctx: object, gradient: Tensor) -> Tensor:
+        return gradient + gradient.mean(0, keepdim=True)
+
+
+def result_of(function: object, order: int = 2, width: int = 2) -> tuple[bool, str]:
+    """Of an image so wide, beside a smaller one, which torch's own check tries as well."""
+    cases = [
+        Case(f"{size} pixels", "ordinary", lambda g, size=size: {"image": uniform(g, 1, 1, 2, size)}, ("image",))
+        for size in (2, width)
+    ]
+    op = Op(function, function, tuple(cases))  # type: ignore[arg-type]
+    result = check_case(op, cases[1], order)
     return result.passed, result.message
 
 
@@ -40,6 +72,22 @@ def test_a_wrong_derivative_fails() -> None:
     passed, message = result_of(square)
     assert not passed
     assert "Jacobian mismatch" in message
+
+
+def test_a_wrong_second_derivative_fails() -> None:
+    for width in (2, 200):
+        assert result_of(_Forgetful.apply, order=1, width=width) == (True, "")
+        passed, message = result_of(_Forgetful.apply, width=width)
+        assert not passed
+        assert "Jacobian mismatch" in message
+
+
+def test_a_derivative_that_leaks_to_another_image_fails() -> None:
+    image = torch.rand(1, 1, 2, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(_Leaking.apply, image)
+    passed, message = result_of(_Leaking.apply, order=1, width=3)
+    assert not passed
+    assert "Jacobian mismatch for output 0 with respect to input 0, number 0 in number 0" in message
 
 
 def test_an_op_that_raises_fails_with_its_words() -> None:

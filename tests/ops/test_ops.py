@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import pytest
@@ -82,13 +82,15 @@ def test_equals_the_equation_in_float64(op: Op, case: Case) -> None:
     assert_same(results_of(op, inputs, case), references)
 
 
-@pytest.mark.parametrize("dtype", TOLERANCE, ids=str)
+# One test for all dtypes, and below one for all layouts: of hundreds of cases tests cost more than the ops in them.
 @every_case
-def test_error_is_that_of_rounding(op: Op, case: Case, dtype: torch.dtype) -> None:
-    if not ILL_CONDITIONED.match(case.name) or dtype == torch.float64:
-        assert relative_error(op, case, dtype) <= TOLERANCE[dtype]
-    expected = dtype if op.least_dtype is None else torch.promote_types(dtype, op.least_dtype)
-    assert {result.dtype for result in results_of(op, case.inputs(dtype), case)} == {expected}
+def test_error_is_that_of_rounding(op: Op, case: Case) -> None:
+    for dtype, tolerance in TOLERANCE.items():
+        # That of float64 is in the test above, number by number.
+        if dtype != torch.float64 and not ILL_CONDITIONED.match(case.name):
+            assert relative_error(op, case, dtype) <= tolerance, dtype
+        expected = dtype if op.least_dtype is None else torch.promote_types(dtype, op.least_dtype)
+        assert {result.dtype for result in results_of(op, case.inputs(dtype), case)} == {expected}, dtype
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
@@ -148,12 +150,16 @@ def expanded(tensor: Tensor) -> Tensor:
     return tensor[:1].expand(2 * min(len(tensor), 1), *tensor.shape[1:])
 
 
-@pytest.mark.parametrize("layout", [transposed, channels_last, strided, expanded])
 @every_case
-def test_layout_in_memory_changes_nothing(op: Op, case: Case, layout: Callable[[Tensor], Tensor]) -> None:
-    inputs = map_tensors(layout, case.inputs())
-    contiguous = map_tensors(lambda tensor: tensor.contiguous(), inputs)
-    assert_same(results_of(op, inputs, case), results_of(op, contiguous, case), rtol=1e-12)
+def test_layout_in_memory_changes_nothing(op: Op, case: Case) -> None:
+    for layout in (transposed, channels_last, strided, expanded):
+        inputs = map_tensors(layout, case.inputs())
+        contiguous = map_tensors(lambda tensor: tensor.contiguous(), inputs)
+        try:
+            assert_same(results_of(op, inputs, case), results_of(op, contiguous, case), rtol=1e-12)
+        except AssertionError as error:
+            error.add_note(f"layout: {layout.__name__}")
+            raise
 
 
 @every_case
@@ -164,26 +170,39 @@ def test_inputs_are_left_alone(op: Op, case: Case) -> None:
         torch.testing.assert_close(after, before, rtol=0, atol=0, equal_nan=True)
 
 
-# Generating code takes seconds, so it is left out where another op has the same code: splatting is the derivative of
-# kernel_conv, and accumulate reprojects. For the many taps of atrous and of
-# temporal_gradient, with their derivatives, it takes minutes.
-# Torch's generator does not lower the derivative of a QR decomposition.
-GENERATOR = dict.fromkeys(("kernel_splat", "reproject", "atrous", "temporal_gradient", "block_regression"), "aot_eager")
+# Generating code takes five to thirty seconds for an op, and what there is to generate is alike within a family. One of
+# each is generated here, the others where slow tests run; all go through the compiler up to its generator.
+GENERATED = {
+    "kernel_conv",  # taps with borders
+    "cross_bilateral_filter",  # weights of guides, a softmax over taps
+    "laplacian_fusion",  # resolutions
+    "demodulate",  # pixels alone
+    "grid_splat",  # scattered sums
+    "clamp_fireflies",  # sums over windows
+    "motion_from_position",  # matrices
+    "accumulate",  # gathered taps, and a test for each
+}
+# Splatting is the derivative of kernel_conv, and accumulate reprojects; the many taps of atrous and of
+# temporal_gradient take minutes with their derivatives; and torch lowers no derivative of a QR decomposition.
+MANY_TAPS = {"atrous", "temporal_gradient"}
+NOT_GENERATED = {"kernel_splat", "reproject", "block_regression"} | MANY_TAPS
+
+
+def compiled_cases(op: Op) -> Iterator[Any]:
+    quick = "inductor" if op.name in GENERATED else "aot_eager"
+    for i, backend in ((0, quick), (1, "aot_eager"), (3, "aot_eager")):
+        case = op.cases[i]
+        # The second is a batch of two, which changes nothing but numbers in what is compiled: of many taps too much.
+        marks = [pytest.mark.slow] if i == 1 and op.name in MANY_TAPS else []
+        yield pytest.param(op, case, backend, id=f"{op.name}-{case.name}-{backend}", marks=marks)
+    if op.name not in NOT_GENERATED | GENERATED:
+        name = f"{op.name}-{op.cases[0].name}-inductor"
+        yield pytest.param(op, op.cases[0], "inductor", id=name, marks=pytest.mark.slow)
 
 
 # The compiler raises deprecation warnings of torch's own making.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize(
-    ("op", "case", "backend"),
-    [
-        pytest.param(op, case, backend, id=f"{op.name}-{case.name}-{backend}")
-        for op in OPS
-        for case, backend in [
-            (op.cases[0], GENERATOR.get(op.name, "inductor")),
-            *((op.cases[i], "aot_eager") for i in (1, 3)),
-        ]
-    ],
-)
+@pytest.mark.parametrize(("op", "case", "backend"), [each for op in OPS for each in compiled_cases(op)])
 def test_compiles_to_the_same(op: Op, case: Case, backend: str) -> None:
     torch.compiler.reset()
     compiled = torch.compile(op.function, fullgraph=True, backend=backend)

@@ -302,7 +302,7 @@ def test_a_change_of_any_source_makes_it_again(small_sequence: Path, tmp_path: P
     command = [sys.executable, "-c", textwrap.dedent(script), small_sequence, folder]
 
     def made() -> set[Path]:
-        environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
+        environment = {**os.environ, "PYTHONPATH": str(root)}
         subprocess.run(command, check=True, env=environment, cwd=root)
         return {path.parent for path in folder.rglob("about.json")}
 

@@ -28,6 +28,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
@@ -125,6 +126,9 @@ class _Exact:
     bound: Tensor
 
 
+Known = dict[str, list[_Exact]]
+
+
 def select(names: Sequence[str] | None = None) -> list[Op]:
     """Ops by name, or functions of one's own, ``path/to/file.py:function``; all ops for ``None``.
 
@@ -132,7 +136,7 @@ def select(names: Sequence[str] | None = None) -> list[Op]:
         InputError: there is no such op or function, or nothing that it runs on.
     """
     # What is not of a batch cannot be tried many times at once.
-    every = OPS + tuple(step for step in STEPS if "weight" not in step.cases[0].inputs())
+    every = OPS + tuple(step for step in STEPS if step.batched)
     return list(every) if names is None else find_ops(names, every)
 
 
@@ -154,9 +158,10 @@ def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
     for dtype in dtypes:
         if not op.half and accumulator_dtype(dtype) != dtype:
             continue
+        known: list[Known] = [{} for _ in op.cases]
         for backend in backends(op):
-            for case in op.cases:
-                yield from check_case(op, case, dtype, backend)
+            for case, found in zip(op.cases, known, strict=True):
+                yield from check_case(op, case, dtype, backend, found)
         for pair in ADJOINTS:
             if op.name == pair[0]:
                 yield from _check_adjoint(op, next(other for other in OPS if other.name == pair[1]), dtype)
@@ -186,7 +191,9 @@ def check_stability(
     return list(check_op(op_of(function, inputs), dtypes))
 
 
-def check_case(op: Op, case: Case, dtype: torch.dtype, backend: Backend | None = None) -> list[Check]:
+def check_case(
+    op: Op, case: Case, dtype: torch.dtype, backend: Backend | None = None, known: Known | None = None
+) -> list[Check]:
     """Everything that must hold for an op on one case.
 
     Args:
@@ -194,6 +201,8 @@ def check_case(op: Op, case: Case, dtype: torch.dtype, backend: Backend | None =
         case: one of its cases.
         dtype: of the inputs.
         backend: see :func:`backends`.
+        known: what is exact in this case and dtype, which takes most of the time and is the same for every backend;
+            what is not yet in it is put there.
 
     Returns:
         One check of each kind that applies; a single one, ``"runs"``, where the backend refuses.
@@ -208,7 +217,8 @@ def check_case(op: Op, case: Case, dtype: torch.dtype, backend: Backend | None =
         passed = bool(backend) and "can run here" in str(error)
         message = in_one_line(error) if op.own else str(error)
         return [Check(op.name, case.name, name_of(dtype), backend or "", "runs", 0, 0, 0, passed, message)]
-    exact = _exact_results(trial, results)
+    known = {} if known is None else known
+    exact = _once(known, "forward", _exact_results, trial, results)
     checks = [_compare(trial, "forward", results, exact)]
     upstream = [_upstream(result) for result in results]
     leaves = [*trial.leaves, *upstream]
@@ -221,12 +231,20 @@ def check_case(op: Op, case: Case, dtype: torch.dtype, backend: Backend | None =
         if not isinstance(error, ValueError) or not backend or "can run here" not in str(error):
             raise
     else:
-        checks.append(_compare(trial, "gradient", gradients, _exact_gradients(trial, leaves, exact)))
+        true = _once(known, "gradient", _exact_gradients, trial, leaves, exact)
+        checks.append(_compare(trial, "gradient", gradients, true))
     if op.weights(case.settings):
         checks.append(_check_weights(trial, results[0]))
     if op.images and case.kind != "extreme":
-        checks += [_check_constant(trial), _check_exposure(trial, results[0])]
+        checks += [_check_constant(trial, known), _check_exposure(trial, results[0])]
     return checks
+
+
+def _once(known: Known, what: str, find: Callable[..., list[_Exact]], *arguments: Any) -> list[_Exact]:
+    """What is exact, found anew only where it is not known."""
+    if what not in known:
+        known[what] = find(*arguments)
+    return known[what]
 
 
 def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
@@ -238,7 +256,7 @@ def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
     rounding = trial.op.rounding(inputs, trial.case.settings)
     leaves = [leaf.double() for leaf in trial.leaves]
     magnitudes = _magnitudes(trial, leaves, rounding, dtype)
-    conditions = _conditions(trial.run, leaves, magnitudes, dtype, at_once=not trial.op.own)
+    conditions = _conditions(trial.run, leaves, magnitudes, dtype, at_once=trial.op.batched)
     return [
         _bounded(reference, condition + rounding.result, fan_in, dtype, result.dtype)
         for reference, result, (condition, fan_in) in zip(references, results, conditions, strict=True)
@@ -251,7 +269,7 @@ def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact])
     exact = [leaf.double() for leaf in leaves]
     magnitudes = _magnitudes(trial, exact[: len(trial.leaves)], rounding, trial.dtype)
     magnitudes += [leaf.abs() + torch.finfo(trial.dtype).tiny for leaf in exact[len(trial.leaves) :]]
-    conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype, at_once=not trial.op.own)
+    conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype, at_once=trial.op.batched)
     largest = max((leaf.abs().max().item() for leaf in exact[len(trial.leaves) :] if leaf.numel()), default=0.0)
     cancelling = _by_leaf(trial, [torch.zeros_like(leaf) for leaf in exact[: len(trial.leaves)]], rounding.gradients)
     # Where a result is infinite by right, so may its derivative be, or be nothing at all; elsewhere nothing excuses it.
@@ -290,20 +308,24 @@ def _conditions(
     base = function(leaves)
     changing = function if at_once else _one_by_one(function, leaves)
     # Infinity is not rounded, and what is never negative is not moved below zero.
-    steps = [torch.where(size.isfinite(), step * size, 0).flatten().tolist() for size in magnitudes]
-    down = [((leaf != 0) | (leaf < 0).any()).flatten().tolist() for leaf in leaves]
+    up = [torch.where(size.isfinite(), step * size, 0).flatten() for size in magnitudes]
+    down = [move * ((leaf != 0) | (leaf < 0).any()).flatten() for move, leaf in zip(up, leaves, strict=True)]
     totals = [torch.zeros_like(result) for result in base]
     fans = [torch.zeros_like(result) for result in base]
-    places = [(i, j) for i, leaf in enumerate(leaves) for j in range(leaf.numel())]
-    for start in range(0, len(places), _AT_ONCE):
-        chosen = places[start : start + _AT_ONCE]
-        copies = [leaf.repeat(2 * len(chosen), *(1,) * (leaf.ndim - 1)) for leaf in leaves]
-        for k, (i, j) in enumerate(chosen):
-            flat = copies[i].reshape(2 * len(chosen), -1)
-            flat[2 * k, j] += steps[i][j]
-            flat[2 * k + 1, j] -= steps[i][j] * down[i][j]
+    starts = list(accumulate((leaf.numel() for leaf in leaves), initial=0))
+    for start in range(0, starts[-1], _AT_ONCE):
+        count = min(_AT_ONCE, starts[-1] - start)
+        copies = [leaf.repeat(2 * count, *(1,) * (leaf.ndim - 1)) for leaf in leaves]
+        for i, (first, end) in enumerate(pairwise(starts)):
+            # Those numbers of the leaf whose turn it is: each has two copies to itself.
+            numbers = torch.arange(max(start, first), max(start, first, min(start + count, end)))
+            if not len(numbers):
+                continue
+            copy, rows, columns = copies[i].view(2 * count, -1), 2 * (numbers - start), numbers - first
+            copy[rows, columns] += up[i][columns]
+            copy[rows + 1, columns] -= down[i][columns]
         for result, total, fan, changed in zip(base, totals, fans, changing(copies), strict=True):
-            both = changed.reshape(len(chosen), 2, *result.shape)
+            both = changed.reshape(count, 2, *result.shape)
             change = (both - result).abs()
             same = (both == result) | (both.isnan() & result.isnan()) | (change <= _NOISE * result.abs())
             larger = torch.where(same, 0, change.nan_to_num(nan=math.inf)).amax(1)
@@ -384,14 +406,15 @@ def _check_weights(trial: _Trial, weights: Tensor) -> Check:
     return _found(trial, "weights", error / eps, allowed / eps, 1.0, message)
 
 
-def _check_constant(trial: _Trial) -> Check:
+def _check_constant(trial: _Trial, known: Known) -> Check:
     """The forward check once more, with constant images: a mean of equal numbers is that number."""
     inputs = dict(trial.inputs)
     for name in trial.images:
         inputs[name] = torch.full_like(_tensor(inputs[name]), _CONSTANT)
     constant = replace(trial, inputs=inputs)
     results = constant.run(constant.leaves)
-    return _compare(constant, "constant", results[:1], _exact_results(constant, results)[:1])
+    exact = _once(known, "constant", _exact_results, constant, results)
+    return _compare(constant, "constant", results[:1], exact[:1])
 
 
 def _check_exposure(trial: _Trial, result: Tensor) -> Check:

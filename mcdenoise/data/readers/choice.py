@@ -18,6 +18,8 @@ from mcdenoise.frame import BUFFERS
 # Buffers that somebody may map a layer to; the rest is no image of a frame.
 MAPPABLE = sorted(set(BUFFERS) - {"current", "length"})
 _ALL, _LOWEST = slice(None), slice(-16, None)
+# Numbers that are compared at a time: 64 MiB.
+_AT_ONCE = 2**24
 
 
 @dataclass
@@ -182,13 +184,25 @@ def _twins(color: Layer, strangers: Sequence[Layer], read: Read) -> list[Layer]:
     if not others:
         return []
     # A few rows of all of them tell most apart: each reading decompresses all layers of its rows.
-    together = replace(color, channels=tuple(name for layer in [color, *others] for name in layer.channels[:3]))
-    first, *rest = np.split(read(together, _LOWEST), len(others) + 1, -1)
+    first, *rest = _together(read, [color, *others], _LOWEST)
     alike = [layer for layer, pixels in zip(others, rest, strict=True) if np.array_equal(first, pixels, equal_nan=True)]
     if not alike:
         return []
     whole = read(color, _ALL)[..., :3]
-    return [layer for layer in alike if np.array_equal(read(layer, _ALL)[..., :3], whole, equal_nan=True)]
+    height, numbers = len(whole), max(1, whole[0].size * len(alike))
+    rows = max(16, _AT_ONCE // numbers)
+    for part in (slice(top, top + rows) for top in range(0, height, rows)):
+        pixels_of = zip(alike, _together(read, alike, part), strict=True)
+        alike = [layer for layer, pixels in pixels_of if np.array_equal(pixels, whole[part], equal_nan=True)]
+        if not alike:
+            break
+    return alike
+
+
+def _together(read: Read, layers: Sequence[Layer], rows: slice) -> list[Image]:
+    """Some rows of the colors of layers of the same part, in one reading."""
+    every = replace(layers[0], channels=tuple(name for layer in layers for name in layer.channels[:3]))
+    return np.split(read(every, rows), len(layers), -1)
 
 
 def _by_values(choice: Choice, strangers: Sequence[Layer], mapping: Mapping[str, str], read: Read) -> None:
