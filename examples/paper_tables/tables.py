@@ -40,7 +40,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import check_references
 from mcdenoise.metrics import PROTOCOLS
-from mcdenoise.models import Output, create_model, describe_weights, parts_of, pretrained_models
+from mcdenoise.models import Output, compared_models, create_model, describe_weights, parts_of
 from mcdenoise.models.accumulated import Accumulated
 
 PROTOCOL_NAMES = ("strict", "meng2020")
@@ -155,7 +155,7 @@ def table_1(measured: Measured) -> Table:
         weights = None
         if model in (*RIVALS.values(), *OWN.values(), *OTHERS.values()):
             own = weights_of(options.runs / "zoo" / model, model)
-            weights = own if own.exists() or model not in pretrained_models() else None
+            weights = own if own.exists() or model not in compared_models() else None
         return [measured.errors(scene, model, weights, image=image) for scene in options.scenes]
 
     every = {"noisy": of("accumulated", "noisy"), "accumulated": of("accumulated", "accumulated")}
