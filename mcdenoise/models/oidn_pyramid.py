@@ -3,8 +3,7 @@
 Its two images of a frame, for noisy and for clean features, are wrong in other places, and both in other ones than a
 mean of noisy pixels is: the network of ``pyramid`` sees all three, and weighs them pixel by pixel. That is an ensemble
 as of Zheng et al. 2021, "Ensemble Denoising for Monte Carlo Renderings", with a learnt denoiser as one of those in it,
-which is trained to be right where the library is not. It is told whether features are exact, too: there the image for
-clean ones is the better one.
+which is trained to be right where the library is not.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from mcdenoise.models.pyramid import PyramidNetwork, widths_of
 from mcdenoise.models.recurrent import Recurrent
 from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.models.with_oidn import EXACT, OIDN, OIDN_CLEAN, WithOidn
+from mcdenoise.models.with_oidn import OIDN, OIDN_CLEAN, WithOidn
 
 
 @register_model("oidn_pyramid", kind="peer", paper="after Zheng et al. 2021", requires="pyoidn")
@@ -42,6 +41,6 @@ def oidn_pyramid(
     Raises:
         InputError: as of both.
     """
-    network = PyramidNetwork(widths_of(width), kernel_size, others=(OIDN, OIDN_CLEAN), maps=(EXACT,))
+    network = PyramidNetwork(widths_of(width), kernel_size, others=(OIDN, OIDN_CLEAN))
     corrected, steadied = Demodulated(Tiled(network)), Recurrent(Tiled(Steadied(history)))
     return WithOidn(Chain(corrected=corrected, steadied=steadied), quality=quality, threads=threads)

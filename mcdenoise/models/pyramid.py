@@ -65,22 +65,15 @@ class PyramidNetwork(nn.Module):
         others: names in ``frame.extra`` of images ``(B, 3, H, W)`` that other methods have made of the frame: it sees
             them, and the result is a mean of its own image and of them with weights that it predicts. One that a frame
             lacks is the noisy one.
-        maps: names in ``frame.extra`` of ``(B, 1, H, W)`` that it sees besides; one that a frame lacks is zero.
     """
 
     def __init__(
-        self,
-        widths: Sequence[int],
-        kernel_size: int = 5,
-        half: bool = False,
-        others: Sequence[str] = (),
-        maps: Sequence[str] = (),
+        self, widths: Sequence[int], kernel_size: int = 5, half: bool = False, others: Sequence[str] = ()
     ) -> None:
         super().__init__()
         scales = len(widths) + half
-        self.others, self.maps = tuple(others), tuple(maps)
-        seen = 9 + FEATURES + 3 * len(self.others) + len(self.maps)
-        self.unet = UNet(seen, widths, scales, _COARSE_CHANNELS, half)
+        self.others = tuple(others)
+        self.unet = UNet(9 + FEATURES + 3 * len(self.others), widths, scales, _COARSE_CHANNELS, half)
         self.taps = kernel_size**2
         # Kernel, its three falloffs, what a scale keeps, and what it takes of the coarser one.
         self.channels = [self.taps + 5] * (scales - 1) + [self.taps + 3]
@@ -110,7 +103,7 @@ class PyramidNetwork(nn.Module):
         behind = sum((radius + 1) << scale for scale in range(self.unet.scales))
         ways = (self.unet.reach(scale) + max(1 << scale, self.unet.stride) for scale in range(self.unet.scales))
         # Other methods have made theirs of this frame, not of its history.
-        uses = _USES | (frozenset(self.others) or _HISTORY) | frozenset(self.maps)
+        uses = _USES | (frozenset(self.others) or _HISTORY)
         return Needs(uses=uses, reach=max(ways) + behind, stride=self.unet.multiple)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
@@ -131,8 +124,7 @@ class PyramidNetwork(nn.Module):
         # In the unit of the image, and with their albedo.
         others = [frame.extra[name] * exposure if name in frame.extra else image * albedo for name in self.others]
         logarithms = [torch.log1p(each) for each in (image * albedo, *others)]
-        maps = [frame.extra.get(name, torch.zeros_like(image[:, :1])) for name in self.maps]
-        seen = torch.cat([input_of(frame, image), logarithms[0], before, *logarithms[1:], *maps], 1)
+        seen = torch.cat([input_of(frame, image), logarithms[0], before, *logarithms[1:]], 1)
         levels = self.unet(seen, self._coarse(frame, exposure))
         sizes = _sizes(frame.size, len(levels))
         predicted = [
