@@ -94,7 +94,7 @@ def _inputs(*arguments: Any) -> _Inputs:
     dtype = accumulator_dtype(image.dtype)
     nothing = torch.empty((0, 0, 0, 0), dtype=dtype)
     tensors = [nothing if each is None else each.detach().to(dtype).contiguous() for each in arguments[:8]]
-    return _Inputs(*(tensor.numpy() for tensor in tensors), kernel_size, dilation)
+    return _Inputs._make([*(tensor.numpy() for tensor in tensors), kernel_size, dilation])
 
 
 def _filtered(image: Tensor, inputs: _Inputs) -> tuple[Tensor, Tensor]:
