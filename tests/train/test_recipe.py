@@ -142,11 +142,13 @@ def test_the_recipes_can_be_read(recipe: Path) -> None:
 
 def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
     pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
-    (block,) = re.findall(r"```toml\n(.*?)```", (RECIPES.parent / "training" / "README.md").read_text(), re.DOTALL)
+    block, runs = re.findall(r"```toml\n(.*?)```", (RECIPES.parent / "training" / "README.md").read_text(), re.DOTALL)
     path = tmp_path / "explained.toml"
     path.write_text(block)
     found = Recipe.read(path, options_of("generate"))
     assert [rendering.clean for rendering in (*found.data, *found.validation)] == [True, False, False]
+    path.write_text(block.partition("[expected]")[0] + runs)
+    assert [run.name for run in Recipe.read(path, options_of("generate")).runs] == ["K-1", "K-2", "K-3"]
     (one,) = found.runs
     assert (one.name, one.config.steps, one.expected, found.credits) == ("", 5000, (0.093, 0.005), "random*: CC0")
 

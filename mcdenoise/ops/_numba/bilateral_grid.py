@@ -133,17 +133,17 @@ def _(gradient: Tensor, grid: Tensor, filled: Tensor, guide: Tensor, cell: int) 
 def _guide(guide: Tensor, cell: int, bins: int, dtype: torch.dtype) -> _Guide:
     like = torch.empty(0, dtype=dtype)
     (rows, row_weights), (columns, column_weights) = (spatial_taps(side, cell, like) for side in guide.shape[2:])
-    scale, offset = (GUIDE_STEPS - 1) / GUIDE_STEPS * bins, 0.5 / GUIDE_STEPS * bins - 0.5
-    # In the dtype of the sums, as scalars of numpy.
-    position = like.new_tensor([scale, offset]).numpy()
+    line = (GUIDE_STEPS - 1) / GUIDE_STEPS * bins, 0.5 / GUIDE_STEPS * bins - 0.5
+    # In the dtype of the sums: numbers in double precision would make the sums so.
+    scale, offset = like.new_tensor(line).numpy()
     return _Guide(
         source(readable(guide, dtype)),
         rows[0].numpy(),
         row_weights.numpy(),
         columns[0].numpy(),
         column_weights.numpy(),
-        position[0],
-        position[1],
+        scale,
+        offset,
         cell,
         bins,
     )
