@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 import statistics
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -16,12 +14,12 @@ import torch
 
 from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.data import Sequence
-from mcdenoise.data.files import write_text
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import PRECISIONS, Precision, pretrained_models
 from mcdenoise.results import Results
+from mcdenoise.user_cache import cache_file, keep
 
 _ROUNDS = 3
 # Frames with a reference that errors are measured on, and frames before the first of them.
@@ -77,7 +75,7 @@ def choose_model(
         results: folder of a finished benchmark, whose errors (mean over its scenes) are taken; without it they are
             measured on the last frames of the sequence that have a reference.
         device: where to run.
-        cache: file of run times that were measured earlier, :func:`cache_file` by default.
+        cache: file of run times that were measured earlier; by default ``run_times.json`` in the user's cache folder.
         on_step: called with the number of models that were measured, and that of all of them.
 
     Raises:
@@ -90,7 +88,7 @@ def choose_model(
         raise InputError(
             f"--max-error: expected references in {sequence.root}, or --results of a finished benchmark, found neither"
         )
-    choices = _timed(sequence.size, device, cache_file() if cache is None else cache, on_step)
+    choices = _timed(sequence.size, device, cache_file("run_times.json") if cache is None else cache, on_step)
     affordable = [choice for choice in choices if budget is None or choice.milliseconds <= budget]
     if not affordable:
         raise InputError(f"--budget-ms: expected a model that takes at most {budget:g} ms, found at best {choices[0]}")
@@ -111,12 +109,6 @@ def choose_model(
     raise InputError(f"--max-error: expected a model with SMAPE of at most {max_error:g}{within}, found {found}")
 
 
-def cache_file() -> Path:
-    """Where run times are kept: in the user's cache folder."""
-    folder = os.environ.get("XDG_CACHE_HOME")
-    return (Path(folder) if folder else Path.home() / ".cache") / "mcdenoise" / "run_times.json"
-
-
 def _timed(size: tuple[int, int], device: str, cache: Path, on_step: Callable[[int, int], None]) -> list[Choice]:
     """All shipped models in all precisions, the fastest first."""
     height, width = size
@@ -131,10 +123,7 @@ def _timed(size: tuple[int, int], device: str, cache: Path, on_step: Callable[[i
             own[choice.name] = _measure(choice, size, device)
         measured.append(replace(choice, milliseconds=own[choice.name]))
         on_step(done, len(choices))
-    # Without a place to keep them, they are measured again.
-    with suppress(OSError, InputError):
-        cache.parent.mkdir(parents=True, exist_ok=True)
-        write_text(cache, json.dumps(known, indent=1) + "\n")
+    keep(cache, json.dumps(known, indent=1) + "\n")
     return sorted(measured, key=lambda choice: choice.milliseconds)
 
 

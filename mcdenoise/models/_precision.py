@@ -7,8 +7,6 @@ import math
 import os
 import platform
 import statistics
-import tempfile
-from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -17,6 +15,7 @@ import torch.nn.functional as F
 
 from mcdenoise.errors import InputError
 from mcdenoise.models._journal import clock
+from mcdenoise.user_cache import cache_file, keep
 
 Precision = Literal["float32", "bfloat16"]
 PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
@@ -50,14 +49,12 @@ def fastest_precision(device: torch.device) -> Chosen:
         raise InputError(f"{ENVIRONMENT}: expected one of {', '.join(PRECISIONS)}, found '{own}'")
     if not _has_bfloat16(device):
         return Chosen("float32", "the processor has no bfloat16")
-    cache, key = _cache_file(), _machine(device)
+    cache, key = cache_file("precision.json"), _machine(device)
     ratios = _read(cache)
     ratio = ratios.get(key, 0.0)
     if not (math.isfinite(ratio) and ratio > 0):
         ratio = _measured(device)
-        # Without a place to keep it, it is measured again.
-        with suppress(OSError):
-            _write(cache, {**ratios, key: ratio})
+        keep(cache, json.dumps({**ratios, key: ratio}, indent=1) + "\n")
     precision: Precision = "bfloat16" if ratio >= _WORTH else "float32"
     return Chosen(precision, f"a convolution in bfloat16 takes {1 / ratio:.2f} of the time in float32 here")
 
@@ -102,24 +99,8 @@ def _machine(device: torch.device) -> str:
     return f"{name}, torch {torch.__version__}"
 
 
-def _cache_file() -> Path:
-    folder = os.environ.get("XDG_CACHE_HOME")
-    return (Path(folder) if folder else Path("~/.cache").expanduser()) / "mcdenoise" / "precision.json"
-
-
 def _read(cache: Path) -> dict[str, float]:
     try:
         return {key: float(value) for key, value in json.loads(cache.read_text(encoding="utf-8")).items()}
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):
         return {}
-
-
-def _write(cache: Path, ratios: dict[str, float]) -> None:
-    cache.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=cache.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump(ratios, file, indent=1)
-        os.replace(temporary, cache)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
