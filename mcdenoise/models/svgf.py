@@ -93,10 +93,11 @@ class Svgf(nn.Module):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         check_needs(self.needs, frame.buffers)
-        history = own_state(state, History, frame, channels=with_carried(frame).shape[1])
+        entering = with_carried(frame)
+        history = own_state(state, History, frame, channels=entering.shape[1])
         normal, depth = frame.normal, frame.depth
         with timed("accumulate", frame.color.device):
-            light, moments, length = self._accumulate(frame, history)
+            light, moments, length = self._accumulate(frame, entering, history)
             variance = variance_of(moments, length, frame)
         filtered, kept = light, light
         with timed("filter", frame.color.device):
@@ -119,9 +120,8 @@ class Svgf(nn.Module):
         output = answered(frame, filtered)
         return output._replace(stages={"accumulated": light[:, :3]}), after
 
-    def _accumulate(self, frame: Frame, history: History | None) -> tuple[Tensor, Tensor, Tensor]:
+    def _accumulate(self, frame: Frame, light: Tensor, history: History | None) -> tuple[Tensor, Tensor, Tensor]:
         """Sec. 4.1: light, moments and length with the history, where there is one."""
-        light = with_carried(frame)
         entering = torch.cat([light, luminance_moments(frame.color.clamp_max(BRIGHTEST)).to(light.dtype)], 1)
         reset, motion = "first frame", None
         if history is not None:
