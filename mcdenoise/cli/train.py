@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import get_type_hints
 
@@ -20,6 +20,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.train import Progress, Recipe, Rendering, Run, RunFolder, TrainConfig, is_first_process
 from mcdenoise.train import train as run
+from mcdenoise.train.recipe import naming
 
 
 def train(
@@ -126,24 +127,15 @@ def _generator(rendering: Rendering, data: Path) -> Callable[[], None]:
             arguments.append(f"--{name}" if value else f"--no-{name}")
         else:
             arguments += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
-    with _naming(rendering.where):
+    with naming(rendering.where):
         command = parse("generate", arguments)
 
     def generate() -> None:
         # What is printed is what this command makes.
-        with _naming(rendering.where), contextlib.redirect_stdout(sys.stderr):
+        with naming(rendering.where), contextlib.redirect_stdout(sys.stderr):
             command()
 
     return generate
-
-
-@contextlib.contextmanager
-def _naming(where: str) -> Iterator[None]:
-    """Say where in a recipe it is that something is wrong."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
 
 
 def _print_errors(errors: Mapping[str, float], expected: tuple[float, float] | None) -> None:

@@ -151,13 +151,13 @@ class Recipe:
             settings = common | own
             sha256 = _digest([settings or None, *rendered])
             config = TrainConfig(**{key: value for key, value in settings.items() if key != "credits"})
-            with _at(where):
+            with naming(where):
                 # What would fail after hours of rendering.
                 check_config(config, 1)
                 create_model(config.model, **config.model_settings)
             runs.append(Run(name, config, expected, sha256))
         if any(rendering.clean for each in made.values() for rendering in each):
-            with _at(str(path)):
+            with naming(str(path)):
                 create_model("oidn")
         return Recipe(runs, made["data"], made["validation"], common.get("credits", ""))
 
@@ -209,7 +209,8 @@ def _expected(where: str, table: Any) -> tuple[float, float] | None:
 
 
 @contextmanager
-def _at(where: str) -> Iterator[None]:
+def naming(where: str) -> Iterator[None]:
+    """Say where in a recipe it is that something is wrong."""
     try:
         yield
     except InputError as error:
