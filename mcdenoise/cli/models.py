@@ -28,8 +28,8 @@ def models(results: Path | None = None, json: Json = None) -> None:
             of those models that it measured as they are shipped.
         json: write the list to this file too.
     """
-    entries = overview()
     measured = _measured(results) if results else {}
+    entries = overview()
     columns = ("model", "paper", "needs", "uses", "weights", "parameters", "kMAC per pixel")
     columns = (*columns, *(_MEASURED if results else ()), "what")
     for kind in dict.fromkeys(entry.kind for entry in entries):
