@@ -32,7 +32,8 @@ def test_lists_every_model_by_kind_and_name() -> None:
     by_name = {entry.name: entry for entry in entries}
     tiny = by_name["cascaded_v2_tiny"]
     assert (tiny.kind, tiny.weights) == ("kernel", "shipped")
-    assert (by_name["cascaded"].weights, by_name["svgf"].paper) == ("to train", "Schied et al. 2017")
+    assert (by_name["cascaded"].weights, by_name["svgf"].paper) == ("compared", "Schied et al. 2017")
+    assert by_name["wskp_unet"].weights == "to train"
     # Multiply-adds are no fewer than a sixteenth of the weights, of which each is used once in 4x4 pixels or more.
     assert tiny.kmacs_per_pixel is not None
     assert tiny.kmacs_per_pixel > tiny.parameters / 64 / 1e3
@@ -45,7 +46,7 @@ def test_a_model_without_its_package_is_listed_with_the_reason(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     archive_of_library.cache_clear()
-    models(tmp_path / "models.json")
+    models(json=tmp_path / "models.json")
     assert "oidn_pyramid" not in pretrained_models()
     absent = [entry for entry in json.loads((tmp_path / "models.json").read_text()) if entry["reason"]]
     assert [(entry["name"], entry["kind"]) for entry in absent] == [
