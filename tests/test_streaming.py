@@ -180,8 +180,8 @@ def test_one_absurdly_bright_pixel_is_replaced_and_counted(shot: list[Frame], pr
             assert denoiser.report.replaced_pixels == (number == 1), value
 
 
-@pytest.mark.parametrize("albedo", [None, 0.0, 1e-3, 0.04, 1.0])
-@pytest.mark.parametrize("where", [slice(10, 11), slice(10, 20), slice(None)])
+@pytest.mark.parametrize("albedo", [None, 0.0, 1e-3, *(pytest.param(a, marks=pytest.mark.slow) for a in (0.04, 1.0))])
+@pytest.mark.parametrize("where", [slice(10, 11), pytest.param(slice(10, 20), marks=pytest.mark.slow), slice(None)])
 def test_the_largest_radiance_that_is_one_stays_finite(shot: list[Frame], where: slice, albedo: float | None) -> None:
     denoiser = Denoiser(MODEL)
     for frame in shot:

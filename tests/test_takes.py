@@ -13,7 +13,7 @@ from mcdenoise.scenes.random import random_scene
 from mcdenoise.scenes.random.takes import Take, random_takes
 from mcdenoise.scenes.render.tracer import scene_digest
 
-SEEDS = range(60)
+SEEDS = range(30)
 
 
 def wild(seed: int, **changes: Any) -> list[Take]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from typing import Any, get_args
 
 import torch
@@ -58,9 +58,6 @@ def overview() -> list[ModelOverview]:
 
 
 def _overview(name: str, weights: str) -> ModelOverview:
-    # Imports Triton where it is installed, which takes a fifth of a second.
-    from torch.utils.flop_counter import FlopCounterMode
-
     listed = partial(ModelOverview, name, "", "other", "")
     try:
         entry = find_model(name)
@@ -68,22 +65,30 @@ def _overview(name: str, weights: str) -> ModelOverview:
         model = build_model(name)
     except InputError as error:
         return listed(reason=str(error))
-    needs, macs = model.needs, None
+    needs = model.needs
     parameters = sum(each.numel() for each in model.parameters()) if isinstance(model, nn.Module) else 0
     weights = weights or ("to train" if needs.trainable else "its own")
-    if parameters:
-        # The counter knows torch's convolutions, not those that are fused where nobody asks for derivatives.
-        with FlopCounterMode(display=False) as counter, torch.enable_grad():
-            model(_frame())
-        macs = counter.get_total_flops() / 2 / _SIDE**2 / 1e3
     return listed(
         parameters=parameters,
-        kmacs_per_pixel=macs,
+        kmacs_per_pixel=_kmacs_per_pixel(name, entry.construct) if parameters else None,
         weights=weights if parameters else "none",
         needs=sorted(needs.buffers),
         uses=sorted(needs.uses),
         trainable=needs.trainable,
     )
+
+
+# Of what makes the model too: another one may be registered under a name.
+@cache
+def _kmacs_per_pixel(name: str, _: object) -> float:
+    # Imports Triton where it is installed, which takes a fifth of a second.
+    from torch.utils.flop_counter import FlopCounterMode
+
+    model = build_model(name)
+    # The counter knows torch's convolutions, not those that are fused where nobody asks for derivatives.
+    with FlopCounterMode(display=False) as counter, torch.enable_grad():
+        model(_frame())
+    return float(counter.get_total_flops()) / 2 / _SIDE**2 / 1e3
 
 
 def _frame() -> Frame:

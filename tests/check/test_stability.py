@@ -44,9 +44,9 @@ def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
 
 
 # bfloat16 and float16 take the same way through the ops; `mcdenoise stability` tries them all.
-# Second derivatives of 25 taps take half a minute in each.
+# Second derivatives of 25 taps take half a minute.
 TRIED = [
-    pytest.param(op, dtype, marks=[pytest.mark.slow] if (op.name, dtype) == ("atrous", torch.float16) else [])
+    pytest.param(op, dtype, marks=[pytest.mark.slow] if op.name == "atrous" else [])
     for op in OPS
     for dtype in (torch.float32, torch.float16)
 ]

@@ -48,8 +48,12 @@ def beyond(shot: str, model: str, precision: str, images: dict[int, Tensor]) -> 
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize(
     ("shot", "settings"),
-    [("moving", {}), ("moving", {"tile": 64}), ("still", {}), ("still", {"tile": 64})],
-    ids=["whole", "tiled", "skipped", "skipped and tiled"],
+    [
+        pytest.param("moving", {}, id="whole"),
+        pytest.param("moving", {"tile": 64}, id="tiled", marks=pytest.mark.slow),
+        pytest.param("still", {}, id="skipped", marks=pytest.mark.slow),
+        pytest.param("still", {"tile": 64}, id="skipped and tiled"),
+    ],
 )
 def test_images_are_those_of_the_file(shot: str, settings: dict[str, Any], model: str, precision: Precision) -> None:
     denoiser = Denoiser(MODELS[model], precision=precision, **settings)

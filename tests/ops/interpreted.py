@@ -64,7 +64,9 @@ def test_result_and_derivatives(op: Op, case: Case) -> None:
     is_that_of_the_plain_form(op, case, torch.float64)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16], ids=str)
+@pytest.mark.parametrize(
+    "dtype", [torch.bfloat16, *(pytest.param(each, marks=pytest.mark.slow) for each in (torch.float32, torch.float16))]
+)
 @every_op
 def test_dtypes(op: Op, dtype: torch.dtype) -> None:
     is_that_of_the_plain_form(op, drawn(1, 3, 3, 5, 3, op, border="renormalize"), dtype)
@@ -72,7 +74,9 @@ def test_dtypes(op: Op, dtype: torch.dtype) -> None:
 
 # Wider, and taller than a tile, and no whole number of them.
 @pytest.mark.parametrize("size", [(1, 1, 2, 35, 3), (2, 1, 6, 3, 3)], ids=str)
-@pytest.mark.parametrize("border", ["replicate", "zeros", "renormalize"])
+@pytest.mark.parametrize(
+    "border", ["renormalize", *(pytest.param(each, marks=pytest.mark.slow) for each in ("replicate", "zeros"))]
+)
 @every_op
 def test_sizes(op: Op, border: str, size: tuple[int, int, int, int, int]) -> None:
     is_that_of_the_plain_form(op, drawn(*size, op, border=border), torch.float64)

@@ -192,8 +192,8 @@ def compiled_cases(op: Op) -> Iterator[Any]:
     quick = "inductor" if op.name in GENERATED else "aot_eager"
     for i, backend in ((0, quick), (1, "aot_eager"), (3, "aot_eager")):
         case = op.cases[i]
-        # The second is a batch of two, which changes nothing but numbers in what is compiled: of many taps too much.
-        marks = [pytest.mark.slow] if i == 1 and op.name in MANY_TAPS else []
+        # Other cases change little but numbers in what is compiled.
+        marks = [pytest.mark.slow] if i > 0 or op.name in MANY_TAPS else []
         yield pytest.param(op, case, backend, id=f"{op.name}-{case.name}-{backend}", marks=marks)
     if op.name not in NOT_GENERATED | GENERATED:
         name = f"{op.name}-{op.cases[0].name}-inductor"

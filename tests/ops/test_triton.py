@@ -30,16 +30,23 @@ def run(*arguments: str, **variables: str) -> None:
     assert result.returncode == 0, result.stdout
 
 
+@pytest.mark.parametrize("cases", ["not slow", pytest.param("slow", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("part", PARTS)
-def test_the_interpreted_kernels_are_the_plain_form(part: str) -> None:
+def test_the_interpreted_kernels_are_the_plain_form(part: str, cases: str) -> None:
     pytest.importorskip("triton", reason="the form for GPUs is in the extra mcdenoise[gpu]")
     arguments = ("-q", "-p", "no:cacheprovider", "-p", "no:xdist", str(HERE / "interpreted.py"))
-    run("-m", "pytest", *arguments, "-k", part, TRITON_INTERPRET="1")
+    run("-m", "pytest", *arguments, "-k", part, "-m", cases, TRITON_INTERPRET="1")
 
 
 # The oldest that each dtype is used on, and a newer one. The interpreter knows nothing of types that a GPU has not, of
 # what may change in a loop, or of names that are missing in its libraries; the compiler does.
-@pytest.mark.parametrize(("capability", "dtype"), [(75, "float16"), (80, "bfloat16"), (90, "float32"), (90, "float64")])
+@pytest.mark.parametrize(
+    ("capability", "dtype"),
+    [
+        (90, "float32"),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((75, "float16"), (80, "bfloat16"), (90, "float64"))),
+    ],
+)
 def test_the_kernels_compile_for(capability: int, dtype: str, tmp_path: Path) -> None:
     pytest.importorskip("triton", reason="the form for GPUs is in the extra mcdenoise[gpu]")
     run(str(HERE / "compile_kernels.py"), str(capability), dtype, TRITON_CACHE_DIR=str(tmp_path), TRITON_INTERPRET="0")
