@@ -15,6 +15,8 @@ Networks are those of RUNS, or else, in Table 1, the shipped ones:
     mcdenoise train --recipe recipes/zoo.toml -o RUNS/zoo               Table 1, trained on random scenes
     mcdenoise train --recipe recipes/ablations.toml -o RUNS/ablations   Tables 3 and 4, likewise, three seeds of each
     python examples/paper_tables/train_folds.py DATASET -o RUNS         Tables 3 and 4, leaving one scene out
+    python examples/paper_tables/train_folds.py DATASET -o RUNS --recipe recipes/zoo.toml
+                                                                        Table 1 with --leave-one-out
 
 All of a table are trained alike, and get frames accumulated by the same rule with alpha 0.2: "accumulated". OIDN gets
 the noisy frames, and is told that features are clean.
@@ -149,14 +151,19 @@ def weights_of(run: Path, model: str) -> Path:
 
 def table_1(measured: Measured) -> Table:
     options = measured.options
-    found = Table([["method", "protocol", *options.scenes, "average"]])
+    scenes = options.held_out if options.leave_one_out else options.scenes
+    found = Table([["method", "protocol", *scenes, "average"]])
+
+    def weights(model: str, scene: str) -> Path | None:
+        if model not in (*RIVALS.values(), *OWN.values(), *OTHERS.values()):
+            return None
+        if options.leave_one_out:
+            return weights_of(fold_folder(options.runs, options.split, scene, options.scenes) / model, model)
+        own = weights_of(options.runs / "zoo" / model, model)
+        return own if own.exists() or model not in compared_models() else None
 
     def of(model: str, image: str = "") -> list[Errors | str]:
-        weights = None
-        if model in (*RIVALS.values(), *OWN.values(), *OTHERS.values()):
-            own = weights_of(options.runs / "zoo" / model, model)
-            weights = own if own.exists() or model not in compared_models() else None
-        return [measured.errors(scene, model, weights, image=image) for scene in options.scenes]
+        return [measured.errors(scene, model, weights(model, scene), image=image) for scene in scenes]
 
     every = {"noisy": of("accumulated", "noisy"), "accumulated": of("accumulated", "accumulated")}
     every |= {name: of(model) for name, model in RIVALS.items()}
@@ -169,7 +176,7 @@ def table_1(measured: Measured) -> Table:
     for name in RIVALS:
         found.claim(f"P+K is ahead of {name} in the mean", averages["P+K"], averages[name])
     found.claim("the final image is ahead of the initial one in the mean", averages["P+K"], averages["P+K, initial"])
-    for scene, final, initial in zip(options.scenes, every["P+K"], every["P+K, initial"], strict=True):
+    for scene, final, initial in zip(scenes, every["P+K"], every["P+K, initial"], strict=True):
         found.claim(f"the final image is ahead of the initial one in {scene}", final, initial)
     return found
 
@@ -301,6 +308,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--tables", type=int, nargs="+", choices=TABLES, default=list(TABLES))
     parser.add_argument("--scenes", nargs="+", metavar="NAME", help="of the dataset; all by default")
     parser.add_argument("--held-out", nargs="+", metavar="NAME", help="scenes with a fold; all by default")
+    parser.add_argument("--leave-one-out", action="store_true", help="Table 1 of networks that have not seen the scene")
     parser.add_argument("--split", choices=get_args(Split), default="grouped", help="of the folds, see folds.py")
     parser.add_argument("--frames", metavar="NUMBERS", help="which frames to use, such as 0-15; all by default")
     parser.add_argument("--rounds", type=int, default=5, help="of Table 2")
