@@ -37,9 +37,7 @@ def test_inspect_prints_what_is_read_and_writes_nothing(run: Run, rendered: Path
     told = json.loads((tmp_path / "found.json").read_text())
     assert [row["buffer"] for row in told["read"]][:3] == ["color", "albedo", "normal"]
     assert told["frames"] == [1, 2, 3, 4]
-    assert told["unused"] == [
-        f"shot_####.exr ViewLayer.{name}" for name in ("DiffCol.RGB", "Normal.XYZ", "Denoising Depth.Z")
-    ]
+    assert told["unused"] == [f"shot_####.exr ViewLayer.{name}" for name in ("Normal.XYZ", "Denoising Depth.Z")]
     words = " ".join(text.split())
     for word in ("not used: shot_####.exr ViewLayer.DiffCol.RGB", "1e+10, read as infinity"):
         assert word in words
