@@ -130,7 +130,8 @@ def render_cycles(
     movers = [name for name in made.scene if name in moves]
     description = translate(made.scene, movers, seed=seed)
     folder = _Folder(out / "inputs", made, size, chosen, (seed, view), blender.version)
-    noisy = [(n, k) for n in range(count) for k in reversed(range(realisations)) if not folder.has_color(n, k)]
+    last = "specular" if parts else "color"
+    noisy = [(n, k) for n in range(count) for k in reversed(range(realisations)) if not folder.has(last, n, k)]
     clean = [n for n in range(count) if clean_samples and not folder.has_reference(n)]
     total = count * (realisations * chosen.samples + clean_samples)
     done = total - len(noisy) * chosen.samples - len(clean) * clean_samples
@@ -242,9 +243,10 @@ class _Folder:
                 f"{described}: rendered with another '{changed[0]}'; choose another output folder, or delete this one"
             )
 
-    def has_color(self, number: int, realisation: int) -> bool:
-        """Whether a frame has one of its noisy colors, which is written behind its features."""
-        return (realisation_folder(self.path, realisation) / f"color{number}.exr").is_file()
+    def has(self, name: str, number: int, realisation: int) -> bool:
+        """Whether a frame has one of its noisy colors, which is written behind its features, with another buffer."""
+        place = realisation_folder(self.path, realisation)
+        return all((place / f"{each}{number}.exr").is_file() for each in (name, "color"))
 
     def has_reference(self, number: int) -> bool:
         """Whether a frame has its reference."""
