@@ -20,6 +20,7 @@ from torch import Tensor
 from mcdenoise.data import Sequence
 from mcdenoise.data.exr import Image, Metadata
 from mcdenoise.data.files import write_text
+from mcdenoise.data.readers.diffuse_specular import PARTS
 from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
@@ -210,14 +211,16 @@ class _Times(NamedTuple):
 
 def _read_frames(sequence: Sequence, denoiser: Denoiser, *, reference: bool) -> Iterator[tuple[int, Frame, _Times]]:
     """Each frame, and meanwhile the next one is read, if there is room for it. Resets the denoiser."""
-    buffers = sequence.buffers - (set() if reference else {"reference"})
+    needs = denoiser.model.needs
+    wanted = needs.buffers | needs.uses
+    buffers = sequence.buffers - (set() if reference else {"reference"}) - (PARTS - wanted)
     denoiser.reset(buffers, len(sequence), sequence.size, len(sequence.lights))
     denoiser.frames_stay = True
     streaming = denoiser.has_history(buffers)
 
     def read(number: int) -> tuple[Frame, float]:
         start = time.perf_counter()
-        frame = sequence.frame(number, reference=reference)
+        frame = sequence.frame(number, reference=reference, buffers=wanted)
         # A depth may be that of the positions.
         return frame if streaming else frame.with_depth().without_past(), _since(start)
 

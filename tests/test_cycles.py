@@ -356,6 +356,26 @@ def test_a_gray_ball_in_an_even_sky_is_as_bright_as_it_is_gray(blender: Blender,
     assert np.isinf(image(frame.depth)[missed]).all()
 
 
+def test_parts_add_up_to_each_noisy_color(blender: Blender, tmp_path: Path) -> None:
+    shiny = {"type": "roughconductor", "material": "none", "alpha": 0.1}
+    scene = scene_of(ball=ball(shiny), sky={"type": "constant", "radiance": 2.0}) | floor()
+    made = RandomScene(scene, [CAMERA])
+    options: dict[str, Any] = {"size": (24, 16), "settings": CENTRE, "realisations": 2, "reference_samples": 0}
+    render_cycles(made, tmp_path, blender, **options)
+    before = pixels(tmp_path)
+    # What is asked for later is added, and the noise stays what it was.
+    sequence = open_sequence(render_cycles(made, tmp_path, blender, **options, parts=True))
+    for name, values in before.items():
+        np.testing.assert_array_equal(pixels(tmp_path)[name], values)
+    assert {"diffuse", "specular"} <= sequence.buffers & sequence.noisy
+    for realisation in range(2):
+        frame = sequence.frame(0, realisation=realisation)
+        total = image(frame.diffuse) + image(frame.specular)
+        # Each is rounded to half floats.
+        np.testing.assert_allclose(total, image(frame.color), rtol=2 * 2.0**-11, atol=3 * 2.0**-24)
+        assert min(image(frame.diffuse).max(), image(frame.specular).max()) > 0
+
+
 def floor(**more: Any) -> dict[str, Any]:
     return scene_of(floor={"type": "rectangle", "to_world": place((0, 0, 0), scale=(5, 5, 1)), "bsdf": GRAY}, **more)
 

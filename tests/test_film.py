@@ -206,3 +206,20 @@ def test_bad_films(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError) as caught:
         Film(**settings)
     assert str(caught.value) == message
+
+
+def test_kept_samples_have_features_of_their_own(tmp_path: Path) -> None:
+    render_sequence(
+        wall(), AT_WALL, tmp_path, spp=4, reference_frames=[], film=Film("box"), keep_samples=True, **SCALAR
+    )
+    frame = open_sequence(tmp_path).frame(0)
+    assert frame.samples is not None
+    assert frame.albedo is not None
+    assert frame.depth is not None
+    assert frame.samples.shape == (1, 4, 10, HEIGHT, WIDTH)
+    mean = frame.samples.mean(1)
+    for found, given in ((mean[:, :3], frame.color), (mean[:, 3:6], frame.albedo), (mean[:, 9:], frame.depth)):
+        torch.testing.assert_close(found, given, rtol=2 * ROUNDING, atol=2.0**-24)
+    # Light as even as here comes with the albedo of what each sample has hit, which the squares make 0.2 or 0.8.
+    assert not torch.equal(frame.samples[:, 0, 3:6], frame.samples[:, 1, 3:6])
+    assert set(frame.samples[:, :, 3:6].double().round(decimals=2).unique().tolist()) == {0.2, 0.8}

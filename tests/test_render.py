@@ -806,3 +806,31 @@ def test_the_command_line_moves_objects_of_a_scene_file(tmp_path: Path, capsys: 
     message = capsys.readouterr().err
     assert "object 'teapot': expected the id of a shape or a light that can move (lamp, moving, still)" in message
     assert message.count("\n") == 1
+
+
+def test_kept_samples_have_the_color_for_their_mean(tmp_path: Path) -> None:
+    cameras = demo_cameras(2)
+    folder = render_sequence(
+        demo_scene(), cameras, tmp_path, spp=3, realisations=2, reference_frames=[], keep_samples=True, **SCALAR
+    )
+    sequence = open_sequence(tmp_path)
+    assert not sequence.warnings
+    assert not sequence.unused
+    assert "samples" in sequence.buffers & sequence.noisy
+    first, second = (sequence.frame(1, realisation=k) for k in range(2))
+    for frame in (first, second):
+        assert frame.samples is not None
+        assert frame.samples.shape == (1, 3, 3, HEIGHT, WIDTH)
+        # Each image is rounded to half floats.
+        torch.testing.assert_close(frame.samples.mean(1), frame.color, rtol=2 * 2.0**-11, atol=2.0**-24)
+    assert first.samples is not None
+    assert second.samples is not None
+    assert not torch.equal(first.samples, second.samples)
+    # Samples of their own: no two are alike.
+    assert not torch.equal(first.samples[:, 0], first.samples[:, 1])
+    before = images(folder)
+    again = {"spp": 3, "realisations": 2, "reference_frames": [], **SCALAR}
+    render_sequence(demo_scene(), cameras, tmp_path, keep_samples=True, **again)
+    assert images(folder) == before
+    with pytest.raises(InputError, match="rendered with samples_kept True, now None"):
+        render_sequence(demo_scene(), cameras, tmp_path, **again)

@@ -10,7 +10,7 @@ from typing import Literal
 import tyro
 from rich.progress import TaskID
 
-from mcdenoise.cli._options import Out
+from mcdenoise.cli._options import Flag, Out
 from mcdenoise.cli._output import progress_bar
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
@@ -36,6 +36,7 @@ def generate(
     renderer: Literal["mitsuba", "cycles"] = "mitsuba",
     cycles_spp: int | None = None,
     blender_python: Path | None = None,
+    parts: Flag = False,
     threads: int = 0,
 ) -> None:
     """Render random rooms, courts and still lifes to sequences to train on: OUT/random0000, OUT/random0001, ...
@@ -61,6 +62,7 @@ def generate(
         cycles_spp: samples a pixel of Cycles' noisy colors; by default drawn from the seed, 1 for half of the scenes.
         blender_python: a Python that has Blender's module bpy; by default that of the environment variable
             BLENDER_PYTHON, or else this one.
+        parts: of Cycles: also write diffuse and specular light, which add up to each noisy color.
         threads: of Cycles; all processors by default.
     """
     if frames < 1:
@@ -69,6 +71,10 @@ def generate(
         raise InputError(f"--zoom: expected a positive number, found {zoom:g}")
     if stills is not None and not 0 <= stills <= 1:
         raise InputError(f"--stills: expected a fraction from 0 to 1, found {stills:g}")
+    if parts and renderer != "cycles":
+        raise InputError("--parts: expected together with --renderer cycles: Mitsuba's path integrator has no parts")
+    if rendering.keep_samples and renderer == "cycles":
+        raise InputError("--keep-samples: expected together with --renderer mitsuba: Cycles writes no single samples")
     chosen, arguments = parse_frames(seeds, name="--seeds"), rendering.arguments()
     with ExitStack() as stack:
         blender = stack.enter_context(Blender(blender_python)) if renderer == "cycles" else None
@@ -103,6 +109,7 @@ def generate(
                         samples=cycles_spp,
                         realisations=rendering.realisations,
                         reference_samples=rendering.reference_spp,
+                        parts=parts,
                         threads=threads,
                         progress=show,
                     )

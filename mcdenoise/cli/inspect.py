@@ -8,6 +8,7 @@ from pathlib import Path
 from mcdenoise.cli._options import Flag, Inputs, Json, Map
 from mcdenoise.cli._output import print_rows, warn, write_json
 from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.data.readers.diffuse_specular import PARTS
 from mcdenoise.errors import InputError, printable
 
 
@@ -31,6 +32,9 @@ def inspect(
     """
     opened = open_inputs(inputs, frames, map, without_albedo=color_without_albedo, with_albedo=color_with_albedo)
     print_sequence(opened)
+    used = _users(opened)
+    for buffer, models in used.items():
+        print(f"{buffer}: of use to {', '.join(models) or 'no model of the zoo'}")
     write_json(
         json,
         {
@@ -40,10 +44,21 @@ def inspect(
             "size": list(opened.size),
             "buffers": sorted(opened.buffers),
             "read": [row._asdict() for row in opened.table],
+            "of_use_to": used,
             "unused": list(opened.unused),
             "warnings": list(opened.warnings),
         },
     )
+
+
+def _users(sequence: Sequence) -> dict[str, list[str]]:
+    """The models that look at what few do: parts of the light and samples."""
+    if not (found := sorted(PARTS & sequence.buffers)):
+        return {}
+    # Here because it imports every model, which takes its time.
+    from mcdenoise.models import users_of
+
+    return users_of(found)
 
 
 def open_inputs(

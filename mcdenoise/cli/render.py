@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from mcdenoise.cli._options import Out, parse_size
+from mcdenoise.cli._options import Flag, Out, parse_size
 from mcdenoise.cli._output import progress_bar
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.errors import InputError
@@ -28,6 +28,7 @@ class RenderOptions:
         size: WIDTHxHEIGHT in pixels.
         workers: processes that render frames side by side; of use with scalar_rgb.
         variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
+        keep_samples: also write the single samples of the noisy colors, for methods such as sbmc and layered.
     """
 
     spp: int = 1
@@ -38,6 +39,7 @@ class RenderOptions:
     size: str = "640x360"
     workers: int = 1
     variant: str | None = None
+    keep_samples: Flag = False
 
     def arguments(self) -> dict[str, Any]:
         """Those of :func:`mcdenoise.scenes.render.render_sequence`."""
@@ -54,6 +56,7 @@ class RenderOptions:
             "size": parse_size(self.size),
             "workers": self.workers,
             "variant": self.variant,
+            "keep_samples": self.keep_samples,
         }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from collections.abc import Sequence as Sequential
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -80,7 +80,13 @@ class Sequence:
         return self._source.folders
 
     @_any_values
-    def frame(self, number: int, reference: bool = True, realisation: int = 0) -> Frame:
+    def frame(
+        self,
+        number: int,
+        reference: bool = True,
+        realisation: int = 0,
+        buffers: Collection[str] | None = None,
+    ) -> Frame:
         """Read one frame: a batch of 1, float32, on the CPU; values are not validated.
 
         ``color`` is radiance with the albedo in it, whatever the files hold. ``depth`` is that of the depth file or
@@ -94,6 +100,8 @@ class Sequence:
             reference: whether to read the reference too, where there is one.
             realisation: which noisy color, from 0 to ``realisations - 1``, with its other ``noisy`` buffers; the
                 others are the same for all.
+            buffers: names of those that are of use: of parts of the light and samples (``PARTS``), which take time to
+                read, the others are left out. All by default.
 
         Raises:
             InputError: there is no such frame or realisation, or a file is damaged.
@@ -104,7 +112,7 @@ class Sequence:
                 f"{self.root}: expected a realisation of the noise from 0 to {self.realisations - 1}, "
                 f"found {realisation}; render more of them"
             )
-        frame = self._source.frame(number, reference=reference, realisation=realisation)
+        frame = self._source.frame(number, reference=reference, realisation=realisation, buffers=buffers)
         if self.numbers.index(number) == 0 or number - 1 in self.numbers:
             return frame
         # They lead to a frame that was not chosen, and not to the one before in this sequence.

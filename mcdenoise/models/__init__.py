@@ -4,7 +4,7 @@ from mcdenoise.models._adapter import FromBuffers, as_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._journal import Journal, Stage, listening, note, summarize, timed
 from mcdenoise.models._layers import answered, carried, with_carried
-from mcdenoise.models._overview import ModelOverview, overview
+from mcdenoise.models._overview import ModelOverview, overview, users_of
 from mcdenoise.models._precision import PRECISIONS, Precision, fastest_precision
 from mcdenoise.models._registry import build_model, find_model, list_models, register_model
 from mcdenoise.models._weights import (
@@ -71,5 +71,6 @@ __all__ = [
     "save_weights",
     "summarize",
     "timed",
+    "users_of",
     "with_carried",
 ]

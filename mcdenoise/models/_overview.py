@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Any, get_args
@@ -55,6 +57,19 @@ def overview() -> list[ModelOverview]:
     weights = dict.fromkeys(compared_models(), "compared") | dict.fromkeys(pretrained_models(), "shipped")
     entries = [_overview(name, weights.get(name, "")) for name in list_models()]
     return sorted(entries, key=lambda entry: get_args(Kind).index(entry.kind))
+
+
+def users_of(buffers: Iterable[str]) -> dict[str, list[str]]:
+    """For each of some buffers the names of the models that need it or are better with it, sorted."""
+    needs: dict[str, frozenset[str]] = {}
+    # Networks are drawn at random, which must not show in what the caller draws.
+    with torch.random.fork_rng(devices=[]):
+        for name in list_models():
+            # One that cannot be made uses nothing.
+            with suppress(InputError):
+                found = build_model(name).needs
+                needs[name] = found.buffers | found.uses
+    return {buffer: [name for name, own in needs.items() if buffer in own] for buffer in buffers}
 
 
 def _overview(name: str, weights: str) -> ModelOverview:

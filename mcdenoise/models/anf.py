@@ -37,13 +37,13 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import timed
+from mcdenoise.models._journal import note, timed
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.recurrent import from_before, to_be_kept
 from mcdenoise.nn.inputs import features_of, image_statistics
-from mcdenoise.nn.samples import samples_of
+from mcdenoise.nn.samples import samples_of, told_of
 from mcdenoise.nn.unet import Head, UNet
 from mcdenoise.ops import affinity_filter
 from mcdenoise.ops._steps.network import normalized_depth
@@ -127,6 +127,7 @@ class Anf(nn.Module):
         albedo, normal, depth = features_of(frame)
         shared = torch.cat([albedo, normal, normalized_depth(depth, near, typical)], 1).to(frame.color.dtype)
         radiance = samples_of(frame).to(frame.color.dtype)
+        note("samples", told_of(frame))
         total: Tensor | None = None
         count = radiance.shape[1]
         for sample in range(count):

@@ -9,7 +9,9 @@ them takes a GPU. The default is smaller, for a CPU.
   exp(specular) - 1``, to which ``emission``, which has no noise, is added where the frame has it.
 - **A frame with color only**: renderers that do not tell the two apart give no ``diffuse`` and ``specular``. Then the
   color, without its albedo, is what the diffuse branch filters, and there is no specular light: that branch is not
-  computed, and does not learn.
+  computed, and does not learn. Weights that were trained on such frames are those of ``split=False``, a network of one
+  branch: beside them, a branch that has learnt nothing would only blur. **The shipped weights are such**: methods are
+  compared on color alone. ``mcdenoise generate --renderer cycles --parts`` makes frames that both branches learn from.
 
 What is taken where the paper or its re-implementation leaves something open, and what is different here:
 
@@ -41,6 +43,7 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._journal import note
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
 from mcdenoise.models._registry import register_model
@@ -81,19 +84,21 @@ class KpcnNetwork(nn.Module):
         width: channels of each convolution but the last, the paper's 100.
         layers: how many 5x5 convolutions a branch has, at least 2, the paper's 9.
         kernel_size: side of the kernels, odd, the paper's 21.
+        split: whether there is a branch for specular light; without it, color is all that is looked at.
 
     Raises:
         InputError: a setting is out of its range.
     """
 
-    def __init__(self, width: int, layers: int, kernel_size: int) -> None:
+    def __init__(self, width: int, layers: int, kernel_size: int, split: bool = True) -> None:
         super().__init__()
         if width < 1:
             raise InputError(f"width: expected at least 1, found {width}")
         if layers < 2:
             raise InputError(f"layers: expected at least 2, found {layers}")
         check_odd(kernel_size)
-        self.diffuse, self.specular = (_Branch(width, layers, kernel_size) for _ in range(2))
+        self.diffuse = _Branch(width, layers, kernel_size)
+        self.specular = _Branch(width, layers, kernel_size) if split else None
         # What a result depends on: convolutions, the variance with the slope of the depth at its taps, and the kernel.
         self._reach = layers * (_CONVOLUTION // 2) + _WINDOW // 2 + 1 + kernel_size // 2
         # Measured at the default's sizes: 3.8 kB a pixel.
@@ -102,8 +107,9 @@ class KpcnNetwork(nn.Module):
     @property
     def needs(self) -> Needs:
         """Features, and the parts of the light."""
-        uses = frozenset({"albedo", "normal", "depth", "diffuse", "specular", "emission"})
-        return Needs(uses=uses, reach=self._reach)
+        uses = frozenset({"albedo", "normal", "depth"})
+        parts = frozenset({"diffuse", "specular", "emission"} if self.specular is not None else ())
+        return Needs(uses=uses | parts, reach=self._reach)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The depth scale of the whole image."""
@@ -117,9 +123,12 @@ class KpcnNetwork(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         others = carried(frame)
-        if frame.diffuse is None or frame.specular is None:
+        if frame.diffuse is None or frame.specular is None or self.specular is None:
+            reason = "these weights are for color alone" if self.specular is None else "no diffuse and specular light"
+            note("specular branch", reason, 1.0)
             image, others = self.diffuse.filtered(frame.color, others, frame)
             return answered(frame, image, others), None
+        note("specular branch", "diffuse and specular light")
         matt, of_matt = self.diffuse.filtered(frame.diffuse, others, frame)
         logarithm, of_shiny = self.specular.filtered(torch.log1p(frame.specular), others, frame)
         shiny = torch.expm1(logarithm)
@@ -158,6 +167,7 @@ def kpcn(
     width: int = 24,
     layers: int = 5,
     kernel_size: int = 11,
+    split: bool = True,
     *,
     alpha_min: float = 0.2,
     position_limit: float = POSITION_LIMIT,
@@ -169,9 +179,11 @@ def kpcn(
         width: see :class:`KpcnNetwork`.
         layers: likewise.
         kernel_size: likewise.
+        split: likewise.
         alpha_min: smallest weight of the current frame in the accumulation; 1 for the paper's single images.
         position_limit: see :func:`mcdenoise.models.cascaded.cascaded`.
         normal_limit: likewise.
     """
-    network = Exposed(Tiled(KpcnNetwork(width, layers, kernel_size)))
-    return as_published(network, alpha_min, position_limit, normal_limit, also=("diffuse", "specular"))
+    network = Exposed(Tiled(KpcnNetwork(width, layers, kernel_size, split)))
+    also = ("diffuse", "specular") if split else ()
+    return as_published(network, alpha_min, position_limit, normal_limit, also=also)

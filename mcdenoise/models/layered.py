@@ -35,6 +35,7 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._journal import note
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
 from mcdenoise.models._registry import register_model
@@ -50,6 +51,7 @@ from mcdenoise.nn.samples import (
     of_each,
     samples_input,
     samples_of,
+    told_of,
     with_context,
 )
 from mcdenoise.nn.unet import bytes_of
@@ -102,6 +104,7 @@ class LayeredNetwork(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         light, others = samples_of(frame), carried(frame)
+        note("samples", told_of(frame))
         embedded, context = self.embedding(samples_input(frame, light))
         logits = of_each(self.partition, with_context(embedded, context)).to(light.dtype)
         weights = _LEAST + (1 - LAYERS * _LEAST) * torch.softmax(logits, 2)

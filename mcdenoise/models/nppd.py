@@ -49,13 +49,13 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Needs, Output, State
-from mcdenoise.models._journal import journal, timed
+from mcdenoise.models._journal import journal, note, timed
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import has_motion, motion_unless_still
 from mcdenoise.nn.inputs import features_of, normalize_depth
-from mcdenoise.nn.samples import samples_of
+from mcdenoise.nn.samples import samples_of, told_of
 from mcdenoise.ops import kernel_splat, learned_upsample, pyramid_partition, reproject
 from mcdenoise.ops._window import corner, up_to_multiple
 
@@ -260,6 +260,7 @@ class Nppd(nn.Module):
     def _encoded(self, frame: Frame, dtype: torch.dtype) -> Tensor:
         """Features of the samples, averaged."""
         samples = samples_of(frame).to(dtype)
+        note("samples", told_of(frame))
         albedo, normal, depth = features_of(frame)
         pixel = torch.cat([normalize_depth(depth), normal, albedo], 1).to(dtype)
         count = samples.shape[1]

@@ -32,6 +32,7 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._journal import note
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
 from mcdenoise.models._registry import register_model
@@ -46,6 +47,7 @@ from mcdenoise.nn.samples import (
     chain,
     samples_input,
     samples_of,
+    told_of,
     with_context,
 )
 from mcdenoise.nn.unet import bytes_of
@@ -94,6 +96,7 @@ class SbmcNetwork(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         light, others = samples_of(frame), carried(frame)
+        note("samples", told_of(frame))
         known = with_context(*self.embedding(samples_input(frame, light)))
         mean, total = light[:, 0], None
         for sample, seen in zip(light.unbind(1), known.unbind(1), strict=True):

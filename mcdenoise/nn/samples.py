@@ -50,6 +50,13 @@ def samples_of(frame: Frame) -> Tensor:
     return light if frame.length is None else torch.cat([light, color.to(light.dtype)], 1)
 
 
+def told_of(frame: Frame) -> str:
+    """What :func:`samples_of` found, for the report."""
+    if frame.samples is None:
+        return "none: the color is one sample of each pixel"
+    return f"{frame.samples.shape[1]} of each pixel{'' if frame.length is None else ', and the history'}"
+
+
 def samples_input(frame: Frame, samples: Tensor) -> Tensor:
     """What a network sees of each sample.
 

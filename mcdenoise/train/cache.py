@@ -15,7 +15,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -301,9 +301,10 @@ def _build(folder: Path, plan: _Plan) -> None:
             start: stack.enter_context(_array_file(folder / _color_name(start), plan.color_shape(start[0])))
             for start in plan.starts
         }
+        wanted = {*plan.features, *plan.front.parts}
         for i, number in enumerate(sequence.numbers):
             for realisation in range(plan.realisations):
-                frame = _read(sequence, number, realisation, digest)
+                frame = _read(sequence, number, realisation, wanted, digest)
                 for first in plan.firsts:
                     if first <= i:
                         seen = dict(steps[first, realisation](frame).items())
@@ -323,9 +324,9 @@ def _build(folder: Path, plan: _Plan) -> None:
     (folder / "about.json").write_text(json.dumps({"sha256": digest.hexdigest(), "files": checksums}) + "\n")
 
 
-def _read(sequence: Sequence, number: int, realisation: int, digest: Any) -> Frame:
+def _read(sequence: Sequence, number: int, realisation: int, buffers: Collection[str], digest: Any) -> Frame:
     """Decode a frame, add what is noisy and what is learnt from to the checksum, and validate."""
-    frame = sequence.frame(number, reference=realisation == 0, realisation=realisation)
+    frame = sequence.frame(number, reference=realisation == 0, realisation=realisation, buffers=buffers)
     radiance = {"color": frame.color} | ({} if frame.reference is None else {"reference": frame.reference})
     for image in radiance.values():
         digest.update(image.numpy().tobytes())

@@ -74,11 +74,15 @@ class DataFolders:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
         opened = [open_sequence(path) for path in (*training, *validation)]
         # What has no albedo is glossy.
+        common = frozenset.intersection(*(features_of(sequence) for sequence in opened))
+        front = front.of((needs.buffers | needs.uses) & common)
         used = (needs.buffers | needs.uses | ({"albedo"} if config.gloss else set())) - front.parts.keys()
+        # The cache knows no single samples: methods that take them learn on their mean.
+        used -= {"samples"}
         wanted = needs.buffers - front.parts.keys() | (used & set(_FEATURES))
         for sequence in opened:
             _check_trainable(sequence, wanted)
-        features = used.intersection(*(features_of(sequence) for sequence in opened))
+        features = used & common
         folders = DataFolders(config, front, features, opened[: len(training)], opened[len(training) :])
         lengths = [(len(s) - len(folders._held_out(s)), s.size) for s in folders.training]
         check_sizes(lengths, config.frames, config.crop)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor, nn
 
-from mcdenoise.frame import Frame
+from mcdenoise.frame import RADIANCE, Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Skipping, State, Wrapper
 from mcdenoise.models.accumulated import ALBEDO_HISTORY, CAUSTICS
 from mcdenoise.models.with_oidn import EXACT, NOISY, OIDN, OIDN_CLEAN, WithOidn
@@ -16,6 +16,7 @@ from mcdenoise.ops import remodulate
 
 # What comes of accumulation, and of Open Image Denoise, with the number of channels.
 ACCUMULATED: Mapping[str, int] = {"color": 3, "current": 3, "length": 1}
+_PARTS = frozenset(RADIANCE) - ACCUMULATED.keys()
 GIVEN: Mapping[str, int] = {OIDN: 3, OIDN_CLEAN: 3, NOISY: 3, EXACT: 1}
 
 
@@ -25,9 +26,11 @@ class Front:
 
     Args:
         wrappers: outermost first, each with the settings of its constructor.
+        given: parts of the light that every frame has: they are handed on as the wrappers make them.
     """
 
     wrappers: tuple[tuple[type[Wrapper], dict[str, Any]], ...] = ()
+    given: tuple[str, ...] = ()
 
     @property
     def accumulates(self) -> bool:
@@ -44,13 +47,19 @@ class Front:
         """Names of the buffers that each noise of its own changes, with their channels: radiance, and histories."""
         also = {name for _, settings in self.wrappers for name in settings.get("also", ())}
         history = {ALBEDO_HISTORY: 3} if "albedo" in also else {}
+        history |= dict.fromkeys(self.given, 3)
         accumulated = ACCUMULATED if self.accumulates else {"color": 3}
         return {**accumulated, **history, **(GIVEN if self._has(WithOidn) else {})}
+
+    def of(self, buffers: Collection[str]) -> Front:
+        """The same for frames that all have these buffers, as far as they are of use."""
+        return replace(self, given=tuple(sorted(_PARTS & set(buffers))))
 
     @property
     def settings(self) -> list[Any]:
         """Everything that the frames depend on, as JSON knows it."""
-        return [[kind.__name__, settings] for kind, settings in self.wrappers]
+        wrappers = [[kind.__name__, settings] for kind, settings in self.wrappers]
+        return [*wrappers, ["given", {"given": list(self.given)}]] if self.given else wrappers
 
     def _has(self, wanted: type[Wrapper]) -> bool:
         return any(kind is wanted for kind, _ in self.wrappers)

@@ -156,11 +156,13 @@ def test_means_and_variance_are_those_of_the_samples(opened: Sequence, number: i
         "position": known["position"].astype(np.float64).mean(-1),
         "previous_position": (known["position"].astype(np.float64) + known["motion"]).mean(-1),
         "reference": known["reference"],
+        "samples": np.moveaxis(samples, -1, 0),
     }
     for name, values in expected.items():
         # Sums in double precision, rounded once to single.
         np.testing.assert_allclose(getattr(frame, name)[0].numpy(), values, rtol=3e-7, atol=1e-7, err_msg=name)
     np.testing.assert_array_equal(opened.reference(number), frame.reference)
+    assert opened.frame(number, buffers={"albedo"}).samples is None
 
 
 def test_radiance_comes_back_from_its_bytes() -> None:

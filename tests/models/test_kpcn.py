@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from toys import frame_of, refused
 
 from mcdenoise.frame import Frame, Hints
-from mcdenoise.models import Demodulated, Exposed, Tiled, create_model, overview, parts_of
+from mcdenoise.models import Demodulated, Exposed, Journal, Tiled, create_model, listening, overview, parts_of
 from mcdenoise.models.kpcn import CHANNELS, PUBLISHED, KpcnNetwork, kpcn
 from mcdenoise.ops import luminance_moments, moments_variance
 
@@ -113,6 +113,33 @@ def test_color_only_teaches_the_diffuse_branch_only() -> None:
     network(parts(6, 7, diffuse=None, specular=None))[0].image.sum().backward()
     assert all(parameter.grad is not None for parameter in network.diffuse.parameters())
     assert all(parameter.grad is None for parameter in network.specular.parameters())
+
+
+@torch.no_grad()
+def test_a_network_for_color_alone_has_one_branch_and_says_so() -> None:
+    torch.manual_seed(3)
+    network, frame = KpcnNetwork(4, 3, 3, split=False).double(), parts(6, 7)
+    assert not {"diffuse", "specular", "emission"} & network.needs.uses
+    assert {name.partition(".")[0] for name, _ in network.named_parameters()} == {"diffuse"}
+    expected = filtered(network.diffuse, frame.color, frame)
+    for each, given, reason in (
+        (network, frame, "these weights are for color alone"),
+        (drawn(), frame.replace(diffuse=None), "no diffuse and specular light"),
+        (drawn(), frame, "diffuse and specular light"),
+    ):
+        journal = Journal()
+        with listening(journal):
+            image = each(given)[0].image
+        assert journal.stages["specular branch"].reason == reason
+        assert journal.stages["specular branch"].skipped == (reason != "diffuse and specular light")
+        if each is network:
+            torch.testing.assert_close(image, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_the_shipped_weights_are_for_color_alone() -> None:
+    model = create_model("kpcn", pretrained=True)
+    (network,) = parts_of(model, KpcnNetwork)
+    assert network.specular is None
 
 
 @torch.no_grad()

@@ -67,9 +67,9 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """Frame number and realisation of every frame that is decoded."""
     read, seen = Sequence.frame, []
 
-    def spy(sequence: Sequence, number: int, reference: bool = True, realisation: int = 0) -> Any:
+    def spy(sequence: Sequence, number: int, reference: bool = True, realisation: int = 0, **options: Any) -> Any:
         seen.append((number, realisation))
-        return read(sequence, number, reference, realisation)
+        return read(sequence, number, reference, realisation, **options)
 
     monkeypatch.setattr(Sequence, "frame", spy)
     return seen
@@ -106,6 +106,28 @@ def test_shots_start_anew_and_are_accumulated(noisy: Path, tmp_path: Path) -> No
                 for name in (*FEATURES, "reference"):
                     assert torch.equal(clip[name][i], frame.buffer(name)[0]), name
             assert (clip["length"][-1] > 1).any()
+
+
+def test_parts_of_the_light_are_accumulated_as_a_method_has_them(small_sequence: Path, tmp_path: Path) -> None:
+    """And not as they stand in the files: behind accumulation and demodulation they are what the network sees."""
+    inputs, sequence = small_sequence / "inputs", open_sequence(small_sequence)
+    for number in sequence.numbers:
+        color = sequence.frame(number).color
+        # Halves of a half float: what they add up to is not rounded.
+        for name in ("diffuse", "specular"):
+            write_buffer(inputs, number, name, color / 2)
+    front, rest = split(create_model("kpcn", width=4))
+    assert front.parts.keys() == {"color", "current", "length"}
+    front = front.of(rest.needs.uses & features_of(open_sequence(small_sequence)))
+    assert front.given == ("diffuse", "specular")
+    clip = opened(small_sequence, tmp_path / "cache", front=front, firsts=[0]).shots[0].read()
+    torch.testing.assert_close(2 * clip["diffuse"], clip["color"], rtol=1e-5, atol=1e-6)
+    # Specular light keeps its color; the first frame has no history, and a pixel of the last one does.
+    given = torch.cat([sequence.frame(number).color for number in sequence.numbers])
+    assert torch.equal(2 * clip["specular"][0], given[0])
+    assert not torch.equal(2 * clip["specular"][-1], given[-1])
+    assert (clip["length"][-1] > 1).any()
+    assert front.of({"color", "albedo"}).parts.keys() == {"color", "current", "length"}
 
 
 class Recorder:

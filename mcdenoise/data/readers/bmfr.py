@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -28,9 +28,13 @@ from mcdenoise.data.exr import (
     write_exr,
 )
 from mcdenoise.data.files import write_text
+from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.data.readers.cameras import convert, read_as
+from mcdenoise.data.readers.diffuse_specular import PARTS, adds_up, off
+from mcdenoise.data.readers.layers import layers_of
 from mcdenoise.data.readers.names import find_files
 from mcdenoise.data.readers.rewrite import write_like
+from mcdenoise.data.readers.samples import mean_is, split_samples, write_samples
 from mcdenoise.data.readers.values import (
     MOTION_PAIRS,
     USUAL_MOTION,
@@ -43,7 +47,7 @@ from mcdenoise.data.readers.values import (
     read_radiance,
 )
 from mcdenoise.errors import InputError
-from mcdenoise.frame import BUFFERS, Frame
+from mcdenoise.frame import BUFFERS, Frame, scale_samples
 
 # Buffer to file name, in the order of writing: color comes last, so that a frame that has its color is complete.
 _STEMS = {
@@ -53,6 +57,9 @@ _STEMS = {
     "depth": "depth",
     "motion": "motion",
     "previous_position": "previous_position",
+    "diffuse": "diffuse",
+    "specular": "specular",
+    "samples": "samples",
     "reference": "reference",
     "color": "color",
 }
@@ -134,35 +141,40 @@ class BmfrFolder:
         """Attributes of the color file of one frame."""
         return read_exr_header(self.files["color"][number]).metadata
 
-    def frame(self, number: int, *, reference: bool = True, realisation: int = 0) -> Frame:
+    def frame(
+        self, number: int, *, reference: bool = True, realisation: int = 0, buffers: Collection[str] | None = None
+    ) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
+        unwanted = frozenset() if buffers is None else PARTS - set(buffers)
         sources: dict[str, Mapping[int, Path]] = dict(self.files)
         if realisation:
             sources |= self.more[realisation - 1]
-        buffers: dict[str, Any] = {
+        found: dict[str, Any] = {
             name: self._read(name, files[number])
             for name, files in sources.items()
-            if number in files and (reference or name != "reference")
+            if number in files and (reference or name != "reference") and name not in unwanted
         }
         if not self.color_has_albedo:
-            buffers["color"] = buffers["color"] * buffers["albedo"]
+            found["color"] = found["color"] * found["albedo"]
+            if "samples" in found:
+                found["samples"] = scale_samples(found["samples"], found["albedo"])
         if self.cameras is not None:
             matrix = convert(self.cameras.view_projection(number, self.size), self.camera_convention)
-            if "position" in buffers:
-                matrix, distance = _view_depth(matrix, buffers["position"])
-                buffers.setdefault("depth", distance)
-            buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
+            if "position" in found:
+                matrix, distance = _view_depth(matrix, found["position"])
+                found.setdefault("depth", distance)
+            found["view_projection"] = torch.from_numpy(matrix).float()[None]
         if self.motion is None:
-            buffers.pop("motion", None)
-        elif "motion" in buffers and self.motion != USUAL_MOTION:
-            stored = buffers["motion"][0].permute(1, 2, 0).numpy()
-            buffers["motion"] = torch.from_numpy(self.motion.apply(stored)).permute(2, 0, 1)[None].contiguous()
-        if self.encoded_normals and "normal" in buffers:
-            encoded = buffers["normal"]
-            buffers["normal"] = torch.where((encoded != 0).any(1, keepdim=True), 2 * encoded - 1, 0)
-        if "depth" in buffers:
-            buffers["depth"] = _with_infinite_background(buffers["depth"], buffers.get("albedo"), buffers.get("normal"))
-        return Frame(**buffers)
+            found.pop("motion", None)
+        elif "motion" in found and self.motion != USUAL_MOTION:
+            stored = found["motion"][0].permute(1, 2, 0).numpy()
+            found["motion"] = torch.from_numpy(self.motion.apply(stored)).permute(2, 0, 1)[None].contiguous()
+        if self.encoded_normals and "normal" in found:
+            encoded = found["normal"]
+            found["normal"] = torch.where((encoded != 0).any(1, keepdim=True), 2 * encoded - 1, 0)
+        if "depth" in found:
+            found["depth"] = _with_infinite_background(found["depth"], found.get("albedo"), found.get("normal"))
+        return Frame(**found)
 
     def reference(self, number: int) -> Tensor:
         """Read the reference of one frame that has one."""
@@ -178,6 +190,8 @@ class BmfrFolder:
         return target
 
     def _read(self, name: str, path: Path) -> Tensor:
+        if name == "samples":
+            return torch.from_numpy(_read_samples(path, self.size))[None]
         image, channels, _ = read_exr(path)
         _check_file(name, path, image.shape[:2], channels, self.size)
         return torch.from_numpy(image).permute(2, 0, 1)[None].contiguous()
@@ -266,7 +280,50 @@ def open_bmfr(
     own = {name: files[name] for name in used}
     stated = _color_has_albedo(path, "albedo" in used) if color_has_albedo is None else color_has_albedo
     folder = BmfrFolder(path, own, numbers, size, cameras, stated is not False, more)
-    return _look(folder, stated)
+    return _look(_with_parts(folder, stated), stated)
+
+
+def _with_parts(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
+    """Without diffuse and specular light that do not add up to the color, and samples whose mean it is not."""
+    number, warnings, dropped = folder.numbers[0], [], set()
+    given = {name for name in PARTS & folder.files.keys() if folder.files[name]}
+    if not given:
+        return folder
+
+    def image(name: str) -> Image:
+        pixels: Image = folder._read(name, folder.files[name][number])[0].numpy()
+        return pixels if name == "samples" else pixels.transpose(1, 2, 0)
+
+    color = image("color")
+    if "samples" in given and not mean_is(color, image("samples")):
+        dropped.add("samples")
+        warnings.append("'samples': their mean is not the color: not used; write all samples of a pixel")
+    if parts := given - {"samples"}:
+        whole = len(parts) == 2 and stated is not False
+        far, light = off({name: image(name) for name in parts}, color, count=3) if whole else (1.0, 0.0)
+        if not whole or not adds_up((far, light)):
+            dropped |= parts
+            found = f"have {light:.1%} of its light" if whole else f"found {', '.join(sorted(parts))}"
+            warnings.append(
+                f"'diffuse', 'specular': expected both, which add up to a color with albedo, {found}: not used"
+            )
+    files = {name: {} if name in dropped else own for name, own in folder.files.items()}
+    more = [{name: own for name, own in each.items() if name not in dropped} for each in folder.more]
+    return replace(folder, files=files, more=more, warnings=warnings)
+
+
+def _read_samples(path: Path, size: tuple[int, int]) -> Image:
+    """``(S, C, H, W)`` of ``samplesN.exr``."""
+    parts = read_image_header(path).parts
+    layers, _ = split_samples(layers_of(0, "", parts))
+    if layers is None or parts[0].size != size:
+        (height, width), (tall, wide) = size, parts[0].size
+        raise InputError(
+            f"{path}: expected layers sample0.RGB, sample1.RGB, ... of {width} x {height} pixels, found "
+            f"{', '.join(parts[0].channels[:8])} of {wide} x {tall}"
+        )
+    images = {key: read_channels(path, {each.part: each.channels})[each.part] for key, each in layers.layers.items()}
+    return layers.samples(images)
 
 
 def _look(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
@@ -280,7 +337,9 @@ def _look(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
         if name in looked_at and number in files
     }
     words = {name: "" for name in sorted(folder.files) if folder.files[name]}
-    warnings: list[str] = []
+    words |= {name: "the parts add up to the color" for name in ("diffuse", "specular") if name in words}
+    words |= {"samples": "their mean is the color"} if "samples" in words else {}
+    warnings = list(folder.warnings)
     motion: Convention | None = USUAL_MOTION
     if "motion" in words:
         motion, words["motion"], warnings = read_motion(_pairs(folder), USUAL_MOTION)
@@ -415,12 +474,15 @@ def write_buffer(
         folder: where to write. It must exist.
         number: frame number.
         name: which buffer, such as ``"reference"``.
-        buffer: ``(1, C, H, W)``.
+        buffer: ``(1, C, H, W)``; samples are ``(1, S, C, H, W)``.
         metadata: attributes for the file.
 
     Raises:
         InputError: the file cannot be written.
     """
+    if name == "samples":
+        write_samples(folder / f"{_STEMS[name]}{number}.exr", buffer[0].detach().float().cpu().numpy())
+        return
     image = buffer[0].detach().float().permute(1, 2, 0).cpu().numpy()
     if name == "depth":
         image = np.where(np.isinf(image), 0, image)
@@ -481,7 +543,7 @@ def _check_header(name: str, path: Path, first: ExrHeader) -> None:
 def _check_file(
     name: str, path: Path, size: Iterable[int], channels: list[str], expected_size: tuple[int, int]
 ) -> None:
-    expected = BUFFERS[name].channels
+    expected = BUFFERS[name].channels if name in BUFFERS else len(channels)
     if len(channels) != expected:
         raise InputError(
             f"{path}: expected {expected} channels for buffer '{name}', found {len(channels)} "

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,16 @@ from mcdenoise.data.exr import Image, Mask, Metadata
 from mcdenoise.data.images import EXR_SUFFIXES, Part, read_channels, read_image_header
 from mcdenoise.data.readers.cameras import convert, fit_camera
 from mcdenoise.data.readers.choice import Choice
+from mcdenoise.data.readers.diffuse_specular import Split
 from mcdenoise.data.readers.layers import Layer
 from mcdenoise.data.readers.lights import Light, is_light, keeps, kept_together, stored
 from mcdenoise.data.readers.names import FileGroup
 from mcdenoise.data.readers.rewrite import write_like
+from mcdenoise.data.readers.samples import SampleLayers
 from mcdenoise.data.readers.transfer import decode
 from mcdenoise.data.readers.values import USUAL_MOTION, Convention, Row, nothing_hit
 from mcdenoise.errors import InputError
-from mcdenoise.frame import BUFFERS, Frame
+from mcdenoise.frame import BUFFERS, Frame, scale_samples
 
 # What is light or a fraction of it: these samples of a PNG went through a transfer function, those of a normal did not.
 _LIGHT = {"color", "albedo", "reference", "diffuse", "specular", "specular_albedo", "emission"}
@@ -46,6 +49,8 @@ class RenderedFiles:
         lights: additive layers of radiance, which are denoised with the color, by name.
         cameras: what a ``camera_matrices.h`` beside the files says.
         color_has_albedo: whether radiance has the albedo in it.
+        split: which layers are diffuse and specular light, if they add up to the color.
+        samples: which layers are single samples, if their mean is the color.
     """
 
     groups: Sequence[FileGroup]
@@ -61,6 +66,8 @@ class RenderedFiles:
     positions_of_camera: bool = False
     has_camera: bool = False
     drops_positions: bool = False
+    split: Split | None = None
+    samples: SampleLayers | None = None
     table: list[Row] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     realisations: int = 1
@@ -86,6 +93,10 @@ class RenderedFiles:
             present.add("view_projection")
         if self.drops_positions:
             present -= {"position", "view_projection"}
+        if self.split is not None:
+            present |= self.split.names
+        if self.samples is not None:
+            present.add("samples")
         return frozenset(present)
 
     @property
@@ -96,13 +107,20 @@ class RenderedFiles:
     @property
     def unused(self) -> list[str]:
         """Layers that look like buffers and are not used."""
-        return [layer.place for layer in self.choice.unused]
+        lit = self._lit
+        return [layer.place for layer in self.choice.unused if layer not in lit]
 
     @property
     def unknown(self) -> list[str]:
         """Layers with names that say nothing, and that nobody has asked for."""
-        lit = {layer for light in self.lights.values() for layer in light.layers}
+        lit = self._lit
         return [layer.place for layer in self.choice.unknown if layer not in lit and not is_light(layer)]
+
+    @property
+    def _lit(self) -> set[Layer]:
+        """Layers that are taken for light or its color."""
+        of_split = [] if self.split is None else self.split.layers.values()
+        return {*(layer for light in self.lights.values() for layer in light.layers), *of_split}
 
     @property
     def reference_numbers(self) -> list[int]:
@@ -118,20 +136,43 @@ class RenderedFiles:
         """Read the reference of one frame that has one."""
         return _tensor(self.read(number, {"reference": self.choice.layers["reference"]})["reference"][..., :3])
 
-    def frame(self, number: int, *, reference: bool = True, realisation: int = 0) -> Frame:
+    def frame(
+        self, number: int, *, reference: bool = True, realisation: int = 0, buffers: Collection[str] | None = None
+    ) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
+        split = self.split if buffers is None or self.split is None or self.split.names & set(buffers) else None
         wanted = {
             name: layer
             for name, layer in self.choice.layers.items()
             if number in self.groups[layer.group].files and (reference or name != "reference")
         }
+        samples = self.samples if buffers is None or "samples" in buffers else None
+        wanted |= {} if split is None else split.layers
+        wanted |= {} if samples is None else samples.layers
         wanted |= {f"{name} {i}": each for name, own in self.lights.items() for i, each in enumerate(own.layers)}
         images = self.read(number, wanted)
         lights = {
             name: _without_lossy_black(own.radiance([images.pop(f"{name} {i}") for i in range(len(own.layers))]))
             for name, own in self.lights.items()
         }
-        return self._as_frame(number, images, lights)
+        if split is not None:
+            read = {key: images.pop(key) for key in split.layers}
+            parts = split.buffers(read, images["color"][..., :3])
+            if parts is None:
+                warnings.warn(
+                    f"frame {number}: {', '.join(sorted(split.parts))} do not add up to the color as in the first "
+                    "frame; not used",
+                    stacklevel=2,
+                )
+            images |= {} if parts is None else parts
+        several = None if samples is None else samples.samples({key: images.pop(key) for key in samples.layers})
+        frame = self._as_frame(number, images, lights)
+        if several is None:
+            return frame
+        single = torch.from_numpy(several)[None]
+        if not self.color_has_albedo and frame.albedo is not None:
+            single = scale_samples(single, frame.albedo)
+        return frame.replace(samples=single)
 
     def check_output_layer(self, name: str) -> None:
         """See :meth:`mcdenoise.data.Sequence.check_output_layer`."""

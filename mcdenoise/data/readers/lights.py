@@ -98,6 +98,11 @@ def is_light(layer: Layer) -> bool:
     return layer.title in _ADDED | colors or layer.title.startswith(("Combined_", *mattes))
 
 
+def color_of(layer: Layer, layers: Sequence[Layer]) -> list[Layer]:
+    """The color that a layer of light is divided by, if there is one."""
+    return [each for each in layers if each.title == _DIVIDED.get(layer.title) and each.family == layer.family][:1]
+
+
 def find_lights(where: str, layers: Sequence[Layer], color: Layer, names: Sequence[str]) -> Mapping[str, Light]:
     """The layers of light that somebody asks for.
 
@@ -133,6 +138,5 @@ def find_lights(where: str, layers: Sequence[Layer], color: Layer, names: Sequen
                 f"{', '.join(map(str, found)) or 'none'}; choose among {pictures}"
             )
         (layer,) = found
-        colors = [each for each in own if each.title == _DIVIDED.get(layer.title) and each.family == layer.family]
-        lights[layer.name] = Light((layer, *colors[:1]))
+        lights[layer.name] = Light((layer, *color_of(layer, own)))
     return lights

@@ -11,7 +11,7 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
@@ -106,7 +106,7 @@ class NoisebaseFiles:
     @property
     def buffers(self) -> frozenset[str]:
         """Names of the buffers that every frame has."""
-        present = {"color"} | ({"variance"} if self.samples > 1 else set())
+        present = {"color"} | ({"variance", "samples"} if self.samples > 1 else set())
         present |= {own for own, name in _SOURCES.items() if name in self.arrays}
         if {"position", "motion"} <= self.arrays:
             present.add("previous_position")
@@ -128,30 +128,37 @@ class NoisebaseFiles:
         with _opened(self.files[number]) as file:
             return _tensor(_mean(file, _described(file, "reference"), self._index(number)))
 
-    def frame(self, number: int, *, reference: bool = True, realisation: int = 0) -> Frame:
+    def frame(
+        self, number: int, *, reference: bool = True, realisation: int = 0, buffers: Collection[str] | None = None
+    ) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`.
 
         ``color`` is the mean over the samples, ``variance`` that of this mean; features are means over the samples.
         """
         index = self._index(number)
+        sampled = self.samples > 1 and (buffers is None or "samples" in buffers)
+        samples = np.empty((self.samples, 3, *self.size), np.float32) if sampled else None
         with _opened(self.files[number]) as file:
-            color, variance = _radiance(file, _described(file, "color"), self._numbers(file, "exposure", index), index)
+            exposure = self._numbers(file, "exposure", index)
+            color, variance = _radiance(file, _described(file, "color"), exposure, index, samples)
             means = {
                 name: _mean(file, _described(file, name), index)
                 for name in _IMAGES
                 if name in self.arrays and name != "color" and (reference or name != "reference")
             }
             matrix = self._matrix(file, index) if self.view is not None else None
-        buffers: dict[str, Any] = {own: _tensor(means[name]) for own, name in _SOURCES.items() if name in means}
+        found: dict[str, Any] = {own: _tensor(means[name]) for own, name in _SOURCES.items() if name in means}
         if {"position", "motion"} <= means.keys():
-            buffers["previous_position"] = _tensor(means["position"] + means["motion"])
+            found["previous_position"] = _tensor(means["position"] + means["motion"])
         if matrix is not None:
             w = np.einsum("chw,c->hw", means["position"], matrix[:3, 3]) + matrix[3, 3]
             depth = np.where(_seen(means) & (w > 0), w, np.inf)
-            buffers |= {"depth": _tensor(depth[None]), "view_projection": torch.from_numpy(matrix).float()[None]}
+            found |= {"depth": _tensor(depth[None]), "view_projection": torch.from_numpy(matrix).float()[None]}
         if variance is not None:
-            buffers["variance"] = _tensor(variance)
-        return Frame(color=_tensor(color), **buffers)
+            found["variance"] = _tensor(variance)
+        if samples is not None:
+            found["samples"] = torch.from_numpy(samples)[None]
+        return Frame(color=_tensor(color), **found)
 
     def write(self, out: Path, number: int, image: Image, *, full_float: bool = False) -> Path:
         """Write an EXR of the name of the zip with R, G, B: the arrays are of samples, and no place for an image.
@@ -250,6 +257,7 @@ def _look(shot: NoisebaseFiles) -> None:
     """Find out which pixels the matrices are of, from the positions of the first frame."""
     mean = f"mean of {shot.samples} samples"
     words = {"color": f"radiance, {mean}", "variance": f"variance of the {mean}", "reference": "radiance"}
+    words["samples"] = f"{shot.samples} of a pixel: radiance"
     if {"position", "view_proj_mat"} <= shot.arrays:
         number = shot.numbers[0]
         index = shot._index(number)
@@ -292,9 +300,9 @@ def _seen(means: Mapping[str, Array]) -> Mask:
 
 
 def _radiance(
-    file: zipfile.ZipFile, array: _ZarrArray, exposure: Array, index: int | None
+    file: zipfile.ZipFile, array: _ZarrArray, exposure: Array, index: int | None, samples_out: Image | None = None
 ) -> tuple[Array, Array | None]:
-    r"""Mean radiance ``(3, H, W)`` and the variance of that mean; ``None`` of one sample.
+    r"""Mean radiance ``(3, H, W)`` and the variance of that mean, ``None`` of one sample; ``(S, 3, H, W)`` gets all.
 
     A sample is :math:`c / 255 \exp(e (b - a) + a)` of its three bytes c, with :math:`e = (E + 1) / 256` of its fourth
     and the exposure (a, b), natural logarithms.
@@ -303,8 +311,10 @@ def _radiance(
     low, high = exposure
     scale = np.exp((np.arange(256) + 1) / 256 * (high - low) + low) / 255
     total, squares = np.zeros((3, height, width)), np.zeros((3, height, width))
-    for (_, rows, columns, _), piece in _pieces(file, array, index):
+    for (_, rows, columns, which), piece in _pieces(file, array, index):
         radiance = piece[:3] * scale[piece[3]]
+        if samples_out is not None:
+            samples_out[which, :, rows, columns] = np.moveaxis(radiance, -1, 0)
         total[:, rows, columns] += radiance.sum(-1)
         squares[:, rows, columns] += (radiance**2).sum(-1)
     mean = total / samples

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -15,11 +15,21 @@ from mcdenoise.data.camera_matrices import MATRICES, Array, find_camera_matrices
 from mcdenoise.data.exr import Image, Mask, Metadata
 from mcdenoise.data.images import ImageHeader, Part, read_channels, read_image_header
 from mcdenoise.data.readers.cameras import FittedCamera, fit_camera, motion_to, read_as
-from mcdenoise.data.readers.choice import choose
+from mcdenoise.data.readers.choice import Choice, choose
+from mcdenoise.data.readers.diffuse_specular import (
+    DIFFUSE,
+    EMISSION,
+    SPECULAR,
+    SPECULAR_ALBEDO,
+    Split,
+    adds_up,
+    find_splits,
+)
 from mcdenoise.data.readers.files import RenderedFiles, hit, seen_of, world_to_camera
 from mcdenoise.data.readers.layers import Layer, layers_of
 from mcdenoise.data.readers.lights import find_lights
 from mcdenoise.data.readers.names import FileGroup, pattern_of
+from mcdenoise.data.readers.samples import SampleLayers, mean_is, split_samples
 from mcdenoise.data.readers.values import (
     MOTION_PAIRS,
     USUAL_MOTION,
@@ -74,8 +84,10 @@ def open_files(
         path = next(iter(groups[layer.group].files.values()))
         return read_channels(path, {layer.part: layer.channels}, rows)[layer.part]
 
+    samples, layers = split_samples(layers)
     choice = choose(where, layers, mapping, read_first)
     color = choice.layers["color"]
+    splits = _splits(layers, choice, mapping)
     numbers = choose_numbers(sorted(groups[color.group].files))
     shot = RenderedFiles(groups, [header.parts for header in headers], numbers, choice, {})
     _check(shot)
@@ -83,6 +95,10 @@ def open_files(
     folder = shot.file(color, numbers[0]).parent
     shot = replace(shot, lights=found, cameras=find_camera_matrices(folder, numbers[-1]))
     _look(shot, color_has_albedo)
+    if shot.color_has_albedo:
+        _look_at_parts(shot, splits)
+    if samples is not None:
+        _look_at_samples(shot, samples)
     return shot
 
 
@@ -347,6 +363,87 @@ def _seen_elsewhere(
     if matrix is None or not known.any():
         return None
     return motion_to(matrix, now[1]["position"], known)
+
+
+def _splits(layers: Sequence[Layer], choice: Choice, mapping: Mapping[str, str]) -> list[Split]:
+    """What may be diffuse and specular light, unless somebody says that nothing is."""
+    if "" in {mapping.get(DIFFUSE), mapping.get(SPECULAR)}:
+        return []
+    asked = {name: choice.layers[name] for name in mapping if name in choice.layers}
+    if {DIFFUSE, SPECULAR} <= asked.keys():
+        # They are read as parts, and no other way.
+        for name in {DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO} & asked.keys():
+            del choice.layers[name]
+    return find_splits(layers, choice.layers["color"], asked)
+
+
+def _look_at_parts(shot: RenderedFiles, splits: Sequence[Split]) -> None:
+    """Take the first split that adds up to the color of the first frame and is there in all."""
+    number, color = shot.numbers[0], shot.choice.layers["color"]
+    refused = []
+    for split in (each for each in splits if _is_everywhere(shot, each.layers.values())):
+        read = shot.read(number, {**split.layers, "color": color})
+        sums = split.sums(read)
+        off = split.off(sums, read["color"][..., :3])
+        if not adds_up(off):
+            refused.append((split, off))
+            continue
+        shot.split = split
+        total = sum(float(np.nansum(each)) for each in sums.values())
+        for name, lights in split.parts.items():
+            own = [layer.layers[0] for layer in lights]
+            place = ", ".join(
+                [own[0].place, *(each.title if each.files == own[0].files else each.place for each in own[1:])]
+            )
+            colors = list(dict.fromkeys(each.title for light in lights for each in light.layers[1:]))
+            fraction = float(np.nansum(sums[name])) / (total or 1)
+            said = f"{fraction:.0%} of the light; the parts add up to the color"
+            shot.table.append(Row(name, place, f"times {', '.join(colors)}; {said}" if colors else said))
+        if split.specular_albedo is not None:
+            shot.table.append(Row(SPECULAR_ALBEDO, split.specular_albedo.place, "clamped to 0 to 1"))
+        return
+    if refused:
+        split, (far, light) = refused[0]
+        found = ", ".join(layer.title for own in split.parts.values() for each in own for layer in each.layers[:1])
+        why = f"render {', '.join(split.absent)}, too, where the scene has such light" if split.absent else ""
+        why = why or "they are of another image, or stored with loss (DWA), or the color has been denoised"
+        shot.warnings.append(
+            f"'diffuse', 'specular': {found} have {light:.1%} of the light of the color and differ from it in "
+            f"{far:.0%} of the pixels: not used; {why}"
+        )
+
+
+def _look_at_samples(shot: RenderedFiles, samples: SampleLayers) -> None:
+    """Take samples that are there in all frames and whose mean is the color of the first one."""
+    number, color = shot.numbers[0], shot.choice.layers["color"]
+    if not _is_everywhere(shot, samples.layers.values()):
+        shot.warnings.append("'samples': some frames have others, or of other pixels, or none: not used")
+        return
+    read = shot.read(number, {**samples.layers, "color": color})
+    if not mean_is(read["color"][..., :3], samples.samples(read)):
+        shot.warnings.append(
+            f"'samples': the mean of {len(samples.radiance)} is not the color: not used; write all samples of a pixel, "
+            "with the weights of the pixel filter in them"
+        )
+        return
+    shot.samples = samples
+    first = samples.radiance[0]
+    shot.table.append(Row("samples", f"{first.place} and on", str(samples)))
+
+
+def _is_everywhere(shot: RenderedFiles, layers: Collection[Layer]) -> bool:
+    """Whether all frames have these layers, in the pixels of the color."""
+    main = shot.part(shot.choice.layers["color"])
+    for layer in set(layers):
+        files = shot.groups[layer.group].files
+        for number in shot.numbers:
+            parts = read_image_header(files[number]).parts if number in files else ()
+            own = parts[layer.part] if layer.part < len(parts) else None
+            if own is None or not {*layer.channels} <= {*own.channels}:
+                return False
+            if (own.size, own.origin) != (main.size, main.origin):
+                return False
+    return True
 
 
 def _span(values: Image) -> str:

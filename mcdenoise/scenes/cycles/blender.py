@@ -101,7 +101,7 @@ def _set_up(scene: Any, settings: dict[str, Any]) -> None:
         scene.render.threads_mode, scene.render.threads = "FIXED", settings["threads"]
     layer = scene.view_layers[0]
     layer.cycles.denoising_store_passes = True
-    for name in ("z", "position", "object_index"):
+    for name in ("z", "position", "object_index", *settings["passes"]):
         setattr(layer, f"use_pass_{name}", True)
     cycles = scene.cycles
     cycles.device = "CPU"

@@ -26,6 +26,7 @@ from mcdenoise.data.exr import Image
 from mcdenoise.data.files import write_text
 from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer, write_clean_features
+from mcdenoise.data.readers.diffuse_specular import find_splits
 from mcdenoise.data.readers.layers import layers_of
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
@@ -46,6 +47,11 @@ _PASSES = {
     "Position": ("Position",),
     "IndexOB": ("IndexOB", "Object Index"),
 }
+# Those of the light, as Blender's Python calls them.
+_LIGHT = [
+    *(f"{kind}_{part}" for kind in ("diffuse", "glossy", "transmission") for part in ("direct", "indirect", "color")),
+    *("emit", "environment"),
+]
 # How much farther than everything else the sky is, as the reader has it.
 _SKY = 1000.0
 _REFERENCE_STREAM = 1
@@ -54,6 +60,7 @@ _CONVENTIONS: dict[str, Any] = {
     "reference_includes_albedo": True,
     "seeds": "numpy.random.SeedSequence((seed, frame, stream)).generate_state(1) % 2**31, of a view but the first "
     "with spawn_key=(view,); stream 0 for the first noisy color, 1 for the reference, 1 + realisation for the others",
+    "parts": "diffuse and specular, where they are there, add up to color: specular is all light that is not diffuse",
     "features": "from the samples of the color beside them: Denoising Albedo clamped to 0..1, Denoising Normal in "
     "world space, Depth, Position",
     "conventions": {
@@ -77,6 +84,7 @@ def render_cycles(
     realisations: int = 2,
     reference_samples: int = 128,
     settings: CyclesSettings | None = None,
+    parts: bool = False,
     threads: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
@@ -97,6 +105,8 @@ def render_cycles(
         reference_samples: a pixel of the references, but at least four times as many as of the noisy colors; 0 for no
             references.
         settings: filter, lens and shutter; drawn by default.
+        parts: also write the diffuse and the specular light of the noisy colors, see
+            :mod:`mcdenoise.data.readers.diffuse_specular`.
         threads: of the processor; all by default. The images do not depend on it.
         progress: called with the finished and the total number of samples a pixel, summed over all frames.
 
@@ -120,7 +130,8 @@ def render_cycles(
     movers = [name for name in made.scene if name in moves]
     description = translate(made.scene, movers, seed=seed)
     folder = _Folder(out / "inputs", made, size, chosen, (seed, view), blender.version)
-    noisy = [(n, k) for n in range(count) for k in reversed(range(realisations)) if not folder.has_color(n, k)]
+    last = "specular" if parts else "color"
+    noisy = [(n, k) for n in range(count) for k in reversed(range(realisations)) if not folder.has(last, n, k)]
     clean = [n for n in range(count) if clean_samples and not folder.has_reference(n)]
     total = count * (realisations * chosen.samples + clean_samples)
     done = total - len(noisy) * chosen.samples - len(clean) * clean_samples
@@ -136,13 +147,13 @@ def render_cycles(
         file = Path(place) / "shot.exr"
         if noisy or clean:
             description.save(Path(place))
-            blender.ask("scene", folder=place, settings=_for_blender(made, moves, movers, chosen, size, threads))
+            blender.ask("scene", folder=place, settings=_for_blender(made, moves, movers, chosen, size, threads, parts))
 
         def shot(number: int, samples: int, stream: int) -> dict[str, Image]:
             sequence = np.random.SeedSequence((seed, number, stream), spawn_key=(view,) if view else ())
             noise = int(sequence.generate_state(1)[0] % 2**31)
             blender.ask("render", frame=number, samples=samples, seed=noise, out=str(file))
-            images = _read(file)
+            images = _read(file, parts)
             file.unlink()
             advance(samples)
             return images
@@ -232,9 +243,10 @@ class _Folder:
                 f"{described}: rendered with another '{changed[0]}'; choose another output folder, or delete this one"
             )
 
-    def has_color(self, number: int, realisation: int) -> bool:
-        """Whether a frame has one of its noisy colors, which is written behind its features."""
-        return (realisation_folder(self.path, realisation) / f"color{number}.exr").is_file()
+    def has(self, name: str, number: int, realisation: int) -> bool:
+        """Whether a frame has one of its noisy colors, which is written behind its features, with another buffer."""
+        place = realisation_folder(self.path, realisation)
+        return all((place / f"{each}{number}.exr").is_file() for each in (name, "color"))
 
     def has_reference(self, number: int) -> bool:
         """Whether a frame has its reference."""
@@ -289,6 +301,7 @@ class _View:
                 own = (index == number) & known[..., 0]
                 before[own] = position[own] @ back[:3, :3].T + back[:3, 3]
             buffers["previous_position"] = before
+        buffers |= {name: images[name] for name in ("diffuse", "specular") if name in images}
         return {**buffers, "color": images["Combined"][..., :3]}
 
 
@@ -304,11 +317,13 @@ def _for_blender(
     chosen: CyclesSettings,
     size: tuple[int, int],
     threads: int,
+    parts: bool,
 ) -> dict[str, Any]:
     fovs = [camera.fov_x for camera in made.cameras]
     return {
         "size": list(size),
         "threads": threads,
+        "passes": _LIGHT if parts else [],
         "box": chosen.pixel_filter == "box",
         "filter_width": WIDTHS[chosen.pixel_filter],
         "aperture": chosen.aperture,
@@ -329,10 +344,14 @@ def _prolonged(poses: Array) -> Array:
     return np.concatenate([first[None], poses, last[None]])
 
 
-def _read(path: Path) -> dict[str, Image]:
+def _read(path: Path, with_parts: bool) -> dict[str, Image]:
     parts = read_image_header(path).parts
-    layers = {layer.title: layer for layer in layers_of(0, "", parts)}
+    listed = layers_of(0, "", parts)
+    layers = {layer.title: layer for layer in listed}
     found: dict[str, Image] = {}
+    for split in find_splits(listed, layers["Combined"], {})[:1] if with_parts else []:
+        images = {key: read_channels(path, {each.part: each.channels})[each.part] for key, each in split.layers.items()}
+        found |= split.sums(images)
     for name, names in _PASSES.items():
         layer = next((layers[each] for each in names if each in layers), None)
         if layer is None and len(layers) == 1:

@@ -34,6 +34,8 @@ _CONVENTIONS: dict[str, Any] = {
     "albedo": "Mitsuba eval_diffuse_reflectance where the BSDF has a diffuse lobe; directional albedo for rough "
     "conductors; 0 for mirrors, glass, background",
     "alpha_masks": "features look through surfaces whose opacity is below 0.5",
+    "samples": "only where they were kept: samplesN.exr has the single paths whose mean is the noisy colour, as layers "
+    "sample0, sample1, ...; on a film with the features of each",
     "previous_position": "only with moves: where the surface point seen now was in the previous frame, world space",
     "conventions": {
         "camera_matrices": "clip = [x,y,z,1] @ M (row vectors; M is the transpose of world_to_clip); "
@@ -64,6 +66,7 @@ _IDENTITY = (
     "far",
     "noisy_spp",
     "film",
+    "samples_kept",
     "max_depth",
     "rr_depth",
     "seed",

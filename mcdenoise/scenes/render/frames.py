@@ -14,6 +14,7 @@ import torch
 
 from mcdenoise.data.camera_path import Array, Camera, PixelRays, pixel_rays
 from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer, write_clean_features
+from mcdenoise.data.readers.samples import FEATURES
 from mcdenoise.scenes.render.film import Film, FilmRenderer
 from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write_realisation, write_reference
 from mcdenoise.scenes.render.halves import ReferenceHalves
@@ -45,6 +46,7 @@ class FrameJob:
         started: how far the references on disk have come.
         seed: of the noise.
         film: filter and lens of jittered samples; ``None`` for samples at the pixel centre.
+        keep_samples: whether the single samples of the noisy colours are written, too.
     """
 
     folder: Path
@@ -60,6 +62,7 @@ class FrameJob:
     started: dict[int, ReferenceState] = field(default_factory=dict)
     seed: int
     film: Film | None = None
+    keep_samples: bool = False
 
     def is_finished(self, number: int) -> bool:
         """Whether a frame has everything."""
@@ -133,8 +136,9 @@ def render_frame(job: FrameJob, tracer: Tracer, number: int, advance: Callable[[
         state = _refine_reference(job, lambda n, seed, even: trace(n, seed, stratified=even), number, advance)
     for realisation in reversed(range(job.realisations)):
         if not job.has_color(number, realisation):
-            color = _color(tracer, rays, job.spp, (job.seed, number, _stream(realisation)), advance)
-            write_realisation(job.folder, number, realisation, {"color": _image(color, job.size)})
+            color, samples = _color(job, tracer, rays, (job.seed, number, _stream(realisation)), advance)
+            own = {"samples": torch.stack([_image(each, job.size) for each in samples], 1)} if samples else {}
+            write_realisation(job.folder, number, realisation, {**own, "color": _image(color, job.size)})
     return state
 
 
@@ -158,14 +162,20 @@ def _render_filtered(
         if job.has_color(number, realisation) and job.has_features(number, realisation):
             continue
         total: dict[str, Array] = {}
-        per_pass = film.paths_per_pass()
+        per_pass = 1 if job.keep_samples else film.paths_per_pass()
+        kept: list[torch.Tensor] = []
         for index, start in enumerate(range(0, job.spp, per_pass)):
             paths = min(per_pass, job.spp - start)
             seed = (job.seed, number, _stream(realisation), index)
-            for name, values in film.frame(camera, back, paths, seed).items():
+            found = film.frame(camera, back, paths, seed)
+            for name, values in found.items():
                 total[name] = total.get(name, 0) + values * (paths / job.spp)
+            if job.keep_samples:
+                kept.append(torch.cat([_image(found[name], job.size) for name in ("color", *FEATURES)], 1))
             advance(paths)
-        images = {name: _image(total[name], job.size) for name in (*sorted({*total} - {"color"}), "color")}
+        images = {name: _image(total[name], job.size) for name in sorted({*total} - {"color"})}
+        images |= {"samples": torch.stack(kept, 1)} if kept else {}
+        images["color"] = _image(total["color"], job.size)
         write_realisation(job.folder, number, realisation, images)
     return state
 
@@ -205,15 +215,18 @@ def _moved_back(job: FrameJob, number: int) -> dict[str, Array]:
 
 
 def _color(
-    tracer: Tracer, rays: PixelRays, spp: int, seed: tuple[int, int, int], advance: Callable[[int], None]
-) -> Array:
-    per_pass = min(spp, tracer.paths_per_pass(rays))
-    total = np.zeros_like(rays.directions)
-    for number, start in enumerate(range(0, spp, per_pass)):
-        paths = min(per_pass, spp - start)
-        total += paths * tracer.radiance(rays, paths, (*seed, number))
+    job: FrameJob, tracer: Tracer, rays: PixelRays, seed: tuple[int, int, int], advance: Callable[[int], None]
+) -> tuple[Array, list[Array]]:
+    """The mean radiance of all paths and, where they are kept, that of each."""
+    per_pass = 1 if job.keep_samples else min(job.spp, tracer.paths_per_pass(rays))
+    total, samples = np.zeros_like(rays.directions), []
+    for number, start in enumerate(range(0, job.spp, per_pass)):
+        paths = min(per_pass, job.spp - start)
+        radiance = tracer.radiance(rays, paths, (*seed, number))
+        total += paths * radiance
+        samples += [radiance] if job.keep_samples else []
         advance(paths)
-    return total / spp
+    return total / job.spp, samples
 
 
 def _refine_reference(

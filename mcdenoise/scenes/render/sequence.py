@@ -50,6 +50,7 @@ def render_sequence(
     workers: int = 1,
     variant: str | None = None,
     film: Film | None = None,
+    keep_samples: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Render a sequence in the BMFR layout.
@@ -86,6 +87,8 @@ def render_sequence(
         film: filter and lens of jittered samples, as Mitsuba's own renderer takes them: noisy colours then come with
             noisy features of the same samples, those of realisation k in its folder, and so does the reference. With
             several threads its sums differ by rounding from run to run. By default all samples are at the pixel centre.
+        keep_samples: also write the single paths of each noisy colour, as layers of ``samplesN.exr``; on a film with
+            the features of each.
         progress: called with the finished and the total number of paths per pixel, summed over all frames. A reference
             that reaches the noise level early counts as complete.
 
@@ -133,6 +136,8 @@ def render_sequence(
         "far": far,
         "noisy_spp": spp,
         "film": None if film is None else asdict(film),
+        # Nothing where they are not, as in folders of the time before they could be.
+        "samples_kept": True if keep_samples else None,
         "realisations": realisations,
         "max_depth": max_depth,
         "rr_depth": RR_DEPTH,
@@ -163,6 +168,7 @@ def render_sequence(
         started=dict(folder.references),
         seed=seed,
         film=film,
+        keep_samples=keep_samples,
     )
 
     done, total = 0, count * realisations * spp + len(references) * reference_spp

@@ -12,6 +12,7 @@ import OpenImageIO as oiio
 import pytest
 
 from mcdenoise import InputError
+from mcdenoise.cli import main
 
 Image = np.ndarray[Any, Any]
 
@@ -62,5 +63,17 @@ def refused() -> Callable[..., str]:
             action(*arguments, **options)
         assert "\n" not in str(error.value)
         return str(error.value)
+
+    return call
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Status, standard output and standard error of a command."""
+
+    def call(*arguments: Any) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as stop:
+            main([str(argument) for argument in arguments])
+        return (int(stop.value.code or 0), *capsys.readouterr())
 
     return call

@@ -12,21 +12,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from mcdenoise.cli import main
-
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Status, standard output and standard error of a command."""
-
-    def call(*arguments: Any) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as stop:
-            main([str(argument) for argument in arguments])
-        return (int(stop.value.code or 0), *capsys.readouterr())
-
-    return call
 
 
 def test_inspect_prints_what_is_read_and_writes_nothing(run: Run, rendered: Path, tmp_path: Path) -> None:
@@ -37,11 +23,9 @@ def test_inspect_prints_what_is_read_and_writes_nothing(run: Run, rendered: Path
     told = json.loads((tmp_path / "found.json").read_text())
     assert [row["buffer"] for row in told["read"]][:3] == ["color", "albedo", "normal"]
     assert told["frames"] == [1, 2, 3, 4]
-    assert told["unused"] == [
-        f"shot_####.exr ViewLayer.{name}" for name in ("DiffCol.RGB", "Normal.XYZ", "Denoising Depth.Z")
-    ]
+    assert told["unused"] == [f"shot_####.exr ViewLayer.{name}" for name in ("Normal.XYZ", "Denoising Depth.Z")]
     words = " ".join(text.split())
-    for word in ("not used: shot_####.exr ViewLayer.DiffCol.RGB", "1e+10, read as infinity"):
+    for word in ("not used: shot_####.exr ViewLayer.Normal.XYZ", "1e+10, read as infinity"):
         assert word in words
     assert sorted(path.name for path in tmp_path.iterdir()) == ["found.json", "shot"]
     assert len(list(folder.iterdir())) == 4

@@ -1,0 +1,110 @@
+"""Single samples of the pixels of a frame: layers ``sample0.RGB``, ``sample1.RGB``, ... of an EXR.
+
+They lie beside the color, or in a file of their own for each frame, such as ``samples_0001.exr``; in the BMFR layout it
+is ``samplesN.exr``. Each may have the features that it has seen: ``sample0.albedo.RGB``, ``sample0.normal.XYZ`` and
+``sample0.depth.Z``. Their mean is the color, or they are not used.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mcdenoise.data.exr import LARGEST_HALF, Image, write_exr
+from mcdenoise.data.readers.layers import Layer
+
+# Channels behind the radiance, in this order where every sample has them.
+FEATURES = {"albedo": "RGB", "normal": "XYZ", "depth": "Z"}
+_NAME = re.compile(r"(?:.*[._ ])?sample[ _]?([0-9]{1,4})(?:\.(albedo|normal|depth))?", re.IGNORECASE)
+# Of the mean of half floats, and of the color, each 2^-11; and as much to spare.
+_ROUNDING, _SMALLEST_HALF = 4 * 2.0**-11, 2.0**-24
+_MOST_OFF = 1e-3  # of the pixels: brighter than a half float can be
+
+
+@dataclass(frozen=True)
+class SampleLayers:
+    """The layers of the samples of a frame.
+
+    Args:
+        radiance: of each sample.
+        features: likewise, by name; only those that every sample has.
+    """
+
+    radiance: tuple[Layer, ...]
+    features: Mapping[str, tuple[Layer, ...]]
+
+    @property
+    def layers(self) -> dict[str, Layer]:
+        """All of them, by a key for :meth:`samples`."""
+        rows = {"radiance": self.radiance, **self.features}
+        return {f"sample {i} {name}": layer for name, own in rows.items() for i, layer in enumerate(own)}
+
+    def samples(self, images: Mapping[str, Image]) -> Image:
+        """``(S, C, H, W)`` of the images of :attr:`layers`: radiance, and features as far as there are any."""
+        found = [
+            np.concatenate(
+                [
+                    images[f"sample {i} {name}"][..., : 1 if name == "depth" else 3]
+                    for name in ("radiance", *self.features)
+                ],
+                -1,
+            )
+            for i in range(len(self.radiance))
+        ]
+        return np.ascontiguousarray(np.stack(found).transpose(0, 3, 1, 2), dtype=np.float32)
+
+    def __str__(self) -> str:
+        features = f" with {', '.join(self.features)}" if self.features else ""
+        return f"{len(self.radiance)} of a pixel{features}; their mean is the color"
+
+
+def split_samples(layers: Sequence[Layer]) -> tuple[SampleLayers | None, list[Layer]]:
+    """The layers of samples, if there are any, and all other layers: the features of a sample are no buffers."""
+    found: dict[str, dict[int, Layer]] = {}
+    others = []
+    for layer in layers:
+        match = _NAME.fullmatch(layer.name)
+        kind = (match[2] or "radiance").lower() if match else ""
+        if match and (kind == "depth" or len(layer.channels) >= 3) and not layer.anonymous:
+            found.setdefault(kind, {}).setdefault(int(match[1]), layer)
+        else:
+            others.append(layer)
+    radiance = found.get("radiance", {})
+    if not radiance:
+        return None, list(layers)
+    numbers = sorted(radiance)
+    features = {
+        name: tuple(found[name][n] for n in numbers) for name in FEATURES if found.get(name, {}).keys() >= {*numbers}
+    }
+    return SampleLayers(tuple(radiance[n] for n in numbers), features), others
+
+
+def mean_is(color: Image, samples: Image) -> bool:
+    """Whether the mean of samples ``(S, C, H, W)`` is the color ``(H, W, 3)``, up to the rounding of half floats."""
+    mean = samples[:, :3].mean(0, dtype=np.float64).transpose(1, 2, 0)
+    known = (np.isfinite(mean) & np.isfinite(color)).all(-1)
+    far = np.abs(mean - color) > _ROUNDING * np.maximum(np.abs(mean), np.abs(color)) + 2 * _SMALLEST_HALF
+    return bool(known.any() and far.any(-1)[known].mean() <= _MOST_OFF)
+
+
+def write_samples(path: Path, samples: Image) -> None:
+    """Write samples as layers of an EXR.
+
+    Args:
+        path: of the file.
+        samples: ``(S, C, H, W)``: radiance, and behind it albedo, normal and depth, or nothing.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    suffixes = [*"RGB"]
+    if samples.shape[1] > 3:
+        suffixes += [f"{name}.{letter}" for name, letters in FEATURES.items() for letter in letters]
+    names = [f"sample{i}.{suffix}" for i in range(len(samples)) for suffix in suffixes]
+    finite = np.where(np.isfinite(samples), samples, 0)
+    image = finite.reshape(-1, *samples.shape[2:]).transpose(1, 2, 0)
+    write_exr(path, np.ascontiguousarray(image), names, half=bool(image.max(initial=0) <= LARGEST_HALF))

@@ -1,0 +1,244 @@
+"""Diffuse and specular light from files: used where it adds up to the color, refused in words where it does not."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mcdenoise.data import open_sequence
+from mcdenoise.frame import Frame
+from mcdenoise.models import create_model, save_weights
+
+SIZE = (12, 16)
+Save = Callable[..., Path]
+Run = Callable[..., tuple[int, str, str]]
+Image = np.ndarray[Any, Any]
+
+# Blender's passes, and which buffer each belongs to.
+BLENDER = {
+    "diffuse": ("DiffDir", "DiffInd"),
+    "specular": ("GlossDir", "GlossInd", "TransDir", "TransInd", "VolumeDir", "VolumeInd", "Emit", "Env"),
+}
+
+
+def drawn(seed: int) -> Image:
+    return np.random.default_rng(seed).uniform(0.1, 2, (*SIZE, 3)).astype(np.float32)
+
+
+def three(name: str, image: Image, letters: str = "RGB") -> dict[str, Image]:
+    return {f"{name}.{letter}": image[..., i] for i, letter in enumerate(letters)}
+
+
+def blender(*without: str) -> tuple[dict[str, Image], dict[str, Image]]:
+    """Channels of a file with Blender's passes but for some, and what each buffer is."""
+    images, truth = {}, {}
+    for seed, (buffer, names) in enumerate(BLENDER.items()):
+        total = np.zeros((*SIZE, 3), np.float32)
+        for number, name in enumerate(names):
+            light, kind = drawn(20 * seed + number), name.removesuffix("Dir").removesuffix("Ind")
+            color: Any = 1.0
+            if kind in ("Diff", "Gloss", "Trans"):
+                color = drawn(100 + len(kind)) / 2
+                images[f"{kind}Col"] = color
+            images[name] = light
+            total += light * color
+        truth[buffer] = total
+    truth["color"] = truth["diffuse"] + truth["specular"]
+    truth["specular_albedo"] = images["GlossCol"]
+    layers = {"Combined": truth["color"], **images}
+    channels = {
+        f"View.{k}": v for name, image in layers.items() if name not in without for k, v in three(name, image).items()
+    }
+    return channels, truth
+
+
+def image_of(frame: Frame, buffer: str) -> Image:
+    found = frame.buffer(buffer)
+    assert found is not None
+    return found[0].permute(1, 2, 0).numpy()
+
+
+@pytest.mark.parametrize("kind", ["float", "half"])
+def test_blenders_passes_are_added_with_their_colors(tmp_path: Path, save: Save, kind: str) -> None:
+    channels, truth = blender()
+    sequence = open_sequence(save(tmp_path / "shot_0001.exr", channels, kind))
+    assert sequence.buffers >= {"diffuse", "specular", "specular_albedo"}
+    assert not sequence.warnings
+    frame = sequence.frame(1)
+    # Light and color are rounded to half floats, 2^-11 each, and so may be the color of the whole.
+    bound = 2.5 * 2.0**-11 if kind == "half" else 1e-6
+    for name in ("diffuse", "specular", "specular_albedo"):
+        np.testing.assert_allclose(image_of(frame, name), truth[name], rtol=bound)
+    assert frame.emission is None
+
+
+@pytest.mark.parametrize("absent", [["Emit"], ["TransInd", "Env"], ["GlossDir"], ["DiffInd"]])
+def test_what_is_missing_is_named_and_nothing_is_used(tmp_path: Path, save: Save, absent: list[str]) -> None:
+    channels, _ = blender(*absent)
+    sequence = open_sequence(save(tmp_path / "shot_0001.exr", channels, "half"))
+    assert not sequence.buffers & {"diffuse", "specular", "specular_albedo"}
+    (warning,) = sequence.warnings
+    assert warning.startswith("'diffuse', 'specular': ")
+    assert warning.endswith(f"not used; render {', '.join(absent)}, too, where the scene has such light")
+    frame = sequence.frame(1)
+    assert frame.diffuse is None
+    assert frame.specular is None
+
+
+def test_a_color_that_has_been_denoised_is_not_the_sum(tmp_path: Path, save: Save) -> None:
+    channels, truth = blender()
+    smooth = truth["color"].mean((0, 1), keepdims=True) + 0 * truth["color"]
+    sequence = open_sequence(save(tmp_path / "shot_0001.exr", {**channels, **three("View.Combined", smooth)}))
+    (warning,) = sequence.warnings
+    assert "100.0% of the light" in warning
+    assert warning.endswith("or the color has been denoised")
+    # What is not denoised yet is: it comes before the other.
+    both = {**channels, **three("View.Combined", smooth), **three("View.Noisy Image", truth["color"])}
+    assert not open_sequence(save(tmp_path / "both_0001.exr", both)).warnings
+
+
+def test_diffuse_light_alone_claims_nothing(tmp_path: Path, save: Save) -> None:
+    channels, _ = blender(*BLENDER["specular"])
+    sequence = open_sequence(save(tmp_path / "shot_0001.exr", channels))
+    assert "diffuse" not in sequence.buffers
+    assert not sequence.warnings
+
+
+def test_a_file_without_color_is_refused_as_ever(tmp_path: Path, save: Save, refused: Callable[..., str]) -> None:
+    channels, _ = blender("Combined")
+    path = save(tmp_path / "shot_0001.exr", channels)
+    assert "expected noisy radiance" in refused(open_sequence, path)
+
+
+@pytest.mark.parametrize("layout", ["layers", "files", "files of a shot"])
+@pytest.mark.parametrize("emits", [False, True])
+def test_anybodys_layers_by_their_names(tmp_path: Path, save: Save, layout: str, emits: bool) -> None:
+    images = {"diffuse": drawn(0), "specular": drawn(1), "specular_albedo": drawn(2) / 2}
+    images |= {"emission": drawn(3)} if emits else {}
+    images["color"] = sum(
+        (images[name] for name in ("diffuse", "specular", "emission") if name in images), 0 * drawn(0)
+    )
+    if layout == "layers":
+        channels = {k: v for name, each in images.items() if name != "color" for k, v in three(name, each).items()}
+        save(
+            tmp_path / "in" / "frame_0007.exr",
+            {**{each: images["color"][..., i] for i, each in enumerate("RGB")}, **channels},
+        )
+    else:
+        shot = "kitchen_" if layout == "files of a shot" else ""
+        for name, image in images.items():
+            save(tmp_path / "in" / f"{shot}{name}_0007.exr", {letter: image[..., i] for i, letter in enumerate("RGB")})
+    sequence = open_sequence(tmp_path / "in")
+    frame = sequence.frame(7)
+    assert not sequence.warnings
+    assert not sequence.unused
+    for name in images:
+        np.testing.assert_array_equal(image_of(frame, name), images[name])
+    assert (frame.emission is not None) == emits
+
+
+def test_emission_that_is_in_the_specular_light_already(tmp_path: Path, save: Save) -> None:
+    diffuse, specular = drawn(0), drawn(1)
+    light = {"": diffuse + specular, "diffuse": diffuse, "specular": specular, "emission": specular / 2}
+    channels = {k.lstrip("."): v for name, image in light.items() for k, v in three(name, image).items()}
+    frame = open_sequence(save(tmp_path / "a_0001.exr", channels)).frame(1)
+    np.testing.assert_array_equal(image_of(frame, "specular"), specular)
+    assert frame.emission is None
+
+
+def test_layers_that_somebody_chooses(tmp_path: Path, save: Save) -> None:
+    matt, shiny = drawn(0), drawn(1)
+    light = {"Combined": matt + shiny, "matt": matt, "shiny": shiny, "other": drawn(2)}
+    path = save(
+        tmp_path / "a_0001.exr", {k: v for n, image in light.items() for k, v in three(f"V.{n}", image).items()}
+    )
+    frame = open_sequence(path, mapping=["diffuse=matt", "specular=shiny"]).frame(1)
+    np.testing.assert_array_equal(image_of(frame, "diffuse"), matt)
+    wrong = open_sequence(path, mapping=["diffuse=matt", "specular=other"])
+    assert wrong.warnings
+    assert wrong.frame(1).specular is None
+
+
+def test_somebody_may_leave_them_out(tmp_path: Path, save: Save) -> None:
+    channels, _ = blender("Emit")
+    path = save(tmp_path / "shot_0001.exr", channels)
+    assert open_sequence(path).warnings
+    assert not open_sequence(path, mapping=["diffuse="]).warnings
+
+
+def test_pixels_that_are_no_numbers_do_not_spoil_a_frame(tmp_path: Path, save: Save) -> None:
+    """A firefly beyond all numbers is mended in the color, and the parts are whatever a method may look at."""
+    channels, _ = blender()
+    # One pixel of 10,000, as in an image: of these 192 it would be too many.
+    channels = {name: np.tile(image, (8, 8)) for name, image in channels.items()}
+    for name in ("View.Combined.R", "View.GlossDir.R"):
+        channels[name][3, 4] = np.inf
+    channels["View.DiffInd.G"][5, 6] = np.nan
+    path = save(tmp_path / "shot_0001.exr", channels)
+    frame, replaced = open_sequence(path, color_has_albedo=True).frame(1).validate()
+    assert replaced == 1
+    assert frame.diffuse is not None
+    assert frame.specular is not None
+    assert bool(torch.isfinite(frame.diffuse).all() and torch.isfinite(frame.specular).all())
+
+
+def test_a_frame_that_does_not_add_up_is_told_and_goes_without(tmp_path: Path, save: Save) -> None:
+    channels, _ = blender()
+    save(tmp_path / "shot_0001.exr", channels)
+    save(tmp_path / "shot_0002.exr", {**channels, **three("View.Emit", 5 * drawn(9))})
+    sequence = open_sequence(tmp_path)
+    assert sequence.frame(1).diffuse is not None
+    with pytest.warns(UserWarning, match="frame 2: diffuse, specular do not add up"):
+        assert sequence.frame(2).diffuse is None
+
+
+def test_a_frame_without_a_pass_leaves_all_without(tmp_path: Path, save: Save) -> None:
+    save(tmp_path / "shot_0001.exr", blender()[0])
+    save(tmp_path / "shot_0002.exr", blender("Emit")[0])
+    assert "diffuse" not in open_sequence(tmp_path).buffers
+
+
+def test_they_are_read_only_for_who_wants_them(tmp_path: Path, save: Save) -> None:
+    sequence = open_sequence(save(tmp_path / "shot_0001.exr", blender()[0]))
+    assert sequence.frame(1, buffers={"albedo"}).diffuse is None
+    assert sequence.frame(1, buffers={"specular"}).diffuse is not None
+
+
+def test_real_files_of_cycles(rendered: Path) -> None:
+    for name in ("blender", "blender5"):
+        sequence = open_sequence(rendered / name)
+        assert sequence.buffers >= {"diffuse", "specular", "specular_albedo"}
+        frame = sequence.frame(1)
+        assert frame.diffuse is not None
+        assert frame.specular is not None
+        # Three roundings to half floats lie between the sum and the color.
+        torch.testing.assert_close(frame.diffuse + frame.specular, frame.color, rtol=3 * 2.0**-11, atol=1e-6)
+
+
+def test_what_few_methods_use_is_told(run: Run, rendered: Path, tmp_path: Path) -> None:
+    status, printed, _ = run("inspect", rendered / "blender", "--json", tmp_path / "found.json")
+    assert status == 0
+    assert "diffuse: of use to kpcn\n" in printed
+    assert "specular: of use to kpcn\n" in printed
+    told = json.loads((tmp_path / "found.json").read_text())
+    assert told["of_use_to"]["diffuse"] == ["kpcn"]
+
+
+@pytest.mark.parametrize("split", [True, False])
+def test_kpcn_filters_both_parts_of_a_real_file(run: Run, rendered: Path, tmp_path: Path, split: bool) -> None:
+    settings = {"width": 4, "layers": 2, "kernel_size": 3, "split": split}
+    torch.manual_seed(0)
+    weights = tmp_path / "kpcn.safetensors"
+    weights.write_bytes(save_weights(create_model("kpcn", **settings), "kpcn", settings, {}))
+    shot = shutil.copytree(rendered / "blender", tmp_path / "shot")
+    status, printed, _ = run("denoise", shot, "-o", tmp_path / "out", "--weights", weights, "--frames", "1-2")
+    assert status == 0
+    said = "kept (diffuse and specular light)" if split else "skipped (these weights are for color alone)"
+    assert f"  specular branch: {said}\n" in printed
