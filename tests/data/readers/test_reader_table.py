@@ -22,9 +22,21 @@ BLENDER = {
     "position": "ViewLayer.Position.XYZ",
     "motion": "ViewLayer.Vector.XYZW",
 }
+# Of those that have the passes of light, which add up.
+PARTS = {
+    "diffuse": "ViewLayer.DiffDir.RGB, DiffInd",
+    "specular": "ViewLayer.GlossDir.RGB, GlossInd, TransDir, TransInd, Emit, Env",
+    "specular_albedo": "ViewLayer.GlossCol.RGB",
+}
+PARTS_5 = {
+    "diffuse": "ViewLayer.Diffuse Direct.RGB, Diffuse Indirect",
+    "specular": "ViewLayer.Glossy Direct.RGB, Glossy Indirect, Transmission Direct, Transmission Indirect, "
+    "Emission, Environment",
+    "specular_albedo": "ViewLayer.Glossy Color.RGB",
+}
 RENDERED = {
-    "blender": BLENDER,
-    "blender5": BLENDER | {"color": "ViewLayer.Noisy Image.RGBA"},
+    "blender": BLENDER | PARTS,
+    "blender5": BLENDER | PARTS_5 | {"color": "ViewLayer.Noisy Image.RGBA"},
     "blender_filtered": {name: text.replace("ViewLayer", "Main Layer v1.2") for name, text in BLENDER.items()},
     "blender_denoised": {
         "color": "ViewLayer.Noisy Image.RGBA",
@@ -50,6 +62,7 @@ RENDERED = {
         "alpha": "ALPHA_####.exr",
     },
 }
+SPLIT = {"diffuse": "diffuse.RGB", "specular": "specular.RGB"}
 PBRT = {"color": "RGB", "albedo": "Albedo.RGB", "normal": "Ns.XYZ", "position": "P.XYZ", "variance": "Variance.RGB"}
 RENDERMAN = {
     "color": "RGBA",
@@ -57,6 +70,7 @@ RENDERMAN = {
     "normal": "normal.XYZ",
     "depth": "zfiltered",
     "motion": "backward.XYZ",
+    **SPLIT,
 }
 NAMED = {
     "pbrt": PBRT,
@@ -67,6 +81,7 @@ NAMED = {
         "normal": "N.XYZ",
         "depth": "Z",
         "variance": "variance.RGB",
+        **SPLIT,
     },
     "renderman": RENDERMAN | {"color": "Ci.RGB", "alpha": "a"},
     "renderman_rgba": RENDERMAN,
