@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
 import signal
@@ -83,6 +84,8 @@ class Interruption:
         for number in [getattr(signal, name) for name in _WORDS if hasattr(signal, name)]:
             if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                 self._before[number] = signal.signal(number, self._heard)
+        # The last thing before the interpreter is taken apart: then all is done, and nobody is there to obey.
+        atexit.register(self._ignore)
         if hasattr(os, "register_at_fork"):
             os.register_at_fork(after_in_child=self.stop)
 
@@ -93,6 +96,7 @@ class Interruption:
         signal.set_wakeup_fd(-1)
         for number, handler in self._before.items():
             signal.signal(number, handler)
+        atexit.unregister(self._ignore)
         # Its end ends the thread.
         os.close(self._pipe[1])
         self._pipe = None
@@ -108,6 +112,11 @@ class Interruption:
         if again or not self.listening or _is_importing(frame):
             self._end(number)
         raise KeyboardInterrupt
+
+    def _ignore(self) -> None:
+        if self._pipe is not None:
+            for number in self._before:
+                signal.signal(number, signal.SIG_IGN)
 
     def _watch(self, reading: int) -> None:
         """In a thread of its own: what holds up the main thread does not hold up this one."""

@@ -20,7 +20,7 @@ MODULES = {
 
 # What each room (a module or folder right below mcdenoise/) may import besides itself. A room that is not in the table
 # fails: place it deliberately.
-SIGNAL = {"errors", "frame", "ops"}
+SIGNAL = {"errors", "frame", "ops", "reading"}
 LIBRARY = SIGNAL | {
     "metrics",
     "nn",
@@ -34,6 +34,7 @@ TOOLS = REPORTS | {"budget", "demo", "export", "preview", "suite", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),
+    "reading": set(),
     # What a signal ends, and what is to be tidied up then.
     "interruption": set(),
     "threads": set(),
