@@ -32,8 +32,9 @@ def read_bytes(path: Path, largest: int = LARGEST_TEXT) -> bytes:
     # What has become a pipe meanwhile does not wait either.
     with open(os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)), "rb") as file:
         # Some files of the system say that they are empty, and are not.
-        content = file.read(largest + 1)
-    if len(content) > largest:
+        content = b"" if os.fstat(file.fileno()).st_size > largest else file.read(largest + 1)
+        larger = os.fstat(file.fileno()).st_size > largest or len(content) > largest
+    if larger:
         raise OSError(errno.EFBIG, f"it is larger than {largest} bytes", str(path))
     return content
 

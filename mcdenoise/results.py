@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import reprlib
-import sys
 import types
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -25,6 +24,8 @@ VERSION = 2
 STAGES = ("read", "accumulate", "network", "filter", "write")
 # Ends the name of a method that skips nothing, beside the same method that does.
 KEEP_ALL = ", keep all"
+# Beyond any figure that is measured; what is squared is finite still, and what is drawn.
+_LARGEST = 1e100
 Kind = Literal["trainable", "fixed", "baseline"]
 
 
@@ -439,7 +440,7 @@ def _made(kind: Any, value: Any, where: str) -> Any:
     if holder is Literal and isinstance(value, str) and value in inner:
         return value
     # Whole numbers may be written where others are meant, but for true and false, which Python counts among them.
-    if kind is float and type(value) in (int, float) and abs(value) <= sys.float_info.max:
+    if kind is float and type(value) in (int, float) and abs(value) <= _LARGEST:
         return float(value)
     # Beyond that they cannot be counted with.
     if kind is int and type(value) is int and abs(value) < 2**53:
