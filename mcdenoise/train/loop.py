@@ -21,6 +21,7 @@ from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
 from mcdenoise.models import CoarseToFine, Model, Output, State, create_model, describe_weights, parts_of, save_weights
+from mcdenoise.models._defaults import plain_defaults
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.data import DataFolders, TrainingData
@@ -58,6 +59,7 @@ class Progress:
     validation: dict[str, float]
 
 
+@plain_defaults()
 def train(
     config: TrainConfig,
     sequences: list[Path],
