@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -12,8 +11,6 @@ if TYPE_CHECKING:
     from mcdenoise.errors import InputError
     from mcdenoise.frame import Frame
     from mcdenoise.models import create_model, list_models
-
-__version__ = version("mcdenoise")
 
 __all__ = ["Denoiser", "Frame", "InputError", "create_model", "denoise", "list_models", "ops"]
 
@@ -32,6 +29,9 @@ def __getattr__(name: str) -> Any:
     # later, and what needs no torch starts at once.
     if name == "ops":
         return importlib.import_module("mcdenoise.ops")
+    if name == "__version__":
+        # Looking it up takes longer than all else here.
+        return importlib.import_module("importlib.metadata").version("mcdenoise")
     if name not in _PAGES:
         raise AttributeError(f"module 'mcdenoise' has no attribute '{name}'")
     return getattr(importlib.import_module(f"mcdenoise.{_PAGES[name]}"), name)

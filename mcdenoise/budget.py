@@ -18,6 +18,7 @@ from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import PRECISIONS, Precision, pretrained_models
+from mcdenoise.reading import read_text
 from mcdenoise.results import Results
 from mcdenoise.user_cache import cache_file, keep
 
@@ -129,9 +130,9 @@ def _timed(size: tuple[int, int], device: str, cache: Path, on_step: Callable[[i
 
 def _read(cache: Path) -> dict[str, dict[str, float]]:
     try:
-        known = json.loads(cache.read_text())
+        known = json.loads(read_text(cache))
         return {key: {name: float(value) for name, value in own.items()} for key, own in known.items()}
-    except (OSError, ValueError, TypeError, AttributeError):
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
         return {}
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from contextlib import nullcontext
+import reprlib
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -100,6 +102,11 @@ class Denoiser:
         alpha: bool = False,
         **settings: Any,
     ) -> None:
+        _check_kind("weights", weights, (str, Path, NoneType), "a path")
+        _check_kind("tile", tile, (int, NoneType), "a whole number of pixels")
+        _check_kind("max_memory", max_memory, (int, float, NoneType), "a number of GB")
+        for name, switch in (("keep_all", keep_all), ("differentiable", differentiable), ("alpha", alpha)):
+            _check_kind(name, switch, (bool,), "True or False")
         self.device = _device(device)
         known = get_args(AskedPrecision)
         if precision not in known:
@@ -151,6 +158,8 @@ class Denoiser:
         Raises:
             InputError: frames of this size cannot be denoised within ``max_memory``; the message says with what.
         """
+        _check_kind("frames", frames, (int, NoneType), "a whole number")
+        _check_kind("layers", layers, (int,), "a whole number")
         self._state: State = None
         self._shape: tuple[int, ...] = ()
         self._layers: tuple[str, ...] = ()
@@ -189,6 +198,7 @@ class Denoiser:
                 out of range; the result is no finite image; or there is too little memory, see :meth:`reset`. After
                 this error, as after any other, the history is that of the frame before.
         """
+        _check_kind("frame", frame, (Frame,), "a Frame, such as Frame(color=...)")
         return self._step(frame.replace(layers={}) if frame.layers else frame, stages=False).image
 
     def output(self, frame: Frame, *, stages: bool = True) -> Output:
@@ -211,6 +221,7 @@ class Denoiser:
         return self._step(frame, stages=stages)
 
     def _step(self, frame: Frame, *, stages: bool) -> Output:
+        _check_kind("frame", frame, (Frame,), "a Frame, such as Frame(color=...)")
         self.report = report = FrameReport(precision=self._why_precision)
         bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
         with listening(report), nullcontext() if self.differentiable else torch.no_grad():
@@ -230,7 +241,7 @@ class Denoiser:
                 report.tiles = self._tiles.divide(self._shot(frame))
             noisy = frame.color
             start = clock(self.device)
-            with bfloat16:
+            with bfloat16, self._explained(dtype):
                 output, state = checked_step(self.model, frame, self._state, self._shape)
             # Of a model that times nothing itself.
             if set(report.milliseconds) == {"validate"}:
@@ -258,6 +269,20 @@ class Denoiser:
     def _carried(self, frame: Frame) -> tuple[str, ...]:
         """Names of what has a history beside the color."""
         return (*frame.layers, *(() if alpha_of(frame) is None else ("alpha",)))
+
+    @contextmanager
+    def _explained(self, dtype: torch.dtype) -> Iterator[None]:
+        """Say why a model fails whose weights are of more digits than its frame."""
+        try:
+            yield
+        except RuntimeError as error:
+            weights = list(self.model.parameters()) if isinstance(self.model, nn.Module) else []
+            if dtype == torch.float64 or all(each.dtype != torch.float64 for each in weights):
+                raise
+            raise InputError(
+                f"model: expected float32 weights for frames of float32, found float64, with which it fails "
+                f"({' '.join(str(error).split())}); call its float(), or have derivatives of float64 frames"
+            ) from error
 
     def _dtype(self, frame: Frame) -> torch.dtype:
         exact = self.differentiable and frame.color.dtype == torch.float64
@@ -331,11 +356,17 @@ def denoise(
     return np.ascontiguousarray(image if layout == "CHW" else image.transpose(1, 2, 0))
 
 
+def _check_kind(name: str, value: object, kinds: tuple[type, ...], expected: str) -> None:
+    # True and False are whole numbers to Python, and no such number of anything to people.
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        raise InputError(f"{name}: expected {expected}, found {type(value).__name__} {reprlib.repr(value)}")
+
+
 def _device(device: torch.device | str) -> torch.device:
     try:
         device = torch.device(device)
         torch.zeros((), device=device).item()
-    except (RuntimeError, AssertionError, ImportError) as error:
+    except (RuntimeError, AssertionError, ImportError, TypeError) as error:
         raise InputError(
             f"device '{device}': expected one that torch can use, found: {str(error).splitlines()[0]}"
         ) from error

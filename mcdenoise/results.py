@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import json
-from dataclasses import asdict, dataclass, field, replace
+import reprlib
+import types
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.models import Precision
+from mcdenoise.reading import read_text
 
 FILE = "results.json"
 OPS_FILE = "ops.json"
@@ -20,6 +24,8 @@ VERSION = 2
 STAGES = ("read", "accumulate", "network", "filter", "write")
 # Ends the name of a method that skips nothing, beside the same method that does.
 KEEP_ALL = ", keep all"
+# Beyond any figure that is measured; what is squared is finite still, and what is drawn.
+_LARGEST = 1e100
 Kind = Literal["trainable", "fixed", "baseline"]
 
 
@@ -305,17 +311,24 @@ class Results:
             InputError: the file is missing, damaged, or of another version.
         """
         path = folder / FILE
+        expected = f"{path}: expected the results of `mcdenoise benchmark`, found"
         try:
-            data = json.loads(path.read_text())
-            if data.get("version") != VERSION:
-                raise InputError(f"{path}: expected version {VERSION} of the format, found {data.get('version')}")
-            return _results(data)
+            data = json.loads(read_text(path), parse_constant=_refuse)
+            if isinstance(data, dict) and data.get("version") != VERSION:
+                raise InputError(f"{path}: expected version {VERSION} of the format, found {data.get('version')!r}")
+            results: Results = _made(cls, data, "it")
+            _check(results)
         except FileNotFoundError as error:
-            raise InputError(f"{path}: expected the results of `mcdenoise benchmark`, found no such file") from error
-        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"{path}: expected the results of `mcdenoise benchmark`, found damage: {error}") from error
+            raise InputError(f"{expected} no such file") from error
+        except OSError as error:
+            raise InputError(f"{expected} none that can be read ({error.strerror})") from error
+        except InputError:
+            raise
+        except RecursionError as error:
+            raise InputError(f"{expected} damage: objects within objects without end") from error
+        except ValueError as error:
+            raise InputError(f"{expected} damage: {error}") from error
+        return results
 
 
 @dataclass(frozen=True)
@@ -405,31 +418,98 @@ def _write(path: Path, results: Results | OpResults) -> None:
     write_text(path, json.dumps(asdict(results), indent=1, allow_nan=False) + "\n")
 
 
-def _results(data: dict[str, Any]) -> Results:
-    def spread(value: dict[str, Any] | None) -> Spread | None:
-        return None if value is None else Spread(**value)
+def _refuse(name: str) -> float:
+    raise ValueError(f"{name}, which is no number")
 
-    def spreads(values: dict[str, Any]) -> dict[str, Spread]:
-        return {name: Spread(**value) for name, value in values.items()}
 
-    cells = [
-        Cell(
-            **one
-            | {
-                "errors_spread": spreads(one["errors_spread"]),
-                "whole": spread(one["whole"]),
-                "computing": spread(one.get("computing")),
-                "stages": spreads(one["stages"]),
-            }
-        )
-        for one in data["cells"]
-    ]
-    parsed = {
-        "machine": Machine(**data["machine"]),
-        "scenes": [Scene(**one) for one in data["scenes"]],
-        "methods": [Method(**one) for one in data["methods"]],
-        "cells": cells,
-        "costs": [Cost(**one | {"milliseconds": spread(one["milliseconds"])}) for one in data["costs"]],
-        "fits": [Fit(**one) for one in data["fits"]],
-    }
-    return Results(**data | parsed)
+def _made(kind: Any, value: Any, where: str) -> Any:
+    """A value as the type that a field is annotated with, to any depth.
+
+    Raises:
+        ValueError: it is of another.
+    """
+    if isinstance(kind, types.UnionType):
+        return None if value is None else _made(get_args(kind)[0], value, where)
+    if is_dataclass(kind):
+        return _made_of_fields(kind, value, where)
+    holder, inner = get_origin(kind), get_args(kind)
+    if holder is list and isinstance(value, list):
+        return [_made(inner[0], one, f"{where}[{index}]") for index, one in enumerate(value)]
+    if holder is dict and isinstance(value, dict):
+        return {key: _made(inner[1], one, f"{where}.{key}") for key, one in value.items()}
+    if holder is Literal and isinstance(value, str) and value in inner:
+        return value
+    # Whole numbers may be written where others are meant, but for true and false, which Python counts among them.
+    if kind is float and type(value) in (int, float) and abs(value) <= _LARGEST:
+        return float(value)
+    # Beyond that they cannot be counted with.
+    if kind is int and type(value) is int and abs(value) < 2**53:
+        return value
+    if kind is Any or (kind in (str, bool) and type(value) is kind):
+        return value
+    known = f"one of {', '.join(inner)}" if holder is Literal else getattr(kind, "__name__", str(kind))
+    raise ValueError(f"{where} is {reprlib.repr(value)} in place of {known}")
+
+
+# It takes longer than all else, and there are hundreds of cells.
+_hints = functools.cache(get_type_hints)
+
+
+def _made_of_fields(kind: Any, value: Any, where: str) -> Any:
+    if not isinstance(value, dict):
+        raise ValueError(f"{where} is {reprlib.repr(value)} in place of an object")
+    hints = _hints(kind)
+    if unknown := sorted(value.keys() - hints.keys()):
+        raise ValueError(f"{where} has {reprlib.repr(unknown[0])}, which is unknown")
+    needed = {one.name for one in fields(kind) if one.default is MISSING and one.default_factory is MISSING}
+    if lacking := sorted(needed - value.keys()):
+        raise ValueError(f"{where} has no '{lacking[0]}'")
+    return kind(**{key: _made(hints[key], one, f"{where}.{key}") for key, one in value.items()})
+
+
+def _check(results: Results) -> None:
+    """See that what the parts say of one another is true, and that figures are such as are measured.
+
+    Raises:
+        ValueError: something is not.
+    """
+
+    def check(holds: bool, what: str) -> None:
+        if not holds:
+            raise ValueError(what)
+
+    scenes, methods = [one.name for one in results.scenes], [one.name for one in results.methods]
+    for kind, names in (("scenes", scenes), ("methods", methods)):
+        check(bool(names), f"there are no {kind}")
+        check(len(set(names)) == len(names), f"two {kind} have one name")
+    for part in (*(scene.name for scene in results.scenes), *(method.folder for method in results.methods)):
+        # Pictures are looked for in folders of these names.
+        plain = part not in ("", ".", "..") and not {"/", "\\", "\0"} & set(part) and part.isprintable()
+        check(plain and len(part.encode(errors="replace")) <= 255, f"{reprlib.repr(part)} is no name of a folder")
+    for scene in results.scenes:
+        check(min(scene.width, scene.height) > 0, f"{scene.name} has {scene.width} x {scene.height} pixels")
+        for numbers in (scene.frames, scene.scored, scene.pictures):
+            check(min(numbers, default=0) >= 0, f"{scene.name} has frame {min(numbers, default=0)}")
+    for cell in results.cells:
+        where = f"{reprlib.repr(cell.method)} on {reprlib.repr(cell.scene)}"
+        check(cell.scene in scenes and cell.method in methods, f"{where} is of no scene or method")
+        check(cell.memory is None or cell.memory >= 0, f"{where} takes {cell.memory} mebibytes")
+        for spread in (cell.whole, cell.computing):
+            _check_time(spread, where)
+        for spread in cell.stages.values():
+            _check_time(spread, where)
+        for row in cell.plan:
+            stage, skipped = row.get("stage"), row.get("skipped")
+            true = isinstance(stage, str) and isinstance(skipped, int | float) and 0 <= skipped <= 1
+            check(true, f"{where} has the plan {reprlib.repr(row)}")
+    for cost in results.costs:
+        check(cost.method in methods, f"a cost is of {reprlib.repr(cost.method)}, which is no method")
+        check(min(cost.width, cost.height) > 0, f"a cost is of {cost.width} x {cost.height} pixels")
+        _check_time(cost.milliseconds, reprlib.repr(cost.method))
+    for fit in results.fits:
+        check(fit.method in methods, f"a fit is of {reprlib.repr(fit.method)}, which is no method")
+
+
+def _check_time(spread: Spread | None, where: str) -> None:
+    if spread is not None and not (0 <= spread.lower <= spread.median <= spread.upper and spread.count > 0):
+        raise ValueError(f"{where} takes {spread}")

@@ -20,7 +20,7 @@ MODULES = {
 
 # What each room (a module or folder right below mcdenoise/) may import besides itself. A room that is not in the table
 # fails: place it deliberately.
-SIGNAL = {"errors", "frame", "ops"}
+SIGNAL = {"errors", "frame", "ops", "reading"}
 LIBRARY = SIGNAL | {
     "metrics",
     "nn",
@@ -34,6 +34,9 @@ TOOLS = REPORTS | {"budget", "demo", "export", "preview", "suite", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),
+    "reading": set(),
+    # What a signal ends, and what is to be tidied up then.
+    "interruption": set(),
     "threads": set(),
     # What is kept is written as all files are; nothing of them is read.
     "user_cache": {"data", "errors"},
@@ -45,8 +48,8 @@ ALLOWED: dict[str, set[str]] = {
     "nn": SIGNAL,
     "models": SIGNAL | {"nn", "own", "user_cache"},
     # Leaves: what is read and rendered knows the frame, and no method.
-    "data": SIGNAL,
-    "scenes": SIGNAL | {"data"},
+    "data": SIGNAL | {"interruption"},
+    "scenes": SIGNAL | {"data", "interruption"},
     "denoiser": SIGNAL | {"models"},
     "methods": SIGNAL | {"models", "denoiser"},
     # For scripts of a renderer: nothing of the package imports them.
@@ -56,9 +59,9 @@ ALLOWED: dict[str, set[str]] = {
     "evaluate": LIBRARY | {"folder"},
     "results": SIGNAL | {"data", "models"},
     "report": LIBRARY | {"evaluate", "results"},
-    "benchmark": LIBRARY | {"check", "commit", "evaluate", "methods", "results"},
+    "benchmark": LIBRARY | {"check", "commit", "evaluate", "interruption", "methods", "results"},
     **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"commit", "results", "user_cache"}),
-    "cli": LIBRARY | TOOLS | {"heap", "results", "threads"},
+    "cli": LIBRARY | TOOLS | {"heap", "interruption", "results", "threads"},
     "__main__": {"cli"},
     # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.
     "": LIBRARY,
@@ -240,6 +243,12 @@ def test_the_command_line_loads_the_chosen_command_alone() -> None:
         f"print(*sorted({LAZY - {'tyro'}!r} & set(sys.modules)))"
     )
     assert python(code).split("\n") == ["models", "", ""]
+
+
+def test_until_the_command_line_obeys_signals_it_loads_next_to_nothing() -> None:
+    code = "import sys\nbefore = set(sys.modules)\nimport mcdenoise.cli\nprint(*sorted(set(sys.modules) - before))"
+    heavy = {"importlib.metadata", "email", "json", "numpy", "subprocess", "torch", "tyro"}
+    assert not heavy & set(python(code).split())
 
 
 def test_importing_is_quick() -> None:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from mcdenoise.cli import main
 from mcdenoise.errors import InputError
+from mcdenoise.report.views import views
 from mcdenoise.results import Cell, Cost, Fit, Machine, Method, Results, Scene, Spread
 
 SPREAD = Spread(2.0, 1.0, 4.0, 3)
@@ -98,3 +103,121 @@ def test_speed_is_pixels_over_the_time_in_memory(results: Results) -> None:
     assert results.megapixels_per_second(noisy) is None
     assert results.failed
     assert not replace(results, cells=[ours]).failed
+
+
+# Damage of every kind, in every place
+
+HOSTILE: list[Any] = [None, True, -1, 0, 1.5, 1e300, 10**400, "", "x" * 500, "../..", "\x1b[2J"]
+HOSTILE += [[], {}, [[]], {"a": 1}, [None], [-1], ["x"]]
+
+
+def places(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where something is in what JSON holds, itself excepted."""
+    items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    for key, value in items:
+        yield (*path, key)
+        yield from places(value, (*path, key))
+
+
+def changed(content: Any, path: tuple[Any, ...], change: Callable[[Any, Any], None]) -> Any:
+    copied = json.loads(json.dumps(content))
+    holder = copied
+    for key in path[:-1]:
+        holder = holder[key]
+    change(holder, path[-1])
+    return copied
+
+
+def damaged(content: Any) -> Iterator[Any]:
+    """With one thing replaced, gone, or more."""
+    for path in places(content):
+        for value in HOSTILE:
+            yield changed(content, path, lambda holder, key, value=value: holder.__setitem__(key, value))
+        yield changed(content, path, lambda holder, key: holder.pop(key))
+        if isinstance(path[-1], str):
+            yield changed(content, path, lambda holder, key: holder.__setitem__(f"{key}_", 1))
+        else:
+            yield changed(content, path, lambda holder, key: holder.append(holder[key]))
+
+
+def read_or_refused(folder: Path) -> Results | None:
+    """Results that are as they are meant to be; those that are not are refused in one line."""
+    message, read = "", None
+    try:
+        read = Results.read(folder)
+    except InputError as error:
+        message = str(error)
+    if read is None:
+        assert message.startswith(f"{folder / 'results.json'}: expected")
+        assert "\n" not in message
+        assert len(message) < 1000
+    else:
+        json.dumps(asdict(read), allow_nan=False)
+    return read
+
+
+def test_whatever_is_changed_it_is_refused_in_one_line_or_still_makes_sense(results: Results, tmp_path: Path) -> None:
+    cells = [
+        results.cells[0],
+        replace(results.cells[1], plan=[{"stage": "history", "skipped": 0.5, "reason": "still"}]),
+    ]
+    replace(results, cells=cells).write(tmp_path)
+    path, counts = tmp_path / "results.json", [0, 0]
+    for content in damaged(json.loads(path.read_text())):
+        path.write_text(json.dumps(content))
+        read = read_or_refused(tmp_path)
+        counts[read is not None] += 1
+        if read is not None:
+            shown = views(read)
+            assert len(shown[-1].rows) == len(read.methods)
+            read.skipped()
+            [read.megapixels_per_second(cell) for cell in read.cells]
+    assert counts[0] > 1000
+    assert counts[1] > 100
+
+
+def test_no_text_is_too_much(results: Results, tmp_path: Path) -> None:
+    results.write(tmp_path)
+    path = tmp_path / "results.json"
+    text = path.read_text()
+    numbers = ("NaN", "Infinity", "-Infinity", "1e999", "-1e999", "9" * 5000, "1" * 400)
+    others = (
+        *(text.replace("0.1", number) for number in numbers),
+        "[" * 100_000,
+        '{"a":' * 100_000,
+        "null",
+        "[]",
+        "0",
+        "",
+    )
+    deep = text.replace('"settings": {', '"settings": {"a": ' + "[" * 50_000 + "]" * 50_000 + ", ")
+    for content in (*others, deep, text + text, text[1:], text.replace("plane", "\udcff")):
+        path.write_bytes(content.encode(errors="surrogateescape"))
+        assert read_or_refused(tmp_path) is None, content[:100]
+    for scenes in ([], None, 1, "x"):
+        path.write_text(json.dumps(json.loads(text) | {"scenes": scenes}))
+        assert read_or_refused(tmp_path) is None
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("command", [["report"], ["models", "--results"]], ids=lambda words: words[0])
+@pytest.mark.parametrize("what", ["pipe", "device", "folder", "link to nothing", "large"])
+def test_what_is_no_file_is_refused_at_once(
+    what: str, command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "results.json"
+    if what == "pipe":
+        os.mkfifo(path)
+    elif what == "folder":
+        path.mkdir()
+    elif what == "large":
+        path.touch()
+        os.truncate(path, 1 << 40)
+    else:
+        path.symlink_to("/dev/zero" if what == "device" else "nothing")
+    with pytest.raises(SystemExit) as stop:
+        main([*command, str(tmp_path)])
+    assert stop.value.code == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"mcdenoise {command[0]}: {path}: expected the results of `mcdenoise benchmark`, found")
+    assert printed.count("\n") == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -127,6 +128,37 @@ def test_an_image_is_an_ordinary_tensor(without: tuple[str, ...]) -> None:
             assert not image.requires_grad
             image.clamp_(0, 1)
             image *= 2
+            scale = torch.ones((), requires_grad=True)
+            (image * scale).mean().backward()
+            torch.testing.assert_close(scale.grad, image.mean())
+
+
+@torch.inference_mode()
+def sealed(color: Tensor, albedo: Tensor) -> Tensor:
+    """What people write who denoise only: a model of theirs that knows no derivatives."""
+    return color * 0.5 + albedo
+
+
+def one_color(color: Tensor, albedo: Tensor) -> Tensor:
+    """All pixels are one."""
+    return (color * albedo).mean((2, 3), keepdim=True).expand_as(color)
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["frames of inference mode", "ordinary frames"])
+@pytest.mark.parametrize("model", [MODEL, "noisy", "accumulated", sealed, one_color])
+def test_an_image_is_an_ordinary_tensor_whatever_the_model_and_the_frame_are(model: Any, given: bool) -> None:
+    denoiser, again = Denoiser(model), Denoiser(model)
+    for number in range(2):
+        with torch.inference_mode(given):
+            frame = scene(number)
+        output, expected = denoiser.output(frame), again(frame)
+        assert torch.equal(output.image, expected)
+        for image in (*output.stages.values(), output.image):
+            before = image.clone()
+            image.clamp_(0, 1)
+            image *= 2
+            image[:, :, 0, 0] = 3
+            assert torch.equal(image[..., 1:, 1:], before.clamp(0, 1)[..., 1:, 1:] * 2)
             scale = torch.ones((), requires_grad=True)
             (image * scale).mean().backward()
             torch.testing.assert_close(scale.grad, image.mean())

@@ -18,6 +18,7 @@ import torch
 
 from mcdenoise.commit import source_commit
 from mcdenoise.errors import InputError
+from mcdenoise.interruption import deaf_children
 from mcdenoise.results import Machine
 
 _PACKAGES = ("torch", "kornia", "numpy", "openimageio", "pyoidn", "flip-evaluator")
@@ -80,7 +81,8 @@ def busy_cores(count: int) -> Iterator[None]:
     started: list[subprocess.Popen[bytes]] = []
     try:
         for _ in range(count):
-            started.append(subprocess.Popen([sys.executable, "-I", "-S", "-c", code]))
+            with deaf_children():
+                started.append(subprocess.Popen([sys.executable, "-I", "-S", "-c", code]))
         yield
     finally:
         for process in started:

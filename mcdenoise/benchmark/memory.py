@@ -17,6 +17,7 @@ import torch
 from mcdenoise.benchmark.machine import fix_threads
 from mcdenoise.benchmark.methods import make_method
 from mcdenoise.frame import Frame
+from mcdenoise.interruption import deaf_children
 from mcdenoise.results import Method
 
 Frames = Callable[[], list[Frame]]
@@ -80,7 +81,8 @@ def peak_memory(make: Make, frames: Frames, *, threads: int, device: str, second
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_send_peak, args=(sender, make, frames, threads), daemon=True)
     try:
-        process.start()
+        with deaf_children():
+            process.start()
     except Exception:  # whatever an object refuses with that only this process can have
         return None
     sender.close()
@@ -94,7 +96,7 @@ def peak_memory(make: Make, frames: Frames, *, threads: int, device: str, second
 
 
 def _send_peak(sender: Connection, make: Make, frames: Frames, threads: int) -> None:
-    # Ctrl+C reaches every process of a terminal; the first one ends this one.
+    # Where it could not be made deaf from its first moment on.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(Exception):  # whatever the method fails with: where it matters, it is found out by denoising

@@ -11,10 +11,9 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-import tyro
-
 from mcdenoise.cli._stdout import forgiving_stdout
 from mcdenoise.errors import InputError
+from mcdenoise.interruption import Interruption
 from mcdenoise.threads import wait_passively
 
 Command = Callable[..., int | None]
@@ -48,19 +47,47 @@ commands:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command; exit status 0, 1 where a check failed, 2 for bad usage or bad input."""
+    """Run a command, and exit.
+
+    The status is 0; 1 where a check failed; 2 for bad usage or bad input; and, after a signal that ends it, 128 and the
+    number of the signal: 130 after Ctrl+C.
+
+    Args:
+        arguments: of a command that this process runs among others; those of the process by default. Then signals are
+            obeyed until its very end.
+    """
+    of_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
     name = arguments[0] if arguments and arguments[0] in COMMANDS else ""
+    interruption = Interruption(name)
+    interruption.start()
+    try:
+        interruption.listening = True
+        status = _status(name, arguments)
+    except BaseException:
+        # Whatever has become of what a signal has raised.
+        if not interruption.number:
+            raise
+        status = 0
+    finally:
+        interruption.listening = False
+        if not of_process and not interruption.number:
+            interruption.stop()
+    sys.exit(interruption.status(status))
+
+
+def _status(name: str, arguments: list[str]) -> int:
+    """Run a command, and say in one line why it could not be; the exit status."""
     try:
         with forgiving_stdout():
-            status = _run(name, arguments)
+            return _run(name, arguments)
     except InputError as error:
         print(f"mcdenoise{f' {name}' if name else ''}: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+        return 2
     except KeyboardInterrupt:
+        # Of somebody who raises it without a signal.
         print(f"mcdenoise {name}: interrupted; finished files are kept", file=sys.stderr)
-        sys.exit(130)
-    sys.exit(status)
+        return 130
 
 
 def _run(name: str, arguments: list[str]) -> int:
@@ -103,6 +130,9 @@ def parse(name: str, arguments: list[str]) -> Callable[[], int | None]:
     Raises:
         InputError: the command does not take them.
     """
+    # Here, and not before signals are obeyed, because it takes its time to load.
+    import tyro
+
     command, prog = load_command(name), f"mcdenoise {name}"
 
     @functools.wraps(command)

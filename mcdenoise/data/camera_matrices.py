@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
+from mcdenoise.reading import read_text
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -21,7 +23,8 @@ MATRICES = "camera_matrices.h"
 _LARGEST_FILE = 50 * 2**20
 # A comment that is never closed swallows the rest, so that whatever it hides counts as missing.
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?(?:\*/|\Z)", re.DOTALL)
-_NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+# Nothing is tried twice: the time is that of the length, whatever the text.
+_NUMBER = re.compile(r"[-+]?(?:[0-9]++(?:\.[0-9]*+)?+|\.[0-9]++)(?:[eE][-+]?[0-9]++)?+")
 _LITERAL = re.compile(rf"\s*(?:([{{}},])|({_NUMBER.pattern})[fF]?(?![\w.]))")
 
 
@@ -83,12 +86,12 @@ def read_camera_matrices(path: Path) -> CameraMatrices:
     if os.path.exists(path) and not os.path.isfile(path):
         raise InputError(f"{path}: expected a text file, found a folder, a device or a pipe; remove it")
     try:
-        if os.path.getsize(path) > _LARGEST_FILE:
+        text = read_text(path, _LARGEST_FILE, errors="replace")
+    except OSError as error:
+        if error.errno == errno.EFBIG:
             raise InputError(
                 f"{path}: expected at most {_LARGEST_FILE} bytes, found more; is this a camera_matrices.h?"
-            )
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
+            ) from error
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
     text = _COMMENT.sub(" ", text)
     matrices = _read_variable(path, text, "camera_matrices", (-1, 4, 4))
@@ -146,12 +149,14 @@ def write_camera_matrices(path: Path, cameras: CameraMatrices, comment: str = ""
 
 def _read_variable(path: Path, text: str, name: str, shape: tuple[int, ...]) -> Array:
     expected = "numbers " + "".join(f"[{n}]" if n >= 0 else "[N]" for n in shape) if shape else "a number"
-    statement = re.search(rf"\b{name}\b[^=;]*=([^;]*);", text)
-    if statement is None:
-        found = "it incomplete" if re.search(rf"\b{name}\b", text) else "no such variable"
-        raise _malformed(path, name, expected, found)
+    word = re.compile(rf"\b{name}\b")
+    # What no semicolon ends is no statement. Each is looked at once, however often the name is in it.
+    statements = (statement.partition("=") for statement in text.split(";")[:-1])
+    initialiser = next((value for head, equals, value in statements if equals and word.search(head)), None)
+    if initialiser is None:
+        raise _malformed(path, name, expected, "it incomplete" if word.search(text) else "no such variable")
     try:
-        values = np.asarray(json.loads(_to_json(statement.group(1))), dtype=np.float64)
+        values = np.asarray(json.loads(_to_json(initialiser)), dtype=np.float64)
     except (ValueError, RecursionError) as error:
         raise _malformed(path, name, expected, "something else") from error
     if values.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, values.shape, strict=True)):

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcdenoise.errors import InputError
+from mcdenoise.reading import read_text
 
 Array: TypeAlias = NDArray[np.float64]
 
 # A text, which is kept as it is, or a comma that nothing follows.
-_LAST_COMMA = re.compile(r'("(?:[^"\\]|\\.)*")|,(?=\s*[}\]])')
+_LAST_COMMA = re.compile(r'("(?:[^"\\]|\\.?)*+(?:"|\Z))|,(?=\s*+[}\]])', re.DOTALL)
 _SMALLEST_VOLUME = 1e-12
 
 
@@ -251,7 +252,7 @@ def _fov_x(holder: dict[str, Any], conventions: dict[str, Any]) -> float:
 
 def _read_json(path: Path) -> Any:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except OSError as error:
         raise InputError(
             f"{path}: expected a camera path, found nothing readable ({error.strerror}); check the path"

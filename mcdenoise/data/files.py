@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mcdenoise.errors import InputError
+from mcdenoise.interruption import unfinished
 
 try:
     import fcntl
@@ -57,7 +58,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     temporary = target.with_name(f"{_PREFIX}{secrets.token_hex(8)}{_MARK}{target.suffix[:64]}")
     handle = -1
     try:
-        with _writing(path):
+        with unfinished(temporary), _writing(path):
             _sweep(target.parent)
             handle = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
             _lock(handle)
@@ -92,7 +93,7 @@ def new_folder(path: Path) -> Iterator[Path]:
     temporary = path.absolute().with_name(f"{_PREFIX}{secrets.token_hex(8)}{_MARK}")
     handle = -1
     try:
-        with _writing(path):
+        with unfinished(temporary), _writing(path):
             temporary.mkdir(parents=True)
             handle = os.open(temporary, os.O_RDONLY)
             _lock(handle)

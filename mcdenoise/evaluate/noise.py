@@ -10,6 +10,7 @@ import torch
 
 from mcdenoise.data import Sequence
 from mcdenoise.evaluate.scores import METRICS, measure
+from mcdenoise.reading import read_text
 
 _NOISE_EPSILON = 0.01
 
@@ -62,7 +63,7 @@ def _noted(sequence: Sequence) -> dict[int, float]:
     """Noise of each reference in use, where ``camera.json`` has it."""
     for path in (sequence.root / "camera.json", sequence.root / "inputs" / "camera.json"):
         if path.is_file():
-            noted = json.loads(path.read_text()).get("reference_noise")
+            noted = json.loads(read_text(path)).get("reference_noise")
             if isinstance(noted, dict):
                 estimates = {number: noted.get(str(number)) for number in sequence.reference_numbers}
                 return {number: float(noise) for number, noise in estimates.items() if noise is not None}

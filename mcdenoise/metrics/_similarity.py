@@ -88,7 +88,7 @@ def multiscale_similarity(image: Tensor, reference: Tensor, data_range: float) -
         raise UncomputableError(
             f"MS-SSIM's five scales: expected more than 160 x 160 pixels, found {image.shape[-2]} x {image.shape[-1]}"
         )
-    product = torch.ones(())
+    product = image.new_ones(())
     for scale, exponent in enumerate(_SCALES):
         whole, contrast = similarity(image, reference, gaussian(), data_range)
         last = scale == len(_SCALES) - 1

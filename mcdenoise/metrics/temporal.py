@@ -174,7 +174,7 @@ class Flicker:
     def __init__(self) -> None:
         self.frames = 0
         # Of the images and of their references.
-        self._mean = self._square = torch.zeros(())
+        self._mean = self._square = torch.zeros((), dtype=torch.float32, device="cpu")
 
     def add(self, image: Tensor, reference: Tensor) -> None:
         """Add the next frame: ``(..., 3, H, W)`` scene-linear radiance, and its reference."""

@@ -104,11 +104,19 @@ def _ready() -> dict[str, frozenset[str]]:
 
 
 def owned(tree: Any, others: Any) -> Any:
-    """A tree with copies of those tensors that share memory with others."""
+    """A tree of ordinary tensors, each with memory of its own.
+
+    Copied is what shares memory with others, what could not be written to element by element, and what was made in
+    inference mode, of which torch lets nothing be changed or differentiated outside that mode.
+    """
     taken = {leaf.untyped_storage().data_ptr() for leaf in pytree.tree_leaves(others) if isinstance(leaf, Tensor)}
 
     def own(tensor: Tensor) -> Tensor:
-        return tensor.clone() if tensor.untyped_storage().data_ptr() in taken else tensor
+        expanded = any(not step and size > 1 for step, size in zip(tensor.stride(), tensor.shape, strict=True))
+        sealed = tensor.is_inference() and not torch.is_inference_mode_enabled()
+        if not (expanded or sealed or tensor.untyped_storage().data_ptr() in taken):
+            return tensor
+        return tensor.clone(memory_format=torch.contiguous_format if expanded else torch.preserve_format)
 
     return pytree.tree_map_only(Tensor, own, tree)
 

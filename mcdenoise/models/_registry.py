@@ -15,6 +15,7 @@ from typing import Any, Literal, get_args
 
 from mcdenoise.errors import InputError
 from mcdenoise.models._adapter import as_model
+from mcdenoise.models._defaults import plain_defaults
 from mcdenoise.models._interface import Model
 from mcdenoise.own import in_one_line, load_own
 
@@ -123,11 +124,16 @@ def find_model(name: str) -> Entry:
 
 
 def build_model(name: str, **settings: Any) -> Model:
-    """A model with fresh weights.
+    """A model with fresh weights, float32 on the CPU whatever torch's defaults are.
 
     Raises:
         InputError: there is no such model, or it has no such setting.
     """
+    with plain_defaults():
+        return _build_model(name, settings)
+
+
+def _build_model(name: str, settings: dict[str, Any]) -> Model:
     entry = find_model(name)
     try:
         inspect.signature(entry.construct).bind(**{**entry.settings, **settings})

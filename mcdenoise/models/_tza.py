@@ -14,12 +14,15 @@ import torch
 from torch import Tensor
 
 from mcdenoise.errors import InputError
+from mcdenoise.reading import check_file, read_bytes
 
 Archive: TypeAlias = dict[str, Tensor]
 
 # The identifier, and the major version.
 _MAGIC = struct.pack("<HB", 0x41D7, 2)
 _TYPES: dict[object, str] = {b"f": "<f4", b"h": "<f2"}
+# Bytes.
+_LARGEST = 1 << 30
 _MOST_TENSORS, _LONGEST_NAME, _MOST_AXES = 1000, 200, 4
 
 
@@ -33,7 +36,7 @@ def read_tza(path: Path) -> Archive:
         InputError: there is no such file, or it is no archive, or a damaged one.
     """
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, _LARGEST)
     except OSError as error:
         raise InputError(f"{path}: expected an archive of weights, found: {error.strerror}") from error
     if not content.startswith(_MAGIC):
@@ -53,6 +56,7 @@ def archives_in(path: Path) -> Iterator[Archive]:
         InputError: the file cannot be read.
     """
     try:
+        check_file(path)
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             at = content.find(_MAGIC)
             while at >= 0:

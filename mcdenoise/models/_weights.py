@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.models._interface import Model
 from mcdenoise.models._registry import build_model, find_model
+from mcdenoise.reading import check_file
 
 _SHIPPED = Path(__file__).parent / "weights"
 # Of methods that are there to be compared: all trained alike, and shortly.
@@ -119,10 +120,12 @@ def describe_weights(path: Path) -> dict[str, Any]:
         InputError: no such file, or not written by :func:`save_weights`.
     """
     try:
+        check_file(path)
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
     except (OSError, SafetensorError) as error:
-        raise InputError(f"{path}: expected a safetensors file, found: {str(error).splitlines()[0]}") from error
+        found = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        raise InputError(f"{path}: expected a safetensors file, found: {found}") from error
     if "architecture" not in metadata:
         raise InputError(f"{path}: expected weights saved by mcdenoise, found no 'architecture' in the header")
     try:

@@ -109,7 +109,10 @@ class Oidn:
         if self._buffers and self._buffers["output"].shape == (height, width, 3):
             return
         _release_filters(self._filters)
-        self._buffers = {name: torch.zeros(height, width, 3) for name in ("color", "albedo", "normal", "output")}
+        self._buffers = {
+            name: torch.zeros(height, width, 3, dtype=torch.float32, device="cpu")
+            for name in ("color", "albedo", "normal", "output")
+        }
 
     def _filter(self, names: tuple[str, ...], quality: Quality, clean: bool) -> Any:
         key = names, quality, clean

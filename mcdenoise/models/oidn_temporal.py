@@ -43,7 +43,7 @@ class Mixed(nn.Module):
         noisy: Tensor = frame.extra.get(OIDN, frame.color)
         clean = frame.extra.get(OIDN_CLEAN, frame.color)
         exact = frame.extra.get(EXACT, torch.zeros_like(noisy[:, :1]))
-        part = torch.where(exact > 0, _CLEAN_PARTS[1], _CLEAN_PARTS[0])
+        part = torch.where(exact > 0, _CLEAN_PARTS[1], _CLEAN_PARTS[0]).to(exact)
         return answered(frame, (noisy + part * clean) / (1 + part), None), None
 
 

@@ -217,7 +217,8 @@ def _front(view: View, metric: str) -> list[str]:
 def _file_name(name: str, place: int) -> str:
     """A name that is safe in a path; the place keeps it unique if characters had to go."""
     safe = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in name)
-    return safe if safe == name else f"{safe}-{place}"
+    # With what stands before it and behind it a name has at most 255 bytes, four for a letter.
+    return safe if safe == name and len(name) <= 40 else f"{safe[:40]}-{place}"
 
 
 def _galleries(folder: Path, results: Results) -> list[Gallery]:

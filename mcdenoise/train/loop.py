@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
@@ -20,6 +21,7 @@ from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
 from mcdenoise.models import CoarseToFine, Model, Output, State, create_model, describe_weights, parts_of, save_weights
+from mcdenoise.models._defaults import plain_defaults
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.data import DataFolders, TrainingData
@@ -57,6 +59,7 @@ class Progress:
     validation: dict[str, float]
 
 
+@plain_defaults()
 def train(
     config: TrainConfig,
     sequences: list[Path],
@@ -332,8 +335,24 @@ def _board(out: Path, first: int, writes: bool) -> Iterator[Any]:
         return
     from torch.utils.tensorboard import SummaryWriter  # here because importing it takes a second
 
-    with SummaryWriter(str(out), purge_step=first) as board:
+    with _quiet_threads(), SummaryWriter(str(out), purge_step=first) as board:
         yield board
+
+
+@contextmanager
+def _quiet_threads() -> Iterator[None]:
+    """What the operating system refuses to TensorBoard's thread is not printed there: the next write raises it."""
+    before = threading.excepthook
+
+    def hook(failed: threading.ExceptHookArgs) -> None:
+        if not issubclass(failed.exc_type, OSError):
+            before(failed)
+
+    threading.excepthook = hook
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 @contextmanager

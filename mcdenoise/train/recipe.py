@@ -28,6 +28,7 @@ from typing import Any
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.models import create_model
+from mcdenoise.reading import read_text
 from mcdenoise.train.cache import locked
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.references import clean_references
@@ -219,7 +220,7 @@ def naming(where: str) -> Iterator[None]:
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(read_text(path))
     except OSError as error:
         raise InputError(f"{path}: expected a recipe, found no file that can be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:

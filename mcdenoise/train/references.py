@@ -11,6 +11,7 @@ from mcdenoise.data.files import write_text
 from mcdenoise.data.readers.bmfr import read_clean_features
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model
+from mcdenoise.reading import read_text
 
 
 def clean_references(source: Path, out: Path) -> Path:
@@ -52,7 +53,7 @@ def clean_references(source: Path, out: Path) -> Path:
         pixels = image[0].clamp(0, 65504).permute(1, 2, 0).numpy()
         write_exr(copied / f"reference{number}.exr", pixels, ["R", "G", "B"], half=True)
     rendered = inputs / description.name
-    about = json.loads(rendered.read_text()) if rendered.exists() else {}
+    about = json.loads(read_text(rendered)) if rendered.exists() else {}
     # What was said of the references no longer holds, and without it no renderer takes them for means of so many paths.
     about = {key: value for key, value in about.items() if key not in ("reference_spp", "reference_noise")}
     write_text(description, json.dumps({**about, "reference_filter": "Open Image Denoise, high, clean aux"}) + "\n")

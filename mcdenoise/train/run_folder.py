@@ -19,8 +19,11 @@ import torch
 
 from mcdenoise.data.files import atomic_path, write_text
 from mcdenoise.errors import InputError
+from mcdenoise.reading import read_bytes, read_text
 
 _SEAL = 32  # bytes of a SHA-256
+# Bytes of a log of millions of lines, or of a checkpoint.
+_LARGEST = 1 << 34
 
 # Steps from ``first_step`` on were computed by the source tree of ``commit``.
 Provenance = list[dict[str, Any]]
@@ -112,10 +115,10 @@ class RunFolder:
         Raises:
             InputError: the checkpoint cannot be loaded.
         """
-        if not self._checkpoint.exists():
+        if not os.path.lexists(self._checkpoint):
             return 0, []
         try:
-            content = memoryview(self._checkpoint.read_bytes())
+            content = memoryview(read_bytes(self._checkpoint, _LARGEST))
             content, seal = content[:-_SEAL], content[-_SEAL:]
             if seal != _sealed(content):
                 raise ValueError("expected the checksum of the content behind it, found another")
@@ -130,7 +133,11 @@ class RunFolder:
             ) from error
 
     def log(self, entry: dict[str, Any]) -> None:
-        """Append a line to ``log.jsonl``."""
+        """Append a line to ``log.jsonl``, which :meth:`rewind` has seen to be a file, if there was one.
+
+        Raises:
+            OSError: it cannot be written.
+        """
         with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
 
@@ -142,22 +149,28 @@ class RunFolder:
         """
         path = self.out / "log.jsonl"
         try:
-            entries = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+            entries = [json.loads(line) for line in read_text(path, _LARGEST).splitlines()]
             measured = [entry["validation"] for entry in entries if entry.get("validation")]
             return dict(measured[-1]) if measured else {}
-        except (OSError, ValueError, AttributeError, TypeError) as error:
+        except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: expected the log of this run, found none that can be read") from error
 
     def rewind(self, step: int) -> None:
-        """Drop from ``log.jsonl`` what will be computed again: steps after ``step``, and a line cut off in writing.
+        """Drop from ``log.jsonl`` what will be computed again, steps after ``step``, and lines that are damaged.
+
+        One may be cut off in writing; others hold zeros, or anything, after a power cut.
 
         Raises:
-            InputError: the log cannot be written.
+            InputError: the log cannot be read or written.
         """
         path = self.out / "log.jsonl"
-        if path.exists():
-            lines = path.read_text(encoding="utf-8").splitlines()
-            write_text(path, "".join(f"{line}\n" for line in lines if _last_step(line) <= step))
+        if not os.path.lexists(path):
+            return
+        try:
+            lines = read_bytes(path, _LARGEST).splitlines()
+        except OSError as error:
+            raise InputError(f"{path}: expected the log of this run, found: {error.strerror}; remove it") from error
+        write_text(path, "".join(f"{line.decode()}\n" for line in lines if _last_step(line) <= step))
 
     @property
     def _checkpoint(self) -> Path:
@@ -169,12 +182,12 @@ def _sealed(content: memoryview) -> bytes:
     return hashlib.sha256(content).digest()
 
 
-def _last_step(line: str) -> float:
-    """The step that a line of the log is about, the first that a start is about; infinity where it is torn."""
+def _last_step(line: bytes) -> float:
+    """The step that a line of the log is about, the first that a start is about; infinity where it is damaged."""
     try:
-        entry = json.loads(line)
+        entry = json.loads(line.decode())
         return float(entry.get("step", entry.get("first_step", math.inf)))
-    except (ValueError, AttributeError, TypeError):
+    except (ValueError, AttributeError, TypeError, RecursionError, OverflowError):
         return math.inf
 
 

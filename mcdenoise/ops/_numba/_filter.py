@@ -71,7 +71,7 @@ def filtered(
 ) -> Tensor:
     """The filtered image, contiguous and in the dtype of ``image``."""
     dtype = _compute_dtype(image, kernel)
-    out = torch.empty(image.shape, dtype=dtype)
+    out = torch.empty(image.shape, dtype=dtype, device="cpu")
     if out.numel():
         inputs = _inputs(dtype, image, kernel, guides, scales, distance_scale, log_domain, border)
         share_rows(image, lambda *rows: _forward(out.numpy(), inputs, *rows))
@@ -102,10 +102,10 @@ def derivatives(
     """
     dtype = _compute_dtype(image, kernel)
     batch, _, height, width = image.shape
-    of_scales = [torch.empty((batch, 1, height, width), dtype=dtype) for _ in scales]
-    of_distance = torch.empty((batch, 0 if distance_scale is None else 1, height, width), dtype=dtype)
+    of_scales = [torch.empty((batch, 1, height, width), dtype=dtype, device="cpu") for _ in scales]
+    of_distance = torch.empty((batch, 0 if distance_scale is None else 1, height, width), dtype=dtype, device="cpu")
     planes = [image, *(guides if of_guides else ())]
-    scattered = torch.empty((batch, sum(plane.shape[1] for plane in planes), height, width), dtype=dtype)
+    scattered = torch.empty((batch, sum(plane.shape[1] for plane in planes), height, width), dtype=dtype, device="cpu")
     slopes = torch.empty_like(kernel if of_kernel else kernel[:, :0], dtype=readable(kernel, dtype).dtype)
     if not image.numel():
         for result in (scattered, slopes, of_distance, *of_scales):
@@ -154,7 +154,7 @@ def _inputs(
     log_domain: bool,
     border: Border,
 ) -> _Inputs:
-    nothing = source(torch.empty((0, 0, 0, 0), dtype=dtype))
+    nothing = source(torch.empty((0, 0, 0, 0), dtype=dtype, device="cpu"))
     return _Inputs(
         source(readable(kernel, dtype)),
         source(image.to(dtype)),

@@ -8,7 +8,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ import torch
 from numba import types
 from numba.extending import overload
 from torch import Tensor
+
+from mcdenoise.ops._numba._cache import VerifiedCache
 
 # A thread of its own for fewer pixels costs more than it saves.
 PIXELS_A_THREAD = 4096
@@ -35,12 +37,11 @@ def compiled(function: Callable[..., Any]) -> Any:
     into it. So its name, by which numba finds what it has stored, holds what all those files are like.
     """
     function.__qualname__ = f"{function.__qualname__}_{_digest()}"
-    compiler = functools.partial(numba.njit, nogil=True, error_model="numpy", fastmath={"contract"})
-    try:
-        return compiler(cache=True)(function)
-    except RuntimeError:
-        # No such folder can be written to: compiled anew in every run.
-        return compiler()(function)
+    kernel: Any = numba.njit(nogil=True, error_model="numpy", fastmath={"contract"})(function)
+    # Where no such folder can be written to, it is compiled anew in every run.
+    with suppress(RuntimeError):
+        kernel._cache = VerifiedCache(function)  # type: ignore[no-untyped-call]
+    return kernel
 
 
 @functools.cache

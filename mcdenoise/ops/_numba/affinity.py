@@ -72,7 +72,7 @@ def _backward(gradient: Tensor, *arguments: Any) -> list[Tensor]:
     # Of the sum of weights times values, and of that of the weights but for its sign.
     pull = (gradient.to(mean.dtype) / total).contiguous()
     shared = (pull * mean).sum(1, keepdim=True)
-    results = [torch.zeros(each.shape, dtype=mean.dtype) for each in inputs[:8]]
+    results = [torch.zeros(each.shape, dtype=mean.dtype, device="cpu") for each in inputs[:8]]
     arrays = tuple(each.numpy() for each in results)
     flush = flushing(gradient, arguments[0])
 
@@ -92,15 +92,15 @@ def _(gradient: Tensor, *arguments: Any) -> list[Tensor]:
 def _inputs(*arguments: Any) -> _Inputs:
     image, *_, kernel_size, dilation = arguments
     dtype = accumulator_dtype(image.dtype)
-    nothing = torch.empty((0, 0, 0, 0), dtype=dtype)
+    nothing = torch.empty((0, 0, 0, 0), dtype=dtype, device="cpu")
     tensors = [nothing if each is None else each.detach().to(dtype).contiguous() for each in arguments[:8]]
     return _Inputs._make([*(tensor.numpy() for tensor in tensors), kernel_size, dilation])
 
 
 def _filtered(image: Tensor, inputs: _Inputs) -> tuple[Tensor, Tensor]:
     """Means, and the sum of the weights of each pixel, in the dtype of the sums."""
-    out = torch.empty(image.shape, dtype=accumulator_dtype(image.dtype))
-    total = torch.empty((len(image), 1, *image.shape[2:]), dtype=out.dtype)
+    out = torch.empty(image.shape, dtype=accumulator_dtype(image.dtype), device="cpu")
+    total = torch.empty((len(image), 1, *image.shape[2:]), dtype=out.dtype, device="cpu")
     if out.numel():
         share_rows(image, lambda *rows: _average(out.numpy(), total.numpy(), inputs, *rows))
     return out, total

@@ -73,7 +73,7 @@ def _splat_backward(gradient: Tensor, image: Tensor, guide: Tensor, cell: int, b
     of_sums = gradient.to(sums.dtype) * inverse
     # Of the weight: the mean is a sum times its inverse.
     of_weight = -(of_sums * sums.mul_(inverse)).sum(1, keepdim=True)
-    of_image = torch.zeros(image.shape, dtype=sums.dtype)
+    of_image = torch.zeros(image.shape, dtype=sums.dtype, device="cpu")
     of_guide = _read(of_image, torch.cat([of_sums, of_weight], 1), None, guide, cell, image, of_guide=True)
     return of_image.to(image.dtype), of_guide.to(guide.dtype)
 
@@ -90,7 +90,7 @@ def _(gradient: Tensor, image: Tensor, guide: Tensor, cell: int, bins: int) -> t
 )
 def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, cell: int) -> Tensor:
     """See :func:`mcdenoise.ops.grid_slice`."""
-    image = torch.zeros((*grid.shape[:2], *guide.shape[2:]), dtype=accumulator_dtype(grid.dtype))
+    image = torch.zeros((*grid.shape[:2], *guide.shape[2:]), dtype=accumulator_dtype(grid.dtype), device="cpu")
     _read(image, grid, filled, guide, cell)
     return image.to(grid.dtype)
 
@@ -118,7 +118,7 @@ def _slice_backward(
     dtype = accumulator_dtype(grid.dtype)
     batch, channels, *_, bins = grid.shape
     # Of the sums of values and of weights at each pixel.
-    pull = torch.zeros((batch, channels + 1, *guide.shape[2:]), dtype=dtype)
+    pull = torch.zeros((batch, channels + 1, *guide.shape[2:]), dtype=dtype, device="cpu")
     of_guide = _read(pull, grid, filled, guide, cell, gradient, of_guide=True)
     of_values, of_weight = _splatted(pull, False, guide, cell, bins, means=False)
     of_filled = (of_values * grid).sum(1, keepdim=True).add_(of_weight)
@@ -131,7 +131,7 @@ def _(gradient: Tensor, grid: Tensor, filled: Tensor, guide: Tensor, cell: int) 
 
 
 def _guide(guide: Tensor, cell: int, bins: int, dtype: torch.dtype) -> _Guide:
-    like = torch.empty(0, dtype=dtype)
+    like = torch.empty(0, dtype=dtype, device="cpu")
     (rows, row_weights), (columns, column_weights) = (spatial_taps(side, cell, like) for side in guide.shape[2:])
     line = (GUIDE_STEPS - 1) / GUIDE_STEPS * bins, 0.5 / GUIDE_STEPS * bins - 0.5
     # In the dtype of the sums: numbers in double precision would make the sums so.
@@ -160,8 +160,8 @@ def _splatted(
     batch, channels, height, width = values.shape
     channels += int(counted) - 1
     cells = cells_of(height, cell), cells_of(width, cell), bins
-    sums = torch.zeros((batch, channels, *cells), dtype=dtype)
-    last = torch.zeros((batch, 1, *cells), dtype=dtype)
+    sums = torch.zeros((batch, channels, *cells), dtype=dtype, device="cpu")
+    last = torch.zeros((batch, 1, *cells), dtype=dtype, device="cpu")
     if last.numel():
         arguments = (
             sums.numpy(),
@@ -284,9 +284,9 @@ def _read(
     ``beside`` into the derivative.
     """
     dtype = out.dtype
-    slope = torch.zeros(guide.shape if of_guide else (0, 0, 0, 0), dtype=dtype)
+    slope = torch.zeros(guide.shape if of_guide else (0, 0, 0, 0), dtype=dtype, device="cpu")
     if out.numel():
-        nothing = torch.empty((0,) * 5, dtype=dtype), torch.empty((0,) * 4, dtype=dtype)
+        nothing = torch.empty((0,) * 5, dtype=dtype, device="cpu"), torch.empty((0,) * 4, dtype=dtype, device="cpu")
         arguments = (
             out.numpy(),
             slope.numpy(),

@@ -84,8 +84,8 @@ def _enter(color: Tensor, albedo: Tensor | None, limits: Tensor, kernel_size: in
     """With the limit of each image, in the dtype of the result."""
     dtype = limits.dtype
     batch, channels, height, width = color.shape
-    out = torch.empty((batch, channels + 2 * roots, height, width), dtype=dtype)
-    nothing = torch.empty((0, 0, 0, 0), dtype=dtype)
+    out = torch.empty((batch, channels + 2 * roots, height, width), dtype=dtype, device="cpu")
+    nothing = torch.empty((0, 0, 0, 0), dtype=dtype, device="cpu")
     images = (source((nothing if image is None else image).to(dtype)) for image in (color, albedo))
     settings = out.new_tensor([FLOOR, NO_ALBEDO]).numpy()
     arguments = (out.numpy(), *images, *settings, limits.detach().contiguous().numpy(), kernel_size // 2, roots)

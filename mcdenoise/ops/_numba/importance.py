@@ -35,7 +35,7 @@ from mcdenoise.ops._window import accumulator_dtype
 def importance_filter(image: Tensor, importance: Tensor, kernel_size: int) -> Tensor:
     """See :func:`mcdenoise.ops.importance_filter`."""
     dtype = torch.promote_types(accumulator_dtype(image.dtype), accumulator_dtype(importance.dtype))
-    out = torch.empty(image.shape, dtype=dtype)
+    out = torch.empty(image.shape, dtype=dtype, device="cpu")
     if out.numel():
         arguments = (out.numpy(), source(readable(image, dtype)), source(readable(importance, dtype)), kernel_size)
         share_rows(image, lambda *rows: _average(*arguments, *rows))

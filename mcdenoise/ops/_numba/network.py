@@ -57,7 +57,7 @@ def _network_input(image: Tensor, features: Tensor, logarithms: bool, dtype: tor
     if result.numel():
         sums = torch.promote_types(dtype, torch.float32)
         arguments = (source(result), source(readable(image, sums)), source(readable(features, sums)))
-        buffer = np.empty((result.shape[1], _CHUNK), torch.empty((), dtype=sums).numpy().dtype)
+        buffer = np.empty((result.shape[1], _CHUNK), torch.empty((), dtype=sums, device="cpu").numpy().dtype)
         share_rows(image, lambda *rows: _stack(*arguments, logarithms, np.empty_like(buffer), result.shape[3], *rows))
     return result
 
@@ -133,10 +133,10 @@ def _buffers_input(
     dtype: torch.dtype,
 ) -> Tensor:
     batch, _, height, width = image.shape
-    result = torch.empty((batch, 14, height, width), dtype=dtype, memory_format=torch.channels_last)
+    result = torch.empty((batch, 14, height, width), dtype=dtype, memory_format=torch.channels_last, device="cpu")
     if result.numel():
         sums = torch.promote_types(dtype, torch.float32)
-        nothing = source(torch.empty((0, 0, 0, 0), dtype=sums))
+        nothing = source(torch.empty((0, 0, 0, 0), dtype=sums, device="cpu"))
         images = tuple(source(readable(buffer, sums)) for buffer in (image, albedo, normal, depth, current))
         lengths = nothing if length is None else source(readable(length, sums))
         factor = torch.ones_like(exposure) if image_factor is None else image_factor
@@ -304,7 +304,7 @@ def _network_features(
 ) -> Tensor:
     result = _empty_features(albedo)
     if result.numel():
-        nothing = source(torch.empty((0, 0, 0, 0), dtype=result.dtype))
+        nothing = source(torch.empty((0, 0, 0, 0), dtype=result.dtype, device="cpu"))
         images = tuple(source(image.to(result.dtype)) for image in (albedo, normal, depth, current))
         lengths = nothing if length is None else source(length.to(result.dtype))
         factors = torch.cat([exposure, near, typical], 1).to(result.dtype).flatten(1).numpy()
@@ -360,7 +360,7 @@ def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
     batch, _, height, _ = depth.shape
     dtype = accumulator_dtype(depth.dtype)
     image = source(readable(depth, dtype))
-    rows = torch.zeros((2, batch, height), dtype=dtype)
+    rows = torch.zeros((2, batch, height), dtype=dtype, device="cpu")
     arguments = (rows.numpy(), image, depth.shape[3])
     share_rows(depth, lambda *share: _roots_of_rows(*arguments, *share))
     root = _mean(rows)
@@ -471,8 +471,12 @@ def gated_fusion(
     result = _empty_planes(fine)
     dtype = result.dtype
     if result.numel():
-        nothing = source(torch.empty((0, 0, 0, 0), dtype=dtype))
-        limits = torch.empty(0, dtype=dtype) if top is None else top.to(dtype).expand(len(fine), 1, 1, 1).flatten()
+        nothing = source(torch.empty((0, 0, 0, 0), dtype=dtype, device="cpu"))
+        limits = (
+            torch.empty(0, dtype=dtype, device="cpu")
+            if top is None
+            else top.to(dtype).expand(len(fine), 1, 1, 1).flatten()
+        )
         arguments = (
             result.numpy(),
             source(readable(fine, dtype)),

@@ -31,7 +31,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
     """See :func:`mcdenoise.ops.motion_from_position`."""
     dtype = torch.promote_types(position.dtype, torch.float32)
     batch, _, height, width = position.shape
-    motion = torch.empty((batch, 2, height, width), dtype=dtype)
+    motion = torch.empty((batch, 2, height, width), dtype=dtype, device="cpu")
     if motion.numel():
         arguments = (
             motion.numpy(),
@@ -147,11 +147,11 @@ def _blend(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The surfaces have the same buffers."""
     dtype = torch.promote_types(color.dtype, torch.float32)
-    accumulated = torch.empty(previous.shape, dtype=dtype)
-    length = torch.empty(previous_length.shape, dtype=dtype)
-    kept = torch.zeros(previous.shape[0], previous.shape[2], dtype=torch.int64)
+    accumulated = torch.empty(previous.shape, dtype=dtype, device="cpu")
+    length = torch.empty(previous_length.shape, dtype=dtype, device="cpu")
+    kept = torch.zeros(previous.shape[0], previous.shape[2], dtype=torch.int64, device="cpu")
     if accumulated.numel():
-        nothing = torch.empty((0, 0, 0, 0))
+        nothing = torch.empty((0, 0, 0, 0), device="cpu")
         surfaces = (
             tuple(source((nothing if buffer is None else buffer).to(dtype)) for buffer in buffers)
             for buffers in (surface, previous_surface)

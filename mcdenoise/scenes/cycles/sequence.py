@@ -30,6 +30,7 @@ from mcdenoise.data.readers.diffuse_specular import find_splits
 from mcdenoise.data.readers.layers import layers_of
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
+from mcdenoise.reading import read_text
 from mcdenoise.scenes.cycles.process import Blender
 from mcdenoise.scenes.cycles.settings import WIDTHS, CyclesSettings, draw_settings
 from mcdenoise.scenes.cycles.translate import translate
@@ -231,7 +232,7 @@ class _Folder:
 
     def _check(self, described: Path, content: Mapping[str, Any]) -> None:
         try:
-            before = json.loads(described.read_text(encoding="utf-8"))
+            before = json.loads(read_text(described))
             # What was rendered before there were several views is the first one.
             changed = [key for key in _IDENTITY if {"view": 0, **before}[key] != content[key]]
         except (OSError, ValueError, KeyError, TypeError) as error:

@@ -16,6 +16,7 @@ from mcdenoise.data.exr import read_exr, read_exr_header
 from mcdenoise.data.files import write_text
 from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer
 from mcdenoise.errors import InputError
+from mcdenoise.reading import read_text
 
 _ADVICE = "choose another output folder, or delete this one"
 _CONVENTIONS: dict[str, Any] = {
@@ -136,12 +137,12 @@ class SequenceFolder:
     def _read(self, settings: dict[str, Any]) -> dict[str, Any]:
         described = self._description
         try:
-            before: dict[str, Any] = json.loads(described.read_text(encoding="utf-8"))
+            before: dict[str, Any] = json.loads(read_text(described))
             before["reference_spp"] = {int(number): int(spp) for number, spp in before["reference_spp"].items()}
             poses = list(zip(*(before[key] for key in _POSES), strict=True))
             before["frames"] = int(before["frames"])
             moves = {identity: list(matrices) for identity, matrices in before.get("moves", {}).items()}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"{described}: cannot be read, so the run cannot be resumed; {_ADVICE}") from error
         for key in _IDENTITY:
             if before.get(key) != settings[key]:

@@ -16,11 +16,14 @@ from multiprocessing.synchronize import Event
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError
+from mcdenoise.interruption import deaf_children
 from mcdenoise.scenes.render.folder import ReferenceState
 from mcdenoise.scenes.render.frames import FrameJob, render_frame
 from mcdenoise.scenes.render.tracer import Scene, Tracer
 
 _SECONDS_BETWEEN_LOOKS = 0.2
+# Which an interrupted process has to end by itself, with what it is just writing.
+_SECONDS_TO_END = 0.4
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,7 @@ _process: _Process | None = None
 
 def _start_process(source: TracerSource, job: FrameJob, paths: Synchronized[int], stop: Event) -> None:
     global _process
-    # Ctrl+C reaches every process of a terminal; the first one tells the others what to do.
+    # Where it could not be made deaf from its first moment on.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _process = _Process(source, job, paths, stop)
@@ -128,11 +131,13 @@ def render_in_processes(
     start = (source, job, paths, stop)
     if not numbers:
         return
+    others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(min(workers, len(numbers)), context, _start_process, start) as pool:
         try:
-            waiting: dict[Future[ReferenceState | None], int] = {
-                pool.submit(_render_frame_in_process, number): number for number in numbers
-            }
+            with deaf_children():
+                waiting: dict[Future[ReferenceState | None], int] = {
+                    pool.submit(_render_frame_in_process, number): number for number in numbers
+                }
             while waiting:
                 finished, _ = wait(waiting, _SECONDS_BETWEEN_LOOKS, FIRST_COMPLETED)
                 traced = paths.value
@@ -148,6 +153,14 @@ def render_in_processes(
                 "a worker process ended without a word, perhaps for lack of memory; finished frames are kept: "
                 "run again with fewer workers"
             ) from error
+        except KeyboardInterrupt:
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            # One that loads a scene, or traces many paths at once, would be waited for.
+            for child in set(multiprocessing.active_children()) - others:
+                child.join(_SECONDS_TO_END / workers)
+                child.kill()
+            raise
         finally:
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,179 @@
+"""Whatever torch's default dtype and device are in a program, what is computed is the same, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from mcdenoise import Denoiser, Frame, InputError, list_models, ops
+from mcdenoise.check.cases import OPS
+from mcdenoise.models import describe_weights
+from mcdenoise.models._registry import find_model
+
+DEFAULTS = ["float64", "meta"]
+HEIGHT, WIDTH = 40, 48
+
+
+@contextmanager
+def default(name: str) -> Iterator[None]:
+    """A default that somebody's program has set. Of a device that holds no data every use is an error."""
+    try:
+        if name == "meta":
+            torch.set_default_device("meta")
+        else:
+            torch.set_default_dtype(getattr(torch, name))
+        yield
+    finally:
+        torch.set_default_device(None)
+        torch.set_default_dtype(torch.float32)
+
+
+def shot(count: int = 2, **size: int) -> list[Frame]:
+    def images(channels: int) -> Tensor:
+        return torch.rand(1, channels, size.get("height", HEIGHT), size.get("width", WIDTH))
+
+    return [
+        Frame(
+            color=images(3),
+            albedo=images(3),
+            normal=nn.functional.normalize(images(3) - 0.5),
+            depth=1 + images(1),
+            motion=images(2) - 0.5,
+            position=images(3),
+            view_projection=torch.eye(4)[None],
+        )
+        for _ in range(count)
+    ]
+
+
+def denoised(name: str, frames: list[Frame]) -> list[Tensor]:
+    denoiser = Denoiser(name, precision="float32")
+    return [denoiser(frame) for frame in frames]
+
+
+@pytest.mark.parametrize("model", [name for name in list_models() if find_model(name).installed])
+def test_a_model_is_made_and_denoises_alike(model: str) -> None:
+    frames = shot()
+    try:
+        expected = denoised(model, frames)
+    except InputError as error:
+        pytest.skip(str(error))
+    for name in DEFAULTS:
+        with default(name):
+            found = denoised(model, frames)
+        assert all(map(torch.equal, found, expected)), name
+        assert (found[0].dtype, found[0].device.type) == (torch.float32, "cpu")
+
+
+@pytest.mark.parametrize("name", DEFAULTS)
+def test_compiled_kernels_denoise_alike(name: str) -> None:
+    pytest.importorskip("numba")
+    frames = shot(height=90, width=120)
+    with ops.use("numba", strict=False):
+        expected = denoised("cascaded_v2_micro", frames)
+        with default(name):
+            found = denoised("cascaded_v2_micro", frames)
+    assert all(map(torch.equal, found, expected))
+
+
+def tensors(results: Any) -> list[Tensor]:
+    return [results] if isinstance(results, Tensor) else list(results)
+
+
+@pytest.mark.parametrize("op", OPS, ids=lambda op: op.name)
+def test_an_op_and_its_derivatives_are_alike(op: Any) -> None:
+    def outcomes(inputs: dict[str, Any]) -> list[Tensor]:
+        leaves = dict(inputs)
+        for key, value in inputs.items():
+            if isinstance(value, Tensor):
+                leaves[key] = value.detach().clone().requires_grad_(value.is_floating_point())
+        results = tensors(op.function(**leaves, **case.settings))
+        total = sum((each * each).sum() for each in results if each.requires_grad)
+        wanted = [value for value in leaves.values() if isinstance(value, Tensor) and value.requires_grad]
+        gradients = torch.autograd.grad(total, wanted, allow_unused=True) if isinstance(total, Tensor) else ()
+        return [each.detach() for each in (*results, *gradients) if each is not None]
+
+    for case in op.cases[:3]:
+        inputs = case.inputs(torch.float32)
+        expected = outcomes(inputs)
+        for name in DEFAULTS:
+            with default(name):
+                found = outcomes(inputs)
+            for a, b in zip(found, expected, strict=True):
+                torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", DEFAULTS)
+def test_training_is_alike(name: str, small_sequence: Path, tmp_path: Path) -> None:
+    pytest.importorskip("lightning_fabric")
+    pytest.importorskip("tensorboard")
+    from mcdenoise.train import TrainConfig, train
+
+    small: dict[str, Any] = {"width": 4, "crop": 16, "frames": 2, "batch": 2, "steps": 2}
+    config = TrainConfig(**small, validation_frames=1)
+    # Of the tensors; the header of a file has no order.
+    expected = describe_weights(train(config, [small_sequence], tmp_path / "expected"))["sha256"]
+    before = torch.get_default_dtype(), torch.get_default_device()
+    with default(name):
+        among = torch.get_default_dtype(), torch.get_default_device()
+        found = describe_weights(train(config, [small_sequence], tmp_path / "found"))["sha256"]
+        assert (torch.get_default_dtype(), torch.get_default_device()) == among
+    assert (torch.get_default_dtype(), torch.get_default_device()) == before
+    assert found == expected
+
+
+def test_weights_of_too_many_digits_are_told(small_sequence: Path) -> None:
+    with default("float64"):
+        network = nn.Conv2d(3, 3, 1)
+    model = nn.Sequential(network)
+    model.forward = lambda color: network(color)  # type: ignore[method-assign]
+    with pytest.raises(InputError, match=r"model: expected float32 weights .* found float64"):
+        Denoiser(model)(shot(1)[0])
+    assert Denoiser(model.float())(shot(1)[0]).dtype == torch.float32
+
+
+# Arguments of another kind
+
+WRONG: list[dict[str, Any]] = [
+    *({"tile": value} for value in ("64", 64.0, True, [64], -1, 65)),
+    *({"max_memory": value} for value in ("1", True, float("nan"), -1, 0, [1])),
+    *({"model": value} for value in (None, 5, "", torch.zeros(3), Denoiser, [], Frame)),
+    *({"device": value} for value in (None, [], "nowhere", "meta", 1.5)),
+    *({"precision": value} for value in (None, 16, [], "float16")),
+    *({"weights": value} for value in (5, b"x", "nothing.safetensors", ".")),
+    *({name: value} for name in ("keep_all", "differentiable", "alpha") for value in ("no", 1, None)),
+    *({name: 5} for name in ("plan", "alpha_min")),
+]
+
+
+def told(action: Callable[[], object]) -> str:
+    with pytest.raises(InputError) as error:
+        action()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=str)
+def test_an_argument_of_another_kind_is_told_by_its_name(wrong: dict[str, Any]) -> None:
+    message = told(lambda: Denoiser(**{"model": "cascaded_v2_micro", **wrong}))
+    assert next(iter(wrong)) in message or str(next(iter(wrong.values()))) in message
+
+
+@pytest.mark.parametrize("given", [torch.zeros(1, 3, 4, 4), None, 5, "x", [], {}, Frame], ids=str)
+def test_what_is_no_frame_is_told(given: Any) -> None:
+    denoiser = Denoiser("noisy")
+    for call in (denoiser, denoiser.output):
+        assert told(lambda call=call: call(given)).startswith(
+            "frame: expected a Frame, such as Frame(color=...), found "
+        )
+
+
+@pytest.mark.parametrize("wrong", [{"frames": "3"}, {"frames": True}, {"layers": "x"}, {"layers": None}], ids=str)
+def test_what_a_shot_cannot_be_is_told(wrong: dict[str, Any]) -> None:
+    assert told(lambda: Denoiser("noisy").reset(**wrong)).startswith(f"{next(iter(wrong))}: expected a whole number")

@@ -1,0 +1,282 @@
+"""Commands that are told to end, at any moment: one line, the status of the signal, nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
+# It takes no more than 2 s where the machine is free; others may use it.
+SECONDS = 10.0
+# A command that says when it obeys signals, a moment after the interpreter does.
+OBEYING = """
+from mcdenoise import cli
+from mcdenoise.interruption import Interruption
+
+start = Interruption.start
+
+def begin(self):
+    start(self)
+    print("begun", flush=True)
+
+Interruption.start = begin
+cli.main()
+"""
+# A further command, whose work is one statement.
+OWN = """
+import concurrent.futures, contextlib, hashlib, importlib, pathlib, sys, threading, time, types
+from mcdenoise import cli
+
+def wait():
+    print("begun", flush=True)
+    {moment}
+
+def endless():
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
+
+def swallowed():
+    while True:
+        with contextlib.suppress(BaseException):
+            time.sleep(60)
+
+def another():
+    try:
+        time.sleep(60)
+    except BaseException as error:
+        raise RuntimeError("no compiled object yet") from error
+
+def deep():
+    try:
+        time.sleep(60)
+    finally:
+        deep()
+
+class Destroyed:
+    def __del__(self):
+        time.sleep(0.2)
+
+def destroyed():
+    while True:
+        Destroyed()
+
+def failing_thread():
+    def fail():
+        raise ValueError("of a thread")
+    try:
+        time.sleep(60)
+    finally:
+        thread = threading.Thread(target=fail)
+        thread.start()
+        thread.join()
+
+def left():
+    try:
+        time.sleep(60)
+    finally:
+        sys.exit(0)
+
+def tidied(how):
+    try:
+        time.sleep(60)
+    finally:
+        how()
+
+def file(wait):
+    from mcdenoise.data.files import atomic_path
+    with atomic_path(pathlib.Path("made.txt")) as path:
+        path.write_text("half")
+        wait()
+
+def folder(wait):
+    from mcdenoise.data.files import new_folder
+    with new_folder(pathlib.Path("made")) as path:
+        (path / "one").write_text("half")
+        wait()
+
+cli.COMMANDS["wait"] = "Does one thing."
+page = types.ModuleType("mcdenoise.cli.wait")
+page.wait = wait
+sys.modules[page.__name__] = page
+cli.main()
+"""
+MOMENTS = {
+    "Python": "while True: pass",
+    "sleep": "time.sleep(60)",
+    "compiled code": "endless()",
+    "an import": "importlib.import_module('slow_module')",
+    "what swallows it": "swallowed()",
+    "what turns it into another": "another()",
+    "a recursion": "deep()",
+    "destructors": "destroyed()",
+    "threads": "concurrent.futures.ThreadPoolExecutor(1).submit(time.sleep, 60).result()",
+    "a thread that fails": "failing_thread()",
+    "what exits": "left()",
+    "what tidies up without end": "tidied(lambda: time.sleep(60))",
+    "what tidies up in compiled code": "tidied(endless)",
+}
+WRITING = {
+    "a file": "file(lambda: time.sleep(60))",
+    "a folder": "folder(lambda: time.sleep(60))",
+    "a file, in compiled code": "file(endless)",
+    "a folder, in compiled code": "folder(endless)",
+}
+
+
+def started(code: str, *arguments: object, folder: Path) -> subprocess.Popen[str]:
+    """A process with a group of its own, as a shell starts it."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, **pipes, text=True, start_new_session=True, cwd=folder)
+
+
+def end(process: subprocess.Popen[str], number: signal.Signals, name: str, lines: int = -1) -> None:
+    """Send a signal to a command and all its processes, as a terminal does, and see how they end.
+
+    One that has printed all its lines may have come to its end before.
+    """
+    with process:
+        os.killpg(process.pid, number)
+        start = time.monotonic()
+        try:
+            printed, errors = process.communicate(timeout=60)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+    assert time.monotonic() - start < SECONDS
+    if process.returncode == 0 and printed.count("\n") == lines:
+        assert errors == ""
+        return
+    assert errors == f"mcdenoise {name}: {WORDS[number]}; finished files are kept\n"
+    assert process.returncode == 128 + number
+
+
+def interrupt(folder: Path, moment: str, number: signal.Signals = signal.SIGINT) -> None:
+    (folder / "slow_module.py").write_text("import time\ntry:\n    time.sleep(60)\nexcept BaseException:\n    pass\n")
+    process = started(OWN.replace("{moment}", moment), "wait", folder=folder)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "begun\n"
+    # Until it does what is meant: a file is only written once its reader is loaded.
+    deadline = time.monotonic() + 60
+    while moment in WRITING.values() and not list(folder.glob(".mcdenoise-*")):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    time.sleep(0.1)
+    end(process, number, "wait")
+    assert [path.name for path in folder.iterdir()] == ["slow_module.py"]
+
+
+@pytest.mark.parametrize("moment", [*MOMENTS, *WRITING])
+def test_whatever_a_command_does_it_can_be_interrupted(moment: str, tmp_path: Path) -> None:
+    interrupt(tmp_path, (MOMENTS | WRITING)[moment])
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("moment", ["sleep", "compiled code"])
+def test_other_signals_end_it_alike(moment: str, number: signal.Signals, tmp_path: Path) -> None:
+    interrupt(tmp_path, MOMENTS[moment], number)
+
+
+def test_what_the_process_was_told_to_ignore_it_ignores(tmp_path: Path) -> None:
+    before = "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+    process = started(before + OWN.replace("{moment}", "time.sleep(1)"), "wait", folder=tmp_path)
+    assert process.stdout is not None
+    process.stdout.readline()
+    os.killpg(process.pid, signal.SIGHUP)
+    assert process.communicate(timeout=60) == ("", "")
+    assert process.returncode == 0
+
+
+def test_within_another_program_signals_are_left_as_they_were(capsys: pytest.CaptureFixture[str]) -> None:
+    from mcdenoise.cli import main
+
+    before = [signal.getsignal(number) for number in WORDS]
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert [signal.getsignal(number) for number in WORDS] == before
+    assert signal.set_wakeup_fd(-1) == -1
+
+
+def interrupted_at_random(folder: Path, name: str, arguments: list[object], count: int, seed: int) -> None:
+    """Run a command to its end, and then end it at moments from its beginning to its end."""
+    draw = random.Random(seed)
+    start = time.monotonic()
+    whole = started(OBEYING, name, *arguments, folder=folder)
+    printed, errors = whole.communicate(timeout=300)
+    assert (whole.returncode, errors) == (0, "")
+    seconds = time.monotonic() - start
+    for _ in range(count):
+        number = draw.choice(list(WORDS))
+        process = started(OBEYING, name, *arguments, folder=folder)
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(draw.uniform(0, 0.8 * seconds))
+        if process.poll() is None:
+            end(process, number, name, printed.count("\n") - 1)
+        assert not [path for path in folder.rglob("*") if path.name.startswith(".mcdenoise-")]
+
+
+def frames(folder: Path) -> list[object]:
+    """A shot of 160x90, as much as is needed for compiled kernels, and arguments that denoise it."""
+    torch = pytest.importorskip("torch")
+    from mcdenoise import Frame
+    from mcdenoise.data.readers.bmfr import write_bmfr_frame
+
+    for number in range(4):
+        images = [torch.rand(1, count, 90, 160) for count in (3, 3, 1)]
+        write_bmfr_frame(folder / "inputs", number, Frame(*images[:2], depth=1 + images[2]))
+    return [folder / "inputs", "-o", folder / "out", "--model", "cascaded_v2_micro"]
+
+
+RENDER = ["--size", "32x24", "--reference-spp", "64", "--variant", "scalar_rgb"]
+
+
+def scene(folder: Path) -> list[object]:
+    """Arguments that render a small scene by two processes."""
+    pytest.importorskip("mitsuba")
+    (folder / "scene.xml").write_text(
+        '<scene version="3.0.0"><integrator type="path"/><shape type="sphere"/><emitter type="constant"/></scene>'
+    )
+    cameras = [{"position": [0, 0.1 * k, 5], "look_at": [0, 0, 0]} for k in range(4)]
+    (folder / "path.json").write_text(json.dumps({"fov": 40, "frames": cameras}))
+    return [folder / "scene.xml", "--camera-path", folder / "path.json", "-o", folder / "out", *RENDER]
+
+
+def test_a_few_moments_of_denoise(tmp_path: Path) -> None:
+    interrupted_at_random(tmp_path, "denoise", frames(tmp_path), count=3, seed=0)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_many_moments_of_denoise(tmp_path: Path) -> None:
+    interrupted_at_random(tmp_path, "denoise", frames(tmp_path), count=20, seed=1)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_many_moments_while_kernels_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # No room for what is compiled, so that it is compiled each time.
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/none")
+    monkeypatch.setenv("NUMBA_CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator")
+    interrupted_at_random(tmp_path, "denoise", frames(tmp_path), count=20, seed=2)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("workers", [1, 2])
+def test_many_moments_of_render(workers: int, tmp_path: Path) -> None:
+    arguments = [*scene(tmp_path), "--workers", workers]
+    interrupted_at_random(tmp_path, "render", arguments, count=20, seed=3)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_many_moments_of_what_only_prints(tmp_path: Path) -> None:
+    interrupted_at_random(tmp_path, "models", [], count=20, seed=4)

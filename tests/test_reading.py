@@ -1,0 +1,195 @@
+"""Files that people name, or that lie where one looks for them: whatever they are, nothing waits for ever."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mcdenoise.data import open_sequence
+from mcdenoise.data.camera_matrices import read_camera_matrices
+from mcdenoise.data.camera_path import load_shot
+from mcdenoise.errors import InputError
+from mcdenoise.methods import parse_method
+from mcdenoise.models import create_model, describe_weights
+from mcdenoise.own import load_own
+from mcdenoise.reading import read_bytes, read_text
+from mcdenoise.results import Results
+from mcdenoise.train.recipe import Recipe
+from mcdenoise.train.run_folder import RunFolder
+
+# Whatever has a name, by that name. A new reader enters here.
+READERS: dict[str, Callable[[Path], object]] = {
+    "camera_matrices.h": read_camera_matrices,
+    "path.json": load_shot,
+    "recipe.toml": lambda path: Recipe.read(path, ()),
+    "results.json": lambda path: Results.read(path.parent),
+    "weights.safetensors": describe_weights,
+    "given.safetensors": lambda path: create_model("cascaded_v2", weights=path),
+    "model.safetensors": lambda path: parse_method(str(path)),
+    "archive.tza": lambda path: create_model("oidn_open", archive=str(path)),
+    "model.py": lambda path: load_own(f"{path}:model", "model", "factory"),
+    "log.jsonl": lambda path: RunFolder(path.parent).errors(),
+    "checkpoint.pt": lambda path: RunFolder(path.parent).load(),
+}
+NO_FILES = ["pipe", "device", "terminal", "folder", "link", "loop", "huge"]
+
+
+def put(what: str, path: Path) -> None:
+    """What is no file of sensible size, at a path."""
+    path.unlink(missing_ok=True)
+    if what == "pipe":
+        os.mkfifo(path)
+    elif what == "folder":
+        path.mkdir()
+    elif what == "huge":
+        path.touch()
+        os.truncate(path, 1 << 42)
+    else:
+        path.symlink_to({"device": "/dev/zero", "terminal": "/dev/ptmx", "link": "nothing", "loop": path.name}[what])
+
+
+def check_refused(action: Callable[[], object], path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        action()
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+    assert "[Errno" not in str(error.value)
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("what", NO_FILES)
+@pytest.mark.parametrize("name", READERS)
+def test_what_is_no_file_is_refused_in_one_line(name: str, what: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    put(what, path)
+    check_refused(functools.partial(READERS[name], path), path)
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("what", NO_FILES)
+@pytest.mark.parametrize("name", ["camera_matrices.h", "camera.json"])
+def test_what_is_no_file_in_a_sequence_is_refused_in_one_line(name: str, what: str, small_sequence: Path) -> None:
+    path = small_sequence / "inputs" / name
+    put(what, path)
+    check_refused(lambda: open_sequence(small_sequence), path)
+
+
+def test_a_file_that_says_it_is_empty_is_read_no_further_than_allowed(tmp_path: Path) -> None:
+    # Its size is 0 as the system tells it.
+    maps = Path("/proc/self/maps")
+    if not maps.exists():
+        pytest.skip("of Linux")
+    assert read_bytes(maps)
+    with pytest.raises(OSError, match="larger than 10 bytes"):
+        read_bytes(maps, 10)
+    path = tmp_path / "text"
+    path.write_bytes(b"0123456789")
+    assert read_text(path, 10) == "0123456789"
+
+
+HEADER = "camera_matrices[1][4][4] = {{{0,0,0,0},{0,0,0,0},{0,0,0,0},{0,0,0,0}}}; pixel_offsets[1][2] = {{0,0}};"
+# Repeated to any length: texts at which one may look again and again.
+PATTERNS = {
+    "name": "camera_matrices[ ",
+    "name and value": "camera_matrices = ",
+    "names": "camera_matrices pixel_offsets ",
+    "statements": "camera_matrices[;",
+    "comment": "/* ",
+    "comments": "/**/",
+    "slashes": "/",
+    "lines": "//\n",
+    "braces": "{",
+    "closed braces": "{}",
+    "spaces": " ",
+    "quotes": '"',
+    "escaped quotes": '\\"',
+    "backslashes": "\\",
+    "commas": ", ",
+    "digits": "1",
+    "points": "1.",
+    "signs": "+-",
+    "exponents": "1e",
+    "underscores": "_",
+    "nothing": "\0",
+}
+STARTS = {
+    "alone": "",
+    "a value": "camera_matrices = {",
+    "a number": "camera_matrices = 1",
+    "a fraction": "camera_matrices = .1",
+    "the last value": HEADER + "normal_limit_squared = 1; position_limit_squared = ",
+    "a text": '{"a": "',
+    "a list": '{"to_world": [',
+}
+ENDS = ["", "x", ";", "x;", "};", "\\", '"}']
+
+
+def seconds(read: Callable[[Path], object], path: Path, text: str) -> float:
+    path.write_text(text)
+    start = time.process_time()
+    with pytest.raises(InputError) as error:
+        read(path)
+    assert "\n" not in str(error.value)
+    return time.process_time() - start
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("read", [read_camera_matrices, load_shot])
+@pytest.mark.parametrize("start", STARTS)
+def test_the_time_to_read_a_text_is_that_of_its_length(
+    start: str, read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    path = tmp_path / "text.json"
+    for name, pattern in PATTERNS.items():
+        for end in ENDS:
+            # A text that is looked at again at every place would take ten seconds and more.
+            text = STARTS[start] + pattern * (400_000 // len(pattern)) + end
+            assert seconds(read, path, text) < 2, (name, end)
+
+
+LINES = [b'{"first_step": 0}', b'{"step": 10, "validation": {"SMAPE": 0.5}}', b'{"step": 20}']
+DAMAGE = [b'{"step": 5', b"\xff\xfe\x00", bytes(100), b'{"step": "\xe4"}', b"[" * 100_000, b"null", b'{"step": null}']
+
+
+def test_a_log_goes_on_without_what_is_damaged_in_it(tmp_path: Path) -> None:
+    path, run = tmp_path / "log.jsonl", RunFolder(tmp_path)
+    for place in range(4):
+        for damage in (*DAMAGE, b'{"step": 1e999}', b'{"step": ' + b"9" * 400 + b"}"):
+            path.write_bytes(b"".join(line + b"\n" for line in [*LINES[:place], damage, *LINES[place:]]))
+            run.rewind(10)
+            assert path.read_bytes() == b"".join(line + b"\n" for line in LINES[:2])
+            assert run.errors() == {"SMAPE": 0.5}
+    for damage in DAMAGE[:-1]:
+        path.write_bytes(damage)
+        check_refused(run.errors, path)
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("what", NO_FILES)
+def test_a_log_that_is_no_file_is_refused_before_it_is_written_to(what: str, tmp_path: Path) -> None:
+    put(what, tmp_path / "log.jsonl")
+    check_refused(lambda: RunFolder(tmp_path).rewind(0), tmp_path / "log.jsonl")
+
+
+def test_a_full_disk_is_one_error_whatever_tensorboard_is_writing(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    # Every write beyond 10 KB fails.
+    code = (
+        "import resource, signal, sys\nfrom pathlib import Path\n"
+        "from mcdenoise.errors import InputError\nfrom mcdenoise.train.loop import _board, _writing\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\nresource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))\n"
+        "try:\n    with _writing(Path(sys.argv[1])), _board(Path(sys.argv[1]), 0, True) as board:\n"
+        "        for step in range(10_000):\n            board.add_scalar('loss', 1.0, step)\n"
+        "            board.flush()\n"
+        "except InputError as error:\n    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"{tmp_path}: cannot be written (File too large); check its permissions and free space\n"
