@@ -13,8 +13,8 @@ demo: $(VENV)/.stamp-fast,render,peers,report ## render a short sequence, denois
 	$(BIN)/mcdenoise demo -o demo
 
 # GOMP_SPINCOUNT: on a busy machine spinning OpenMP threads make torch many times slower.
-test: $(VENV)/.stamp-dev ## run every test that is not marked slow, on up to four cores
-	GOMP_SPINCOUNT=0 $(BIN)/pytest -m "not slow" --numprocesses auto --maxprocesses 4
+test: $(VENV)/.stamp-dev ## run every test that is not marked slow or attack, on up to four cores
+	GOMP_SPINCOUNT=0 $(BIN)/pytest -m "not slow and not attack" --numprocesses auto --maxprocesses 4
 
 lint: $(VENV)/.stamp-dev ## check style, format and types; change nothing
 	$(BIN)/ruff check
