@@ -120,6 +120,39 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def check_writable(path: Path) -> None:
+    """See that a file can be written, and change nothing: before work of hours, not after it.
+
+    Args:
+        path: the file. Its folder must exist.
+
+    Raises:
+        InputError: as :func:`atomic_path`.
+    """
+    with suppress(_Tried), atomic_path(path):
+        raise _Tried
+
+
+class _Tried(Exception):
+    """Writing would have begun."""
+
+
+def remove(path: Path) -> None:
+    """Remove a file, if it is there.
+
+    Raises:
+        InputError: it is no file, or the operating system refused.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise InputError(
+            f"{path}: expected to replace it, found what cannot be removed ({reason}); check the folder and its "
+            "permissions, or choose another"
+        ) from error
+
+
 def _lock(handle: int) -> bool:
     """Hold an open file or folder until it is closed, or the process ends; false if another process holds it."""
     if fcntl is None:

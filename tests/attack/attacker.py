@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shutil
@@ -9,18 +10,22 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 from mutations import DAMAGES, PLACES
 from server import HUNG, Ended, Process, Server
-from table import COMMANDS, KINDS, SHOWN, Command
+from table import COMMANDS, KINDS, RENDERING, SHOWN, Command
 from world import build
 
 from mcdenoise.data.exr import read_exr
 from mcdenoise.errors import InputError
 
 # What commands write; all else in a case's folder has to stay as it was.
-_WRITTEN = re.compile(r"(out|run|\.cache|\.config|\.triton)(/.*)?|results/(index\.html|plots(/.*)?)|\.output.*")
+_WRITTEN = re.compile(
+    r"(out|run|rendered|\.cache|\.config|\.triton)(/.*)?|results/(index\.html|plots(/.*)?)|\.output.*"
+)
 _CHANGING = re.compile(r"run/(events\..*|cache/.*)|results/plots/.*|\.(cache|config|triton)(/.*)?")
 _LEFTOVER = re.compile(r"\.mcdenoise-|\.tmp|\.copy\.exr|/building")
 # Beside the reader of a pipe nobody may wait for long; on a busy machine a case takes some seconds.
@@ -42,14 +47,16 @@ class Attacker:
         self._expected: dict[str, tuple[object, set[str]]] = {}
         self._number = 0
         build(self.world)
-        done = self.run(SHOWN.split(), self.world)
-        assert done.status == 0, done
+        made = [SHOWN, RENDERING] if has_mitsuba() else [SHOWN]
+        for each in made:
+            done = self.run(each.split(), self.world)
+            assert done.status == 0, done
         shutil.rmtree(self.world / ".cache", ignore_errors=True)
         self.intact = {path: path.read_bytes() for path in sorted(self.world.rglob("*")) if path.is_file()}
 
-    def run(self, command: list[str], folder: Path, **options: object) -> Ended:
+    def run(self, command: list[str], folder: Path, **options: Any) -> Ended:
         """Run one command."""
-        (ended,) = self.server.run(Process(command, str(folder), **options))  # type: ignore[arg-type]
+        (ended,) = self.server.run(Process(command, str(folder), **options))
         return ended
 
     def fresh(self, needs: tuple[str, ...]) -> Path:
@@ -81,6 +88,8 @@ class Attacker:
 
     def damaged(self, kind: str, name: str, seeds: range, group: str) -> list[str]:
         """Cases of a kind of file and a command; those that failed, in words. The first are those of another place."""
+        if name == "render" and not has_mitsuba():
+            pytest.skip("Mitsuba is not installed")
         target, command, failed = KINDS[kind], COMMANDS[name], []
         self.expected(name)
         source = min(path for path in self.intact if path.relative_to(self.world).match(target.path))
@@ -139,12 +148,8 @@ class Attacker:
         strange = {each for each in found - after if not _CHANGING.fullmatch(each)} - {besides}
         if ended.status == 0 and strange:
             return f"unexpected: {sorted(strange)}"
-        for path, content in self.intact.items():
-            place = path.relative_to(self.world).as_posix()
-            own = folder / place
-            if place != besides and place.split("/")[0] in command.needs and not _WRITTEN.fullmatch(place):
-                if not own.is_file() or own.read_bytes() != content:
-                    return f"{place} was changed"
+        if problem := self.touched(folder, command.needs, besides):
+            return problem
         if problem := unreadable(folder / "out", besides):
             return problem
         if ended.status == 0:
@@ -155,6 +160,25 @@ class Attacker:
             if same and made != result and "warning: " not in ended.err:
                 return "another result, without a word"
         return ""
+
+    def touched(self, folder: Path, needs: tuple[str, ...], besides: str = "") -> str:
+        """Which input is not as it was."""
+        for path, content in self.intact.items():
+            place = path.relative_to(self.world).as_posix()
+            if place == besides or place.split("/")[0] not in needs or _WRITTEN.fullmatch(place):
+                continue
+            if not (folder / place).is_file() or (folder / place).read_bytes() != content:
+                return f"{place} was changed"
+        return ""
+
+    def lines(self, name: str, ended: Ended) -> str:
+        """What is wrong with how a command ended, and with what it printed."""
+        return _of_lines(COMMANDS[name], ended)
+
+
+def has_mitsuba() -> bool:
+    """Whether anything can be rendered."""
+    return importlib.util.find_spec("mitsuba") is not None
 
 
 def names(folder: Path) -> set[str]:

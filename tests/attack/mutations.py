@@ -41,7 +41,13 @@ def swapped(g: Generator, content: bytes) -> bytes:
     """Two pieces in each other's place."""
     a, b = sorted(int(each) for each in g.integers(0, len(content), 2))
     length = min(int(g.integers(1, 64)), b - a, len(content) - b)
-    return content[:a] + content[b : b + length] + content[a + length : b] + content[a : a + length] + content[b + length :]
+    return (
+        content[:a]
+        + content[b : b + length]
+        + content[a + length : b]
+        + content[a : a + length]
+        + content[b + length :]
+    )
 
 
 def inserted(g: Generator, content: bytes) -> bytes:
@@ -69,7 +75,19 @@ def other_value(g: Generator, content: bytes) -> bytes:
     if not words:
         return flipped(g, content)
     word = words[int(g.integers(0, len(words)))]
-    values = [b"null", b"-1", b"0", b"1e300", b'"x"', b"[]", b"{}", b"true", b"123456789012345678901", b"0.5", b'"\\ud800"']
+    values = [
+        b"null",
+        b"-1",
+        b"0",
+        b"1e300",
+        b'"x"',
+        b"[]",
+        b"{}",
+        b"true",
+        b"123456789012345678901",
+        b"0.5",
+        b'"\\ud800"',
+    ]
     return content[: word.start()] + values[int(g.integers(0, len(values)))] + content[word.end() :]
 
 

@@ -34,6 +34,7 @@ class Process:
         folder: where it runs; also its home and the place of its cache.
         stdout: where its output goes; a file of its own by default.
         seconds: after so many it counts as hung.
+        delay: seconds that it waits first.
         kill_after: seconds after which it gets ``signal``.
         signal: to end it with.
         largest_file: bytes that a file may have, which is how a full disk is played.
@@ -45,6 +46,7 @@ class Process:
     folder: str
     stdout: str = ""
     seconds: float = SECONDS
+    delay: float = 0.0
     kill_after: float | None = None
     signal: int = signal.SIGKILL
     largest_file: int | None = None
@@ -161,6 +163,7 @@ def fork(task: dict, room: int) -> int:
         if task["user"] is not None:
             os.setgid(task["user"])
             os.setuid(task["user"])
+        time.sleep(task["delay"])
         status = run(task["command"])
     except BaseException:
         traceback.print_exc()

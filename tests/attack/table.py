@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from world import MODEL, TRAINING
+from world import HEIGHT, MODEL, TRAINING, WIDTH
 
 from mcdenoise.data.exr import read_exr
 from mcdenoise.errors import InputError
@@ -74,13 +74,14 @@ def page(folder: Path, _: str) -> object:
     return (folder / "results/index.html").read_text().rstrip().endswith("</html>")
 
 
-def exported(folder: Path, _: str) -> object:
+def rendered(folder: Path, _: str) -> object:
     """Pixels of what was rendered."""
     return {path.name: digest(read_exr(path)[0]) for path in sorted((folder / "rendered/inputs").glob("*.exr"))}
 
 
 SHOWN = "denoise shot -o out --model joint_bilateral"
 NETWORK = "denoise shot -o out --weights weights.safetensors --precision float32"
+RENDERING = "render scene.xml --camera-path path.json -o rendered --size 16x12 --reference-spp 4 --variant scalar_rgb"
 COMMANDS = {
     "denoise": Command(SHOWN, ("shot",), images),
     "denoise layers": Command("denoise layers -o out --model joint_bilateral --alpha", ("layers",), images),
@@ -93,6 +94,7 @@ COMMANDS = {
     "train": Command(f"train shot -o run {TRAINING}", ("shot", "run"), weights, r"step \d+  loss .*"),
     "report": Command("report results", ("results",), page),
     "models": Command("models --results results", ("results",), printed),
+    "render": Command(RENDERING, ("scene.xml", "path.json", "rendered"), rendered),
     "reader exr": Command("reader exr shot/inputs/color0.exr", ("shot",), printed),
     "reader sequence": Command("reader sequence shot", ("shot",), printed),
     "reader layers": Command("reader sequence layers", ("layers",), printed),
@@ -177,7 +179,7 @@ def read_clean(path: Path) -> object:
 def read_halves(path: Path) -> object:
     from mcdenoise.scenes.render.halves import ReferenceHalves
 
-    halves = ReferenceHalves.load(path)
+    halves = ReferenceHalves.load(path, (WIDTH, HEIGHT))
     return [halves.mean(), halves.noise(), halves.spp]
 
 
@@ -243,7 +245,7 @@ class Kind:
     Args:
         path: in the world; a pattern, of which the first is taken.
         meaning: of its content: where it is the same as before, so is the result.
-        commands: names in :data:`COMMANDS`, and how many cases there are in a hundredth of the whole suite.
+        commands: names in :data:`COMMANDS`, and how many cases each has.
     """
 
     path: str
@@ -266,9 +268,7 @@ KINDS = {
     "motion": Kind("shot/inputs/motion1.exr", pixels, {"denoise": 80, "inspect": 40}),
     "reference": Kind("shot/inputs/reference0.exr", pixels, {"evaluate": 80, "evaluate model": 40, "train": 16}),
     "image to evaluate": Kind("out/denoised0.exr", pixels, {"evaluate": 90}),
-    "layers": Kind(
-        "layers/shot1.exr", pixels, {"denoise layers": 130, "inspect layers": 60, "reader layers": 80}
-    ),
+    "layers": Kind("layers/shot1.exr", pixels, {"denoise layers": 130, "inspect layers": 60, "reader layers": 80}),
     "camera.json": Kind(
         "shot/inputs/camera.json", json.loads, {"denoise": 100, "inspect": 40, "evaluate model": 60, "train": 16}
     ),
@@ -287,6 +287,11 @@ KINDS = {
     "data of a run": Kind("run/data.json", exactly, {"train": 40}),
     "decoded cache": Kind("run/cache/*/*/*.npy", exactly, {"train": 80}),
     "about the decoded cache": Kind("run/cache/*/*/about.json", exactly, {"train": 40}),
+    "rendered color": Kind("rendered/inputs/color0.exr", pixels, {"render": 40}),
+    "rendered feature": Kind("rendered/inputs/albedo1.exr", pixels, {"render": 40}),
+    "rendered reference": Kind("rendered/inputs/reference1.exr", pixels, {"render": 40}),
+    "about what was rendered": Kind("rendered/inputs/camera.json", json.loads, {"render": 40}),
+    "scene": Kind("scene.xml", anything, {"render": 30}),
     "precision.json": Kind("precision.json", json.loads, {"reader precision": 120}),
     "run_times.json": Kind("run_times.json", json.loads, {"reader run_times": 120}),
     "clean features": Kind("clean/clean/albedo0.exr", pixels, {"reader clean": 100}),
@@ -301,11 +306,11 @@ def warm_up() -> None:
     oiio.attribute("threads", 1)
     for name in ("denoise", "inspect", "evaluate", "train", "report", "models"):
         importlib.import_module(f"mcdenoise.cli.{name}")
+    # Imports that wait for their first use.
     for name in ("torch.utils.tensorboard", "lightning_fabric", "kornia", "colour", "numba", "jinja2"):
         importlib.import_module(name)
     from mcdenoise.cli import main
 
-    # Imports that wait for their first use.
     for command in ("models", "denoise --help"):
         with redirect_stdout(io.StringIO()):
             try:

@@ -25,7 +25,7 @@ from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, v
 from mcdenoise.data.exr import Image
 from mcdenoise.data.files import write_text
 from mcdenoise.data.images import read_channels, read_image_header
-from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer, write_clean_features
+from mcdenoise.data.readers.bmfr import has_buffer, realisation_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.layers import layers_of
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
@@ -163,6 +163,10 @@ def render_cycles(
     return folder.path
 
 
+# Those that every frame has, as `_View` gives them.
+_FEATURES = ("albedo", "normal", "position", "depth")
+
+
 class _Folder:
     """``inputs`` of a sequence, with its description."""
 
@@ -175,7 +179,7 @@ class _Folder:
         seed: tuple[int, int],
         version: str,
     ) -> None:
-        self.path = path
+        self.path, self.size = path, size
         width, height = size
         scale = _extent(made)
         matrices = np.stack(
@@ -233,12 +237,13 @@ class _Folder:
             )
 
     def has_color(self, number: int, realisation: int) -> bool:
-        """Whether a frame has one of its noisy colors, which is written behind its features."""
-        return (realisation_folder(self.path, realisation) / f"color{number}.exr").is_file()
+        """Whether a frame has one of its noisy colors, with the features of its samples."""
+        place = realisation_folder(self.path, realisation)
+        return all(has_buffer(place, number, name, self.size) for name in (*_FEATURES, "color"))
 
     def has_reference(self, number: int) -> bool:
         """Whether a frame has its reference."""
-        return (self.path / f"reference{number}.exr").is_file()
+        return has_buffer(self.path, number, "reference", self.size)
 
     def write(self, number: int, realisation: int, buffers: Mapping[str, Image]) -> None:
         """Write one noisy color and its features, the color last."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -46,8 +47,12 @@ class ReferenceHalves:
         return cls(np.stack([mean * spp, np.zeros_like(mean)]), (spp, 0), passes)
 
     @classmethod
-    def load(cls, path: Path) -> ReferenceHalves:
+    def load(cls, path: Path, size: tuple[int, int]) -> ReferenceHalves:
         """Read what :meth:`save` wrote.
+
+        Args:
+            path: the file.
+            size: width and height in pixels.
 
         Raises:
             InputError: the file is damaged.
@@ -57,7 +62,9 @@ class ReferenceHalves:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 first, second, passes = (int(number) for number in stored["counts"])
                 sums: NDArray[np.float64] = stored["sums"]
-        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            if sums.shape != (2, size[0] * size[1], 3) or sums.dtype != np.float64 or min(first, second, passes) < 0:
+                raise ValueError("other counts, or pixels of another image")
+        except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: expected a reference in the making, found something else; remove it") from error
         return cls(sums, (first, second), passes)
 
