@@ -29,6 +29,11 @@ def progress_bar() -> Progress:
     return Progress(*columns, console=console, disable=not console.is_terminal)
 
 
+def say(line: object) -> None:
+    """Print a line that has paths in it, or what else others have named: a terminal obeys nothing of it."""
+    print(printable(str(line)), flush=True)
+
+
 def show(table: Table) -> None:
     """Print a table to stdout."""
     # A pipe has no width: never fold what a script may read.

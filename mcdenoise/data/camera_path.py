@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mcdenoise.data.files import read_file
 from mcdenoise.errors import InputError
 
 Array: TypeAlias = NDArray[np.float64]
@@ -20,6 +21,7 @@ Array: TypeAlias = NDArray[np.float64]
 # A text, which is kept as it is, or a comma that nothing follows.
 _LAST_COMMA = re.compile(r'("(?:[^"\\]|\\.)*")|,(?=\s*[}\]])')
 _SMALLEST_VOLUME = 1e-12
+_LARGEST_FILE = 2**28
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,12 +252,9 @@ def _fov_x(holder: dict[str, Any], conventions: dict[str, Any]) -> float:
 
 
 def _read_json(path: Path) -> Any:
+    content = read_file(path, "a camera path", _LARGEST_FILE)
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(
-            f"{path}: expected a camera path, found nothing readable ({error.strerror}); check the path"
-        ) from error
+        text = content.decode()
     except ValueError as error:
         raise InputError(f"{path}: expected JSON, found no UTF-8 text; check that it is a camera path") from error
     try:

@@ -106,6 +106,31 @@ def new_folder(path: Path) -> Iterator[Path]:
             os.close(handle)
 
 
+def read_file(path: Path, expected: str, largest: int = 2**26) -> bytes:
+    """The content of a file: not that of a pipe, for which one would wait for ever, or of a device without end.
+
+    Args:
+        path: the file.
+        expected: what it should be, such as ``"a recipe"``, for messages.
+        largest: bytes that it may have.
+
+    Raises:
+        InputError: there is none, it is something else or larger, or the operating system refused to read it.
+    """
+    try:
+        if os.path.exists(path) and not os.path.isfile(path):
+            found = "a folder" if os.path.isdir(path) else "a device or a pipe"
+            raise InputError(f"{path}: expected {expected}, found {found}; check the path")
+        if (size := os.path.getsize(path)) > largest:
+            raise InputError(f"{path}: expected {expected} of at most {largest} bytes, found {size}; check the path")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{path}: expected {expected}, found no file that can be read ({error.strerror}); check the path and its "
+            "permissions"
+        ) from error
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file, whole or not at all.
 

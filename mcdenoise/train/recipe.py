@@ -25,7 +25,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from mcdenoise.data.files import write_text
+from mcdenoise.data.files import read_file, write_text
 from mcdenoise.errors import InputError
 from mcdenoise.models import create_model
 from mcdenoise.train.cache import locked
@@ -219,9 +219,9 @@ def naming(where: str) -> Iterator[None]:
 
 def _parse(path: Path) -> dict[str, Any]:
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: expected a recipe, found no file that can be read ({error.strerror})") from error
+        content = tomllib.loads(read_file(path, "a recipe").decode())
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected a recipe in TOML, found: {error}") from error
     _check_keys(str(path), content, _TABLES)

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from mcdenoise.data.files import atomic_path, write_text
+from mcdenoise.data.files import atomic_path, read_file, write_text
 from mcdenoise.errors import InputError
 
 _SEAL = 32  # bytes of a SHA-256
@@ -47,7 +47,7 @@ class RunFolder:
         """
         for name, content in identity.items():
             path = self.out / f"{name}.json"
-            if path.exists() and (not path.is_file() or path.read_bytes() != _json(content).encode()):
+            if os.path.lexists(path) and (not path.is_file() or path.read_bytes() != _json(content).encode()):
                 raise InputError(
                     f"{path}: expected the same as in this run, found another; choose a new folder for a new run"
                 )
@@ -68,7 +68,7 @@ class RunFolder:
         self.check(**identity)
         for name, content in identity.items():
             path = self.out / f"{name}.json"
-            if not path.exists():
+            if not os.path.lexists(path):
                 write_text(path, _json(content))
 
     @contextmanager
@@ -112,10 +112,10 @@ class RunFolder:
         Raises:
             InputError: the checkpoint cannot be loaded.
         """
-        if not self._checkpoint.exists():
+        if not os.path.lexists(self._checkpoint):
             return 0, []
         try:
-            content = memoryview(self._checkpoint.read_bytes())
+            content = memoryview(read_file(self._checkpoint, "a checkpoint", 2**36))
             content, seal = content[:-_SEAL], content[-_SEAL:]
             if seal != _sealed(content):
                 raise ValueError("expected the checksum of the content behind it, found another")
@@ -142,10 +142,10 @@ class RunFolder:
         """
         path = self.out / "log.jsonl"
         try:
-            entries = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+            entries = [json.loads(line) for line in read_file(path, "the log of a run").decode().splitlines()]
             measured = [entry["validation"] for entry in entries if entry.get("validation")]
-            return dict(measured[-1]) if measured else {}
-        except (OSError, ValueError, AttributeError, TypeError) as error:
+            return {str(name): float(error) for name, error in measured[-1].items()} if measured else {}
+        except (ValueError, AttributeError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: expected the log of this run, found none that can be read") from error
 
     def rewind(self, step: int) -> None:
@@ -155,8 +155,9 @@ class RunFolder:
             InputError: the log cannot be written.
         """
         path = self.out / "log.jsonl"
-        if path.exists():
-            lines = path.read_text(encoding="utf-8").splitlines()
+        if os.path.lexists(path):
+            # What is no text is a line that a damaged disk or a power cut has left.
+            lines = read_file(path, "the log of this run").decode(errors="replace").splitlines()
             write_text(path, "".join(f"{line}\n" for line in lines if _last_step(line) <= step))
 
     @property
@@ -174,7 +175,7 @@ def _last_step(line: str) -> float:
     try:
         entry = json.loads(line)
         return float(entry.get("step", entry.get("first_step", math.inf)))
-    except (ValueError, AttributeError, TypeError):
+    except (ValueError, AttributeError, TypeError, RecursionError, OverflowError):
         return math.inf
 
 

@@ -29,7 +29,7 @@ _WRITTEN = re.compile(
 _CHANGING = re.compile(r"run/(events\..*|cache/.*)|results/plots/.*|\.(cache|config|triton)(/.*)?")
 _LEFTOVER = re.compile(r"\.mcdenoise-|\.tmp|\.copy\.exr|/building")
 # Beside the reader of a pipe nobody may wait for long; on a busy machine a case takes some seconds.
-LONG = 40.0
+LONG = 20.0
 
 
 class Attacker:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 import zlib
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.data.files import atomic_path
+from mcdenoise.data.files import atomic_path, read_file
 from mcdenoise.errors import InputError
 
 NOISE_EPSILON = 0.01
@@ -58,8 +59,8 @@ class ReferenceHalves:
             InputError: the file is damaged.
         """
         try:
-            # Opened here, because numpy leaves a damaged file open.
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            content = read_file(path, "a reference in the making", 2**34)
+            with np.load(io.BytesIO(content), allow_pickle=False) as stored:
                 first, second, passes = (int(number) for number in stored["counts"])
                 sums: NDArray[np.float64] = stored["sums"]
             if sums.shape != (2, size[0] * size[1], 3) or sums.dtype != np.float64 or min(first, second, passes) < 0:
