@@ -54,7 +54,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     target = Path(os.path.realpath(path))
     if os.path.lexists(target) and not os.path.isfile(path):
         raise InputError(f"{path}: expected a file to write, found a folder or a device; choose another path")
-    temporary = target.with_name(f"{_PREFIX}{secrets.token_hex(8)}{_MARK}{target.suffix[:64]}")
+    # By its suffix a library tells the format: that of the name it was given, not of what that may be a link to.
+    temporary = target.with_name(f"{_PREFIX}{secrets.token_hex(8)}{_MARK}{path.suffix[:64]}")
     handle = -1
     try:
         with _writing(path):

@@ -19,6 +19,8 @@ import numpy as np
 import torch
 from world import HEIGHT, MODEL, TRAINING, WIDTH
 
+from mcdenoise.cli import COMMANDS as CLI
+from mcdenoise.cli import load_command, main
 from mcdenoise.data.exr import read_exr
 from mcdenoise.errors import InputError
 
@@ -304,13 +306,11 @@ def warm_up() -> None:
     import OpenImageIO as oiio
 
     oiio.attribute("threads", 1)
-    for name in ("denoise", "inspect", "evaluate", "train", "report", "models"):
-        importlib.import_module(f"mcdenoise.cli.{name}")
+    for name in CLI:
+        load_command(name)
     # Imports that wait for their first use.
     for name in ("torch.utils.tensorboard", "lightning_fabric", "kornia", "colour", "numba", "jinja2"):
         importlib.import_module(name)
-    from mcdenoise.cli import main
-
     for command in ("models", "denoise --help"):
         with redirect_stdout(io.StringIO()):
             try:
