@@ -19,7 +19,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import PRECISIONS, Precision, pretrained_models
 from mcdenoise.results import Results
-from mcdenoise.user_cache import cache_file, keep
+from mcdenoise.user_cache import cache_file, keep, kept
 
 _ROUNDS = 3
 # Frames with a reference that errors are measured on, and frames before the first of them.
@@ -129,9 +129,9 @@ def _timed(size: tuple[int, int], device: str, cache: Path, on_step: Callable[[i
 
 def _read(cache: Path) -> dict[str, dict[str, float]]:
     try:
-        known = json.loads(cache.read_text())
+        known = json.loads(kept(cache))
         return {key: {name: float(value) for name, value in own.items()} for key, own in known.items()}
-    except (OSError, ValueError, TypeError, AttributeError):
+    except (ValueError, TypeError, AttributeError, RecursionError, OverflowError):
         return {}
 
 

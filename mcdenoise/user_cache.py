@@ -15,6 +15,17 @@ def cache_file(name: str) -> Path:
     return (Path(folder) if folder else Path("~/.cache").expanduser()) / "mcdenoise" / name
 
 
+def kept(path: Path) -> str:
+    """The text of a file of a cache.
+
+    Raises:
+        ValueError: there is none.
+    """
+    from mcdenoise.data.files import read_file
+
+    return read_file(path, "a file of a cache").decode()
+
+
 def keep(path: Path, text: str) -> None:
     """Write a file of a cache, whole or not at all; where there is no place for it, it is measured again next time."""
     # Here because it brings the readers of files, which take their time to load.

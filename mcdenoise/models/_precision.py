@@ -15,7 +15,7 @@ import torch.nn.functional as F
 
 from mcdenoise.errors import InputError
 from mcdenoise.models._journal import clock
-from mcdenoise.user_cache import cache_file, keep
+from mcdenoise.user_cache import cache_file, keep, kept
 
 Precision = Literal["float32", "bfloat16"]
 PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
@@ -101,6 +101,6 @@ def _machine(device: torch.device) -> str:
 
 def _read(cache: Path) -> dict[str, float]:
     try:
-        return {key: float(value) for key, value in json.loads(cache.read_text(encoding="utf-8")).items()}
+        return {key: float(value) for key, value in json.loads(kept(cache)).items()}
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):
         return {}

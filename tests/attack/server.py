@@ -93,9 +93,9 @@ def taken(place: str) -> tuple[str, str]:
     texts = []
     for stream in ("out", "err"):
         path = Path(f"{place}.{stream}")
-        # As they would reach the terminal.
-        texts.append(path.read_bytes().decode(errors="backslashreplace"))
-        path.unlink()
+        # Killed before it has one, it has said nothing. Else, as it would reach the terminal.
+        texts.append(path.read_bytes().decode(errors="backslashreplace") if path.exists() else "")
+        path.unlink(missing_ok=True)
     return texts[0], texts[1]
 
 

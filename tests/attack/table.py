@@ -83,7 +83,9 @@ def rendered(folder: Path, _: str) -> object:
 
 SHOWN = "denoise shot -o out --model joint_bilateral"
 NETWORK = "denoise shot -o out --weights weights.safetensors --precision float32"
-RENDERING = "render scene.xml --camera-path path.json -o rendered --size 16x12 --reference-spp 4 --variant scalar_rgb"
+RENDERING = (
+    "render scene/scene.xml --camera-path path.json -o rendered --size 16x12 --reference-spp 4 --variant scalar_rgb"
+)
 COMMANDS = {
     "denoise": Command(SHOWN, ("shot",), images),
     "denoise layers": Command("denoise layers -o out --model joint_bilateral --alpha", ("layers",), images),
@@ -96,7 +98,7 @@ COMMANDS = {
     "train": Command(f"train shot -o run {TRAINING}", ("shot", "run"), weights, r"step \d+  loss .*"),
     "report": Command("report results", ("results",), page),
     "models": Command("models --results results", ("results",), printed),
-    "render": Command(RENDERING, ("scene.xml", "path.json", "rendered"), rendered),
+    "render": Command(RENDERING, ("scene", "path.json", "rendered"), rendered),
     "reader exr": Command("reader exr shot/inputs/color0.exr", ("shot",), printed),
     "reader sequence": Command("reader sequence shot", ("shot",), printed),
     "reader layers": Command("reader sequence layers", ("layers",), printed),
@@ -259,20 +261,20 @@ KINDS = {
     "color": Kind(
         "shot/inputs/color0.exr",
         pixels,
-        {"denoise": 130, "inspect": 60, "evaluate model": 60, "reader exr": 100, "train": 24},
+        {"denoise": 130, "inspect": 60, "evaluate model": 60, "reader exr": 100, "train": 8},
     ),
     "color of the second frame": Kind(
         "shot/inputs/color1.exr", pixels, {"denoise": 60, "denoise network": 40, "reader sequence": 60}
     ),
-    "albedo": Kind("shot/inputs/albedo1.exr", pixels, {"denoise": 80, "denoise network": 40, "train": 16}),
+    "albedo": Kind("shot/inputs/albedo1.exr", pixels, {"denoise": 80, "denoise network": 40, "train": 6}),
     "normal": Kind("shot/inputs/shading_normal0.exr", pixels, {"denoise": 80, "reader sequence": 60}),
     "position": Kind("shot/inputs/world_position1.exr", pixels, {"denoise": 80, "evaluate model": 40}),
     "motion": Kind("shot/inputs/motion1.exr", pixels, {"denoise": 80, "inspect": 40}),
-    "reference": Kind("shot/inputs/reference0.exr", pixels, {"evaluate": 80, "evaluate model": 40, "train": 16}),
+    "reference": Kind("shot/inputs/reference0.exr", pixels, {"evaluate": 80, "evaluate model": 40, "train": 6}),
     "image to evaluate": Kind("out/denoised0.exr", pixels, {"evaluate": 90}),
     "layers": Kind("layers/shot1.exr", pixels, {"denoise layers": 130, "inspect layers": 60, "reader layers": 80}),
     "camera.json": Kind(
-        "shot/inputs/camera.json", json.loads, {"denoise": 100, "inspect": 40, "evaluate model": 60, "train": 16}
+        "shot/inputs/camera.json", json.loads, {"denoise": 100, "inspect": 40, "evaluate model": 60, "train": 6}
     ),
     "camera_matrices.h": Kind(
         "shot/inputs/camera_matrices.h", anything, {"denoise": 100, "inspect": 60, "reader camera_matrices": 160}
@@ -280,20 +282,20 @@ KINDS = {
     "weights": Kind("weights.safetensors", exactly, {"denoise network": 120, "reader weights": 160}),
     "recipe": Kind("recipe.toml", toml, {"reader recipe": 200}),
     "camera path": Kind("path.json", json.loads, {"reader camera_path": 200}),
-    "results.json": Kind("results/results.json", json.loads, {"reader results": 160, "models": 24, "report": 24}),
+    "results.json": Kind("results/results.json", json.loads, {"reader results": 160, "models": 10, "report": 10}),
     "earlier denoise.json": Kind("out/denoise.json", exactly, {"denoise again": 100}),
     "earlier image": Kind("out/denoised1.exr", exactly, {"denoise again": 60}),
-    "checkpoint": Kind("run/checkpoint.pt", exactly, {"train": 80}),
+    "checkpoint": Kind("run/checkpoint.pt", exactly, {"train": 40}),
     "log": Kind("run/log.jsonl", anything, {"train": 40, "reader run": 160}),
     "config of a run": Kind("run/config.json", exactly, {"train": 40}),
-    "data of a run": Kind("run/data.json", exactly, {"train": 40}),
-    "decoded cache": Kind("run/cache/*/*/*.npy", exactly, {"train": 80}),
+    "data of a run": Kind("run/data.json", exactly, {"train": 12}),
+    "decoded cache": Kind("run/cache/*/*/*.npy", exactly, {"train": 40}),
     "about the decoded cache": Kind("run/cache/*/*/about.json", exactly, {"train": 40}),
-    "rendered color": Kind("rendered/inputs/color0.exr", pixels, {"render": 40}),
-    "rendered feature": Kind("rendered/inputs/albedo1.exr", pixels, {"render": 40}),
-    "rendered reference": Kind("rendered/inputs/reference1.exr", pixels, {"render": 40}),
-    "about what was rendered": Kind("rendered/inputs/camera.json", json.loads, {"render": 40}),
-    "scene": Kind("scene.xml", anything, {"render": 30}),
+    "rendered color": Kind("rendered/inputs/color0.exr", pixels, {"render": 24}),
+    "rendered feature": Kind("rendered/inputs/albedo1.exr", pixels, {"render": 24}),
+    "rendered reference": Kind("rendered/inputs/reference1.exr", pixels, {"render": 24}),
+    "about what was rendered": Kind("rendered/inputs/camera.json", json.loads, {"render": 24}),
+    "scene": Kind("scene/scene.xml", anything, {"render": 20}),
     "precision.json": Kind("precision.json", json.loads, {"reader precision": 120}),
     "run_times.json": Kind("run_times.json", json.loads, {"reader run_times": 120}),
     "clean features": Kind("clean/clean/albedo0.exr", pixels, {"reader clean": 100}),

@@ -10,7 +10,7 @@ from attacker import Attacker, aged, unreadable
 from server import Process
 from table import COMMANDS
 
-KILLED = {"denoise": 60, "denoise layers": 40, "denoise again": 40, "train": 24}
+KILLED = {"denoise": 50, "denoise layers": 30, "denoise again": 30, "train": 10}
 
 
 @pytest.mark.attack

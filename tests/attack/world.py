@@ -69,7 +69,9 @@ def build(folder: Path) -> None:
     weights = save_weights(create_model(MODEL, pretrained=True), MODEL, {}, {"licence": "Apache-2.0"})
     (folder / "weights.safetensors").write_bytes(weights)
     (folder / "recipe.toml").write_text(RECIPE)
-    (folder / "scene.xml").write_text(SCENE)
+    # Its folder is the scene's name.
+    (folder / "scene").mkdir()
+    (folder / "scene/scene.xml").write_text(SCENE)
     poses = [{"position": [0.1 * n, 0.2, 3], "look_at": [0, 0, 0]} for n in range(FRAMES)]
     (folder / "path.json").write_text(json.dumps({"fov": 40, "frames": poses}, indent=1))
     (folder / "results").mkdir()
