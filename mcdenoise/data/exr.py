@@ -202,7 +202,7 @@ def picture_metadata(spec: oiio.ImageSpec) -> Metadata:
         if isinstance(value, tuple) and not all(isinstance(item, int | float) for item in value):
             continue
         if isinstance(value, str | int | float | tuple) and not attribute.name.startswith(_STORAGE_PREFIXES):
-            kept[attribute.name] = value
+            kept[_as_text(attribute.name)] = value
     return kept
 
 

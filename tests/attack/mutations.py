@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -69,8 +70,6 @@ def replaced_token(g: Generator, content: bytes) -> bytes:
 
 def other_value(g: Generator, content: bytes) -> bytes:
     """Of a text: one of its words or numbers is another value, so that it still parses."""
-    import re
-
     words = list(re.finditer(rb'"[^"]*"|-?[0-9][0-9.e+-]*|true|false|null', content))
     if not words:
         return flipped(g, content)
@@ -89,10 +88,6 @@ def other_value(g: Generator, content: bytes) -> bytes:
         b'"\\ud800"',
     ]
     return content[: word.start()] + values[int(g.integers(0, len(values)))] + content[word.end() :]
-
-
-def emptied(g: Generator, content: bytes) -> bytes:
-    return b""
 
 
 def noise(g: Generator, content: bytes) -> bytes:

@@ -8,6 +8,7 @@ import io
 import json
 import re
 import sys
+import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
@@ -217,9 +218,19 @@ def pixels(content: bytes) -> object:
     """What another library reads in an EXR."""
     import OpenImageIO as oiio
 
-    file = oiio.ImageInput.open("shot.exr", None, oiio.IOMemReader(content))
-    if file is None:
-        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "image.exr")
+        path.write_bytes(content)
+        file = oiio.ImageInput.open(str(path))
+        if file is None:
+            return oiio.geterror()
+        return of_image(file)
+
+
+def of_image(file: Any) -> object:
+    """What its header says, and its pixels."""
+    import OpenImageIO as oiio
+
     spec = file.spec()
     size = (spec.width, spec.height, spec.nchannels)
     found = file.read_image(oiio.FLOAT) if spec.width * spec.height * spec.nchannels < 10**6 else None
