@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-# A hundred times what a case takes on an idle machine.
+# Hundreds of times what most cases take on an idle machine.
 SECONDS = 60.0
 # Address space beyond what the server has: what a damaged file makes a reader ask for is far more.
 MEMORY = 6 * 2**30

@@ -56,7 +56,6 @@ LINES = {
     "inspect": "inspect shot --json figures.json",
     "inspect layers": "inspect layers --json figures.json",
     "evaluate": "evaluate shot done --json figures.json",
-    "models": "models --json figures.json",
 }
 
 

@@ -20,7 +20,7 @@ from damage import assert_clear, outcomes_of
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import open_sequence
 from mcdenoise.data.camera_matrices import MATRICES
-from mcdenoise.data.exr import read_exr, read_exr_header
+from mcdenoise.data.exr import read_exr, read_exr_header, write_exr
 from mcdenoise.errors import InputError, printable
 
 SIZE = 11, 13
@@ -290,3 +290,11 @@ def test_whole_numbers_beside_a_text_in_latin_1_stay(tmp_path: Path) -> None:
     assert b"M\xfcller" in written
     path.write_bytes(written.replace(b"M\xfcller", b"M?ller"))
     np.testing.assert_array_equal(OpenEXR.File(str(path)).channels()["id"].pixels, channels["id"].pixels)
+
+
+def test_an_attribute_with_a_name_in_latin_1_is_read_as_text(tmp_path: Path) -> None:
+    path = write(tmp_path / "shot.exr", part("RGB", gr_n=3))
+    path.write_bytes(path.read_bytes().replace(b"gr_n\0", b"gr\xfcn\0"))
+    for metadata in (read_exr(path)[2], open_sequence([path]).metadata(0)):
+        assert metadata["grün"] == 3
+        write_exr(tmp_path / "again.exr", np.zeros((*SIZE, 3)), "RGB", metadata=metadata)
