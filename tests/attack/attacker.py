@@ -27,7 +27,7 @@ from mcdenoise.errors import InputError
 _WRITTEN = re.compile(
     r"(out|run|rendered|\.cache|\.config|\.triton)(/.*)?|results/(index\.html|plots(/.*)?)|\.output.*"
 )
-_CHANGING = re.compile(r"run/(events\..*|cache/.*)|results/plots/.*|\.(cache|config|triton)(/.*)?")
+_CHANGING = re.compile(r"run/(events\..*|cache/.*)|results/plots/.*|\.(cache|config|triton)(/.*)?", re.DOTALL)
 _LEFTOVER = re.compile(r"\.mcdenoise-|\.tmp|\.copy\.exr|/building")
 
 
@@ -110,8 +110,6 @@ class Attacker:
                 # Only where it is asked for: hostile bytes are not for every library.
                 same = partial(_alike, target.meaning, content, self.intact[source])
             ended = self.run(command.command, folder)
-            # A link to nothing is followed where something is written.
-            (folder / place).with_name("nothing").unlink(missing_ok=True)
             problem = self.judge(name, folder, ended, same=same, besides=str(place))
             failed += self.count(group, problem, f"{kind}, {name}, seed {seed} ({what.__name__})", folder)
         return failed
@@ -154,7 +152,9 @@ class Attacker:
         found = names(folder)
         if left := [each for each in found if _LEFTOVER.search(each)]:
             return f"left over: {left}"
-        strange = {each for each in found - after if not _CHANGING.fullmatch(each)} - {besides}
+        # A link to nothing is followed where something is written.
+        followed = {besides, Path(besides).with_name("nothing").as_posix()} if besides else set()
+        strange = {each for each in found - after - followed if not _CHANGING.fullmatch(each)}
         if ended.status == 0 and strange:
             return f"unexpected: {sorted(strange)}"
         if problem := self.touched(folder, command.needs, besides):
@@ -202,7 +202,7 @@ def unreadable(out: Path, besides: str = "") -> str:
     """What is there under a final name and is not whole, or not finite."""
     if not out.is_dir():
         return ""
-    for path in sorted(out.glob("*.exr")):
+    for path in sorted(out.glob("[!.]*.exr")):
         if f"out/{path.name}" == besides:
             continue
         try:

@@ -77,7 +77,7 @@ def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> 
         if os.path.lexists(folder / given) and not os.path.lexists(folder / part):
             (folder / given).rename(folder / part)
         # What is printed has the name in it.
-        same = name not in ("inspect", "inspect layers", "evaluate", "evaluate model")
+        same = name not in ("inspect", "inspect layers", "evaluate", "reader recipe")
         problem = attacker.judge(name, folder, ended, same=same, needed=is_text(given) and given not in OPTIONS)
         failed += attacker.count("hostile names", problem, f"{name}, {part} is {given!r}", folder)
     assert not failed, "\n".join(failed)
