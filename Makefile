@@ -14,8 +14,8 @@ demo: $(VENV)/.stamp-fast,render,peers,report ## render a short sequence, denois
 
 # OMP_NUM_THREADS: each process has a core, which threads would only share. GOMP_SPINCOUNT: those of tests that ask for
 # more must not spin, which on a busy machine makes torch many times slower.
-test: $(VENV)/.stamp-dev ## run every test that is not marked slow, on up to four cores
-	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=0 $(BIN)/pytest -m "not slow" --numprocesses auto --maxprocesses 4
+test: $(VENV)/.stamp-dev ## run every test that is not marked slow or attack, on up to four cores
+	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=0 $(BIN)/pytest -m "not slow and not attack" --numprocesses auto --maxprocesses 4
 
 lint: $(VENV)/.stamp-dev ## check style, format and types; change nothing
 	$(BIN)/ruff check

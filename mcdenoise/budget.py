@@ -132,7 +132,7 @@ def _read(cache: Path) -> dict[str, dict[str, float]]:
     try:
         known = json.loads(read_text(cache))
         return {key: {name: float(value) for name, value in own.items()} for key, own in known.items()}
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError, OverflowError):
         return {}
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -19,7 +21,7 @@ from torch import Tensor
 
 from mcdenoise.data import Sequence
 from mcdenoise.data.exr import Image, Metadata
-from mcdenoise.data.files import write_text
+from mcdenoise.data.files import remove, write_text
 from mcdenoise.data.readers.diffuse_specular import PARTS
 from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
@@ -28,6 +30,7 @@ from mcdenoise.models import Output, Skipping, Stage, parts_of, summarize
 
 # Most pixels of a frame, and how much two frames have to correlate to show the same place.
 _MOST, _ALIKE = 0.5, 0.9
+_NUMBERS = re.compile("[0-9]+")
 
 
 @dataclass
@@ -40,6 +43,7 @@ class SequenceReport:
         frames: what happened to each frame, by number; its run times include waiting for the disk.
         files: what was written, by number.
         alike: frames that look like the one before and find no history in it.
+        older: names of files of other frames that were there before, and still are.
     """
 
     model: str
@@ -47,6 +51,7 @@ class SequenceReport:
     frames: dict[int, FrameReport] = field(default_factory=dict)
     files: dict[int, Path] = field(default_factory=dict)
     alike: list[int] = field(default_factory=list)
+    older: list[str] = field(default_factory=list)
 
     @property
     def milliseconds(self) -> dict[str, float]:
@@ -77,13 +82,21 @@ class SequenceReport:
     @property
     def warnings(self) -> list[str]:
         """What is probably wrong."""
+        found = []
         # A shot has its cuts; what begins anew with every other frame has none.
-        if len(self.alike) * 4 <= len(self.frames):
-            return []
-        return [
-            f"history: in {len(self.alike)} of {len(self.frames)} frames most pixels find nothing in the frame before, "
-            "though the two look alike; check motion and cameras with `mcdenoise inspect`"
-        ]
+        if len(self.alike) * 4 > len(self.frames):
+            found.append(
+                f"history: in {len(self.alike)} of {len(self.frames)} frames most pixels find nothing in the frame "
+                "before, though the two look alike; check motion and cameras with `mcdenoise inspect`"
+            )
+        # They may be of other frames of the same shot, and hours of work: nobody but their owner removes them.
+        if self.older:
+            names = ", ".join(self.older if len(self.older) <= 4 else [self.older[0], "...", self.older[-1]])
+            found.append(
+                f"output: {len(self.older)} {'file' if len(self.older) == 1 else 'files'} of an earlier run ({names}) "
+                "remain beside the result, and denoise.json does not list them; remove what is not wanted"
+            )
+        return found
 
     @property
     def replaced_pixels(self) -> int:
@@ -130,7 +143,7 @@ def denoise_sequence(
     make_folder(out)
     _check_apart(sequence, out)
     # A report stands for a complete result: an old one must not survive a run that fails half-way.
-    (out / "denoise.json").unlink(missing_ok=True)
+    remove(out / "denoise.json")
     stored = "with albedo" if sequence.color_has_albedo else "without albedo, which the reader multiplies back"
     report = SequenceReport(model, f"color is stored {stored}")
 
@@ -178,6 +191,7 @@ def denoise_sequence(
             on_frame()
         if writing is not None:
             writing.result()
+    report.older = _of_earlier_runs(out, report.files.values())
     write_text(out / "denoise.json", json.dumps(_as_json(sequence, denoiser, report), indent=2) + "\n")
     return report
 
@@ -306,11 +320,40 @@ def make_folder(out: Path) -> None:
 
 
 def _check_apart(sequence: Sequence, out: Path) -> None:
-    """Results have the names of what they were made of: they must not take its place."""
-    if out.resolve() in {folder.resolve() for folder in (*sequence.folders, sequence.root)}:
+    """Results have the names of what they were made of: they must not take its place, by way of a link either."""
+    inputs = {os.path.realpath(folder) for folder in (*sequence.folders, sequence.root)}
+    # They may be links themselves, to files elsewhere.
+    inputs |= {os.path.realpath(path) for folder in sequence.folders for path in _links(folder)}
+    if os.path.realpath(out) in inputs:
         raise InputError(
             f"{out}: expected another folder than that of the input, found the same; choose one to write to"
         )
+    for path in _links(out):
+        target = os.path.realpath(path)
+        if {target, os.path.dirname(target)} & inputs:
+            raise InputError(
+                f"{path}: expected no link to an input, which would be written to, found one; remove it, or choose "
+                "another folder"
+            )
+
+
+def _links(folder: Path) -> list[Path]:
+    """The symbolic links in a folder.
+
+    Raises:
+        InputError: it cannot be listed.
+    """
+    try:
+        return [path for path in folder.iterdir() if path.is_symlink()]
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
+
+
+def _of_earlier_runs(out: Path, written: Iterable[Path]) -> list[str]:
+    """Names of files as those that were written, but for the numbers in them, that were not."""
+    own = {path.name for path in written}
+    kinds = {_NUMBERS.sub("#", name) for name in own}
+    return sorted(name for name in os.listdir(out) if name not in own and _NUMBERS.sub("#", name) in kinds)
 
 
 def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> dict[str, Any]:

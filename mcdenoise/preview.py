@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mcdenoise.data.color_space import to_rec709
 from mcdenoise.data.exr import Metadata
+from mcdenoise.data.files import remove
 from mcdenoise.data.png import Picture, read_png, write_png
 from mcdenoise.data.video import check_video, write_video
 from mcdenoise.errors import InputError
@@ -86,7 +87,7 @@ class Preview:
         if not self._pictures:
             make_folder(self.folder / "preview")
             if self._video_path.is_file():
-                self._video_path.unlink()
+                remove(self._video_path)
         shown = to_rec709(image.detach().reshape(3, *image.shape[-2:]), metadata or {})
         if self.exposure is None and float(shown.amax()) > 0:
             self.exposure = math.log2(float(auto_exposure(shown[None].float(), _MIDDLE_GREY)))

@@ -764,3 +764,51 @@ def test_the_installed_command_helps() -> None:
     result = subprocess.run([command, "denoise", "--help"], capture_output=True, text=True, check=False, timeout=120)
     assert (result.returncode, result.stderr) == (0, "")
     assert "--alpha-min" in result.stdout
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "inspect {shot}",
+        "denoise {shot} -o {tmp}/out",
+        "evaluate {shot} {shot}/inputs",
+        "models",
+        "stability no_such_op",
+    ],
+)
+@pytest.mark.parametrize("place", ["nowhere/figures.json", "folder", "loop.json"])
+def test_a_json_that_cannot_be_written_is_told_before_the_work(
+    small_sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, place: str
+) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "loop.json").symlink_to("loop.json")
+    arguments = command.format(shot=small_sequence, tmp=tmp_path).split()
+    with pytest.raises(SystemExit) as stop:
+        main([*arguments, "--json", str(tmp_path / place)])
+    assert stop.value.code == 2
+    printed = capsys.readouterr()
+    assert not printed.out
+    assert printed.err.startswith(f"mcdenoise {arguments[0]}: {tmp_path / place}: ")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["camera.json", "camera_matrices.h", "color0.exr"])
+def test_a_json_in_the_place_of_an_input_is_refused(
+    small_sequence: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    path = small_sequence / "inputs" / name
+    path.touch()
+    before = path.read_bytes()
+    with pytest.raises(SystemExit) as stop:
+        main(["inspect", str(small_sequence), "--json", str(path)])
+    assert stop.value.code == 2
+    assert "which is read" in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
+def test_a_json_may_lie_in_the_folder_that_the_command_makes(small_sequence: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as stop:
+        main(["denoise", str(small_sequence), "-o", str(out), "--model", "noisy", "--json", str(out / "times.json")])
+    assert stop.value.code == 0
+    assert json.loads((out / "times.json").read_text())["model"] == "noisy"

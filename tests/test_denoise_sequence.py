@@ -350,3 +350,55 @@ def test_a_sequence_and_its_frames_one_by_one_are_the_same(small_sequence: Path,
     report = denoise_sequence(sequence, tmp_path / "out", Denoiser(small_model()), "small")
     assert [row["stage"] for row in report.plan][:2] == ["read", "demodulate"]
     assert {row["stage"]: row["skipped"] for row in report.plan}["remember"] == pytest.approx(1 / 4)
+
+
+@pytest.mark.parametrize("name", ["denoised0.exr", "denoised3.exr", "denoise.json", "preview", "preview.mp4"])
+@pytest.mark.parametrize("target", ["color0.exr", "albedo1.exr", "camera_matrices.h", "."])
+def test_an_output_that_is_a_link_to_an_input_is_refused(
+    small_sequence: Path, tmp_path: Path, name: str, target: str
+) -> None:
+    """Links are followed where something is written, so that this would replace the input."""
+    inputs, out = small_sequence / "inputs", tmp_path / "out"
+    out.mkdir()
+    (out / name).symlink_to(inputs / target)
+    before = {path.name: path.read_bytes() for path in inputs.iterdir()}
+    assert "expected no link to an input" in refused(
+        lambda: denoise_sequence(open_sequence(small_sequence), out, Denoiser("noisy"), "noisy")
+    )
+    assert {path.name: path.read_bytes() for path in inputs.iterdir()} == before
+    assert [path.name for path in out.iterdir()] == [name]
+
+
+def test_an_output_that_is_a_link_to_what_an_input_links_to_is_refused(small_sequence: Path, tmp_path: Path) -> None:
+    color, out = small_sequence / "inputs" / "color2.exr", tmp_path / "out"
+    color.rename(tmp_path / "elsewhere.exr")
+    color.symlink_to(tmp_path / "elsewhere.exr")
+    out.mkdir()
+    (out / "denoised2.exr").symlink_to(tmp_path / "elsewhere.exr")
+    assert "expected no link to an input" in refused(
+        lambda: denoise_sequence(open_sequence(small_sequence), out, Denoiser("noisy"), "noisy")
+    )
+
+
+def test_files_of_an_earlier_longer_run_are_kept_and_named(small_sequence: Path, tmp_path: Path) -> None:
+    """They may be other frames of the same shot: it is for their owner to remove them."""
+    out = tmp_path / "out"
+    denoise_sequence(open_sequence(small_sequence), out, Denoiser("noisy"), "noisy")
+    report = denoise_sequence(open_sequence(small_sequence, "1-2"), out, Denoiser("noisy"), "noisy")
+    assert report.older == ["denoised0.exr", "denoised3.exr"]
+    (warning,) = report.warnings
+    assert "2 files of an earlier run (denoised0.exr, denoised3.exr) remain" in warning
+    assert warning in json.loads((out / "denoise.json").read_text())["warnings"]
+    assert len(list(out.glob("*.exr"))) == 4
+    assert not denoise_sequence(open_sequence(small_sequence), out, Denoiser("noisy"), "noisy").warnings
+
+
+def test_an_old_report_that_cannot_be_removed_ends_the_run_before_it_begins(
+    small_sequence: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "out" / "denoise.json").mkdir(parents=True)
+    message = refused(
+        lambda: denoise_sequence(open_sequence(small_sequence), tmp_path / "out", Denoiser("noisy"), "noisy")
+    )
+    assert "denoise.json: expected to replace it, found what cannot be removed" in message
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["denoise.json"]

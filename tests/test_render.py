@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from mcdenoise.cli import main
-from mcdenoise.data.exr import read_exr
+from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
@@ -157,6 +157,36 @@ def test_a_stopped_run_is_resumed(tmp_path: Path) -> None:
     assert describe(folder) == description
     with pytest.raises(InputError, match=r"rendered with seed 0, now 1"):
         render(None, seed=1)
+
+
+def test_damaged_files_are_rendered_again(tmp_path: Path) -> None:
+    """What is empty, cut short, garbage, of another size or elsewhere is none of a finished frame's files."""
+
+    def render() -> Path:
+        return render_sequence(demo_scene(), demo_cameras(2), tmp_path, realisations=2, reference_spp=2, **SCALAR)
+
+    folder = render()
+    paths = sorted(path for path in folder.rglob("*.exr") if path.stem[-1] == "1")
+    assert {path.parent.name for path in paths} == {"inputs", "realisation1"}
+    intact = {path: path.read_bytes() for path in folder.rglob("*.exr")}
+    shown = {path: read_exr(path)[0] for path in intact}
+    other = write_exr_bytes(tmp_path / "other.exr", np.zeros((3, 5, 3)))
+    for number, path in enumerate(paths):
+        content = intact[path]
+        damaged = [b"", content[: len(content) // 2], content[:-1], b"garbage" * 99, other]
+        path.write_bytes(damaged[number % len(damaged)])
+    render()
+    for path, image in shown.items():
+        np.testing.assert_array_equal(read_exr(path)[0], image)
+        # What was whole was not rendered again: the header holds the time.
+        assert (path.read_bytes() == intact[path]) or path in paths
+
+
+def write_exr_bytes(path: Path, image: np.ndarray[Any, Any]) -> bytes:
+    write_exr(path, image, ["R", "G", "B"])
+    content = path.read_bytes()
+    path.unlink()
+    return content
 
 
 def test_another_scene_of_the_same_name_is_refused(tmp_path: Path) -> None:

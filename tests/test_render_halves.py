@@ -60,10 +60,12 @@ def test_saved_and_loaded(tmp_path: Path) -> None:
     path = tmp_path / "reference0.partial.npz"
     halves.save(path)
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
-    found = ReferenceHalves.load(path)
+    found = ReferenceHalves.load(path, (PIXELS, 1))
     assert (found.paths, found.passes, found.noise()) == (halves.paths, halves.passes, halves.noise())
     np.testing.assert_array_equal(found.mean(), halves.mean())
+    with pytest.raises(InputError, match="expected a reference in the making"):
+        ReferenceHalves.load(path, (PIXELS, 2))
     for content in (path.read_bytes()[:-9], b""):
         path.write_bytes(content)
         with pytest.raises(InputError, match="expected a reference in the making"):
-            ReferenceHalves.load(path)
+            ReferenceHalves.load(path, (PIXELS, 1))

@@ -9,6 +9,7 @@ import io
 import itertools
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from mcdenoise.cli._stdout import forgiving_stdout
@@ -104,10 +105,28 @@ def _run(name: str, arguments: list[str]) -> int:
         raise InputError(f"unknown command '{arguments[0]}'; expected one of {', '.join(COMMANDS)}")
     wait_passively()
     try:
-        return parse(name, arguments[1:])() or 0
+        command = parse(name, arguments[1:])
+        _check_json(command)
+        return command() or 0
     except SystemExit as stop:
         # Help was asked for.
         return int(stop.code or 0)
+
+
+def _check_json(command: Callable[[], int | None]) -> None:
+    """See that the file of ``--json`` can be written, where a command has one, before its work and not after it."""
+    given: dict[str, Any] = getattr(command, "keywords", {})
+    if given.get("json") is None:
+        return
+    from mcdenoise.cli._output import check_json
+
+    inputs: list[Path] = []
+    for name, value in given.items():
+        if name not in ("json", "out"):
+            inputs += (
+                each for each in (value if isinstance(value, list | tuple) else [value]) if isinstance(each, Path)
+            )
+    check_json(given["json"], inputs, given.get("out"))
 
 
 def load_command(name: str) -> Command:

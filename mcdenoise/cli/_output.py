@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from mcdenoise.errors import printable
+from mcdenoise.errors import InputError, printable
 
 
 def progress_bar() -> Progress:
@@ -26,6 +27,11 @@ def progress_bar() -> Progress:
         TimeRemainingColumn(),
     )
     return Progress(*columns, console=console, disable=not console.is_terminal)
+
+
+def say(line: object) -> None:
+    """Print a line that has paths in it, or what else others have named: a terminal obeys nothing of it."""
+    print(printable(str(line)), flush=True)
 
 
 def show(table: Table) -> None:
@@ -59,6 +65,32 @@ def warn(warnings: Iterable[str]) -> None:
     """Say on stderr what is probably wrong, a line each."""
     for warning in warnings:
         print(f"warning: {printable(warning)}", file=sys.stderr)
+
+
+def check_json(path: Path | None, inputs: Iterable[Path], out: Path | None) -> None:
+    """See that the file of ``--json`` can be written before there is anything to be written.
+
+    Args:
+        path: of ``--json``.
+        inputs: files and folders that the command reads, which it must not be one of.
+        out: folder that the command makes, in which it may be.
+
+    Raises:
+        InputError: it cannot.
+    """
+    if path is None:
+        return
+    # Here because it brings the reader of images, which not every command needs.
+    from mcdenoise.data.files import check_writable
+
+    real = os.path.realpath(path)
+    for given in map(os.path.realpath, inputs):
+        read = real.endswith("camera.json") or not real.endswith(".json")
+        if real == given or (os.path.lexists(real) and read and real.startswith(f"{given}{os.sep}")):
+            raise InputError(f"--json: expected a file to write, found {path}, which is read; choose another path")
+    made = out is not None and not os.path.lexists(out) and real.startswith(f"{os.path.realpath(out)}{os.sep}")
+    if not made:
+        check_writable(path)
 
 
 def write_json(path: Path | None, content: Any) -> None:

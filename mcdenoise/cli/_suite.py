@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mcdenoise.benchmark import Settings, choose_methods, run_benchmark
 from mcdenoise.benchmark.tables import remarks
-from mcdenoise.cli._output import progress_bar, write_json
+from mcdenoise.cli._output import progress_bar, say, write_json
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT
@@ -60,7 +60,7 @@ def score_suite(
             shots = list(dict.fromkeys(row.shot for row in rows))
             render_suite(shots, data, blender_python=blender_python, threads=settings.threads, on_stage=show)
     if out is None:
-        print(data)
+        say(data)
         return 0
     found = rows_there(rows, data)
     if not found:
@@ -87,6 +87,6 @@ def score_suite(
     write_close_ups(out, results, found, ["noisy", *ours, *best])
     print(text)
     for line in [*remarks(results), *([f"not rendered: {', '.join(missing)}"] if missing else [])]:
-        print(line)
-    print(f"tables: {out / 'suite.md'}, close-ups: {out / 'close-ups'}, report: {write_report(out)}")
+        say(line)
+    say(f"tables: {out / 'suite.md'}, close-ups: {out / 'close-ups'}, report: {write_report(out)}")
     return 1 if results.failed else 0

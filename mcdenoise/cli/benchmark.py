@@ -14,7 +14,7 @@ from mcdenoise.benchmark import Settings, benchmark_ops, choose_methods, parse_s
 from mcdenoise.benchmark.sizes import SIZES
 from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows, skipped_rows
 from mcdenoise.cli._options import Json, check_threads, parse_size
-from mcdenoise.cli._output import print_rows, progress_bar, write_json
+from mcdenoise.cli._output import print_rows, progress_bar, say, write_json
 from mcdenoise.cli._suite import SHOWN, score_suite
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
@@ -162,7 +162,7 @@ def benchmark(
     print_rows(scene_rows(results))
     print_rows(skipped_rows(results))
     for line in [*remarks(results), f"report: {write_report(out)}"]:
-        print(line)
+        say(line)
     write_json(json, asdict(results))
     return 1 if results.failed else 0
 

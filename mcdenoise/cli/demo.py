@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from mcdenoise.cli._options import Json, Out
-from mcdenoise.cli._output import print_times, progress_bar, show, write_json
+from mcdenoise.cli._output import print_times, progress_bar, say, show, write_json
 from mcdenoise.demo import FRAMES, run_demo
 from mcdenoise.heap import keep_heap
 from mcdenoise.models import DEFAULT
@@ -40,7 +40,8 @@ def demo(out: Out = Path("demo"), model: str = DEFAULT, json: Json = None) -> No
     scores = [asdict(score) for score in result.scores]
     _print_scores(scores)
     print_times(result.report.milliseconds)
-    print(f"clean frames: {result.denoised}\npicture: {result.picture}\nreport: {result.page}")
+    for what, path in {"clean frames": result.denoised, "picture": result.picture, "report": result.page}.items():
+        say(f"{what}: {path}")
     write_json(json, {"scores": scores, "milliseconds": result.report.milliseconds})
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from mcdenoise.cli._options import Flag, Inputs, Json, Layers, Map, Out, check_threads
-from mcdenoise.cli._output import print_times, progress_bar, stages, warn, write_json
+from mcdenoise.cli._output import print_times, progress_bar, say, stages, warn, write_json
 from mcdenoise.cli.inspect import open_inputs, print_sequence
 from mcdenoise.denoiser import AskedPrecision
 from mcdenoise.errors import InputError
@@ -131,7 +131,7 @@ def denoise(
                 device=device,
                 on_step=lambda done, total: progress.update(task, completed=done, total=total),
             )
-        print(f"picked {choice}")
+        say(f"picked {choice}")
         model, precision = choice.model, choice.precision
     spelling = _spelling(model, weights)
     # What is not asked for is not passed on: a model of another kind has no such setting.
@@ -161,7 +161,7 @@ def denoise(
             task = progress.add_task("preview", total=len(opened))
             shown.close(on_frame=lambda: progress.advance(task))
     for row in report.plan:
-        print(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
+        say(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
     if report.replaced_pixels:
         print(f"replaced {report.replaced_pixels} NaN, infinite, negative or absurdly bright pixels of the noisy color")
     print(f"  tiles: {report.tiles}")
@@ -170,14 +170,14 @@ def denoise(
     print(f"{'beside that' if denoiser.has_room_ahead else 'of the waiting'}: {stages(report.beside)}")
     absent = {name for done in report.frames.values() for name in done.missing}
     if missing := sorted(absent - (MOTION if len(opened) == 1 else frozenset())):
-        print(f"without {', '.join(missing)}, with which {report.model} is better")
+        say(f"without {', '.join(missing)}, with which {report.model} is better")
     warn(report.warnings)
     files = list(report.files.values())
     names = files[0].name if len(files) == 1 else f"{files[0].name} to {files[-1].name}"
     write_json(json, {"model": report.model, "milliseconds": report.milliseconds, "beside": report.beside})
     if shown:
-        print(f"preview: {shown.written[-1]}")
-    print(f"{len(files)} {'frame' if len(files) == 1 else 'frames'} in {taken:.1f} s: {out / names}")
+        say(f"preview: {shown.written[-1]}")
+    say(f"{len(files)} {'frame' if len(files) == 1 else 'frames'} in {taken:.1f} s: {out / names}")
 
 
 def _spelling(model: str | None, weights: Path | None) -> Spelling:

@@ -8,7 +8,7 @@ import tyro
 from rich.table import Table
 
 from mcdenoise.cli._options import Json
-from mcdenoise.cli._output import progress_bar, show, write_json
+from mcdenoise.cli._output import progress_bar, say, show, write_json
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import Evaluation, evaluate_folder, evaluate_method
@@ -74,10 +74,10 @@ def _print_evaluation(result: Evaluation) -> None:
             table.add_row("perfect", *(_figure(result.floor.get(metric)) for metric, _, _ in columns))
         if columns:
             show(table)
-        print(f"{name}: {own.description}")
+        say(f"{name}: {own.description}")
         for reason in dict.fromkeys(own.skipped.values()):
             without = [metric for metric, why in own.skipped.items() if why == reason]
-            print(f"{name}: no {', '.join(without)}: {reason}")
+            say(f"{name}: no {', '.join(without)}: {reason}")
     if result.warping_error:
         ours, theirs = result.warping_error
         print(f"warping error (Lai et al. 2018): {ours:.4g}; of the references {theirs:.4g}")

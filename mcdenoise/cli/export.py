@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from mcdenoise.cli._options import Json, Out
-from mcdenoise.cli._output import write_json
+from mcdenoise.cli._output import say, write_json
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.export import Format, default_buffers, differences, export_model
@@ -65,4 +65,4 @@ def export(
             found[number] = difference
             print(f"frame {number}: largest difference to torch {difference:.1e}, relative")
     write_json(json, {"model": model, "inputs": exported.inputs, "outputs": exported.outputs, "differences": found})
-    print(f"wrote {out}")
+    say(f"wrote {out}")

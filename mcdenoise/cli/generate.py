@@ -11,7 +11,7 @@ import tyro
 from rich.progress import TaskID
 
 from mcdenoise.cli._options import Flag, Out
-from mcdenoise.cli._output import progress_bar
+from mcdenoise.cli._output import progress_bar, say
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.errors import InputError
@@ -126,5 +126,5 @@ def generate(
                         **{**arguments, "spp": take.spp, "reference_spp": reference_spp},
                     )
                 progress.remove_task(task)
-                print(written, flush=True)
+                say(written)
             progress.advance(whole)

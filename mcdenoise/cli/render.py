@@ -9,7 +9,7 @@ from typing import Any
 import tyro
 
 from mcdenoise.cli._options import Flag, Out, parse_size
-from mcdenoise.cli._output import progress_bar
+from mcdenoise.cli._output import progress_bar, say
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.render import load_shot, render_sequence
@@ -100,4 +100,4 @@ def render(
             progress=lambda done, total: progress.update(task, completed=done, total=total),
             **arguments,
         )
-    print(written)
+    say(written)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import tyro
 
+from mcdenoise.cli._output import say
 from mcdenoise.report import write_report
 
 
@@ -15,4 +16,4 @@ def report(folder: tyro.conf.Positional[Path]) -> None:
     Args:
         folder: what `mcdenoise benchmark` wrote: results.json and images/.
     """
-    print(write_report(folder))
+    say(write_report(folder))

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from mcdenoise.cli import load_command, parse
 from mcdenoise.cli._options import Out
-from mcdenoise.cli._output import warn
+from mcdenoise.cli._output import say, warn
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.train import Progress, Recipe, Rendering, Run, RunFolder, TrainConfig, is_first_process
@@ -98,7 +98,7 @@ def train(
         if is_first_process():
             if recipe is not None:
                 _print_errors(RunFolder(out / one.name).errors(), one.expected)
-            print(weights)
+            say(weights)
 
 
 def options_of(command: str) -> set[str]:

@@ -28,7 +28,7 @@ _ROWS = 256
 # or of a run of 128 bytes two.
 _LARGEST_RATIO, _LARGEST_DWA_RATIO = 2_000, 70_000
 # These describe how one file stores its pixels, not what they show; the next file has its own.
-_STORAGE_PREFIXES = ("oiio:", "openexr:", "compression")
+_STORAGE_PREFIXES = ("oiio:", "openexr:", "compression", "textureformat")
 _TUPLE_TYPES = {"FramesPerSecond": "rational", "smpte:TimeCode": "timecode"}
 
 
@@ -202,7 +202,7 @@ def picture_metadata(spec: oiio.ImageSpec) -> Metadata:
         if isinstance(value, tuple) and not all(isinstance(item, int | float) for item in value):
             continue
         if isinstance(value, str | int | float | tuple) and not attribute.name.startswith(_STORAGE_PREFIXES):
-            kept[attribute.name] = value
+            kept[_as_text(attribute.name)] = value
     return kept
 
 

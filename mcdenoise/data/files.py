@@ -55,7 +55,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     target = Path(os.path.realpath(path))
     if os.path.lexists(target) and not os.path.isfile(path):
         raise InputError(f"{path}: expected a file to write, found a folder or a device; choose another path")
-    temporary = target.with_name(f"{_PREFIX}{secrets.token_hex(8)}{_MARK}{target.suffix[:64]}")
+    # By its suffix a library tells the format: that of the name it was given, not of what that may be a link to.
+    temporary = target.with_name(f"{_PREFIX}{secrets.token_hex(8)}{_MARK}{path.suffix[:64]}")
     handle = -1
     try:
         with unfinished(temporary), _writing(path):
@@ -119,6 +120,39 @@ def write_text(path: Path, text: str) -> None:
     """
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def check_writable(path: Path) -> None:
+    """See that a file can be written, and change nothing: before work of hours, not after it.
+
+    Args:
+        path: the file. Its folder must exist.
+
+    Raises:
+        InputError: as :func:`atomic_path`.
+    """
+    with suppress(_Tried), atomic_path(path):
+        raise _Tried
+
+
+class _Tried(Exception):
+    """Writing would have begun."""
+
+
+def remove(path: Path) -> None:
+    """Remove a file, if it is there.
+
+    Raises:
+        InputError: it is no file, or the operating system refused.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise InputError(
+            f"{path}: expected to replace it, found what cannot be removed ({reason}); check the folder and its "
+            "permissions, or choose another"
+        ) from error
 
 
 def _lock(handle: int) -> bool:

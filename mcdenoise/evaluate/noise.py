@@ -9,6 +9,7 @@ from collections.abc import Collection
 import torch
 
 from mcdenoise.data import Sequence
+from mcdenoise.errors import InputError
 from mcdenoise.evaluate.scores import METRICS, measure
 from mcdenoise.reading import read_text
 
@@ -63,8 +64,18 @@ def _noted(sequence: Sequence) -> dict[int, float]:
     """Noise of each reference in use, where ``camera.json`` has it."""
     for path in (sequence.root / "camera.json", sequence.root / "inputs" / "camera.json"):
         if path.is_file():
-            noted = json.loads(read_text(path)).get("reference_noise")
-            if isinstance(noted, dict):
-                estimates = {number: noted.get(str(number)) for number in sequence.reference_numbers}
-                return {number: float(noise) for number, noise in estimates.items() if noise is not None}
+            try:
+                noted = json.loads(read_text(path)).get("reference_noise")
+            except (OSError, ValueError, AttributeError, RecursionError):
+                # Somebody else's: that of a folder in our layout has been read before.
+                return {}
+            if noted is None:
+                return {}
+            estimates = {number: noted.get(str(number)) for number in sequence.reference_numbers if type(noted) is dict}
+            for noise in estimates.values() if type(noted) is dict else [noted]:
+                if noise is not None and not (type(noise) in (int, float) and 0 <= noise < math.inf):
+                    raise InputError(
+                        f"{path}: expected 'reference_noise' to have numbers of 0 or more, found {str(noise)[:80]}"
+                    )
+            return {number: float(noise) for number, noise in estimates.items() if noise is not None}
     return {}

@@ -244,8 +244,8 @@ def _key(root: Path, settings: list[Any]) -> str:
         # What begins with a dot is being written by a renderer, and gone in a moment.
         if path.suffix not in _SUFFIXES or path.name.startswith("."):
             continue
-        # A link to nothing is no file of the sequence.
-        with suppress(FileNotFoundError):
+        # A link to nothing, or to itself, is no file of the sequence.
+        with suppress(OSError):
             status = path.stat()
             digest.update(os.fsencode(path.relative_to(root)))
             digest.update(f"\0{status.st_size}\0{status.st_mtime_ns}\0".encode())

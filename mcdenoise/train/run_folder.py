@@ -50,7 +50,7 @@ class RunFolder:
         """
         for name, content in identity.items():
             path = self.out / f"{name}.json"
-            if path.exists() and (not path.is_file() or path.read_bytes() != _json(content).encode()):
+            if os.path.lexists(path) and (not path.is_file() or path.read_bytes() != _json(content).encode()):
                 raise InputError(
                     f"{path}: expected the same as in this run, found another; choose a new folder for a new run"
                 )
@@ -71,7 +71,7 @@ class RunFolder:
         self.check(**identity)
         for name, content in identity.items():
             path = self.out / f"{name}.json"
-            if not path.exists():
+            if not os.path.lexists(path):
                 write_text(path, _json(content))
 
     @contextmanager
@@ -151,7 +151,7 @@ class RunFolder:
         try:
             entries = [json.loads(line) for line in read_text(path, _LARGEST).splitlines()]
             measured = [entry["validation"] for entry in entries if entry.get("validation")]
-            return dict(measured[-1]) if measured else {}
+            return {str(name): float(error) for name, error in measured[-1].items()} if measured else {}
         except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: expected the log of this run, found none that can be read") from error
 

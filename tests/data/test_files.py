@@ -121,3 +121,35 @@ def test_what_was_written_is_on_the_disk_before_it_has_its_name(
     monkeypatch.setattr(os, "replace", lambda *paths: (done.append("replace"), replace(*paths)))
     write_text(tmp_path / "file.txt", "text")
     assert done == ["fsync", "replace"]
+
+
+def test_what_could_be_written_is_told_and_nothing_changed(tmp_path: Path) -> None:
+    (tmp_path / "there").write_text("before")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "loop").symlink_to("loop")
+    for name in ("there", "new"):
+        files.check_writable(tmp_path / name)
+    for name in ("folder", "loop", "nowhere/new", "there/new"):
+        with pytest.raises(InputError, match=f"{name}: "):
+            files.check_writable(tmp_path / name)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "loop", "there"]
+    assert (tmp_path / "there").read_text() == "before"
+
+
+def test_a_link_is_followed_and_its_own_suffix_tells_the_format(tmp_path: Path) -> None:
+    (tmp_path / "video.mp4").symlink_to("latest")
+    with atomic_path(tmp_path / "video.mp4") as temporary:
+        assert temporary.suffix == ".mp4"
+        temporary.write_text("frames")
+    assert (tmp_path / "latest").read_text() == "frames"
+    assert (tmp_path / "video.mp4").is_symlink()
+
+
+def test_what_cannot_be_removed_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    files.remove(tmp_path / "file")
+    files.remove(tmp_path / "file")
+    with pytest.raises(InputError, match="folder: expected to replace it, found what cannot be removed"):
+        files.remove(tmp_path / "folder")
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]

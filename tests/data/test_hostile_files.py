@@ -20,7 +20,7 @@ from damage import assert_clear, outcomes_of
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import open_sequence
 from mcdenoise.data.camera_matrices import MATRICES
-from mcdenoise.data.exr import read_exr, read_exr_header
+from mcdenoise.data.exr import read_exr, read_exr_header, write_exr
 from mcdenoise.errors import InputError, printable
 
 SIZE = 11, 13
@@ -254,9 +254,9 @@ def test_any_values_are_read_and_written_without_a_warning(tmp_path: Path, seed:
     ("name", "kind"),
     [("pic.exr", "half"), ("pic.png", "uint8"), ("pic.tif", "float"), ("pic.hdr", "float"), ("pic.pfm", "float")],
 )
-def test_a_full_disk_is_told_to_the_last_byte(tmp_path: Path, name: str, kind: str) -> None:
-    """OpenImageIO says nothing of what it still holds back when the disk is full."""
-    size = 70, 90
+@pytest.mark.parametrize("size", [(70, 90), (6, 8)])
+def test_a_full_disk_is_told_to_the_last_byte(tmp_path: Path, name: str, kind: str, size: tuple[int, int]) -> None:
+    """The libraries say nothing of what they still hold back when the disk is full, of a small file all of it."""
     noise = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
     file = oiio.ImageOutput.create(name)
     assert file.open(str(tmp_path / name), oiio.ImageSpec(size[1], size[0], 3, kind))
@@ -268,7 +268,8 @@ def test_a_full_disk_is_told_to_the_last_byte(tmp_path: Path, name: str, kind: s
     length = sequence.write(out, 0, noise).stat().st_size
     (out / name).unlink()
     unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
-    for room in (100, length // 2, length - 5000, length - 100, length - 1):
+    rooms = {100, length // 2, length - 5000, length - 100, length - 1, *range(1, length, max(length // 40, 1))}
+    for room in sorted(room for room in rooms if 0 < room < length):
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, unlimited[1]))
         try:
             with pytest.raises(InputError, match="cannot be written"):
@@ -289,3 +290,11 @@ def test_whole_numbers_beside_a_text_in_latin_1_stay(tmp_path: Path) -> None:
     assert b"M\xfcller" in written
     path.write_bytes(written.replace(b"M\xfcller", b"M?ller"))
     np.testing.assert_array_equal(OpenEXR.File(str(path)).channels()["id"].pixels, channels["id"].pixels)
+
+
+def test_an_attribute_with_a_name_in_latin_1_is_read_as_text(tmp_path: Path) -> None:
+    path = write(tmp_path / "shot.exr", part("RGB", gr_n=3))
+    path.write_bytes(path.read_bytes().replace(b"gr_n\0", b"gr\xfcn\0"))
+    for metadata in (read_exr(path)[2], open_sequence([path]).metadata(0)):
+        assert metadata["grün"] == 3
+        write_exr(tmp_path / "again.exr", np.zeros((*SIZE, 3)), "RGB", metadata=metadata)

@@ -530,3 +530,15 @@ def test_the_checksum_is_that_of_the_images(small_sequence: Path, tmp_path: Path
     assert opened(small_sequence, tmp_path / "cache", front=Front(), firsts=[0]).sha256 == first
     about = json.loads(next((tmp_path / "cache").rglob("about.json")).read_text())
     assert about["sha256"] == first
+
+
+def test_links_to_nothing_and_names_that_are_no_text_are_no_part_of_a_sequence(noisy: Path, tmp_path: Path) -> None:
+    """Whoever makes a link that leads nowhere, or to itself, beside the frames, trains on the frames."""
+    settings = {"front": FRONT, "features": FEATURES, "firsts": [0]}
+    first = open_cached(open_sequence(noisy), tmp_path / "cache", **settings).sha256
+    for folder in (noisy, noisy / "inputs", noisy / "inputs" / "realisation1"):
+        for suffix in (".exr", ".json", ".h"):
+            (folder / f"dangling{suffix}").symlink_to("nothing")
+            (folder / f"loop{suffix}").symlink_to(f"loop{suffix}")
+            Path(os.fsdecode(os.fsencode(folder) + b"/M\xfcller" + suffix.encode())).touch()
+    assert open_cached(open_sequence(noisy), tmp_path / "other", **settings).sha256 == first

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import re
@@ -489,6 +490,35 @@ def write_buffer(
     half = name not in _FULL_FLOAT and not (name == "depth" and image.max() > LARGEST_HALF)
     path = folder / f"{_STEMS[name]}{number}.exr"
     write_exr(path, image, _CHANNELS[image.shape[2]], half=half, metadata=metadata)
+
+
+def has_buffer(folder: Path, number: int, name: str, size: tuple[int, int]) -> bool:
+    """Whether a buffer of a frame is there, and whole: its pixels are read, once in a process.
+
+    A file that is damaged, empty or of another size, as a power cut may leave it, is none.
+
+    Args:
+        folder: where it would be.
+        number: frame number.
+        name: which buffer.
+        size: width and height in pixels that it has to have.
+    """
+    path = folder / f"{_STEMS[name]}{number}.exr"
+    try:
+        status = os.stat(path)
+    except OSError:
+        return False
+    return _is_whole(path, size, len(_CHANNELS[BUFFERS[name].channels]), status.st_mtime_ns, status.st_size)
+
+
+@functools.cache
+def _is_whole(path: Path, size: tuple[int, int], channels: int, *_: int) -> bool:
+    try:
+        header = read_exr_header(path)
+        whole = header.size == size[::-1] and header.origin == (0, 0) and len(header.channels) == channels
+        return whole and bool(read_exr(path)[0].size)
+    except InputError:
+        return False
 
 
 CLEAN = "clean"

@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 
 from mcdenoise.data.exr import Image, pending_error, within_half
 from mcdenoise.data.files import atomic_path
-from mcdenoise.data.images import FORMATS, Part, read_image_header, read_picture
+from mcdenoise.data.images import FORMATS, Part, read_channels, read_image_header, read_picture
 from mcdenoise.data.readers.attributes import put_back, readable
 from mcdenoise.data.readers.transfer import encode
 from mcdenoise.errors import InputError
@@ -96,10 +96,13 @@ def _write_exr(
         file.write(str(target))
         if strange:
             put_back(target, strange)
-        written = read_image_header(target)
+        written = read_image_header(target).parts
+        # The library does not tell when the last few kilobytes no longer fit on the disk: see whether they are there.
+        for index, each in enumerate(written):
+            read_channels(target, {index: each.channels}, slice(each.size[0] - 1, each.size[0]))
     except _LIBRARY_ERRORS as error:
         return _first_line(error)
-    return "" if len(written.parts) == len(expected) else "incomplete"
+    return "" if len(written) == len(expected) else "incomplete"
 
 
 def _first_line(error: Exception) -> str:

@@ -25,7 +25,7 @@ from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, v
 from mcdenoise.data.exr import Image
 from mcdenoise.data.files import write_text
 from mcdenoise.data.images import read_channels, read_image_header
-from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer, write_clean_features
+from mcdenoise.data.readers.bmfr import has_buffer, realisation_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.diffuse_specular import find_splits
 from mcdenoise.data.readers.layers import layers_of
 from mcdenoise.data.readers.values import nothing_hit
@@ -175,6 +175,10 @@ def render_cycles(
     return folder.path
 
 
+# Those that every frame has, as `_View` gives them.
+_FEATURES = ("albedo", "normal", "position", "depth")
+
+
 class _Folder:
     """``inputs`` of a sequence, with its description."""
 
@@ -187,7 +191,7 @@ class _Folder:
         seed: tuple[int, int],
         version: str,
     ) -> None:
-        self.path = path
+        self.path, self.size = path, size
         width, height = size
         scale = _extent(made)
         matrices = np.stack(
@@ -247,11 +251,11 @@ class _Folder:
     def has(self, name: str, number: int, realisation: int) -> bool:
         """Whether a frame has one of its noisy colors, which is written behind its features, with another buffer."""
         place = realisation_folder(self.path, realisation)
-        return all((place / f"{each}{number}.exr").is_file() for each in (name, "color"))
+        return all(has_buffer(place, number, each, self.size) for each in (*_FEATURES, name, "color"))
 
     def has_reference(self, number: int) -> bool:
         """Whether a frame has its reference."""
-        return (self.path / f"reference{number}.exr").is_file()
+        return has_buffer(self.path, number, "reference", self.size)
 
     def write(self, number: int, realisation: int, buffers: Mapping[str, Image]) -> None:
         """Write one noisy color and its features, the color last."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.exr import read_exr, read_exr_header
 from mcdenoise.data.files import write_text
-from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer
+from mcdenoise.data.readers.bmfr import has_buffer, realisation_folder, write_buffer
 from mcdenoise.errors import InputError
 from mcdenoise.reading import read_text
 
@@ -167,7 +167,8 @@ class SequenceFolder:
         found: dict[int, ReferenceState] = {}
         for number in range(self._settings["frames"]):
             path = self.path / f"reference{number}.exr"
-            if not path.is_file():
+            # One that is damaged is rendered again, as any other file of a frame.
+            if not has_buffer(self.path, number, "reference", (self._settings["width"], self._settings["height"])):
                 continue
             header = read_exr_header(path).metadata
             spp, passes, noise = (header.get(f"reference_{name}") for name in ("spp", "passes", "noise"))

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from mcdenoise.data.camera_path import Array, Camera, PixelRays, pixel_rays
-from mcdenoise.data.readers.bmfr import realisation_folder, write_buffer, write_clean_features
+from mcdenoise.data.readers.bmfr import has_buffer, realisation_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.samples import FEATURES
 from mcdenoise.scenes.render.film import Film, FilmRenderer
 from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write_realisation, write_reference
@@ -72,14 +72,14 @@ class FrameJob:
         return colors and features and (number not in self.references or self.has_reference(number))
 
     def has_color(self, number: int, realisation: int) -> bool:
-        """Whether a frame has one of its noisy colours."""
-        return (realisation_folder(self.folder, realisation) / f"color{number}.exr").is_file()
+        """Whether a frame has one of its noisy colours, whole."""
+        return has_buffer(realisation_folder(self.folder, realisation), number, "color", self.size)
 
     def has_features(self, number: int, realisation: int = 0) -> bool:
         """Whether a frame has everything but colours and reference, in the folder of a realisation."""
         folder = realisation_folder(self.folder, realisation)
-        names = ["albedo", "shading_normal", "world_position", "depth", *(["previous_position"] if self.moves else [])]
-        return all((folder / f"{name}{number}.exr").is_file() for name in names)
+        names = ["albedo", "normal", "position", "depth", *(["previous_position"] if self.moves else [])]
+        return all(has_buffer(folder, number, name, self.size) for name in names)
 
     def has_reference(self, number: int) -> bool:
         """Whether a frame has a reference that is good enough."""
@@ -239,7 +239,7 @@ def _refine_reference(
     unfinished = job.folder / f"reference{number}.partial.npz"
     before = job.started.get(number, ReferenceState(0, 0, None))
     if unfinished.is_file():
-        halves = ReferenceHalves.load(unfinished)
+        halves = ReferenceHalves.load(unfinished, job.size)
         advance(halves.spp - before.spp)
     else:
         mean = read_reference(job.folder, number) if before.spp else np.zeros((job.size[0] * job.size[1], 3))

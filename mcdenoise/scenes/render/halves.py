@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +13,10 @@ from numpy.typing import NDArray
 from mcdenoise.data.camera_path import Array
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
+from mcdenoise.reading import read_bytes
 
 NOISE_EPSILON = 0.01
+_LARGEST = 1 << 34  # bytes
 
 
 class ReferenceHalves:
@@ -46,18 +50,24 @@ class ReferenceHalves:
         return cls(np.stack([mean * spp, np.zeros_like(mean)]), (spp, 0), passes)
 
     @classmethod
-    def load(cls, path: Path) -> ReferenceHalves:
+    def load(cls, path: Path, size: tuple[int, int]) -> ReferenceHalves:
         """Read what :meth:`save` wrote.
+
+        Args:
+            path: the file.
+            size: width and height in pixels.
 
         Raises:
             InputError: the file is damaged.
         """
         try:
-            # Opened here, because numpy leaves a damaged file open.
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            content = read_bytes(path, _LARGEST)
+            with np.load(io.BytesIO(content), allow_pickle=False) as stored:
                 first, second, passes = (int(number) for number in stored["counts"])
                 sums: NDArray[np.float64] = stored["sums"]
-        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            if sums.shape != (2, size[0] * size[1], 3) or sums.dtype != np.float64 or min(first, second, passes) < 0:
+                raise ValueError("other counts, or pixels of another image")
+        except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: expected a reference in the making, found something else; remove it") from error
         return cls(sums, (first, second), passes)
 

@@ -1,0 +1,133 @@
+"""Ways in which a file is damaged, by seed, and what may stand in its place."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+Generator = np.random.Generator
+
+
+def truncated(g: Generator, content: bytes) -> bytes:
+    return content[: int(g.integers(0, len(content)))]
+
+
+def zeroed(g: Generator, content: bytes) -> bytes:
+    """A run of zeros, as a disk leaves it after a power cut."""
+    start = int(g.integers(0, len(content)))
+    length = int(g.integers(1, 1 + max(1, len(content) // 2)))
+    return content[:start] + bytes(min(length, len(content) - start)) + content[start + length :]
+
+
+def flipped(g: Generator, content: bytes) -> bytes:
+    """One bit."""
+    damaged = bytearray(content)
+    damaged[int(g.integers(0, len(content)))] ^= 1 << int(g.integers(0, 8))
+    return bytes(damaged)
+
+
+def flipped_head(g: Generator, content: bytes) -> bytes:
+    """Some bits where formats say what follows."""
+    damaged = bytearray(content)
+    for _ in range(int(g.integers(1, 5))):
+        damaged[int(g.integers(0, min(len(content), 400)))] ^= 1 << int(g.integers(0, 8))
+    return bytes(damaged)
+
+
+def swapped(g: Generator, content: bytes) -> bytes:
+    """Two pieces in each other's place."""
+    a, b = sorted(int(each) for each in g.integers(0, len(content), 2))
+    length = min(int(g.integers(1, 64)), b - a, len(content) - b)
+    return (
+        content[:a]
+        + content[b : b + length]
+        + content[a + length : b]
+        + content[a : a + length]
+        + content[b + length :]
+    )
+
+
+def inserted(g: Generator, content: bytes) -> bytes:
+    """Noise, in one place."""
+    start = int(g.integers(0, len(content) + 1))
+    return content[:start] + g.bytes(int(g.integers(1, 40))) + content[start:]
+
+
+TOKENS = [b"NaN", b"1e999", b"-1", b"null", b"[" * 3000, b'{"a":' * 3000, b'"', b"\xff", b"\0", b"{}", b"9" * 400]
+TOKENS += [b"true", b"[]", b"0", b"\n", b"//", b"/*", b";", b"Infinity", b"\x1b[2J", b"\\ud800", b"9" * 5000]
+
+
+def replaced_token(g: Generator, content: bytes) -> bytes:
+    """A value, or what stands for one, in place of some bytes."""
+    start, end = sorted(int(each) for each in g.integers(0, len(content) + 1, 2))
+    end = min(end, start + int(g.integers(0, 20)))
+    return content[:start] + TOKENS[int(g.integers(0, len(TOKENS)))] + content[end:]
+
+
+def other_value(g: Generator, content: bytes) -> bytes:
+    """Of a text: one of its words or numbers is another value, so that it still parses."""
+    words = list(re.finditer(rb'"[^"]*"|-?[0-9][0-9.e+-]*|true|false|null', content))
+    if not words:
+        return flipped(g, content)
+    word = words[int(g.integers(0, len(words)))]
+    values = [
+        b"null",
+        b"-1",
+        b"0",
+        b"1e300",
+        b'"x"',
+        b"[]",
+        b"{}",
+        b"true",
+        b"123456789012345678901",
+        b"0.5",
+        b'"\\ud800"',
+    ]
+    return content[: word.start()] + values[int(g.integers(0, len(values)))] + content[word.end() :]
+
+
+def noise(g: Generator, content: bytes) -> bytes:
+    return g.bytes(int(g.integers(1, 3000)))
+
+
+DAMAGES: tuple[Callable[[Generator, bytes], bytes], ...] = (
+    *(truncated, zeroed, flipped, flipped_head, swapped, inserted, replaced_token, other_value, flipped, noise),
+)
+
+
+def put_folder(path: Path) -> None:
+    path.mkdir()
+
+
+def put_pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def put_dangling(path: Path) -> None:
+    path.symlink_to("nothing")
+
+
+def put_loop(path: Path) -> None:
+    path.symlink_to(path.name)
+
+
+def put_endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def put_empty(path: Path) -> None:
+    path.touch()
+
+
+def put_nothing(path: Path) -> None:
+    assert not path.exists()
+
+
+# What may be where a file is expected; no seed changes them.
+PLACES: tuple[Callable[[Path], None], ...] = (
+    *(put_folder, put_pipe, put_dangling, put_loop, put_endless, put_empty, put_nothing),
+)

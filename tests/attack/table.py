@@ -1,0 +1,361 @@
+"""Commands, readers, files and what holds for them: what is new enters here by a line."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import io
+import json
+import re
+import sys
+import tempfile
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from world import HEIGHT, MODEL, TRAINING, WIDTH
+
+from mcdenoise.cli import COMMANDS as CLI
+from mcdenoise.cli import load_command, main
+from mcdenoise.data.exr import read_exr
+from mcdenoise.errors import InputError
+
+Meaning = Callable[[bytes], object]
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command, or a reader of the API.
+
+    Args:
+        arguments: as on the command line, in a folder that has the world's files.
+        needs: which of them.
+        result: what it has made, given the folder and what it printed: the same, if the input is the same.
+        progress: lines on stderr that are neither a warning nor an error.
+        statuses: that it may end with.
+    """
+
+    arguments: str
+    needs: tuple[str, ...]
+    result: Callable[[Path, str], object]
+    progress: str = r"(?!)"
+    statuses: tuple[int, ...] = (0, 2)
+
+    @property
+    def command(self) -> list[str]:
+        return self.arguments.split()
+
+
+def images(folder: Path, _: str) -> object:
+    """Pixels of all that was written, and what the report says of them."""
+    out = folder / "out"
+    pixels = {path.name: digest(read_exr(path)[0]) for path in sorted(out.glob("*.exr"))}
+    report = json.loads((out / "denoise.json").read_text())
+    return pixels, sorted(each["file"] for each in report["frames"].values())
+
+
+def printed(_: Path, out: str) -> object:
+    """What a script would read."""
+    return hashlib.sha256(out.encode()).hexdigest()
+
+
+def weights(folder: Path, _: str) -> object:
+    """Checksum of the tensors."""
+    from safetensors import safe_open
+
+    with safe_open(folder / f"run/{MODEL}.safetensors", framework="pt") as file:
+        return file.metadata()["sha256"]
+
+
+def page(folder: Path, _: str) -> object:
+    """Whether there is one, whole."""
+    return (folder / "results/index.html").read_text().rstrip().endswith("</html>")
+
+
+def rendered(folder: Path, _: str) -> object:
+    """Pixels of what was rendered."""
+    return {path.name: digest(read_exr(path)[0]) for path in sorted((folder / "rendered/inputs").glob("*.exr"))}
+
+
+SHOWN = "denoise shot -o out --model joint_bilateral"
+NETWORK = "denoise shot -o out --weights weights.safetensors --precision float32"
+RENDERING = (
+    "render scene/scene.xml --camera-path path.json -o rendered --size 16x12 --reference-spp 4 --variant scalar_rgb"
+)
+COMMANDS = {
+    "denoise": Command(SHOWN, ("shot",), images),
+    "denoise layers": Command("denoise layers -o out --model joint_bilateral --alpha", ("layers",), images),
+    "denoise network": Command(NETWORK, ("shot", "weights.safetensors"), images),
+    "denoise again": Command(SHOWN, ("shot", "out"), images),
+    "inspect": Command("inspect shot", ("shot",), printed),
+    "inspect layers": Command("inspect layers", ("layers",), printed),
+    "evaluate": Command("evaluate shot out", ("shot", "out"), printed),
+    "evaluate model": Command("evaluate shot --model noisy", ("shot",), printed),
+    "train": Command(f"train shot -o run {TRAINING}", ("shot", "run"), weights, r"step \d+  loss .*"),
+    "report": Command("report results", ("results",), page),
+    "models": Command("models --results results", ("results",), printed),
+    "render": Command(RENDERING, ("scene", "path.json", "rendered"), rendered),
+    "reader exr": Command("reader exr shot/inputs/color0.exr", ("shot",), printed),
+    "reader sequence": Command("reader sequence shot", ("shot",), printed),
+    "reader layers": Command("reader sequence layers", ("layers",), printed),
+    "reader camera_matrices": Command("reader camera_matrices shot/inputs/camera_matrices.h", ("shot",), printed),
+    "reader camera_path": Command("reader camera_path path.json", ("path.json",), printed),
+    "reader recipe": Command("reader recipe recipe.toml", ("recipe.toml",), printed),
+    "reader weights": Command("reader weights weights.safetensors", ("weights.safetensors",), printed),
+    "reader results": Command("reader results results", ("results",), printed),
+    "reader run": Command("reader run run", ("run",), printed),
+    "reader run_times": Command("reader run_times run_times.json", ("run_times.json",), printed),
+    "reader precision": Command("reader precision precision.json", ("precision.json",), printed),
+    "reader clean": Command("reader clean clean", ("clean",), printed),
+    "reader halves": Command("reader halves reference0.partial.npz", ("reference0.partial.npz",), printed),
+}
+
+
+def read_sequence(path: Path) -> object:
+    from mcdenoise.data import open_sequence
+
+    sequence = open_sequence(path)
+    return [dict(sequence.frame(number).items()) for number in sequence.numbers]
+
+
+def read_recipe(path: Path) -> object:
+    from mcdenoise.cli.train import options_of
+    from mcdenoise.train import Recipe
+
+    recipe = Recipe.read(path, options_of("generate"))
+    return [recipe.data, recipe.validation, recipe.credits, recipe.chosen([])]
+
+
+def read_weights(path: Path) -> object:
+    from mcdenoise.models import load_weights
+
+    return load_weights(path).state_dict()
+
+
+def read_run(path: Path) -> object:
+    from mcdenoise.train import RunFolder
+
+    run = RunFolder(path)
+    run.rewind(2)
+    return run.errors()
+
+
+def read_run_times(path: Path) -> object:
+    from mcdenoise import budget
+
+    return budget._read(path)
+
+
+def read_precision(path: Path) -> object:
+    from mcdenoise.models import _precision
+
+    return _precision._read(path)
+
+
+def read_matrices(path: Path) -> object:
+    from mcdenoise.data.camera_matrices import read_camera_matrices
+
+    return read_camera_matrices(path)
+
+
+def read_path(path: Path) -> object:
+    from mcdenoise.data.camera_path import load_shot
+
+    return load_shot(path)
+
+
+def read_results(path: Path) -> object:
+    from mcdenoise.results import Results
+
+    return Results.read(path)
+
+
+def read_clean(path: Path) -> object:
+    from mcdenoise.data.readers.bmfr import read_clean_features
+
+    return read_clean_features(path, 0)
+
+
+def read_halves(path: Path) -> object:
+    from mcdenoise.scenes.render.halves import ReferenceHalves
+
+    halves = ReferenceHalves.load(path, (WIDTH, HEIGHT))
+    return [halves.mean(), halves.noise(), halves.spp]
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "exr": read_exr,
+    "sequence": read_sequence,
+    "camera_matrices": read_matrices,
+    "camera_path": read_path,
+    "recipe": read_recipe,
+    "weights": read_weights,
+    "results": read_results,
+    "run": read_run,
+    "run_times": read_run_times,
+    "precision": read_precision,
+    "clean": read_clean,
+    "halves": read_halves,
+}
+
+
+def read(name: str, path: Path) -> int:
+    """Print a checksum of what a reader gives, or the one line of its error."""
+    try:
+        print(digest(READERS[name](path)))
+    except InputError as error:
+        print(f"mcdenoise reader: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def pixels(content: bytes) -> object:
+    """What another library reads in an EXR."""
+    import OpenImageIO as oiio
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "image.exr")
+        path.write_bytes(content)
+        file = oiio.ImageInput.open(str(path))
+        if file is None:
+            return oiio.geterror()
+        return of_image(file)
+
+
+def of_image(file: Any) -> object:
+    """What its header says, and its pixels."""
+    import OpenImageIO as oiio
+
+    spec = file.spec()
+    size = (spec.width, spec.height, spec.nchannels)
+    found = file.read_image(oiio.FLOAT) if spec.width * spec.height * spec.nchannels < 10**6 else None
+    file.close()
+    names = [*spec.channelnames, *((each.name, str(each.value)) for each in spec.extra_attribs)]
+    return size, names, None if found is None else np.asarray(found).tobytes()
+
+
+def anything(content: bytes) -> object:
+    """Of text whose every character counts."""
+    return content
+
+
+def exactly(_: bytes) -> object:
+    """Of what has a checksum: it is as it was, or it is refused, or made anew."""
+    return None
+
+
+def toml(content: bytes) -> object:
+    return tomllib.loads(content.decode())
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file, and who reads it.
+
+    Args:
+        path: in the world; a pattern, of which the first is taken.
+        meaning: of its content: where it is the same as before, so is the result.
+        commands: names in :data:`COMMANDS`, and how many cases each has.
+    """
+
+    path: str
+    meaning: Meaning
+    commands: dict[str, int]
+
+
+KINDS = {
+    "color": Kind(
+        "shot/inputs/color0.exr",
+        pixels,
+        {"denoise": 130, "inspect": 60, "evaluate model": 60, "reader exr": 100, "train": 8},
+    ),
+    "color of the second frame": Kind(
+        "shot/inputs/color1.exr", pixels, {"denoise": 60, "denoise network": 40, "reader sequence": 60}
+    ),
+    "albedo": Kind("shot/inputs/albedo1.exr", pixels, {"denoise": 80, "denoise network": 40, "train": 6}),
+    "normal": Kind("shot/inputs/shading_normal0.exr", pixels, {"denoise": 80, "reader sequence": 60}),
+    "position": Kind("shot/inputs/world_position1.exr", pixels, {"denoise": 80, "evaluate model": 40}),
+    "motion": Kind("shot/inputs/motion1.exr", pixels, {"denoise": 80, "inspect": 40}),
+    "reference": Kind("shot/inputs/reference0.exr", pixels, {"evaluate": 80, "evaluate model": 40, "train": 6}),
+    "image to evaluate": Kind("out/denoised0.exr", pixels, {"evaluate": 90}),
+    "layers": Kind("layers/shot1.exr", pixels, {"denoise layers": 130, "inspect layers": 60, "reader layers": 80}),
+    "camera.json": Kind(
+        "shot/inputs/camera.json", json.loads, {"denoise": 100, "inspect": 40, "evaluate model": 60, "train": 6}
+    ),
+    "camera_matrices.h": Kind(
+        "shot/inputs/camera_matrices.h", anything, {"denoise": 100, "inspect": 60, "reader camera_matrices": 160}
+    ),
+    "weights": Kind("weights.safetensors", exactly, {"denoise network": 120, "reader weights": 160}),
+    "recipe": Kind("recipe.toml", toml, {"reader recipe": 200}),
+    "camera path": Kind("path.json", json.loads, {"reader camera_path": 200}),
+    "results.json": Kind("results/results.json", json.loads, {"reader results": 160, "models": 10, "report": 10}),
+    "earlier denoise.json": Kind("out/denoise.json", exactly, {"denoise again": 100}),
+    "earlier image": Kind("out/denoised1.exr", exactly, {"denoise again": 60}),
+    "checkpoint": Kind("run/checkpoint.pt", exactly, {"train": 40}),
+    "log": Kind("run/log.jsonl", anything, {"train": 40, "reader run": 160}),
+    "config of a run": Kind("run/config.json", exactly, {"train": 40}),
+    "data of a run": Kind("run/data.json", exactly, {"train": 12}),
+    "decoded cache": Kind("run/cache/*/*/*.npy", exactly, {"train": 40}),
+    "about the decoded cache": Kind("run/cache/*/*/about.json", exactly, {"train": 40}),
+    "rendered color": Kind("rendered/inputs/color0.exr", pixels, {"render": 24}),
+    "rendered feature": Kind("rendered/inputs/albedo1.exr", pixels, {"render": 24}),
+    "rendered reference": Kind("rendered/inputs/reference1.exr", pixels, {"render": 24}),
+    "about what was rendered": Kind("rendered/inputs/camera.json", json.loads, {"render": 24}),
+    "scene": Kind("scene/scene.xml", anything, {"render": 20}),
+    "precision.json": Kind("precision.json", json.loads, {"reader precision": 120}),
+    "run_times.json": Kind("run_times.json", json.loads, {"reader run_times": 120}),
+    "clean features": Kind("clean/clean/albedo0.exr", pixels, {"reader clean": 100}),
+    "reference in the making": Kind("reference0.partial.npz", exactly, {"reader halves": 120}),
+}
+
+
+def warm_up() -> None:
+    """Import what the commands need; nothing that starts a thread."""
+    import OpenImageIO as oiio
+
+    oiio.attribute("threads", 1)
+    for name in CLI:
+        load_command(name)
+    # Imports that wait for their first use.
+    for name in ("torch.utils.tensorboard", "lightning_fabric", "kornia", "colour", "numba", "jinja2"):
+        importlib.import_module(name)
+    for command in ("models", "denoise --help"):
+        with redirect_stdout(io.StringIO()):
+            try:
+                main(command.split())
+            except SystemExit:
+                continue
+
+
+def digest(value: object) -> str:
+    """Checksum of numbers, arrays, texts, and of what holds them."""
+    sha256 = hashlib.sha256()
+    for piece in pieces(value):
+        sha256.update(piece)
+    return sha256.hexdigest()
+
+
+def pieces(value: Any) -> Iterator[bytes]:
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {each.name: getattr(value, each.name) for each in fields(value)}
+    if isinstance(value, torch.Tensor):
+        value = value.detach().numpy()
+    if isinstance(value, np.ndarray):
+        yield str((value.shape, value.dtype)).encode()
+        yield value.tobytes()
+    elif isinstance(value, dict):
+        for key in sorted(value, key=repr):
+            yield repr(key).encode()
+            yield from pieces(value[key])
+    elif isinstance(value, list | tuple):
+        yield b"["
+        for each in value:
+            yield from pieces(each)
+        yield b"]"
+    else:
+        yield re.sub(r" at 0x[0-9a-f]+", "", repr(value)).encode(errors="surrogateescape")

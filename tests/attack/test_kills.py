@@ -1,0 +1,55 @@
+"""Commands that are killed at random moments, or run twice at once."""
+
+from __future__ import annotations
+
+import signal
+
+import numpy as np
+import pytest
+from attacker import Attacker, aged, unreadable
+from server import Process
+from table import COMMANDS
+
+KILLED = {"denoise": 50, "denoise layers": 30, "denoise again": 30, "train": 10}
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(("name", "count"), KILLED.items())
+def test_killed(attacker: Attacker, name: str, count: int) -> None:
+    """Nothing partial under a final name, and the same command again ends as if nothing had happened."""
+    failed, command, g = [], COMMANDS[name], np.random.default_rng(1)
+    attacker.expected(name)
+    folder = attacker.fresh(command.needs)
+    longest = attacker.run(command.command, folder).seconds
+    for seed in range(count):
+        folder = attacker.fresh(command.needs)
+        how = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM)[seed % 3]
+        attacker.run(command.command, folder, kill_after=float(g.uniform(0, 1.1 * longest)), signal=how)
+        problem = unreadable(folder / "out")
+        aged(folder)
+        if not problem:
+            ended = attacker.run(command.command, folder)
+            problem = attacker.judge(name, folder, ended, same=True, needed=True)
+        failed += attacker.count("killed", problem, f"{name}, kill {seed}", folder)
+    assert not failed, "\n".join(failed)
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(("name", "count"), KILLED.items())
+def test_two_at_once(attacker: Attacker, name: str, count: int) -> None:
+    """In one folder: each is done, or refused in one line, and what is there in the end is whole."""
+    failed, command, g = [], COMMANDS[name], np.random.default_rng(2)
+    attacker.expected(name)
+    for seed in range(count // 2):
+        folder = attacker.fresh(command.needs)
+        one = Process(command.command, str(folder))
+        other = Process(command.command, str(folder), delay=float(g.uniform(0, 0.2)))
+        ended = attacker.server.run(one, other)
+        needed = name != "train"
+        problems = [attacker.judge(name, folder, each, same=True, needed=needed) for each in ended]
+        if not any(each.status == 0 for each in ended):
+            problems.append("neither is done")
+        failed += attacker.count("two at once", next(filter(None, problems), ""), f"{name}, {seed}", folder)
+    assert not failed, "\n".join(failed)

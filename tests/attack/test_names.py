@@ -1,0 +1,124 @@
+"""Names that trip terminals, tables, patterns and file systems, wherever a command takes or finds one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from attacker import Attacker
+from table import COMMANDS
+
+NAMES = [
+    *(
+        "with space",
+        "line\nbreak",
+        "\x1b[2J\x1b[31mred",
+        "M\udcfcller",
+        "\udcff\udcfe",
+        "n" * 240,
+        "n" * 255,
+        "-o",
+        "--json",
+    ),
+    *(
+        "[a]",
+        "[bold]",
+        "*",
+        "?",
+        "%04d",
+        "####",
+        "ä€𝄞",
+        "\u202eabc",
+        "'\"$(id)`",
+        ".hidden",
+        " ",
+        "\x7f",
+        "\x9b31m",
+        "a\tb",
+    ),
+    *("a:b", "~", "a\\b", "null", "1", "inputs", "color0.exr", "e\u0301", "\r", "#", "{}", "%s%n", "=", ","),
+]
+# What a command line says by it: a folder is named `./-o` there.
+OPTIONS = {"-o", "--json"}
+# Commands by the part of their line that is given the name.
+GIVEN = {
+    "shot": ["denoise", "inspect", "evaluate", "train", "reader sequence"],
+    "layers": ["denoise layers", "inspect layers"],
+    "out": ["denoise", "denoise layers", "denoise network", "evaluate"],
+    "weights.safetensors": ["denoise network", "reader weights"],
+    "results": ["reader results"],
+    "run": ["train"],
+    "recipe.toml": ["reader recipe"],
+    "path.json": ["reader camera_path"],
+}
+EVERY = [(part, command) for part, commands in GIVEN.items() for command in commands]
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(("part", "name"), EVERY)
+def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> None:
+    failed, command = [], COMMANDS[name]
+    attacker.expected(name)
+    for given in NAMES:
+        folder = attacker.fresh(command.needs)
+        if (folder / part).exists():
+            (folder / part).rename(folder / given)
+        if name == "train" and part == "shot":
+            # A run belongs to data of one name; begun anew, it ends with the same weights.
+            shutil.rmtree(folder / "run")
+        # A command line that begins with a minus is an option; nobody can mean a file by it.
+        # The name of a reader stays.
+        kept = 2 if command.command[0] == "reader" else 1
+        line = [*command.command[:kept], *(given if each == part else each for each in command.command[kept:])]
+        ended = attacker.run(line, folder)
+        # Where it is expected to be found.
+        if os.path.lexists(folder / given) and not os.path.lexists(folder / part):
+            (folder / given).rename(folder / part)
+        # What is printed has the name in it.
+        same = name not in ("inspect", "inspect layers", "evaluate", "reader recipe")
+        problem = attacker.judge(name, folder, ended, same=same, needed=is_text(given) and given not in OPTIONS)
+        failed += attacker.count("hostile names", problem, f"{name}, {part} is {given!r}", folder)
+    assert not failed, "\n".join(failed)
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("name", ["denoise", "denoise layers", "inspect", "evaluate", "train"])
+def test_names_that_are_found(attacker: Attacker, name: str) -> None:
+    """Files, folders and links of such names beside those that are read."""
+    failed, command = [], COMMANDS[name]
+    attacker.expected(name)
+    place = "layers" if "layers" in command.needs else "shot/inputs"
+    made: list[Callable[[Path], object]] = [
+        lambda path: path.touch(),
+        lambda path: path.mkdir(),
+        lambda path: path.symlink_to("nowhere"),
+        lambda path: path.symlink_to(path.name),
+    ]
+    for number, given in enumerate(NAMES):
+        for suffix in ("", ".exr", ".json")[number % 2 :]:
+            if len(os.fsencode(given + suffix)) > 255 or os.path.lexists(attacker.world / place / (given + suffix)):
+                continue
+            if given == "inputs" and not suffix:
+                continue
+            folder = attacker.fresh(command.needs)
+            path = folder / place / (given + suffix)
+            make = made[number % len(made)]
+            make(path)
+            ended = attacker.run(command.command, folder)
+            besides = path.relative_to(folder).as_posix()
+            problem = attacker.judge(name, folder, ended, same=False, besides=besides)
+            failed += attacker.count("hostile names", problem, f"{name}, beside {given + suffix!r} ({number})", folder)
+    assert not failed, "\n".join(failed)
+
+
+def is_text(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True

@@ -1,0 +1,164 @@
+"""Places that cannot be written to, that hold something else, and disks without room."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from attacker import Attacker, names, unreadable
+from mutations import PLACES
+from table import COMMANDS
+
+NOBODY = 65534
+
+
+def link_to(target: str) -> Callable[[Path], None]:
+    def put(path: Path) -> None:
+        path.symlink_to(os.path.relpath(path.parent.resolve().joinpath(target), path.parent.resolve()))
+
+    put.__name__ = f"link_to_{target}"
+    return put
+
+
+def put_full(path: Path) -> None:
+    path.symlink_to("/dev/full")
+
+
+def put_text(path: Path) -> None:
+    path.write_text("somebody's own")
+
+
+# The place, in the folder of a case, and what may stand there instead of nothing.
+STANDING = {
+    "out": [link_to("shot/inputs"), link_to("shot"), link_to("layers"), put_full, put_text],
+    "out/denoised0.exr": [
+        link_to("../shot/inputs/color0.exr"),
+        link_to("../shot/inputs/albedo0.exr"),
+        put_full,
+        put_text,
+    ],
+    "out/shot0.exr": [link_to("../layers/shot0.exr"), link_to("../layers/shot1.exr"), put_full, put_text],
+    "out/denoise.json": [link_to("../shot/inputs/camera.json"), put_full, put_text],
+    "out/preview": [link_to("../shot/inputs"), put_full, put_text],
+    "out/preview.mp4": [link_to("../shot/inputs/color0.exr"), put_full, put_text],
+    "figures.json": [link_to("shot/inputs/camera.json"), link_to("layers/shot0.exr"), put_full, put_text],
+    "figures": [put_text],
+}
+LINES = {
+    "denoise": "denoise shot -o out --model joint_bilateral --json figures.json --preview",
+    "denoise layers": "denoise layers -o out --model joint_bilateral --json figures.json",
+    "denoise, json in a folder": "denoise shot -o out --model joint_bilateral --json figures/figures.json",
+    "inspect": "inspect shot --json figures.json",
+    "inspect layers": "inspect layers --json figures.json",
+    "evaluate": "evaluate shot done --json figures.json",
+}
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("command", LINES)
+def test_something_stands_there(attacker: Attacker, command: str) -> None:
+    """An input is never written to, by whatever name; what is refused is refused before any frame is denoised."""
+    failed, line = [], LINES[command].split()
+    for place, own in STANDING.items():
+        # What a command does not write is nothing to it.
+        if not place.startswith(("figures", "out") if "-o" in line else "figures"):
+            continue
+        for put in [*PLACES, *own]:
+            folder = attacker.fresh(("shot", "layers"))
+            (folder / "done").symlink_to(attacker.world / "out")
+            (folder / place).parent.mkdir(exist_ok=True)
+            put(folder / place)
+            ended = attacker.run(line, folder)
+            problem = attacker.lines(command.split(",")[0], ended)
+            problem = problem or attacker.touched(folder, tuple(line[1:2]))
+            written = [name for name in names(folder) if name.startswith("out/") and name != place]
+            if not problem and ended.status == 2 and place.startswith("figures") and written:
+                problem = f"--json is told after the work: {written}"
+            if not problem and ended.status == 0 and not (folder / place).is_symlink():
+                problem = unreadable(folder / "out", place)
+            failed += attacker.count("outputs", problem, f"{command}, {place}: {put.__name__}", folder)
+    assert not failed, "\n".join(failed)
+
+
+@pytest.mark.attack
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("name", ["denoise", "denoise layers", "denoise again", "train"])
+def test_no_room(attacker: Attacker, name: str) -> None:
+    """Files that may not grow beyond some bytes: nothing partial is left, and a run with room is complete."""
+    failed, command, g = [], COMMANDS[name], np.random.default_rng(0)
+    attacker.expected(name)
+    limits = g.integers(1, 400_000 if name == "train" else 2500, 6 if name == "train" else 30)
+    for limit in map(int, limits):
+        folder = attacker.fresh(command.needs)
+        # What it prints is not what is tried here, and has no room either.
+        ended = attacker.run(command.command, folder, largest_file=max(limit, 700), stdout="/dev/null")
+        problem = attacker.judge(name, folder, ended, same=False)
+        if not problem:
+            again = attacker.run(command.command, folder)
+            problem = attacker.judge(name, folder, again, same=True, needed=True)
+        failed += attacker.count("outputs", problem, f"{name}, {limit} bytes", folder)
+    assert not failed, "\n".join(failed)
+
+
+@pytest.mark.attack
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount")
+@pytest.mark.parametrize("name", ["denoise", "denoise layers"])
+def test_a_small_disk(attacker: Attacker, name: str) -> None:
+    failed, command = [], COMMANDS[name]
+    for options in ("ro", *(f"size={kilobytes}k" for kilobytes in (4, 8, 12, 16, 24, 32))):
+        folder = attacker.fresh(command.needs)
+        (folder / "out").mkdir()
+        mount = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder / "out")]
+        if subprocess.run(mount, capture_output=True, check=False).returncode:
+            pytest.skip("may not mount")
+        try:
+            ended = attacker.run(command.command, folder)
+            problem = attacker.judge(name, folder, ended, same=True)
+        finally:
+            subprocess.run(["umount", str(folder / "out")], check=True)
+        failed += attacker.count("outputs", problem, f"{name}, {options}", folder)
+    assert not failed, "\n".join(failed)
+
+
+@pytest.mark.attack
+@pytest.mark.skipif(os.geteuid() != 0, reason="takes the rights of another user")
+@pytest.mark.parametrize("name", ["denoise", "denoise again", "denoise layers", "train", "report", "inspect"])
+def test_somebody_elses_folder(attacker: Attacker, name: str) -> None:
+    failed, command = [], COMMANDS[name]
+    for place in ("out", "run", "results", "shot/inputs", "layers", "."):
+        for mode in (0o700, 0o755, 0o1777):
+            folder = attacker.fresh(command.needs)
+            folder.chmod(0o777)
+            if not (folder / place).exists():
+                (folder / place).mkdir(parents=True)
+            (folder / place).chmod(mode)
+            ended = attacker.run(command.command, folder, user=NOBODY)
+            problem = attacker.judge(name, folder, ended, same=False)
+            failed += attacker.count("outputs", problem, f"{name}, {place} of mode {mode:o}", folder)
+    assert not failed, "\n".join(failed)
+
+
+@pytest.mark.attack
+def test_an_earlier_longer_run(attacker: Attacker) -> None:
+    """Whatever an earlier report lists, what is older stays and is named: it may be hours of work."""
+    failed = []
+    for number, listed in enumerate([["denoised7.exr"], [], ["denoised7.exr", "denoised8.exr"], ["../out7.exr"]]):
+        folder = attacker.fresh(("shot", "out"))
+        for name in ("denoised7.exr", "denoised8.exr"):
+            (folder / "out" / name).write_bytes((attacker.world / "out/denoised0.exr").read_bytes())
+        report = json.loads((folder / "out/denoise.json").read_text())
+        report["frames"] |= {str(7 + i): {**report["frames"]["0"], "file": name} for i, name in enumerate(listed)}
+        (folder / "out/denoise.json").write_text(json.dumps(report))
+        ended = attacker.run(COMMANDS["denoise"].command, folder)
+        problem = attacker.lines("denoise", ended)
+        older = ["denoised7.exr", "denoised8.exr"]
+        if not problem and not all((folder / "out" / name).is_file() and name in ended.err for name in older):
+            problem = f"not kept, or nothing is said of it: {ended.err}"
+        failed += attacker.count("outputs", problem, f"earlier run {number}", folder)
+    assert not failed, "\n".join(failed)

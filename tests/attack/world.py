@@ -1,0 +1,157 @@
+"""What is attacked, intact: a shot in several layouts, weights, results, a training that was stopped, and so on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import torch
+from torch import Tensor
+
+from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
+from mcdenoise.data.camera_path import Camera, pixel_rays, view_projection
+from mcdenoise.data.readers.bmfr import write_bmfr_frame, write_clean_features
+from mcdenoise.frame import Frame
+from mcdenoise.models import create_model, save_weights
+from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
+from mcdenoise.scenes.render.halves import ReferenceHalves
+from mcdenoise.train import Progress, TrainConfig, train
+
+WIDTH, HEIGHT, FRAMES = 16, 12, 2
+MODEL = "cascaded_v2_micro"
+
+RECIPE = """\
+[train]
+model = "cascaded_v2_micro"
+steps = 3
+frames = 2
+crop = 64
+credits = "nobody"
+
+[[data]]
+seeds = "0-1"
+frames = 2
+size = "64x64"
+
+[[validation]]
+seeds = "9"
+frames = 2
+size = "64x64"
+
+[expected]
+smape = 0.5
+tolerance = 0.1
+"""
+
+SCENE = """\
+<scene version="3.0.0">
+  <shape type="rectangle"><bsdf type="diffuse"><rgb name="reflectance" value="0.5, 0.4, 0.3"/></bsdf></shape>
+  <emitter type="constant"/>
+</scene>
+"""
+
+# What `train` is told besides folders.
+TRAINING = f"--model {MODEL} --steps 3 --crop 12 --frames 2 --batch 1 --checkpoint-every 1 --validation-frames 0"
+
+
+def build(folder: Path) -> None:
+    """Write all of it but what `denoise` makes of it."""
+    frames, cameras = rendered()
+    for number, frame in enumerate(frames):
+        write_bmfr_frame(folder / "shot/inputs", number, frame)
+        write_layers(folder / f"layers/shot{number}.exr", frame)
+    write_camera_matrices(folder / "shot/inputs/camera_matrices.h", cameras, "a wall")
+    description = {"color_includes_albedo": True, "reference_noise": {"0": 0.01, "1": 0.02}}
+    (folder / "shot/inputs/camera.json").write_text(json.dumps(description))
+    weights = save_weights(create_model(MODEL, pretrained=True), MODEL, {}, {"licence": "Apache-2.0"})
+    (folder / "weights.safetensors").write_bytes(weights)
+    (folder / "recipe.toml").write_text(RECIPE)
+    # Its folder is the scene's name.
+    (folder / "scene").mkdir()
+    (folder / "scene/scene.xml").write_text(SCENE)
+    poses = [{"position": [0.1 * n, 0.2, 3], "look_at": [0, 0, 0]} for n in range(FRAMES)]
+    (folder / "path.json").write_text(json.dumps({"fov": 40, "frames": poses}, indent=1))
+    (folder / "results").mkdir()
+    results().write(folder / "results")
+    (folder / "run_times.json").write_text(json.dumps({"a machine": {MODEL: 12.5}}))
+    (folder / "precision.json").write_text(json.dumps({"a machine": 1.5}))
+    (folder / "clean").mkdir()
+    write_clean_features(folder / "clean", 0, *(tensor(np.ones((WIDTH * HEIGHT, 3))),) * 2)
+    halves = ReferenceHalves.start(np.ones((WIDTH * HEIGHT, 3)), 4, 1)
+    halves.add(np.full((WIDTH * HEIGHT, 3), 1.5), 4)
+    halves.save(folder / "reference0.partial.npz")
+    stop_a_training(folder)
+
+
+def stop_a_training(folder: Path) -> None:
+    """A run that was stopped after two steps of three, with its cache."""
+    config = TrainConfig(model=MODEL, steps=3, crop=12, frames=2, batch=1, validation_frames=0)
+    whole = folder / "whole"
+
+    def keep(progress: Progress) -> None:
+        if progress.step == 2:
+            shutil.copytree(whole, folder / "run")
+
+    train(config, [folder / "shot"], whole, checkpoint_every=1, report=keep)
+    shutil.rmtree(whole)
+
+
+def rendered() -> tuple[list[Frame], CameraMatrices]:
+    """Frames of a wall with a pattern, noisy, and their cameras."""
+    g, frames, matrices = np.random.default_rng(0), [], []
+    for number in range(FRAMES):
+        camera = Camera.look_at((0.3 + 0.05 * number, 0.2, 4), (0, 0, 0), 40)
+        rays = pixel_rays(camera, WIDTH, HEIGHT)
+        position = rays.origin - rays.origin[2] / rays.directions[:, 2:] * rays.directions
+        matrices.append(view_projection(camera, WIDTH, HEIGHT, 0.01, 100))
+        checker = (np.floor(position[:, 0] * 2) + np.floor(position[:, 1] * 2)) % 2
+        albedo = np.where(checker[:, None] > 0, [0.8, 0.6, 0.4], [0.2, 0.3, 0.4])
+        reference = albedo * (1 + 0.5 * np.cos(position[:, :1]))
+        frame = Frame(
+            color=tensor(reference * g.exponential(size=reference.shape)),
+            albedo=tensor(albedo),
+            normal=tensor(np.broadcast_to([0.0, 0.0, 1.0], position.shape)),
+            position=tensor(position),
+            motion=tensor(np.zeros((WIDTH * HEIGHT, 2))),
+            reference=tensor(reference),
+        )
+        frames.append(frame)
+    return frames, CameraMatrices(np.stack(matrices), np.full((FRAMES, 2), 0.5), 0.01, 0.25)
+
+
+def tensor(values: np.ndarray) -> Tensor:
+    image = torch.from_numpy(np.ascontiguousarray(values)).float()
+    return image.reshape(HEIGHT, WIDTH, -1).permute(2, 0, 1)[None].contiguous()
+
+
+def write_layers(path: Path, frame: Frame) -> None:
+    """One file with all layers, as Blender writes it."""
+    path.parent.mkdir(exist_ok=True)
+    names = {"Combined": "color", "Denoising Albedo": "albedo", "Denoising Normal": "normal"}
+    channels = {}
+    for layer, buffer in names.items():
+        pixels = getattr(frame, buffer)[0].numpy().astype(np.float16)
+        letters = "XYZ" if "Normal" in layer else "RGB"
+        channels |= {f"View.{layer}.{each}": pixels[i].copy() for i, each in enumerate(letters)}
+    channels["View.Combined.A"] = np.ones((HEIGHT, WIDTH), np.float16)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "owner": "somebody"}
+    OpenEXR.File(header, channels).write(str(path))
+
+
+def results() -> Results:
+    """Of a benchmark of two methods on one scene."""
+    spread = Spread(10.0, 9.0, 11.0, 3)
+    cells = [
+        Cell("wall", name, {"SMAPE": error, "PSNR": 30.0}, {"SMAPE": spread}, spread, {"network": spread}, 12.0)
+        for name, error in ((MODEL, 0.05), ("noisy", 0.2))
+    ]
+    methods = [
+        Method(MODEL, "trainable", MODEL, MODEL, {"width": 8}, parameters=1000),
+        Method("noisy", "baseline", "noisy", "noisy"),
+    ]
+    scene = Scene("wall", WIDTH, HEIGHT, [0, 1], [0, 1])
+    machine = Machine("a processor", 2, 4.0, "cpu", 1, "a system", {"torch": "2"})
+    return Results("mcdenoise benchmark", "2026-01-01T00:00:00+00:00", machine, 1, [scene], methods, cells)
