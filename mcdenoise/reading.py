@@ -9,6 +9,8 @@ from pathlib import Path
 
 # Far more than any text of ours takes.
 LARGEST_TEXT = 64 << 20
+# Some files of the system say that they are empty, and are not.
+_UNSAID = 1 << 20
 
 
 def check_file(path: Path) -> None:
@@ -31,9 +33,10 @@ def read_bytes(path: Path, largest: int = LARGEST_TEXT) -> bytes:
     check_file(path)
     # What has become a pipe meanwhile does not wait either.
     with open(os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)), "rb") as file:
-        # Some files of the system say that they are empty, and are not.
-        content = b"" if os.fstat(file.fileno()).st_size > largest else file.read(largest + 1)
-        larger = os.fstat(file.fileno()).st_size > largest or len(content) > largest
+        size = os.fstat(file.fileno()).st_size
+        # Memory for all that is asked for is taken at once.
+        content = b"" if size > largest else file.read(min(largest, max(size, _UNSAID)) + 1)
+        larger = size > largest or len(content) > largest
     if larger:
         raise OSError(errno.EFBIG, f"it is larger than {largest} bytes", str(path))
     return content

@@ -16,7 +16,7 @@ from mcdenoise.cli import main
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.models import pretrained_models
-from mcdenoise.results import Cell, Machine, Results
+from mcdenoise.results import Cell, Machine, Method, Results, Scene
 
 TIMES = {"cascaded_v2": 300.0, "cascaded_v2_small": 170.0, "cascaded_v2_tiny": 80.0, "cascaded_v2_micro": 50.0}
 TIMES["oidn_pyramid"] = 5000.0  # where the package is installed that it requires
@@ -52,7 +52,9 @@ def results(tmp_path: Path) -> Path:
     ]
     folder = tmp_path / "results"
     folder.mkdir()
-    Results("", "", Machine("", 1, 1.0, "cpu", 1, ""), 1, [], [], cells).write(folder)
+    scenes = [Scene(name, 24, 20, [0], [0], []) for name in ("a", "b")]
+    methods = [Method(name, "trainable", f"method{i}", name.partition(",")[0]) for i, name in enumerate(errors)]
+    Results("", "", Machine("", 1, 1.0, "cpu", 1, ""), 1, scenes, methods, cells).write(folder)
     return folder
 
 
