@@ -7,8 +7,9 @@ DATASET is a folder with a sequence in the BMFR layout for each scene.
 
 Table 1 is PSNR and SSIM of each method on each scene; Table 2 milliseconds of networks and filters at 1280x720; Table 3
 the order of the networks (K, P, K+P, K+K, P+K); Table 4 bilateral weights (BWA) and temporal loss (TL) on and off.
-Below each stands which of the paper's claims holds here. PSNR and SSIM are given by two protocols: "strict" (sRGB
-curve, data range 1) and "meng2020", by which the published figures on this dataset seem to have been made.
+Below each stands which of the paper's claims holds here. PSNR and SSIM are given by three protocols: "strict" (sRGB
+curve, data range 1), and those of two rivals' code, "meng2020" and "fan2021", by which the published figures on this
+dataset seem to have been made.
 
 Networks are those of RUNS, or else, in Table 1, the shipped ones:
 
@@ -45,7 +46,7 @@ from mcdenoise.metrics import PROTOCOLS
 from mcdenoise.models import Output, compared_models, create_model, describe_weights, parts_of
 from mcdenoise.models.accumulated import Accumulated
 
-PROTOCOL_NAMES = ("strict", "meng2020")
+PROTOCOL_NAMES = ("strict", "meng2020", "fan2021")
 SEEDS = (1, 2, 3)
 KINDS = ("random scenes", "four times the steps", "one left out")
 Errors = dict[str, float]  # by "protocol metric"
