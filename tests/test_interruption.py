@@ -130,9 +130,17 @@ WRITING = {
 }
 
 
+# These tests may themselves run in the background, or under nohup, and what is ignored is inherited.
+HEEDING = """import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGTERM, signal.SIG_DFL)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+"""
+
+
 def started(code: str, *arguments: object, folder: Path) -> subprocess.Popen[str]:
-    """A process with a group of its own, as a shell starts it."""
-    command = [sys.executable, "-c", code, *map(str, arguments)]
+    """A process with a group of its own, as a shell starts it: not one in the background, which ignores Ctrl+C."""
+    command = [sys.executable, "-c", f"{HEEDING}{code}", *map(str, arguments)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen(command, **pipes, text=True, start_new_session=True, cwd=folder)
 
