@@ -397,6 +397,7 @@ def test_skipped_shows_five_shots_of_a_scene(small_sequence: Path) -> None:
         assert change == pytest.approx(short - whole, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_start_up_times_whole_processes(tmp_path: Path) -> None:
     pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
     file = tmp_path / "times.json"

@@ -61,7 +61,9 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return render_sequence(demo_scene(), demo_cameras(2), out, realisations=2, reference_spp=2, film=film, **SCALAR)
 
 
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=[] if each == "gaussian" else [pytest.mark.slow]) for each in FILTERS]
+)
 def test_the_mean_of_noisy_colors_and_features_is_that_of_many_samples(tmp_path: Path, name: str) -> None:
     """Albedo and color of a wall in even light are one and the same image, filtered by the same filter.
 

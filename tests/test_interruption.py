@@ -181,7 +181,13 @@ def interrupt(folder: Path, moment: str, number: signal.Signals = signal.SIGINT)
     assert [path.name for path in folder.iterdir()] == ["slow_module.py"]
 
 
-@pytest.mark.parametrize("moment", [*MOMENTS, *WRITING])
+# The others take seconds each.
+QUICK = ("sleep", "compiled code", "destructors", "a file")
+
+
+@pytest.mark.parametrize(
+    "moment", [pytest.param(each, marks=[] if each in QUICK else [pytest.mark.slow]) for each in (*MOMENTS, *WRITING)]
+)
 def test_whatever_a_command_does_it_can_be_interrupted(moment: str, tmp_path: Path) -> None:
     interrupt(tmp_path, (MOMENTS | WRITING)[moment])
 

@@ -142,7 +142,9 @@ def seconds(read: Callable[[Path], object], path: Path, text: str) -> float:
 
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("read", [read_camera_matrices, load_shot])
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize(
+    "start", [pytest.param(each, marks=[pytest.mark.slow] if i else []) for i, each in enumerate(STARTS)]
+)
 def test_the_time_to_read_a_text_is_that_of_its_length(
     start: str, read: Callable[[Path], object], tmp_path: Path
 ) -> None:

@@ -192,7 +192,7 @@ def refused(action: Callable[[], object]) -> str:
     return str(error.value)
 
 
-@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize("precision", ["float32", pytest.param("bfloat16", marks=pytest.mark.slow)])
 def test_one_absurdly_bright_pixel_is_replaced_and_counted(shot: list[Frame], precision: str) -> None:
     window = shot[1].color[0, :, 9:12, 19:22].reshape(3, 9)
 

@@ -46,7 +46,7 @@ def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
 # bfloat16 and float16 take the same way through the ops; `mcdenoise stability` tries them all.
 # Second derivatives of 25 taps take half a minute.
 TRIED = [
-    pytest.param(op, dtype, marks=[pytest.mark.slow] if op.name == "atrous" else [])
+    pytest.param(op, dtype, marks=[pytest.mark.slow] if op.name == "atrous" or dtype == torch.float16 else [])
     for op in OPS
     for dtype in (torch.float32, torch.float16)
 ]

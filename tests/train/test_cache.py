@@ -306,6 +306,7 @@ def test_a_stale_cache_is_made_again(noisy: Path, tmp_path: Path, reads: list[tu
     assert not set(entries(folder)) & set(before)
 
 
+@pytest.mark.slow
 def test_a_change_of_any_source_makes_it_again(small_sequence: Path, tmp_path: Path) -> None:
     """Each in a process of its own, with a copy of the package."""
     root = tmp_path / "copy"

@@ -385,6 +385,7 @@ def test_a_run_killed_while_it_saves_keeps_the_checkpoint_before(small_sequence:
     assert not left.exists()
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_does(small_sequence: Path, tmp_path: Path) -> None:
     settings = {**SMALL, "batch": 4, "steps": 4, "ema": 0.9, "losses": "image=1,initial=0.5"}
     config = TrainConfig(**settings, gradient_norm=0.5, lamps=0.5, exposure=1.0)
