@@ -115,6 +115,7 @@ def write_exr(
         raise ValueError(
             f"image: expected shape (H, W, {len(channels)}) for channels {list(channels)}, found {image.shape}"
         )
+    check_name(path)
     height, width, count = image.shape
     spec = oiio.ImageSpec(width, height, count, "half" if half else "float")
     spec.channelnames = tuple(channels)

@@ -46,8 +46,15 @@ class RunFolder:
             identity: for each file its content.
 
         Raises:
-            InputError: an earlier run wrote something else to one of the files.
+            InputError: an earlier run wrote something else to one of the files, or the folder's name is not UTF-8.
         """
+        try:
+            str(self.out).encode()
+        except UnicodeEncodeError as error:
+            # TensorBoard cannot write its events there.
+            raise InputError(
+                f"{self.out}: expected a folder whose name is UTF-8; choose another one for the run"
+            ) from error
         for name, content in identity.items():
             path = self.out / f"{name}.json"
             if os.path.lexists(path) and (not path.is_file() or path.read_bytes() != _json(content).encode()):

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from mutations import DAMAGES, PLACES
 from server import HUNG, Ended, Process, Server
-from table import COMMANDS, KINDS, RENDERING, SHOWN, Command
+from table import COMMANDS, GENERATION, KINDS, RENDERING, SHOWN, Command
 from world import build
 
 from mcdenoise.data.exr import read_exr
@@ -25,7 +25,7 @@ from mcdenoise.errors import InputError
 
 # What commands write; all else in a case's folder has to stay as it was.
 _WRITTEN = re.compile(
-    r"(out|run|rendered|\.cache|\.config|\.triton)(/.*)?|results/(index\.html|plots(/.*)?)|\.output.*"
+    r"(out|run|rendered|generated|compared|\.cache|\.config|\.triton)(/.*)?|results/(index\.html|plots(/.*)?)|model\.pt2|\.output.*"
 )
 _CHANGING = re.compile(r"run/(events\..*|cache/.*)|results/plots/.*|\.(cache|config|triton)(/.*)?", re.DOTALL)
 _LEFTOVER = re.compile(r"\.mcdenoise-|\.tmp|\.copy\.exr|/building")
@@ -46,7 +46,7 @@ class Attacker:
         self._expected: dict[str, tuple[object, set[str]]] = {}
         self._number = 0
         build(self.world)
-        made = [SHOWN, RENDERING] if has_mitsuba() else [SHOWN]
+        made = [SHOWN, RENDERING, GENERATION] if is_installed("mitsuba") else [SHOWN]
         for each in made:
             done = self.run(each.split(), self.world)
             assert done.status == 0, done
@@ -87,9 +87,9 @@ class Attacker:
 
     def damaged(self, kind: str, name: str, seeds: range, group: str) -> list[str]:
         """Cases of a kind of file and a command; those that failed, in words. The first are those of another place."""
-        if name == "render" and not has_mitsuba():
-            pytest.skip("Mitsuba is not installed")
         target, command, failed = KINDS[kind], COMMANDS[name], []
+        if not is_installed(command.requires):
+            pytest.skip(f"{command.requires} is not installed")
         self.expected(name)
         source = min(path for path in self.intact if path.relative_to(self.world).match(target.path))
         place = source.relative_to(self.world)
@@ -185,9 +185,9 @@ class Attacker:
         return _of_lines(COMMANDS[name], ended)
 
 
-def has_mitsuba() -> bool:
-    """Whether anything can be rendered."""
-    return importlib.util.find_spec("mitsuba") is not None
+def is_installed(module: str) -> bool:
+    """Whether a command can do anything here."""
+    return not module or importlib.util.find_spec(module) is not None
 
 
 def names(folder: Path) -> set[str]:

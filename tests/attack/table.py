@@ -10,9 +10,11 @@ import re
 import sys
 import tempfile
 import tomllib
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,7 @@ class Command:
         result: what it has made, given the folder and what it printed: the same, if the input is the same.
         progress: lines on stderr that are neither a warning nor an error.
         statuses: that it may end with.
+        requires: a module without which it can do nothing.
     """
 
     arguments: str
@@ -45,6 +48,7 @@ class Command:
     result: Callable[[Path, str], object]
     progress: str = r"(?!)"
     statuses: tuple[int, ...] = (0, 2)
+    requires: str = ""
 
     @property
     def command(self) -> list[str]:
@@ -79,7 +83,35 @@ def page(folder: Path, _: str) -> object:
 
 def rendered(folder: Path, _: str) -> object:
     """Pixels of what was rendered."""
-    return {path.name: digest(read_exr(path)[0]) for path in sorted((folder / "rendered/inputs").glob("*.exr"))}
+    return exr_files(folder / "rendered/inputs")
+
+
+def generated(folder: Path, _: str) -> object:
+    """The same of a random scene."""
+    return exr_files(folder / "generated/random0000/inputs")
+
+
+def exr_files(folder: Path) -> dict[str, str]:
+    return {path.name: digest(read_exr(path)[0]) for path in sorted(folder.glob("*.exr"))}
+
+
+def pictures(folder: Path, _: str) -> object:
+    """Pixels of all that was written, of whatever format."""
+    import OpenImageIO as oiio
+
+    written = (path for path in sorted((folder / "out").iterdir()) if path.suffix != ".json")
+    return {path.name: of_image(oiio.ImageInput.open(str(path))) for path in written}
+
+
+def errors(folder: Path, _: str) -> object:
+    """Errors of each method; times are never the same."""
+    cells = json.loads((folder / "compared/results.json").read_text())["cells"]
+    return [(each["scene"], each["method"], each["errors"]) for each in cells]
+
+
+def exported(folder: Path, _: str) -> object:
+    """Whether the graph is there, whole: a zip whose checksums hold."""
+    return zipfile.ZipFile(folder / "model.pt2").testzip()
 
 
 SHOWN = "denoise shot -o out --model joint_bilateral"
@@ -87,9 +119,19 @@ NETWORK = "denoise shot -o out --weights weights.safetensors --precision float32
 RENDERING = (
     "render scene/scene.xml --camera-path path.json -o rendered --size 16x12 --reference-spp 4 --variant scalar_rgb"
 )
+GENERATION = (
+    "generate -o generated --seeds 0 --frames 2 --size 16x12 --realisations 1 --reference-spp 4 --variant scalar_rgb"
+)
+COMPARISON = "benchmark shot -o compared --models joint_bilateral --rounds 1 --sizes none --pictures 1 --threads 1"
 COMMANDS = {
     "denoise": Command(SHOWN, ("shot",), images),
     "denoise layers": Command("denoise layers -o out --model joint_bilateral --alpha", ("layers",), images),
+    "denoise hdr": Command("denoise still.hdr -o out --model joint_bilateral", ("still.hdr",), pictures),
+    "denoise pfm": Command("denoise still.pfm -o out --model joint_bilateral", ("still.pfm",), pictures),
+    "denoise tif": Command("denoise still.tif -o out --model joint_bilateral", ("still.tif",), pictures),
+    "denoise zip": Command(
+        "denoise frame0.zip -o out --model joint_bilateral", ("frame0.zip",), images, requires="numcodecs"
+    ),
     "denoise network": Command(NETWORK, ("shot", "weights.safetensors"), images),
     "denoise again": Command(SHOWN, ("shot", "out"), images),
     "inspect": Command("inspect shot", ("shot",), printed),
@@ -99,10 +141,16 @@ COMMANDS = {
     "train": Command(f"train shot -o run {TRAINING}", ("shot", "run"), weights, r"step \d+  loss .*"),
     "report": Command("report results", ("results",), page),
     "models": Command("models --results results", ("results",), printed),
-    "render": Command(RENDERING, ("scene", "path.json", "rendered"), rendered),
+    "render": Command(RENDERING, ("scene", "path.json", "rendered"), rendered, requires="mitsuba"),
+    "generate": Command(GENERATION, ("generated",), generated, requires="mitsuba"),
+    "benchmark": Command(COMPARISON, ("shot",), errors),
+    "export": Command(f"export {MODEL} --weights weights.safetensors -o model.pt2", ("weights.safetensors",), exported),
     "reader exr": Command("reader exr shot/inputs/color0.exr", ("shot",), printed),
     "reader sequence": Command("reader sequence shot", ("shot",), printed),
     "reader layers": Command("reader sequence layers", ("layers",), printed),
+    "reader zip": Command("reader sequence frame0.zip", ("frame0.zip",), printed, requires="numcodecs"),
+    "reader hdr": Command("reader sequence still.hdr", ("still.hdr",), printed),
+    "reader png": Command("reader sequence still.png", ("still.png",), printed),
     "reader camera_matrices": Command("reader camera_matrices shot/inputs/camera_matrices.h", ("shot",), printed),
     "reader camera_path": Command("reader camera_path path.json", ("path.json",), printed),
     "reader recipe": Command("reader recipe recipe.toml", ("recipe.toml",), printed),
@@ -214,12 +262,12 @@ def read(name: str, path: Path) -> int:
     return 0
 
 
-def pixels(content: bytes) -> object:
-    """What another library reads in an EXR."""
+def pixels(content: bytes, suffix: str = ".exr") -> object:
+    """What another library reads in an image."""
     import OpenImageIO as oiio
 
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "image.exr")
+        path = Path(folder, f"image{suffix}")
         path.write_bytes(content)
         file = oiio.ImageInput.open(str(path))
         if file is None:
@@ -237,6 +285,12 @@ def of_image(file: Any) -> object:
     file.close()
     names = [*spec.channelnames, *((each.name, str(each.value)) for each in spec.extra_attribs)]
     return size, names, None if found is None else np.asarray(found).tobytes()
+
+
+def entries(content: bytes) -> object:
+    """Of a zip: what another library finds in it."""
+    with zipfile.ZipFile(io.BytesIO(content)) as file:
+        return {each.filename: file.read(each) for each in file.infolist()}
 
 
 def anything(content: bytes) -> object:
@@ -272,7 +326,7 @@ KINDS = {
     "color": Kind(
         "shot/inputs/color0.exr",
         pixels,
-        {"denoise": 130, "inspect": 60, "evaluate model": 60, "reader exr": 100, "train": 8},
+        {"denoise": 130, "inspect": 60, "evaluate model": 60, "reader exr": 100, "train": 8, "benchmark": 12},
     ),
     "color of the second frame": Kind(
         "shot/inputs/color1.exr", pixels, {"denoise": 60, "denoise network": 40, "reader sequence": 60}
@@ -290,7 +344,12 @@ KINDS = {
     "camera_matrices.h": Kind(
         "shot/inputs/camera_matrices.h", anything, {"denoise": 100, "inspect": 60, "reader camera_matrices": 160}
     ),
-    "weights": Kind("weights.safetensors", exactly, {"denoise network": 120, "reader weights": 160}),
+    "weights": Kind("weights.safetensors", exactly, {"denoise network": 120, "reader weights": 160, "export": 30}),
+    "hdr": Kind("still.hdr", partial(pixels, suffix=".hdr"), {"denoise hdr": 60, "reader hdr": 60}),
+    "pfm": Kind("still.pfm", partial(pixels, suffix=".pfm"), {"denoise pfm": 60}),
+    "tif": Kind("still.tif", partial(pixels, suffix=".tif"), {"denoise tif": 60}),
+    "png": Kind("still.png", partial(pixels, suffix=".png"), {"reader png": 80}),
+    "zip": Kind("frame0.zip", entries, {"denoise zip": 100, "reader zip": 100}),
     "recipe": Kind("recipe.toml", toml, {"reader recipe": 200}),
     "camera path": Kind("path.json", json.loads, {"reader camera_path": 200}),
     "results.json": Kind("results/results.json", json.loads, {"reader results": 160, "models": 10, "report": 10}),
@@ -306,6 +365,9 @@ KINDS = {
     "rendered feature": Kind("rendered/inputs/albedo1.exr", pixels, {"render": 24}),
     "rendered reference": Kind("rendered/inputs/reference1.exr", pixels, {"render": 24}),
     "about what was rendered": Kind("rendered/inputs/camera.json", json.loads, {"render": 24}),
+    "generated color": Kind("generated/random0000/inputs/color0.exr", pixels, {"generate": 16}),
+    "generated matrices": Kind("generated/random0000/inputs/camera_matrices.h", anything, {"generate": 16}),
+    "about what was generated": Kind("generated/random0000/inputs/camera.json", json.loads, {"generate": 24}),
     "scene": Kind("scene/scene.xml", anything, {"render": 20}),
     "precision.json": Kind("precision.json", json.loads, {"reader precision": 120}),
     "run_times.json": Kind("run_times.json", json.loads, {"reader run_times": 120}),

@@ -50,6 +50,10 @@ GIVEN = {
     "out": ["denoise", "denoise layers", "denoise network", "evaluate"],
     "weights.safetensors": ["denoise network", "reader weights"],
     "results": ["reader results"],
+    "compared": ["benchmark"],
+    "generated": ["generate"],
+    "still.hdr": ["denoise hdr"],
+    "frame0.zip": ["denoise zip"],
     "run": ["train"],
     "recipe.toml": ["reader recipe"],
     "path.json": ["reader camera_path"],
@@ -63,7 +67,9 @@ EVERY = [(part, command) for part, commands in GIVEN.items() for command in comm
 def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> None:
     failed, command = [], COMMANDS[name]
     attacker.expected(name)
-    for given in NAMES:
+    # The ending tells what a picture, or a zip, is.
+    suffix = Path(part).suffix if part.startswith(("still", "frame")) else ""
+    for given in (each + suffix for each in NAMES if len(os.fsencode(each + suffix)) <= 255):
         folder = attacker.fresh(command.needs)
         if (folder / part).exists():
             (folder / part).rename(folder / given)
@@ -78,9 +84,14 @@ def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> 
         # Where it is expected to be found.
         if os.path.lexists(folder / given) and not os.path.lexists(folder / part):
             (folder / given).rename(folder / part)
-        # What is printed has the name in it.
-        same = name not in ("inspect", "inspect layers", "evaluate", "reader recipe")
-        problem = attacker.judge(name, folder, ended, same=same, needed=is_text(given) and given not in OPTIONS)
+        if suffix and ended.status == 0:
+            (written,) = (path for path in (folder / "out").iterdir() if path.name != "denoise.json")
+            written.rename(written.with_name(Path(part).stem + written.suffix))
+        # What is printed, or the report of the written file, has the name in it.
+        same = name not in ("inspect", "inspect layers", "evaluate", "reader recipe") and not suffix
+        problem = attacker.judge(
+            name, folder, ended, same=same, needed=is_text(given) and given.removesuffix(suffix) not in OPTIONS
+        )
         failed += attacker.count("hostile names", problem, f"{name}, {part} is {given!r}", folder)
     assert not failed, "\n".join(failed)
 

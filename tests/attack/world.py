@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
+import OpenImageIO as oiio
 import torch
 from torch import Tensor
 
@@ -63,6 +66,11 @@ def build(folder: Path) -> None:
     for number, frame in enumerate(frames):
         write_bmfr_frame(folder / "shot/inputs", number, frame)
         write_layers(folder / f"layers/shot{number}.exr", frame)
+    for suffix in (".hdr", ".pfm", ".tif", ".png"):
+        image = oiio.ImageBuf(frames[0].color[0].permute(1, 2, 0).numpy().copy())
+        assert image.write(str(folder / f"still{suffix}")), oiio.geterror()
+    if importlib.util.find_spec("numcodecs"):
+        write_zip(folder / "frame0.zip", frames[0])
     write_camera_matrices(folder / "shot/inputs/camera_matrices.h", cameras, "a wall")
     description = {"color_includes_albedo": True, "reference_noise": {"0": 0.01, "1": 0.02}}
     (folder / "shot/inputs/camera.json").write_text(json.dumps(description))
@@ -139,6 +147,29 @@ def write_layers(path: Path, frame: Frame) -> None:
     channels["View.Combined.A"] = np.ones((HEIGHT, WIDTH), np.float16)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "owner": "somebody"}
     OpenEXR.File(header, channels).write(str(path))
+
+
+def write_zip(path: Path, frame: Frame) -> None:
+    """Four samples a pixel as Noisebase has them: radiance of three bytes and an exponent, which is 2^0 here."""
+    from numcodecs import Blosc
+
+    shape = (HEIGHT, WIDTH, 4)
+    g = np.random.default_rng(3)
+    radiance, exponent = g.integers(0, 256, (3, *shape)), np.full((1, *shape), 255)
+    arrays = {
+        "color": np.concatenate([radiance, exponent]).astype(np.uint8),
+        "exposure": np.array([-3, 0], np.float32),
+        "reference": frame.reference[0].numpy(),
+        "normal": np.broadcast_to(frame.normal[0, ..., None].numpy(), (3, *shape)).astype(np.float16),
+        "diffuse": np.broadcast_to(frame.albedo[0, ..., None].numpy(), (3, *shape)).astype(np.float16),
+    }
+    codec = Blosc("lz4hc", 9)
+    with zipfile.ZipFile(path, "w") as file:
+        for name, values in arrays.items():
+            about = {"zarr_format": 2, "shape": values.shape, "chunks": values.shape, "dtype": values.dtype.str}
+            about |= {"order": "C", "fill_value": 0, "filters": None, "compressor": codec.get_config()}
+            file.writestr(f"{name}/.zarray", json.dumps(about))
+            file.writestr(f"{name}/{'.'.join('0' * values.ndim)}", codec.encode(np.ascontiguousarray(values)))
 
 
 def results() -> Results:

@@ -8,6 +8,7 @@ import pickle
 import random
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,23 @@ def test_what_is_kept_is_found_by_the_next_run(kernels: dict[str, Callable[..., 
     assert len(files(folder)) == 3
     kept(kernels["twice"])._cache.flush()
     assert len(files(folder)) == 1
+
+
+def test_a_file_that_somebody_killed_was_writing_is_removed_later(
+    kernels: dict[str, Callable[..., Any]], folder: Path
+) -> None:
+    hits(kernels["twice"], 2.0)
+    (whole,) = (path for path in files(folder) if path.suffix == ".nbc")
+    content = whole.read_bytes()
+    fresh, old = (whole.with_name(f"{whole.name}.tmp.{name}") for name in ("fresh", "old"))
+    for path in (fresh, old):
+        path.write_bytes(content[:100])
+    os.utime(old, (time.time() - 7200,) * 2)
+    whole.unlink()
+    assert [hits(kernels["twice"], 2.0) for _ in range(2)] == [0, 1]
+    # This one may be of a process that is at work.
+    assert fresh.exists()
+    assert not old.exists()
 
 
 def test_nothing_of_a_damaged_file_is_used(

@@ -436,6 +436,13 @@ def test_another_config_needs_another_folder(small_sequence: Path, tmp_path: Pat
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.skipif(sys.platform == "darwin", reason="has no file names but UTF-8")
+def test_a_folder_whose_name_is_not_utf_8_is_refused_before_the_work(small_sequence: Path, tmp_path: Path) -> None:
+    run = tmp_path / "M\udcfcller"
+    assert "whose name is UTF-8" in refused(lambda: train(TrainConfig(**SMALL), [small_sequence], run))
+    assert not run.exists()
+
+
 def test_other_data_needs_another_folder(small_sequence: Path, tmp_path: Path) -> None:
     config, run = TrainConfig(**{**SMALL, "steps": 1}), tmp_path / "run"
     train(config, [small_sequence], run)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias
@@ -20,6 +21,8 @@ MAPPABLE = sorted(set(BUFFERS) - {"current", "length"})
 _ALL, _LOWEST = slice(None), slice(-16, None)
 # Numbers that are compared at a time: 64 MiB.
 _AT_ONCE = 2**24
+# What is more than single letters.
+_WORDS = re.compile(r"[^\W_]{2}")
 
 
 @dataclass
@@ -67,7 +70,7 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
         else:
             strangers.append(layer)
     if not candidates["color"]:
-        # A shot may have a letter for a name, such as a_0001.exr, that stands for a buffer elsewhere.
+        # A shot may have a letter for a name, such as a_0001.exr or [n].hdr, that stands for a buffer elsewhere.
         for ranked in candidates.values():
             strangers += [layer for _, layer in ranked if _is_letter(layer)]
             ranked[:] = [(rank, layer) for rank, layer in ranked if not _is_letter(layer)]
@@ -121,7 +124,7 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
 
 
 def _is_letter(layer: Layer) -> bool:
-    return layer.anonymous and layer.is_color and len(layer.name) == 1
+    return layer.anonymous and layer.is_color and _WORDS.search(layer.name) is None
 
 
 def _mapped(where: str, layers: Sequence[Layer], buffer: str, text: str) -> Layer:

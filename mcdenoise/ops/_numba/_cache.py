@@ -7,6 +7,7 @@ import os
 import pickle
 import secrets
 import stat
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from numba.core.serialize import dumps
 _DIGEST = hashlib.sha256
 # Object code of one kernel takes some hundred KB.
 _LARGEST = 64 << 20
+# Seconds after which nobody writes to a temporary file any more.
+_ABANDONED = 3600.0
 
 
 class VerifiedCache(FunctionCache):
@@ -84,6 +87,10 @@ def _write(path: Path, content: bytes) -> None:
         with open(temporary, "xb") as file:
             file.write(content)
         os.replace(temporary, path)
+        # A process killed while it writes leaves its file; the next one to compile the kernel comes here.
+        for other in path.parent.glob(f"{path.name}.tmp.*"):
+            if time.time() - other.stat().st_mtime > _ABANDONED:
+                other.unlink()
     finally:
         # Gone already if all went well.
         with suppress(OSError):

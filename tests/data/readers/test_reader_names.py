@@ -279,7 +279,7 @@ def test_a_buffer_that_some_frames_lack_is_told(
     assert open_sequence(tmp_path, "1,3").buffers == {"color", "albedo"}
 
 
-@pytest.mark.parametrize("letter", ["a", "n", "p", "z", "N", "x"])
+@pytest.mark.parametrize("letter", ["a", "n", "p", "z", "N", "x", "[a]", "a:b", "%s%n"])
 def test_a_shot_may_have_a_letter_for_a_name(letter: str, image: Callable[..., list[Path]], tmp_path: Path) -> None:
     image(f"s/{letter}_1.exr", f"s/{letter}_2.exr", f"s/{letter}_albedo_1.exr", f"s/{letter}_albedo_2.exr")
     assert open_sequence(tmp_path / "s").buffers == {"color", "albedo"}
