@@ -76,7 +76,7 @@ class Attacker:
         if name not in self._expected:
             command = COMMANDS[name]
             folder = self.fresh(command.needs)
-            ended = self.run(command.command, folder)
+            ended = self.run(command.command, folder, seconds=command.seconds)
             problem = _of_lines(command, ended)
             assert ended.status == 0, (name, ended)
             assert not problem, (name, problem)
@@ -109,7 +109,7 @@ class Attacker:
                 path.write_bytes(content)
                 # Only where it is asked for: hostile bytes are not for every library.
                 same = partial(_alike, target.meaning, content, self.intact[source])
-            ended = self.run(command.command, folder)
+            ended = self.run(command.command, folder, seconds=command.seconds)
             problem = self.judge(name, folder, ended, same=same, besides=str(place))
             failed += self.count(group, problem, f"{kind}, {name}, seed {seed} ({what.__name__})", folder)
         return failed

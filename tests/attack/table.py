@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from server import SECONDS
 from world import HEIGHT, MODEL, TRAINING, WIDTH
 
 from mcdenoise.cli import COMMANDS as CLI
@@ -41,6 +42,7 @@ class Command:
         progress: lines on stderr that are neither a warning nor an error.
         statuses: that it may end with.
         requires: a module without which it can do nothing.
+        seconds: after so many it counts as hung.
     """
 
     arguments: str
@@ -49,6 +51,7 @@ class Command:
     progress: str = r"(?!)"
     statuses: tuple[int, ...] = (0, 2)
     requires: str = ""
+    seconds: float = SECONDS
 
     @property
     def command(self) -> list[str]:
@@ -143,8 +146,11 @@ COMMANDS = {
     "models": Command("models --results results", ("results",), printed),
     "render": Command(RENDERING, ("scene", "path.json", "rendered"), rendered, requires="mitsuba"),
     "generate": Command(GENERATION, ("generated",), generated, requires="mitsuba"),
-    "benchmark": Command(COMPARISON, ("shot",), errors),
-    "export": Command(f"export {MODEL} --weights weights.safetensors -o model.pt2", ("weights.safetensors",), exported),
+    # It says of each method why it failed, and ends with 1.
+    "benchmark": Command(COMPARISON, ("shot",), errors, statuses=(0, 1, 2)),
+    "export": Command(
+        f"export {MODEL} --weights weights.safetensors -o model.pt2", ("weights.safetensors",), exported, seconds=600
+    ),
     "reader exr": Command("reader exr shot/inputs/color0.exr", ("shot",), printed),
     "reader sequence": Command("reader sequence shot", ("shot",), printed),
     "reader layers": Command("reader sequence layers", ("layers",), printed),
