@@ -18,7 +18,19 @@ from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
-from mcdenoise.models import DEFAULT, Journal, Model, Output, State, create_model, fastest_precision, listening, timed
+from mcdenoise.models import (
+    DEFAULT,
+    Journal,
+    Model,
+    Output,
+    State,
+    computing_in,
+    create_model,
+    fastest_precision,
+    listening,
+    quantize,
+    timed,
+)
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
 from mcdenoise.models._journal import clock
@@ -26,7 +38,7 @@ from mcdenoise.models._layers import REST, alpha_of, closed, completed, opened
 from mcdenoise.models._memory import Division, Frames
 from mcdenoise.models._precision import Chosen
 
-AskedPrecision = Literal["auto", "float32", "bfloat16"]
+AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
 
 
 @dataclass
@@ -59,7 +71,9 @@ class Denoiser:
         precision: of convolutions; everything else stays in float32. ``"bfloat16"`` is about twice as fast on
             processors that compute with it. ``"auto"`` takes it for a model of the zoo that learns, where it pays on
             this machine (see :func:`mcdenoise.models.fastest_precision`), and float32 otherwise: for a model of yours,
-            and where ``differentiable``. The attribute ``precision`` is the one that runs, the report says why.
+            and where ``differentiable``. ``"int8"`` computes the U-Nets of a model that is calibrated for it in 8-bit
+            integers, on processors with dot products of these; what that costs is in docs/performance.md. The attribute
+            ``precision`` is the one that runs, the report says why.
         keep_all: skip nothing, whether a scene needs it or not.
         tile: compute tiles of at most so many pixels a side, a multiple of 32 from 64 on. The result is that of the
             whole image, up to the rounding of convolutions; the margins that tiles share cost time. By default they are
@@ -124,10 +138,14 @@ class Denoiser:
             model.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
         self.model = as_model(model)
         self.precision, self._why_precision = self._chosen(precision, of_zoo=of_zoo)
+        if self.precision == "int8":
+            if differentiable:
+                raise InputError("precision: expected float32 or bfloat16 with differentiable, found int8")
+            quantize(self.model, self.device)
         self.report = FrameReport()
         # Set by who never writes into a frame again that was handed over: then nothing of it is copied.
         self.frames_stay = False
-        self._tiles = Division(self.model, tile, max_memory, self.device, bfloat16=self.precision == "bfloat16")
+        self._tiles = Division(self.model, tile, max_memory, self.device, bfloat16=self.precision != "float32")
         self.reset()
 
     def _chosen(self, asked: AskedPrecision, *, of_zoo: bool) -> Chosen:
@@ -223,7 +241,6 @@ class Denoiser:
     def _step(self, frame: Frame, *, stages: bool) -> Output:
         _check_kind("frame", frame, (Frame,), "a Frame, such as Frame(color=...)")
         self.report = report = FrameReport(precision=self._why_precision)
-        bfloat16 = torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bfloat16")
         with listening(report), nullcontext() if self.differentiable else torch.no_grad():
             with timed("validate", self.device):
                 given, dtype = frame, self._dtype(frame)
@@ -241,7 +258,7 @@ class Denoiser:
                 report.tiles = self._tiles.divide(self._shot(frame))
             noisy = frame.color
             start = clock(self.device)
-            with bfloat16, self._explained(dtype):
+            with computing_in(self.precision, self.device), self._explained(dtype):
                 output, state = checked_step(self.model, frame, self._state, self._shape)
             # Of a model that times nothing itself.
             if set(report.milliseconds) == {"validate"}:

@@ -15,7 +15,16 @@ from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.methods import Spelling, parse_method, split_methods
-from mcdenoise.models import PRECISIONS, Output, Skipping, list_models, parts_of, pretrained_models
+from mcdenoise.models import (
+    FLOATS,
+    PRECISIONS,
+    Output,
+    Skipping,
+    can_quantize,
+    list_models,
+    parts_of,
+    pretrained_models,
+)
 from mcdenoise.nn import FusionModule, LogFusion, UNet
 from mcdenoise.results import KEEP_ALL, Kind, Method
 
@@ -100,7 +109,7 @@ def make_method(method: Method, *, threads: int | None = None, device: str = "cp
 def choose_methods(
     names: str | None = None,
     *,
-    precisions: str = ",".join(PRECISIONS),
+    precisions: str = ",".join(FLOATS),
     keep_all: bool = False,
     baselines: Collection[str] = BASELINES,
 ) -> list[Method]:
@@ -110,7 +119,8 @@ def choose_methods(
         names: spellings of methods separated by commas, see :func:`mcdenoise.methods.split_methods`; ``"pretrained"``
             stands for all models with shipped weights, ``None`` for :data:`COMPARED`, ``"all"`` for these and every
             other model there is, ``"none"`` for none.
-        precisions: of the convolutions of what learns, separated by commas: ``float32``, ``bfloat16``.
+        precisions: of the convolutions of what learns, separated by commas: ``float32``, ``bfloat16``, and ``int8`` of
+            what is calibrated for it.
         keep_all: have each method that skips what a scene does not need twice, the second time skipping nothing.
         baselines: methods that are there in any case, first.
 
@@ -167,7 +177,8 @@ def _variants(method: Method, model: Any, precisions: list[str], keep_all: bool)
         return
     weights = sum(parameter.numel() for parameter in model.parameters()) if isinstance(model, nn.Module) else None
     whole = (False, True) if keep_all and next(parts_of(model, Skipping), None) else (False,)
-    for precision in PRECISIONS:
+    possible = PRECISIONS if can_quantize(model) else FLOATS
+    for precision in possible:
         for everything in whole if precision in precisions else ():
             name = method.name if precision == "float32" else f"{method.name}, {precision}"
             name += KEEP_ALL if everything else ""

@@ -61,7 +61,7 @@ def benchmark(
             "oidn(quality=fast|high)"; weights files; file.py:factory; "pretrained" for all with shipped weights; "all"
             for every name there is, saying which have no weights yet; or none. By default those with shipped weights,
             filters, and other denoisers. Doing nothing and accumulation alone are always there.
-        precisions: of the convolutions of models that learn: float32, bfloat16, or both.
+        precisions: of the convolutions of models that learn: float32, bfloat16, and int8 of those calibrated for it.
         frames: which frames of each sequence, such as 0-59,70; all by default.
         rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.
         threads: CPU threads of all methods; torch's choice by default.

@@ -67,7 +67,7 @@ def denoise(
         device: cpu or cuda.
         threads: CPU threads; torch's choice by default.
         precision: of the network's convolutions; auto takes bfloat16 where the processor has it and it is faster, which
-            is measured once on each machine.
+            is measured once on each machine; int8 is for models that are calibrated for it, see `mcdenoise calibrate`.
         map: layer of a buffer whose name does not tell, such as albedo=RGBA.diff; 'motion=' for none.
         color_without_albedo: the noisy color was divided by the albedo, which is multiplied back.
         color_with_albedo: it was not; by default its values tell, and if they do not, it was not.

@@ -5,7 +5,17 @@ from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._journal import Journal, Stage, listening, note, summarize, timed
 from mcdenoise.models._layers import answered, carried, with_carried
 from mcdenoise.models._overview import ModelOverview, overview, users_of
-from mcdenoise.models._precision import PRECISIONS, Precision, fastest_precision
+from mcdenoise.models._precision import (
+    FLOATS,
+    PRECISIONS,
+    FloatPrecision,
+    Precision,
+    calibrating,
+    can_quantize,
+    computing_in,
+    fastest_precision,
+    quantize,
+)
 from mcdenoise.models._registry import build_model, find_model, list_models, register_model
 from mcdenoise.models._weights import (
     compared_models,
@@ -29,6 +39,7 @@ DEFAULT = "cascaded_v2"
 
 __all__ = [
     "DEFAULT",
+    "FLOATS",
     "PRECISIONS",
     "TOLERANCE",
     "Accumulated",
@@ -36,6 +47,7 @@ __all__ = [
     "CoarseToFine",
     "Demodulated",
     "Exposed",
+    "FloatPrecision",
     "FromBuffers",
     "Journal",
     "Model",
@@ -53,8 +65,11 @@ __all__ = [
     "answered",
     "as_model",
     "build_model",
+    "calibrating",
+    "can_quantize",
     "carried",
     "compared_models",
+    "computing_in",
     "create_model",
     "describe_weights",
     "fastest_precision",
@@ -67,6 +82,7 @@ __all__ = [
     "parts_of",
     "prepared",
     "pretrained_models",
+    "quantize",
     "register_model",
     "save_weights",
     "summarize",

@@ -7,19 +7,28 @@ import math
 import os
 import platform
 import statistics
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
+from torch import nn
 
 from mcdenoise.errors import InputError
+from mcdenoise.models._interface import Model
 from mcdenoise.models._journal import clock
+from mcdenoise.nn import UNet
+from mcdenoise.nn.int8 import has_int8, integers
 from mcdenoise.reading import read_text
 from mcdenoise.user_cache import cache_file, keep
 
-Precision = Literal["float32", "bfloat16"]
-PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
+FloatPrecision = Literal["float32", "bfloat16"]
+Precision = Literal["float32", "bfloat16", "int8"]
+# Those that any model runs in.
+FLOATS: tuple[FloatPrecision, ...] = ("float32", "bfloat16")
+PRECISIONS: tuple[Precision, ...] = (*FLOATS, "int8")
 # What "auto" means, for whoever wants the same on every machine.
 ENVIRONMENT = "MCDENOISE_PRECISION"
 # So many times as fast bfloat16 must be: below that, what it rounds buys nothing.
@@ -44,10 +53,10 @@ def fastest_precision(device: torch.device) -> Chosen:
         InputError: the environment variable is no precision.
     """
     if own := os.environ.get(ENVIRONMENT):
-        for known in PRECISIONS:
+        for known in FLOATS:
             if own == known:
                 return Chosen(known, f"the environment variable {ENVIRONMENT} says so")
-        raise InputError(f"{ENVIRONMENT}: expected one of {', '.join(PRECISIONS)}, found '{own}'")
+        raise InputError(f"{ENVIRONMENT}: expected one of {', '.join(FLOATS)}, found '{own}'")
     if not _has_bfloat16(device):
         return Chosen("float32", "the processor has no bfloat16")
     cache, key = cache_file("precision.json"), _machine(device)
@@ -58,6 +67,66 @@ def fastest_precision(device: torch.device) -> Chosen:
         keep(cache, json.dumps({**ratios, key: ratio}, indent=1) + "\n")
     precision: Precision = "bfloat16" if ratio >= _WORTH else "float32"
     return Chosen(precision, f"a convolution in bfloat16 takes {1 / ratio:.2f} of the time in float32 here")
+
+
+def can_quantize(model: Model) -> bool:
+    """Whether a model has what :func:`quantize` needs, and this machine too."""
+    unets = _unets(model)
+    return has_int8() and bool(unets) and all(unet.ranges is not None for unet in unets)
+
+
+def quantize(model: Model, device: torch.device) -> None:
+    """Get the U-Nets of a model ready to compute in integers, see :mod:`mcdenoise.nn.int8`.
+
+    Raises:
+        InputError: they are not calibrated, or the machine is none for it.
+    """
+    if device.type != "cpu" or not has_int8():
+        raise InputError(
+            "precision: expected a processor with dot products of 8-bit integers (VNNI) for int8, found none; "
+            "take bfloat16 or float32"
+        )
+    if not can_quantize(model):
+        found = "one that is not" if _unets(model) else "one without a U-Net that could be"
+        raise InputError(
+            f"precision: expected a model that is calibrated for int8, found {found}; "
+            "see `mcdenoise calibrate --help`, or take bfloat16 or float32"
+        )
+    for unet in _unets(model):
+        try:
+            unet.quantize()
+        except ValueError as error:
+            raise InputError(f"precision: int8: {error}; calibrate the weights again") from error
+
+
+@contextmanager
+def calibrating(model: Model) -> Iterator[None]:
+    """Calibrate the U-Nets of a model on what they see in this block.
+
+    Raises:
+        InputError: it has none.
+    """
+    unets = _unets(model)
+    if not unets:
+        raise InputError("model: expected one with a U-Net of `mcdenoise.nn`, found none; no other is computed in int8")
+    handles = [unet.register_forward_pre_hook(lambda own, given: own.calibrate(*given)) for unet in unets]
+    try:
+        yield
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
+@contextmanager
+def computing_in(precision: Precision, device: torch.device) -> Iterator[None]:
+    """Run convolutions in this precision; what is left of them in int8 in bfloat16, where the processor has it."""
+    rounded = precision == "bfloat16" or (precision == "int8" and _has_bfloat16(device))
+    with torch.autocast(device.type, torch.bfloat16, enabled=rounded), integers(precision == "int8"):
+        yield
+
+
+def _unets(model: Model) -> list[UNet]:
+    return [module for module in model.modules() if isinstance(module, UNet)] if isinstance(model, nn.Module) else []
 
 
 def _has_bfloat16(device: torch.device) -> bool:
@@ -76,7 +145,7 @@ def _measured(device: torch.device) -> float:
     weight = torch.full((_CHANNELS, _CHANNELS, 3, 3), 0.01, device=device)
     image = torch.full((1, _CHANNELS, _SIDE, _SIDE), 0.01, device=device)
     image = image.contiguous(memory_format=torch.channels_last)
-    times: dict[Precision, list[float]] = {precision: [] for precision in PRECISIONS}
+    times: dict[FloatPrecision, list[float]] = {precision: [] for precision in FLOATS}
     with torch.inference_mode():
         for _ in range(_ROUNDS):
             for precision, own in times.items():

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.models._interface import Model
 from mcdenoise.models._registry import build_model, find_model
+from mcdenoise.nn import UNet
 from mcdenoise.reading import check_file
 
 _SHIPPED = Path(__file__).parent / "weights"
@@ -95,6 +96,10 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
         raise InputError(f"{path}: expected settings of model '{found}', found {settings}") from error
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - a safetensors handle is no dict
+    for name, unet in _unets(model).items():
+        # Only of a network that has been calibrated.
+        if (ranges := tensors.get(f"{name}.ranges")) is not None:
+            unet.ranges = torch.zeros(ranges.shape)
     own = _named(model)
     for key in sorted(own.keys() | tensors.keys()):
         expected = tuple(own[key].shape) if key in own else "no such layer"
@@ -165,16 +170,25 @@ def save_weights(model: Model, architecture: str, settings: dict[str, Any], abou
 
 
 def _named(model: Model) -> dict[str, Tensor]:
-    """The weights of a model by name; what it wears does not count, so that a file fits it with and without."""
+    """The weights of a model by name, and the ranges of what is calibrated.
+
+    What it wears does not count, so that a file fits it with and without.
+    """
     if not isinstance(model, nn.Module):
         return {}
-    own = {
-        ".".join(part for part in key.split(".") if part not in ("inner", "function")): value
-        for key, value in model.state_dict().items()
-    }
+    own = {_bare(key): value for key, value in model.state_dict().items()}
     if len(own) < len(model.state_dict()):
         raise InputError("model: expected weights that differ by name without 'inner', found two of one name")
-    return own
+    return own | {f"{name}.ranges": unet.ranges for name, unet in _unets(model).items() if unet.ranges is not None}
+
+
+def _unets(model: Model) -> dict[str, UNet]:
+    modules = model.named_modules() if isinstance(model, nn.Module) else ()
+    return {_bare(name): module for name, module in modules if isinstance(module, UNet)}
+
+
+def _bare(key: str) -> str:
+    return ".".join(part for part in key.split(".") if part not in ("inner", "function"))
 
 
 def _digest(tensors: dict[str, Tensor]) -> str:

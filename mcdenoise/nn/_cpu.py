@@ -26,7 +26,7 @@ class ConvBlock(nn.Sequential):
     """Convolutions and ReLUs in turn, which are one step where no derivative is asked for."""
 
     def forward(self, x: Tensor) -> Tensor:
-        fused = _plain_inference(x)
+        fused = is_plain_inference(x)
         for layer in self:
             if not fused:
                 x = layer(x)
@@ -123,7 +123,7 @@ class _ReLUOfBits(Function):
 
 def max_pool(x: Tensor) -> Tensor:
     """``F.max_pool2d(x, 2)`` of what is not negative, in less time where nobody asks which of the pixels it was."""
-    if not _plain_inference(x):
+    if not is_plain_inference(x):
         return F.max_pool2d(x, 2)
     # Behind a ReLU, bfloat16 numbers are in the order of their bits as integers, which a CPU compares twice as fast.
     values = x.view(torch.int16) if x.dtype == torch.bfloat16 else x
@@ -131,5 +131,5 @@ def max_pool(x: Tensor) -> Tensor:
     return torch.maximum(rows[..., ::2], rows[..., 1::2]).view(x.dtype)
 
 
-def _plain_inference(x: Tensor) -> bool:
+def is_plain_inference(x: Tensor) -> bool:
     return x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()

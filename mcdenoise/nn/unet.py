@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.nn._cpu import ConvBlock, ReLU, Upsampling, layout_of, max_pool
+from mcdenoise.nn._cpu import ConvBlock, ReLU, Upsampling, is_plain_inference, layout_of, max_pool
+from mcdenoise.nn.int8 import Int8UNet, measure, wants_integers
 from mcdenoise.ops._window import corner
 
 # Peak numbers for each pixel, measured: 4.5 widths inside the U-Net, and 54 of images and features around it, which
@@ -56,6 +57,9 @@ class UNet(nn.Module):
         upwards = list(itertools.pairwise(self.widths[::-1]))
         self.up = nn.ModuleList(Upsampling(coarser, finer, 2, stride=2) for coarser, finer in upwards)
         self.decoder = nn.ModuleList(_block(2 * finer, finer) for _, finer in upwards)
+        # Ranges of its tensors, where it is calibrated, and what computes with them.
+        self.ranges: Tensor | None = None
+        self._integers: Int8UNet | None = None
 
     def level(self, scale: int) -> int:
         """Of which level the features of a scale are."""
@@ -92,7 +96,21 @@ class UNet(nn.Module):
         """
         height, width = x.shape[-2:]
         # Whole multiples, whose halves are simple expressions in a graph for images of any size, as a remainder is not.
-        x = _padded(x, [(side + self.multiple - 1) // self.multiple * self.multiple for side in (height, width)])
+        x = self._whole(x)
+        if self._integers is not None and wants_integers() and is_plain_inference(x):
+            dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
+            features = self._integers(x, self._beside(x, coarse), self.level(self.scales - 1) + 1, dtype)
+        else:
+            features = self._features(x, coarse)
+        found = []
+        for scale in range(self.scales):
+            level = self.level(scale)
+            side = self.stride << level
+            found.append(corner(features[level], (height + side - 1) // side, (width + side - 1) // side))
+        return found
+
+    def _features(self, x: Tensor, coarse: Sequence[Tensor]) -> list[Tensor]:
+        """Those of each level, the finest first."""
         skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):
             if level:
@@ -106,12 +124,36 @@ class UNet(nn.Module):
         for up, block in zip(self.up, self.decoder, strict=True):
             x = block(torch.cat([up(x), skips.pop()], 1))
             features.append(x)
-        found = []
-        for scale in range(self.scales):
-            level = self.level(scale)
-            side = self.stride << level
-            found.append(corner(features[-1 - level], (height + side - 1) // side, (width + side - 1) // side))
-        return found
+        return features[::-1]
+
+    @torch.no_grad()
+    def calibrate(self, x: Tensor, coarse: Sequence[Tensor] = ()) -> None:
+        """Let the ranges of its tensors hold those of one more input; arguments as of :meth:`forward`."""
+        x = self._whole(x.float())
+        found = measure(self.encoder, self.up, self.decoder, x, [given.float() for given in self._beside(x, coarse)])
+        if self.ranges is not None:
+            low, high = torch.stack([self.ranges, found]).unbind(-1)
+            found = torch.stack([low.amin(0), high.amax(0)], -1)
+        self.ranges = found
+
+    def quantize(self) -> None:
+        """Get ready to compute in integers, see :func:`mcdenoise.nn.int8.integers`, with today's weights.
+
+        Raises:
+            ValueError: it is not calibrated, or by the ranges of another network.
+        """
+        if self.ranges is None:
+            raise ValueError("ranges: expected a calibrated U-Net, found one that is not")
+        self._integers = Int8UNet(self.encoder, self.up, self.decoder, self.ranges)
+
+    def _whole(self, x: Tensor) -> Tensor:
+        """Whole pixels of the coarsest level."""
+        return _padded(x, [(side + self.multiple - 1) // self.multiple * self.multiple for side in x.shape[-2:]])
+
+    def _beside(self, x: Tensor, coarse: Sequence[Tensor]) -> list[Tensor]:
+        """The same of what each level is given besides."""
+        sizes = ([side // (self.stride << level) for side in x.shape[-2:]] for level in range(1, self.levels))
+        return [_padded(given, size) for given, size in zip(coarse, sizes, strict=False)]
 
 
 class Head(nn.Conv2d):

@@ -25,7 +25,7 @@ from mcdenoise.errors import InputError
 
 # What commands write; all else in a case's folder has to stay as it was.
 _WRITTEN = re.compile(
-    r"(out|run|rendered|generated|compared|\.cache|\.config|\.triton)(/.*)?|results/(index\.html|plots(/.*)?)|model\.pt2|\.output.*"
+    r"(out|run|rendered|generated|compared|\.cache|\.config|\.triton)(/.*)?|results/(index\.html|plots(/.*)?)|model\.pt2|out\.safetensors|\.output.*"
 )
 _CHANGING = re.compile(r"run/(events\..*|cache/.*)|results/plots/.*|\.(cache|config|triton)(/.*)?", re.DOTALL)
 _LEFTOVER = re.compile(r"\.mcdenoise-|\.tmp|\.copy\.exr|/building")

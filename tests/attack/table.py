@@ -79,6 +79,14 @@ def weights(folder: Path, _: str) -> object:
         return file.metadata()["sha256"]
 
 
+def calibrated(folder: Path, _: str) -> object:
+    """Checksum of the tensors, and of the ranges with them."""
+    from safetensors import safe_open
+
+    with safe_open(folder / "out.safetensors", framework="pt") as file:
+        return file.metadata()["sha256"]
+
+
 def page(folder: Path, _: str) -> object:
     """Whether there is one, whole."""
     return (folder / "results/index.html").read_text().rstrip().endswith("</html>")
@@ -146,6 +154,9 @@ COMMANDS = {
     "models": Command("models --results results", ("results",), printed),
     "render": Command(RENDERING, ("scene", "path.json", "rendered"), rendered, requires="mitsuba"),
     "generate": Command(GENERATION, ("generated",), generated, requires="mitsuba"),
+    "calibrate": Command(
+        "calibrate weights.safetensors shot -o out.safetensors", ("shot", "weights.safetensors"), calibrated
+    ),
     # It says of each method why it failed, and ends with 1.
     "benchmark": Command(COMPARISON, ("shot",), errors, statuses=(0, 1, 2)),
     "export": Command(
@@ -332,7 +343,7 @@ KINDS = {
     "color": Kind(
         "shot/inputs/color0.exr",
         pixels,
-        {"denoise": 130, "inspect": 60, "evaluate model": 60, "reader exr": 100, "train": 8, "benchmark": 12},
+        {"denoise": 130, "inspect": 60, "evaluate model": 60, "reader exr": 100, "train": 8, "benchmark": 12, "calibrate": 12},
     ),
     "color of the second frame": Kind(
         "shot/inputs/color1.exr", pixels, {"denoise": 60, "denoise network": 40, "reader sequence": 60}
@@ -350,7 +361,7 @@ KINDS = {
     "camera_matrices.h": Kind(
         "shot/inputs/camera_matrices.h", anything, {"denoise": 100, "inspect": 60, "reader camera_matrices": 160}
     ),
-    "weights": Kind("weights.safetensors", exactly, {"denoise network": 120, "reader weights": 160, "export": 30}),
+    "weights": Kind("weights.safetensors", exactly, {"denoise network": 120, "reader weights": 160, "export": 30, "calibrate": 30}),
     "hdr": Kind("still.hdr", partial(pixels, suffix=".hdr"), {"denoise hdr": 60, "reader hdr": 60}),
     "pfm": Kind("still.pfm", partial(pixels, suffix=".pfm"), {"denoise pfm": 60}),
     "tif": Kind("still.tif", partial(pixels, suffix=".tif"), {"denoise tif": 60}),

@@ -108,8 +108,8 @@ def test_who_gets_it(measured: list[float]) -> None:
         Denoiser("cascaded_v2_micro", precision="float32"),
     ):
         assert others.precision == "float32"
-    with pytest.raises(InputError, match="precision: expected one of auto, float32, bfloat16, found 'int8'"):
-        Denoiser("cascaded_v2_micro", precision="int8")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="precision: expected one of auto, float32, bfloat16, int8, found 'int4'"):
+        Denoiser("cascaded_v2_micro", precision="int4")  # type: ignore[arg-type]
 
 
 def test_the_report_says_why_and_the_image_is_that_of_the_precision(measured: list[float]) -> None:
