@@ -343,7 +343,15 @@ KINDS = {
     "color": Kind(
         "shot/inputs/color0.exr",
         pixels,
-        {"denoise": 130, "inspect": 60, "evaluate model": 60, "reader exr": 100, "train": 8, "benchmark": 12, "calibrate": 12},
+        {
+            "denoise": 130,
+            "inspect": 60,
+            "evaluate model": 60,
+            "reader exr": 100,
+            "train": 8,
+            "benchmark": 12,
+            "calibrate": 12,
+        },
     ),
     "color of the second frame": Kind(
         "shot/inputs/color1.exr", pixels, {"denoise": 60, "denoise network": 40, "reader sequence": 60}
@@ -361,7 +369,9 @@ KINDS = {
     "camera_matrices.h": Kind(
         "shot/inputs/camera_matrices.h", anything, {"denoise": 100, "inspect": 60, "reader camera_matrices": 160}
     ),
-    "weights": Kind("weights.safetensors", exactly, {"denoise network": 120, "reader weights": 160, "export": 30, "calibrate": 30}),
+    "weights": Kind(
+        "weights.safetensors", exactly, {"denoise network": 120, "reader weights": 160, "export": 30, "calibrate": 30}
+    ),
     "hdr": Kind("still.hdr", partial(pixels, suffix=".hdr"), {"denoise hdr": 60, "reader hdr": 60}),
     "pfm": Kind("still.pfm", partial(pixels, suffix=".pfm"), {"denoise pfm": 60}),
     "tif": Kind("still.tif", partial(pixels, suffix=".tif"), {"denoise tif": 60}),

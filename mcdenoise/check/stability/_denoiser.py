@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.check.stability._check import DTYPES, Check, name_of
-from mcdenoise.check.stability._models import ALLOWED, EXPOSURES, relative_change
+from mcdenoise.check.stability._models import ALLOWED, EXPOSURES, ROUNDED, relative_change
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, replace_invalid
@@ -217,7 +217,7 @@ def _exposure(denoiser: Denoiser, exposure: float, dtype: torch.dtype) -> Check:
         for before, after in zip(plain, scaled, strict=True)
         for name in {OIDN, OIDN_CLEAN} & before.stages.keys()
     )
-    allowed = ALLOWED * max(largest / eps, 1) + max(library, default=0.0)
+    allowed = ALLOWED * ROUNDED * max(largest / eps, 1) + max(library, default=0.0)
     message = "" if error <= allowed else f"error {error:.3g} eps, expected at most {allowed:.3g}"
     check = _found(f"exposure {exposure:g}", dtype, "exposure", message)
     return replace(check, error=error, allowed=allowed, condition=2 * largest / eps)
