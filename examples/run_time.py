@@ -28,7 +28,16 @@ from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.methods import parse_method
-from mcdenoise.models import Accumulated, Skipping, parts_of, pretrained_models
+from mcdenoise.models import (
+    Accumulated,
+    Precision,
+    Skipping,
+    can_quantize,
+    computing_in,
+    parts_of,
+    pretrained_models,
+    quantize,
+)
 
 OIDN = (
     "oidn(quality=fast, auxiliary=noisy)",
@@ -38,22 +47,30 @@ OIDN = (
 
 
 def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], object]]:
-    """Calls of a method on this frame; of one that learns, in both precisions."""
+    """Calls of a method on this frame; of one that learns, in every precision that it can have here."""
     spelling = parse_method(spelt)
     settings = {"threads": threads, **spelling.settings} if spelling.takes("threads") else spelling.settings
-    # Fresh weights take as long as others.
-    model = create_model(spelling.model, weights=spelling.weights, **settings)
+    # Fresh weights take as long as others, but are not calibrated.
+    pretrained = spelling.weights is None and spelling.model in pretrained_models()
+    model = create_model(spelling.model, pretrained=pretrained, weights=spelling.weights, **settings)
     if isinstance(model, torch.nn.Module):
         model.to(memory_format=torch.channels_last)
     for accumulated in parts_of(model, Accumulated):
         model = accumulated.inner.inner if isinstance(accumulated.inner, Skipping) else accumulated.inner
 
-    def call(bfloat16: bool) -> object:
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+    cpu = torch.device("cpu")
+
+    def call(precision: Precision) -> object:
+        with torch.no_grad(), computing_in(precision, cpu):
             return model(frame)
 
-    calls = {spelling.name: lambda: call(False)}
-    return calls | {f"{spelling.name}, bfloat16": lambda: call(True)} if model.needs.trainable else calls
+    calls: dict[str, Callable[[], object]] = {spelling.name: lambda: call("float32")}
+    if model.needs.trainable:
+        calls[f"{spelling.name}, bfloat16"] = lambda: call("bfloat16")
+    if can_quantize(model):
+        quantize(model, cpu)
+        calls[f"{spelling.name}, int8"] = lambda: call("int8")
+    return calls
 
 
 def interleaved(calls: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
