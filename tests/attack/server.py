@@ -67,8 +67,10 @@ class Server:
     """The server; it ends with the ``with`` block."""
 
     def __init__(self) -> None:
-        command = [sys.executable, __file__]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        # Threads of OpenMP do not outlive a fork: who waits for them afterwards waits for ever.
+        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        command, pipe = [sys.executable, __file__], subprocess.PIPE
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment)
 
     def __enter__(self) -> Server:
         return self
