@@ -10,12 +10,12 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from mcdenoise.benchmark.machine import Moment, Stopwatch
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.methods import Spelling, parse_method, split_methods
 from mcdenoise.models import PRECISIONS, Output, Skipping, list_models, parts_of, pretrained_models
+from mcdenoise.models._stopwatch import Moment, Stopwatch
 from mcdenoise.nn import FusionModule, LogFusion, UNet
 from mcdenoise.results import KEEP_ALL, Kind, Method
 

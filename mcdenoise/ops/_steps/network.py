@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops._constants import BLOCK, DARK, FARTHEST, SHORTEST
+from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._op import op, plain
 from mcdenoise.ops._rows import by_rows
 from mcdenoise.ops._window import accumulator_dtype, corner
@@ -263,4 +264,4 @@ def softplus(x: Tensor, units: Sequence[float]) -> Tensor:
         units: factor of each channel of the result.
     """
     planes = F.softplus(x.to(accumulator_dtype(x.dtype)).contiguous())
-    return planes * planes.new_tensor(units).reshape(-1, 1, 1)
+    return planes * numbers_like(planes, units).reshape(-1, 1, 1)
