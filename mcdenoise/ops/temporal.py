@@ -27,7 +27,7 @@ def _check_motion(position: Tensor, previous_view_projection: Tensor) -> None:
     check_shapes(position=(position, "B 3 H W"), previous_view_projection=(previous_view_projection, "B 4 4"))
 
 
-@op("numba", check=_check_motion)
+@op("numba", "triton", check=_check_motion)
 def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
     """Where each static surface point was in the previous frame, relative to where it is now.
 
@@ -218,7 +218,7 @@ def check_accumulate(
     check_surfaces(surface, previous_surface, previous, rule, position_limit, normal_limit)
 
 
-@op("numba", check=check_accumulate)
+@op("numba", "triton", check=check_accumulate)
 def accumulate(
     color: Tensor,
     previous: Tensor,
