@@ -218,7 +218,7 @@ def check_accumulate(
     check_surfaces(surface, previous_surface, previous, rule, position_limit, normal_limit)
 
 
-@op("numba", "triton", check=check_accumulate)
+@op("numba", "triton", check=check_accumulate, differentiable="numba")
 def accumulate(
     color: Tensor,
     previous: Tensor,

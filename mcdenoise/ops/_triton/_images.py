@@ -20,7 +20,7 @@ from mcdenoise.ops._triton._filter import _tile as tile
 from mcdenoise.ops._triton._filter import _write_plane as write_plane
 from mcdenoise.ops._window import accumulator_dtype
 
-__all__ = ["is_finite", "is_inside", "launch", "log1p", "expm1", "read_plane", "sums_of", "tile", "write_plane"]  # noqa: RUF022
+__all__ = ["expm1", "is_finite", "is_inside", "launch", "log1p", "read_plane", "sums_of", "tile", "write_plane"]
 
 
 def sums_of(*tensors: Tensor | None) -> torch.dtype:
