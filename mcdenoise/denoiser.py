@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,10 +33,11 @@ from mcdenoise.models import (
 )
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
-from mcdenoise.models._journal import clock
+from mcdenoise.models._journal import ask
 from mcdenoise.models._layers import REST, alpha_of, closed, completed, opened
 from mcdenoise.models._memory import Division, Frames
 from mcdenoise.models._precision import Chosen
+from mcdenoise.models._reads import at_hand
 
 AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
 
@@ -142,7 +143,7 @@ class Denoiser:
             if differentiable:
                 raise InputError("precision: expected float32 or bfloat16 with differentiable, found int8")
             quantize(self.model, self.device)
-        self.report = FrameReport()
+        self._report = FrameReport()
         # Set by who never writes into a frame again that was handed over: then nothing of it is copied.
         self.frames_stay = False
         self._tiles = Division(self.model, tile, max_memory, self.device, bfloat16=self.precision != "float32")
@@ -191,6 +192,16 @@ class Denoiser:
             shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else MOTION), streaming, carried=carried)
             self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
 
+    @property
+    def report(self) -> FrameReport:
+        """What happened to the last frame. On a GPU, asking for it waits until that is done.
+
+        Raises:
+            InputError: on a GPU, what a call raises on a processor: the frame was bad. The history begins anew.
+        """
+        self._settle()
+        return self._report
+
     def detach(self) -> None:
         """Cut the graph of the history, for truncated backpropagation: ``backward`` from later frames ends here."""
         self._state = pytree.tree_map_only(Tensor, Tensor.detach, self._state)
@@ -214,7 +225,9 @@ class Denoiser:
         Raises:
             InputError: a buffer that the model needs is missing, another holds NaN, an illegal infinity or a value far
                 out of range; the result is no finite image; or there is too little memory, see :meth:`reset`. After
-                this error, as after any other, the history is that of the frame before.
+                this error, as after any other, the history is that of the frame before. On a GPU, which is not waited
+                for, what is wrong with the values of a frame is told by the next call, or by ``report``, and the
+                history begins anew.
         """
         _check_kind("frame", frame, (Frame,), "a Frame, such as Frame(color=...)")
         return self._step(frame.replace(layers={}) if frame.layers else frame, stages=False).image
@@ -240,7 +253,8 @@ class Denoiser:
 
     def _step(self, frame: Frame, *, stages: bool) -> Output:
         _check_kind("frame", frame, (Frame,), "a Frame, such as Frame(color=...)")
-        self.report = report = FrameReport(precision=self._why_precision)
+        self._settle()
+        self._report = report = FrameReport(precision=self._why_precision)
         with listening(report), nullcontext() if self.differentiable else torch.no_grad():
             with timed("validate", self.device):
                 given, dtype = frame, self._dtype(frame)
@@ -251,18 +265,15 @@ class Denoiser:
                     keep_all=self.keep_all,
                     alpha=self.alpha,
                 )
-                frame, report.replaced_pixels, _ = frame.to(self.device).to(dtype).inspect()
+                frame = self._inspected(frame.to(self.device).to(dtype), report)
                 frame = closed(frame.with_depth().replace(hints=hints))
                 self._check_layers(frame)
                 report.missing = absent_buffers(self.model, frame)
                 report.tiles = self._tiles.divide(self._shot(frame))
             noisy = frame.color
-            start = clock(self.device)
-            with computing_in(self.precision, self.device), self._explained(dtype):
+            precision = computing_in(self.precision, self.device)
+            with precision, self._explained(dtype), timed("model", self.device, unless_told=True):
                 output, state = checked_step(self.model, frame, self._state, self._shape)
-            # Of a model that times nothing itself.
-            if set(report.milliseconds) == {"validate"}:
-                report.milliseconds["model"] = clock(self.device) - start
             with timed("validate", self.device):
                 # A renderer may write its next frame into the same buffers, and a user change an image in place.
                 state = state if self.frames_stay else owned(state, [given, noisy])
@@ -274,6 +285,27 @@ class Denoiser:
         self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1
         self._layers = self._carried(frame)
         return result
+
+    def _inspected(self, frame: Frame, report: FrameReport) -> Frame:
+        """The frame with valid values; what was wrong with it is raised, or where that would wait, found out later."""
+        if at_hand(self.device):
+            frame, report.replaced_pixels, _ = frame.inspect()
+            return frame
+        repaired = frame.repaired()
+
+        def judge(numbers: Sequence[float]) -> None:
+            report.replaced_pixels = repaired.judge(numbers)
+
+        ask(repaired.numbers, judge)
+        return repaired.frame
+
+    def _settle(self) -> None:
+        """Learn what is not known yet of the last frame; without its history if that is bad."""
+        try:
+            self._report.settle()
+        except InputError as error:
+            self._state, self._shape, self._layers = None, (), ()
+            raise InputError(f"{error} (of the last frame, told a frame late; the history begins anew)") from error
 
     def _check_layers(self, frame: Frame) -> None:
         if self._state is not None and self._layers != self._carried(frame):
@@ -370,6 +402,8 @@ def denoise(
     denoiser = Denoiser(model, device=device, precision=precision, **settings)
     denoiser.reset(frames=1)
     image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()
+    # What was wrong with the values, of a device that is read late.
+    denoiser._settle()
     return np.ascontiguousarray(image if layout == "CHW" else image.transpose(1, 2, 0))
 
 

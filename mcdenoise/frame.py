@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -388,6 +388,15 @@ class Frame:
                     changes[name] = clean
         return Inspected(self.replace(**changes) if changes else self, replaced, ranges)
 
+    def repaired(self) -> Unread:
+        """As :meth:`validate` on a device that is not to be waited for: repair everything, and read nothing.
+
+        Returns:
+            The frame, the numbers that tell how it was, and what judges them when they were read: it raises what
+            :meth:`validate` raises. What that refuses is in the frame as it was, but for what is out of range.
+        """
+        return _repaired(self)
+
 
 _OF_HOSTS = ("extra", "layers", "statistics", "skip")
 _NAMES = tuple(each.name for each in fields(Frame) if each.name not in (*_OF_HOSTS, "hints"))
@@ -472,13 +481,22 @@ def _replace_invalid(color: Tensor, layers: Mapping[str, Tensor]) -> tuple[list[
     usable = by_rows(_usable, color)
     for name, layer in layers.items():
         of_layer = by_rows(_usable, layer)
-        if (broken := float((usable & ~of_layer).float().mean())) > _MOST_BROKEN:
-            raise InputError(
-                f"layer '{name}': expected radiance, not negative and finite, found something else in {broken:.0%} of "
-                "the pixels; leave it out"
-            )
+        _refuse_broken(name, float(_broken(usable, of_layer)))
         usable = usable & of_layer
     return [by_rows(_mended, image, usable, reach=1) for image in images], int((~usable).sum())
+
+
+def _broken(usable: Tensor, of_layer: Tensor) -> Tensor:
+    """The fraction of the pixels that a layer alone spoils."""
+    return (usable & ~of_layer).float().mean()
+
+
+def _refuse_broken(name: str, broken: float) -> None:
+    if broken > _MOST_BROKEN:
+        raise InputError(
+            f"layer '{name}': expected radiance, not negative and finite, found something else in {broken:.0%} of "
+            "the pixels; leave it out"
+        )
 
 
 def scale_samples(samples: Tensor, factor: Tensor) -> Tensor:
@@ -585,39 +603,116 @@ def _check_buffer(name: str, value: object) -> None:
 
 def _check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]]:
     """The values, clamped, and their extremes."""
-    spec = _MATRIX if name == _MATRIX_NAME else BUFFERS.get(name, _ANYTHING)
+    spec = _spec_of(name)
     low, high = (float(extreme) for extreme in torch.aminmax(value.detach()))
     # A NaN comes through the extremes and fails the comparison; only then is it worth to look at every value again.
-    if not -_UNBOUNDED < low <= high < _UNBOUNDED:
-        _refuse_illegal(name, spec, value)
-    if (spec.high == _UNBOUNDED and spec.low == -_UNBOUNDED) or (low >= spec.low and high <= spec.high):
+    if not -_UNBOUNDED < low <= high < _UNBOUNDED and (bad := _illegal(spec, value)).any():
+        where = bad.nonzero()[0].tolist()
+        place = f"first at row {where[2]}, column {where[3]}" if len(where) == 4 else f"first at {where[1:]}"
+        _refuse_illegal(name, int(bad.sum()), f", {place}")
+    if low >= spec.low and high <= spec.high:
         return value, (low, high)
-    # The largest radiance itself is rounded.
-    limit = spec.high + max(spec.slack, 1e-6 * spec.high)
+    _refuse_range(name, low, high, float(_above(spec, value)) if high > _limit(spec) else 0.0)
+    return value.clamp(spec.low, spec.high), (max(low, spec.low), min(high, spec.high))
+
+
+def _spec_of(name: str) -> BufferSpec:
+    return _MATRIX if name == _MATRIX_NAME else BUFFERS.get(name, _ANYTHING)
+
+
+def _limit(spec: BufferSpec) -> float:
+    """Up to which values are clamped; the largest radiance itself is rounded."""
+    return spec.high + max(spec.slack, 1e-6 * spec.high)
+
+
+def _above(spec: BufferSpec, value: Tensor) -> Tensor:
+    """The fraction of values above the limit."""
+    return (value > _limit(spec)).double().mean()
+
+
+def _illegal(spec: BufferSpec, value: Tensor) -> Tensor:
+    if spec.infinite:
+        return torch.isnan(value) | ((value == -_UNBOUNDED) & (spec.low != -_UNBOUNDED))
+    return ~torch.isfinite(value)
+
+
+def _refuse_illegal(name: str, count: int, place: str = "") -> None:
+    raise InputError(
+        f"buffer '{name}': expected finite values ({_spec_of(name).meaning}), "
+        f"found {count} NaN or infinite ones{place}; render the buffer again or leave it out"
+    )
+
+
+def _refuse_range(name: str, low: float, high: float, above: float) -> None:
+    """Refuse extremes out of range, or warn where the fraction ``above`` the limit is small enough to be forgiven."""
+    spec = _spec_of(name)
     # A lamp's radiance among reflectances is a pixel's fault; all of them are another unit, or another buffer.
-    forgiven = high > limit and spec.forgiven and bool((value > limit).double().mean() < 0.5)
+    forgiven = high > _limit(spec) and spec.forgiven and above < 0.5
     if forgiven:
         warnings.warn(
             f"buffer '{name}': expected values up to {spec.high:g} ({spec.meaning}), found some up to {high:.4g}, "
             f"which count as {spec.high:g}; leave the buffer out if it is another one",
             stacklevel=2,
         )
-    if low < spec.low - _ROUNDING or (high > limit and not forgiven):
+    if low < spec.low - _ROUNDING or (high > _limit(spec) and not forgiven):
         raise InputError(
             f"buffer '{name}': expected values in [{spec.low:g}, {spec.high:g}] ({spec.meaning}), "
             f"found [{low:.4g}, {high:.4g}]"
         )
-    return value.clamp(spec.low, spec.high), (max(low, spec.low), min(high, spec.high))
 
 
-def _refuse_illegal(name: str, spec: BufferSpec, value: Tensor) -> None:
-    bad = ~torch.isfinite(value)
-    if spec.infinite:
-        bad = torch.isnan(value) | ((value == -_UNBOUNDED) & (spec.low != -_UNBOUNDED))
-    if bad.any():
-        where = bad.nonzero()[0].tolist()
-        place = f"first at row {where[2]}, column {where[3]}" if len(where) == 4 else f"first at {where[1:]}"
-        raise InputError(
-            f"buffer '{name}': expected finite values ({spec.meaning}), "
-            f"found {int(bad.sum())} NaN or infinite ones, {place}; render the buffer again or leave it out"
-        )
+class Unread(NamedTuple):
+    """A frame that was repaired, whatever is in it, and what tells how it was: nothing of it has been read.
+
+    Args:
+        frame: with valid values, where they are of a kind that can be repaired.
+        numbers: ``(N,)`` on the frame's device.
+        judge: takes the numbers once they were read, and returns how many pixels of ``color`` were replaced.
+
+    Raises:
+        InputError: of ``judge``, what :meth:`Frame.validate` raises.
+    """
+
+    frame: Frame
+    numbers: Tensor
+    judge: Callable[[Sequence[float]], int]
+
+
+def _repaired(frame: Frame) -> Unread:
+    """See :meth:`Frame.repaired`."""
+    images, layers = [frame.color, *frame.layers.values()], list(frame.layers)
+    usable = by_rows(_usable, frame.color)
+    numbers: list[Tensor] = []
+    for layer in frame.layers.values():
+        of_layer = by_rows(_usable, layer)
+        numbers.append(_broken(usable, of_layer))
+        usable = usable & of_layer
+    color, *mended = (by_rows(_mended, image, usable, reach=1) for image in images)
+    numbers.append((~usable).sum())
+    changes: dict[str, Any] = {"color": color, "layers": dict(zip(layers, mended, strict=True))}
+    names = [name for name, _ in frame.items() if name != "color"]
+    for name in names:
+        value = frame.buffer(name)
+        assert value is not None
+        spec = _spec_of(name)
+        seen = value.detach()
+        numbers += [*torch.aminmax(seen), _illegal(spec, seen).sum(), _above(spec, seen)]
+        if spec.high != _UNBOUNDED or spec.low != -_UNBOUNDED:
+            changes[name] = value.clamp(spec.low, spec.high)
+
+    def judge(read: Sequence[float]) -> int:
+        found = iter(read)
+        for layer in layers:
+            _refuse_broken(layer, next(found))
+        replaced = int(next(found))
+        for name in names:
+            low, high, illegal, above = (next(found) for _ in range(4))
+            if illegal:
+                _refuse_illegal(name, int(illegal))
+            if low < _spec_of(name).low or high > _spec_of(name).high:
+                _refuse_range(name, low, high, above)
+        return replaced
+
+    # On the device by itself: a number of the host would be waited for.
+    dtype = torch.promote_types(frame.color.dtype, torch.float32)
+    return Unread(frame.replace(**changes), torch.stack([number.to(dtype) for number in numbers]), judge)

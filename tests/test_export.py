@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from mcdenoise import Denoiser, Frame, InputError, create_model
 from mcdenoise.export import Exported, Step, default_buffers, export_model, traced
-from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, State
+from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, State, pretrained_models
+from mcdenoise.models import Recurrent as Recurrence
 
 # Of sums in another order, through some thirty layers: the suite's bound for whole models, see tests/golden.
 RTOL, ATOL = 1e-4, 1e-5
@@ -195,6 +196,46 @@ def test_every_model_of_the_zoo_is_exported_for_images_of_any_size(name: str, tm
     for size, batch in (((64, 96), 1), ((45, 70), 2)):
         shot = frames(size, batch=batch)
         assert_alike(with_onnxruntime(exported, step, shot), eager(model, shot))
+
+
+SHIPPED = sorted(set(pretrained_models()) - {"oidn_pyramid"})  # which calls a library
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
+@pytest.mark.parametrize("name", ["", *(pytest.param(name, marks=pytest.mark.slow) for name in SHIPPED)])
+@pytest.mark.timeout(1800)
+def test_a_step_is_one_graph_of_fixed_shapes_that_can_be_replayed(name: str) -> None:
+    """What a CUDA graph asks for: no value is read, no size depends on one, and a state goes in as it came out."""
+    model = create_model(name, pretrained=True) if name else Demodulated(Recurrence(Moved()))
+    step = Step(model, default_buffers(model))
+    shot = frames((40, 56))
+    given = [{name: buffers[name] for name in step.given} for buffers in shot]
+    state = step.no_history(shot[0])
+    program = torch.export.export(step, (given[0], state), strict=True)
+    assert not program.range_constraints
+    called = {str(node.target) for node in program.graph.nodes if node.op == "call_function"}
+    reads = ("aten.item", "scalar_dense", "nonzero", "masked_select", "sym_")
+    assert not [each for each in called if any(read in each for read in reads)]
+    sizes = [node.meta["val"].shape for node in program.graph.nodes if isinstance(node.meta.get("val"), Tensor)]
+    assert all(isinstance(size, int) for shape in sizes for size in shape)
+    run, images = program.module(check_guards=False), []
+    for buffers in given:
+        image, after = run(buffers, state)
+        assert [(key, each.shape, each.dtype) for key, each in after.items()] == [
+            (key, each.shape, each.dtype) for key, each in state.items()
+        ]
+        state = after
+        images.append(image)
+    assert_alike(images, eager(model, shot))
+
+
+class Moved(nn.Module):
+    """Adds half of the image before, from where it was."""
+
+    needs = Needs(uses=frozenset({"previous"}))
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        return Output(frame.color + 0.5 * frame.extra["previous"]), None
 
 
 class Impatient(nn.Module):

@@ -6,12 +6,10 @@ import os
 import platform
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeAlias
 
 import OpenImageIO as oiio
 import torch
@@ -23,35 +21,6 @@ from mcdenoise.results import Machine
 
 _PACKAGES = ("torch", "kornia", "numpy", "openimageio", "pyoidn", "flip-evaluator")
 _CGROUP = Path("/sys/fs/cgroup")
-
-# What a stopwatch marks: a number of milliseconds, or a CUDA event.
-Moment: TypeAlias = Any
-
-
-class Stopwatch:
-    """Marks moments of a device: by CUDA events on a GPU, else by the clock.
-
-    Args:
-        device: where the work is done.
-    """
-
-    def __init__(self, device: torch.device | str) -> None:
-        self._cuda = torch.device(device).type == "cuda"
-
-    def mark(self) -> Moment:
-        """Now; on a GPU, when it will have done what it was told to do so far."""
-        if not self._cuda:
-            return time.perf_counter() * 1e3
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        return event
-
-    def between(self, start: Moment, end: Moment) -> float:
-        """Milliseconds from one moment to another; waits until the latter has come."""
-        if not self._cuda:
-            return float(end - start)
-        end.synchronize()
-        return float(start.elapsed_time(end))
 
 
 def check_device(device: str) -> None:

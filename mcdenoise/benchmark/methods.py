@@ -10,7 +10,6 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from mcdenoise.benchmark.machine import Moment, Stopwatch
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
@@ -25,6 +24,7 @@ from mcdenoise.models import (
     parts_of,
     pretrained_models,
 )
+from mcdenoise.models._stopwatch import Moment, Stopwatch
 from mcdenoise.nn import FusionModule, LogFusion, UNet
 from mcdenoise.results import KEEP_ALL, Kind, Method
 

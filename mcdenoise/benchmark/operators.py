@@ -11,13 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mcdenoise.benchmark.machine import Stopwatch, check_device, describe_machine, fix_threads
+from mcdenoise.benchmark.machine import check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.methods import one_line
 from mcdenoise.benchmark.tables import write_ops_csv
 from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.check.overview import DTYPES, relative_error
 from mcdenoise.data.files import new_folder
 from mcdenoise.errors import InputError
+from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.ops import use
 from mcdenoise.ops._backend import Backend
 from mcdenoise.ops._op import backends_of

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from mcdenoise.benchmark.machine import Stopwatch, busy_cores, check_device, describe_machine, fix_threads
+from mcdenoise.benchmark.machine import busy_cores, check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.memory import Peaks
 from mcdenoise.benchmark.methods import Timed, make_method, one_line
 from mcdenoise.benchmark.scoring import Errors
@@ -27,6 +27,7 @@ from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.evaluate import USUAL, check_references, reference_noise
 from mcdenoise.frame import Frame
 from mcdenoise.models import Output, Stage, summarize
+from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.results import IMAGES, STAGES, Cell, Method, Results, Scene, Spread
 
 _WHOLE, _COMPUTING = "whole", "computing"

@@ -8,11 +8,12 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import torch
 
-from mcdenoise.benchmark.machine import Stopwatch, available_memory
+from mcdenoise.benchmark.machine import available_memory
 from mcdenoise.benchmark.memory import Peaks
 from mcdenoise.benchmark.methods import Timed, one_line
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
+from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.results import Cost, Fit, Method, Spread
 
 Size = tuple[int, int]

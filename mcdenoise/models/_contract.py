@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import torch
@@ -13,6 +13,8 @@ from torch.utils import _pytree as pytree
 from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._journal import ask
+from mcdenoise.models._reads import at_hand
 from mcdenoise.models._registry import build_model, find_model, list_models
 from mcdenoise.models._weights import pretrained_models
 
@@ -131,10 +133,15 @@ def _check_image(output: Any, frame: Frame) -> None:
     if image.device != frame.color.device:
         raise InputError(f"model: expected an image on {frame.color.device}, found one on {image.device}")
     # A sum is the fastest way to see either, and only what is far beyond all radiance overflows it.
-    if not image.detach().sum().isfinite() and (broken := int((~image.isfinite()).any(1).sum())):
+    if not at_hand(image.device) or not image.detach().sum().isfinite():
+        ask((~image.detach().isfinite()).any(1).sum(), _refuse_pixels)
+
+
+def _refuse_pixels(broken: Sequence[float]) -> None:
+    if broken[0]:
         raise InputError(
-            f"model: expected finite radiance, found {broken} NaN or infinite pixels; the frame is not kept: check "
-            "the buffers for values far out of range and the network for weights that are"
+            f"model: expected finite radiance, found {int(broken[0])} NaN or infinite pixels; the frame is not kept: "
+            "check the buffers for values far out of range and the network for weights that are"
         )
 
 

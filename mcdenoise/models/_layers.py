@@ -7,7 +7,7 @@ layers sum to it whatever happened to it besides (logarithms, clamping), and non
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from torch import Tensor
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Output
-from mcdenoise.models._journal import journal, note
+from mcdenoise.models._journal import ask, journal, note
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.ops import cross_bilateral_filter, downsample, upsample
 
@@ -160,11 +160,16 @@ def closed(frame: Frame) -> Frame:
         return frame
     total = _sum(frame.layers)
     excess = (total - frame.color).clamp_min(0).mean() / total.mean().clamp_min(1e-30)
-    if excess > _MOST_EXCESS:
-        raise InputError(
-            f"layers: expected parts of the color, found {', '.join(frame.layers)} brighter than it together, by "
-            f"{float(excess):.0%} of their light; leave out what is not a part of it"
-        )
+    names = ", ".join(frame.layers)
+
+    def refuse(excess: Sequence[float]) -> None:
+        if excess[0] > _MOST_EXCESS:
+            raise InputError(
+                f"layers: expected parts of the color, found {names} brighter than it together, by {excess[0]:.0%} of "
+                "their light; leave out what is not a part of it"
+            )
+
+    ask(excess, refuse)
     rest = frame.color - total
     least = _ROUNDING * frame.color + (len(frame.layers) + 1) * _SMALLEST_HALF
     # Of all pixels or none: what is dim in some is a layer all the same.

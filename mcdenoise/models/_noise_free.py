@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.frame import Frame
+from mcdenoise.models._reads import at_hand
 from mcdenoise.ops import NO_ALBEDO
 from mcdenoise.ops._window import corner, up_to_multiple
 
@@ -32,7 +33,7 @@ def noise_free(frame: Frame) -> Tensor | None:
             radiance of the frame alone is looked at; its albedo may have been divided out.
 
     Returns:
-        ``(B, 1, H, W)`` bool, or ``None`` where there is no such pixel.
+        ``(B, 1, H, W)`` bool, or ``None`` where there is known to be no such pixel.
     """
     kinds = []
     current = frame.color if frame.current is None else frame.current
@@ -44,8 +45,8 @@ def noise_free(frame: Frame) -> Tensor | None:
     if not kinds:
         return None
     known = kinds[0] if len(kinds) == 1 else kinds[0] | kinds[1]
-    band = slice(None)
-    if not torch.compiler.is_compiling():
+    band, looks = slice(None), at_hand(current.device)
+    if looks:
         rows = known.any(-1).flatten(0, -2).any(0).nonzero()
         if not len(rows):
             return None
@@ -64,7 +65,7 @@ def noise_free(frame: Frame) -> Tensor | None:
     sums = F.avg_pool2d(up_to_multiple(counted, _CELL), _CELL)
     witnesses = (F.avg_pool2d(sums, 3, 1, 1) * (9 * _CELL**2)).round()
     cells = (witnesses >= _LEAST_WITNESSES) & (witnesses < _MANY)
-    if not torch.compiler.is_compiling() and not cells.any():
+    if looks and not cells.any():
         return None
     wide = cells.repeat_interleave(_CELL, -2).repeat_interleave(_CELL, -1)
     found = torch.zeros_like(known)

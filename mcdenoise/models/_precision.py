@@ -18,7 +18,7 @@ from torch import nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.models._interface import Model
-from mcdenoise.models._journal import clock
+from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.nn import UNet
 from mcdenoise.nn.int8 import has_int8, integers
 from mcdenoise.reading import read_text
@@ -146,13 +146,14 @@ def _measured(device: torch.device) -> float:
     image = torch.full((1, _CHANNELS, _SIDE, _SIDE), 0.01, device=device)
     image = image.contiguous(memory_format=torch.channels_last)
     times: dict[FloatPrecision, list[float]] = {precision: [] for precision in FLOATS}
+    watch = Stopwatch(device)
     with torch.inference_mode():
         for _ in range(_ROUNDS):
             for precision, own in times.items():
                 with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
-                    start = clock(device)
+                    start = watch.mark()
                     F.conv2d(image, weight, padding=1)
-                    own.append(clock(device) - start)
+                    own.append(watch.between(start, watch.mark()))
     # The first rounds make kernels.
     exact, rounded = (statistics.median(own[2:]) for own in times.values())
     return exact / rounded

@@ -14,8 +14,9 @@ from torch.utils import _pytree as pytree
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, RADIANCE, Frame, tells_motion
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import Journal, journal, note, timed
+from mcdenoise.models._journal import Journal, ask, journal, note, tell_history, timed
 from mcdenoise.models._layers import alpha_of, completed
+from mcdenoise.models._reads import at_hand
 from mcdenoise.models._state import ADVICE, own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops import Surface, clamp_fireflies, motion_from_position
@@ -179,7 +180,8 @@ class Accumulated(Wrapper):
 
     def _accumulate(self, frame: Frame, history: History | None, inner: State) -> tuple[Frame, History | None, State]:
         """The frame with its history, the history for the next one, and the state that the method inside may have."""
-        compiling = torch.compiler.is_compiling()
+        # Of a graph, and on a GPU, no value is looked at: both ways of a decision are computed.
+        blind = not at_hand(frame.color.device)
         can_move = tells_motion(frame.buffers)
         reset = "" if history is None else _misfit(history, frame) or self._other_buffers(history, frame)
         surfaces = (frame, frame if history is None else history.surface)
@@ -190,7 +192,7 @@ class Accumulated(Wrapper):
         # What has no history and will be none is compared with nothing.
         compared = math.isfinite(self.lag_threshold) and (keeps or not reset)
         limit = self._chosen(frame.color) if reset or history is None else history.limit
-        if compiling and self.firefly_limit is None:
+        if blind and not reset:
             limit = torch.where(limit > 0, limit, self._chosen(frame.color))
         entering = incoming(frame.color, None, limit, compared=compared)
         seen = lights(entering[:, MEAN]) if compared else None
@@ -200,11 +202,10 @@ class Accumulated(Wrapper):
             still = is_still(frame, history.view_projection)
             color, length, kept = self._blend(frame, entering, history.color, seen, history, still)
             cut = kept.mean() < CUT_FRACTION
-            if (found := journal()) is not None:
-                found.history = float(kept.mean())
-            if compiling or not cut:
+            tell_history(kept.mean())
+            if blind or not cut:
                 carried = self._blend_carried(frame, entering, seen, history, still)
-            if compiling:
+            if blind:
                 color = torch.where(cut, without_history(entering), color)
                 carried = tuple(
                     None if part is None or old is None else torch.where(cut, part, old)
@@ -213,6 +214,7 @@ class Accumulated(Wrapper):
                 length = torch.where(cut, 1, length)
                 limit = torch.where(cut, 0, limit)
                 inner = pytree.tree_map_only(Tensor, lambda tensor: torch.where(cut, 0, tensor), inner)
+                self._tell_cut(cut)
             elif cut:
                 reset = "cut"
                 # Another shot may be of another light, which is seen only now.
@@ -223,14 +225,15 @@ class Accumulated(Wrapper):
             color, length = without_history(entering), torch.ones_like(entering[:, :1])
             carried = self._first(frame, entering)
             inner, still = None, False
+        still_for_sure = not blind and bool(still)
         if (found := journal()) is not None:
-            self._report(found, frame, reset, still=bool(still), can_move=can_move, keeps=keeps)
+            self._report(found, frame, reset, still=still_for_sure, can_move=can_move, keeps=keeps)
         after = None
         if keeps:
             label = None if seen is None else seen * _steady(color)
             surface = Surface(frame.position, frame.normal, frame.depth, label)
             after = History(color, length, surface, frame.view_projection, limit, carried)
-        hints = frame.hints._replace(still=not compiling and bool(still))
+        hints = frame.hints._replace(still=still_for_sure)
         current = entering[:, COLOR] if self.clamp_current else frame.color.to(color.dtype)
         # What was found of another image is not handed on.
         seen_inside = {"color": color[:, COLOR], "current": current, "length": length, "statistics": {}}
@@ -337,6 +340,15 @@ class Accumulated(Wrapper):
             return torch.full_like(color[:, :1, :1, :1], self.firefly_limit, dtype=torch.float32)
         return torch.where(_takes_light(color), CAUSTICS, LIMIT).reshape(-1, 1, 1, 1).to(torch.float32)
 
+    def _tell_cut(self, cut: Tensor) -> None:
+        if (found := journal()) is None:
+            return
+
+        def tell(cut: Sequence[float]) -> None:
+            found.reset = "cut" if cut[0] else found.reset
+
+        ask(cut, tell)
+
     def _report(self, found: Journal, frame: Frame, reset: str, *, still: bool, can_move: bool, keeps: bool) -> None:
         found.reset = reset
         source = "motion" if frame.motion is not None else "positions and cameras"
@@ -409,10 +421,11 @@ def is_still(frame: Frame, previous_view_projection: Tensor | None) -> bool | Te
 
     Returns:
         Whether its motion is zero everywhere, or else the camera is the same and no position differs from its previous
-        position; a tensor while a graph is recorded.
+        position; a tensor where values are not at hand.
     """
+    blind = not at_hand(frame.color.device)
     if frame.motion is not None:
-        if torch.compiler.is_compiling():
+        if blind:
             return ~frame.motion.any()
         return not (_thinned(frame.motion).any() or frame.motion.any())
     pairs = [(previous_view_projection, frame.view_projection)]
@@ -421,7 +434,7 @@ def is_still(frame: Frame, previous_view_projection: Tensor | None) -> bool | Te
     known = [(a, b) for a, b in pairs if a is not None and b is not None]
     if frame.position is None or len(known) < len(pairs):
         return False
-    if torch.compiler.is_compiling():
+    if blind:
         return torch.stack([torch.eq(a, b).all() for a, b in known]).all()
     return all(_equal(a, b) for a, b in known)
 

@@ -89,6 +89,8 @@ class Bmfr(nn.Module):
         InputError: a setting is out of its range.
     """
 
+    _starts: Tensor
+
     def __init__(
         self,
         *,
@@ -107,6 +109,8 @@ class Bmfr(nn.Module):
             raise InputError(f"ridge: expected a positive number, found {ridge}")
         self.block, self.second_alpha, self.ridge = block, second_alpha, ridge
         self.position_limit, self.normal_limit = position_limit, normal_limit
+        starts = torch.tensor([_start(number, block) for number in range(len(_OFFSETS))])
+        self.register_buffer("_starts", starts, persistent=False)
 
     @property
     def needs(self) -> Needs:
@@ -135,14 +139,14 @@ class Bmfr(nn.Module):
         assert frame.normal is not None
         assert frame.position is not None
         features = torch.cat([frame.normal, frame.position], 1)
-        starts = [_start(int(each), self.block) for each in number.flatten().tolist()]
-        # Images of a batch may be at different places of their shots.
-        parts = [(images, features)] if len(set(starts)) == 1 else zip(images.split(1), features.split(1), strict=True)
-        fits = [
-            block_regression(image, guide, block=self.block, offset=start, squares=3, ridge=self.ridge)
-            for (image, guide), start in zip(parts, starts, strict=False)
-        ]
-        return torch.cat(fits).clamp_min(0)
+        # Images of a batch may be at different places of their shots; and no place is read from where it is computed.
+        rows, columns = self._starts[number.flatten().long()].unbind(1)
+        image, guide = (
+            _moved(_moved(each, rows, -2, self.block), columns, -1, self.block) for each in (images, features)
+        )
+        fitted = block_regression(image, guide, block=self.block, squares=3, ridge=self.ridge)
+        height, width = frame.size
+        return _moved_back(_moved_back(fitted, rows, -2, height), columns, -1, width).clamp_min(0)
 
     def _accumulated(self, frame: Frame, images: Tensor, history: History) -> Tensor:
         """With the result before, at the taps and with the length of the first accumulation."""
@@ -155,6 +159,27 @@ class Bmfr(nn.Module):
         assert frame.length is not None
         alpha = torch.where(weight > 0, (1 / frame.length).clamp_min(self.second_alpha), 1)
         return torch.lerp(before, images, alpha.to(images.dtype))
+
+
+def _moved(image: Tensor, starts: Tensor, axis: int, block: int) -> Tensor:
+    """Whole blocks that begin so many pixels before each image ``(B, C, H, W)``, which goes on mirrored."""
+    size = image.shape[axis]
+    places = torch.arange(-(-(size + block - 1) // block) * block, device=image.device)
+    places = (places - starts[:, None]) % (2 * size)
+    return _taken(image, torch.minimum(places, 2 * size - 1 - places), axis)
+
+
+def _moved_back(blocks: Tensor, starts: Tensor, axis: int, size: int) -> Tensor:
+    """The inverse of :func:`_moved`."""
+    return _taken(blocks, torch.arange(size, device=blocks.device) + starts[:, None], axis)
+
+
+def _taken(image: Tensor, places: Tensor, axis: int) -> Tensor:
+    """Of each image of a batch other places along one of its last two axes, ``(B, N)``."""
+    index = places[:, None, :, None] if axis == -2 else places[:, None, None, :]
+    shape = list(image.shape)
+    shape[axis] = places.shape[1]
+    return image.gather(axis, index.expand(shape))
 
 
 def _start(number: int, block: int) -> tuple[int, int]:

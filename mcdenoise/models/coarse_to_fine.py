@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.frame import BUFFERS, Frame, Skip
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
+from mcdenoise.models._reads import at_hand
 from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.models.tiled import TILE, Tiled
 from mcdenoise.ops import downsample
@@ -52,7 +52,7 @@ class CoarseToFine(Wrapper):
         return Output(self._at(frame if frame.statistics else prepared(self.inner, frame), self.resolutions)), None
 
     def _at(self, frame: Frame, resolutions: int) -> Tensor:
-        skip = None if frame.hints.keep_all or torch.compiler.is_compiling() else frame.skip
+        skip = None if frame.hints.keep_all or not at_hand(frame.color.device) else frame.skip
         needed = resolutions > 1 and (skip is None or not bool(skip.mask.all()))
         coarse = self._at(_halved(frame), resolutions - 1) if needed else None
         fine = self.inner(frame)[0].image

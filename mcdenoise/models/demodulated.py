@@ -11,6 +11,7 @@ from torch import Tensor
 from mcdenoise.frame import Frame, scale_samples
 from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._journal import note, timed
+from mcdenoise.models._reads import at_hand
 from mcdenoise.models._wrapper import Wrapper, run
 from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
 from mcdenoise.ops._rows import by_rows
@@ -82,7 +83,7 @@ def _why_not(albedo: Tensor | None) -> str:
     """Why there is nothing to divide out; empty if there is."""
     if albedo is None:
         return "no albedo"
-    if torch.compiler.is_compiling():
+    if not at_hand(albedo.device):
         return ""
     low, high = (float(value) for value in torch.aminmax(albedo.detach()))
     return "albedo is one everywhere" if low == high == 1 else "no albedo anywhere" if high < NO_ALBEDO else ""

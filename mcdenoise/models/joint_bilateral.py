@@ -20,6 +20,7 @@ from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.tiled import TILE, Tiled
 from mcdenoise.nn.inputs import scale_of_depth
+from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._steps.network import normalized_depth
 
 # Depths in [0, 1] differ by much less than albedos and normals do: without a scale of its own, depth hardly guides.
@@ -76,8 +77,8 @@ class JointBilateral(nn.Module):
         # All of kornia comes with it, which takes as long to import as a single frame to denoise.
         from kornia.filters import joint_bilateral_blur
 
-        size, sigma_space = 2 * self.radius + 1, (self.sigma_space, self.sigma_space)
-        images = with_carried(frame)
+        size, images = 2 * self.radius + 1, with_carried(frame)
+        sigma_space = numbers_like(images, (self.sigma_space, self.sigma_space))[None]
         blurred: Tensor = joint_bilateral_blur(
             images,
             guide_of(frame, DEPTH_SCALE),

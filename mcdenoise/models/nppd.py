@@ -49,7 +49,7 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Needs, Output, State
-from mcdenoise.models._journal import journal, note, timed
+from mcdenoise.models._journal import journal, note, tell_history, timed
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
@@ -253,8 +253,7 @@ class Nppd(nn.Module):
             return list(radiance.new_zeros(len(radiance), sum(channels), *frame.size).split(channels, 1))
         motion = motion_unless_still(frame, before.view_projection)
         warped, weight = reproject(torch.cat(before[:3], 1).to(radiance.dtype), motion)
-        if found is not None:
-            found.history = float(weight.detach().mean())
+        tell_history(weight.mean())
         return list(warped.split(channels, 1))
 
     def _encoded(self, frame: Frame, dtype: torch.dtype) -> Tensor:

@@ -39,7 +39,7 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame, tells_motion
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import journal
+from mcdenoise.models._journal import ask, journal
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import CUT_FRACTION
@@ -172,8 +172,12 @@ def _recalled(frame: Frame, memory: Memory | None) -> list[Tensor | None]:
         return list(memory.hidden)
     _, weight = from_before(frame, memory.before, channels=1)
     goes_on = weight.mean((1, 2, 3), keepdim=True) >= CUT_FRACTION
-    if (found := journal()) is not None and not found.reset and not bool(goes_on.any()):
-        found.reset = "cut"
+    if (found := journal()) is not None and not found.reset:
+
+        def tell(any_goes_on: Sequence[float]) -> None:
+            found.reset = "" if any_goes_on[0] else "cut"
+
+        ask(goes_on.any(), tell)
     return [torch.where(goes_on, hidden, 0) for hidden in memory.hidden]
 
 

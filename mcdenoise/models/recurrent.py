@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Needs, Output, State
-from mcdenoise.models._journal import journal, note, timed
+from mcdenoise.models._journal import journal, note, tell_history, timed
 from mcdenoise.models._state import own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import comparable, has_motion, motion_unless_still, surface_before
@@ -117,11 +117,12 @@ def from_before(frame: Frame, state: State, channels: int, keeper: str = "recurr
     motion = motion_unless_still(frame, before.view_projection)
     found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
     weight = weight * before.weight
-    _report("", float(weight.detach().mean()) if journal() is not None else 0.0)
+    _report("", None)
+    tell_history(weight.mean())
     return found, weight
 
 
-def _report(reset: str, history: float) -> None:
+def _report(reset: str, history: float | None) -> None:
     if (found := journal()) is not None:
         found.reset, found.history = reset, history
         note("reproject", reset or "the image of the frame before", float(reset != ""))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, Skip
 from mcdenoise.models._interface import Model, Output, State
-from mcdenoise.models._journal import note, timed
+from mcdenoise.models._journal import ask, journal, note, timed
 from mcdenoise.models._layers import alpha_of, completed
 from mcdenoise.models._noise_free import noise_free
 from mcdenoise.models._state import own_pair, own_state
@@ -197,10 +197,15 @@ def _skip(
 
 
 def _note(name: str, pixels: Tensor | None, reason: str, none: str = "there are none", *, exact: bool) -> None:
-    if torch.compiler.is_compiling():
+    note(name, none, exact=exact)
+    if (found := journal()) is None or pixels is None:
         return
-    fraction = 0.0 if pixels is None else int(pixels.count_nonzero()) / pixels.numel()
-    note(name, reason if fraction else none, fraction, exact=exact)
+    total = pixels.numel()
+
+    def tell(count: Sequence[float]) -> None:
+        found.note(name, reason if count[0] else none, count[0] / total, exact=exact)
+
+    ask(pixels.count_nonzero(), tell)
 
 
 def _change(color: Tensor, weight: Tensor, old_color: Tensor, old_weight: Tensor, tile: int) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Output, State, prepared
 from mcdenoise.models._journal import note
+from mcdenoise.models._reads import at_hand
 from mcdenoise.models._wrapper import Wrapper
 
 # Rectangles begin and end at multiples of this.
@@ -90,7 +91,7 @@ class Tiled(Wrapper):
         whole = [Region(0, 0, *frame.size)]
         if self.halo is None or torch.compiler.is_compiling():
             return None
-        skipped = None if frame.hints.keep_all else frame.skip
+        skipped = frame.skip if at_hand(frame.color.device) and not frame.hints.keep_all else None
         parts = whole if skipped is None else regions(~skipped.mask, self.halo)
         if self.side is not None:
             parts = [tile for part in parts for tile in part.split(self.side)]

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.nn._cpu import ConvBlock, ReLU, max_pool
+from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._window import corner
 
 Size: TypeAlias = Literal["small", "base", "large"]
@@ -187,7 +188,7 @@ def oidn_exposure(color: Tensor) -> Tensor:
         ``(B, 1, 1, 1)``, positive, at least in float32; 1 for a black image. It has no gradient.
     """
     color = color.detach().to(torch.promote_types(color.dtype, torch.float32))
-    weights = color.new_tensor(_LUMINANCE).reshape(1, _COLORS, 1, 1)
+    weights = numbers_like(color, _LUMINANCE).reshape(1, _COLORS, 1, 1)
     luminance = (color * weights).sum(1, keepdim=True)
     bins = _binned(_binned(luminance, 2), 3)
     lit = bins > _DARK
@@ -200,8 +201,8 @@ def _binned(image: Tensor, axis: int) -> Tensor:
     """The means over equal parts of an axis. Sums: autocast would round a product of matrices to half precision."""
     side = image.shape[axis]
     count = -(-side // _BIN)
-    edges = torch.arange(1, count + 1, device=image.device) * side // count
-    part = torch.searchsorted(edges, torch.arange(side, device=image.device), right=True)
+    edges = torch.arange(count + 1, device=image.device) * side // count
+    part = torch.searchsorted(edges[1:], torch.arange(side, device=image.device), right=True)
     shape = [size if each != axis else count for each, size in enumerate(image.shape)]
-    sizes = torch.bincount(part, minlength=count).reshape([-1 if each == axis else 1 for each in range(4)])
+    sizes = edges.diff().reshape([-1 if each == axis else 1 for each in range(4)])
     return image.new_zeros(shape).index_add(axis, part, image) / sizes

@@ -6,7 +6,7 @@ import functools
 import importlib
 import importlib.util
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Literal, get_args
 
@@ -33,19 +33,21 @@ def check_backend(backend: str | None) -> None:
         raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, found {backend!r}")
 
 
-def choose_backend(forms: Sequence[Backend], tensors: Sequence[Tensor], *, differentiable: bool = False) -> Backend:
+def choose_backend(
+    forms: Sequence[Backend], tensors: Sequence[Tensor], *, differentiable: Collection[Backend] = ()
+) -> Backend:
     """The backend to run an op on ``tensors`` with: the fastest that can run and pays, or the one of :func:`use`.
 
     Args:
         forms: what the op has fast forms in.
         tensors: the arguments of the op, ``(B, C, H, W)`` or with other axes behind the second.
-        differentiable: whether the fast forms have derivatives.
+        differentiable: those of the forms that have derivatives.
 
     Raises:
         ValueError: the backend of :func:`use` cannot run; the message says why.
     """
     wanted, strict = _used or (_fastest(tensors), False)
-    obstacle = _obstacle(wanted, tensors, differentiable, forms)
+    obstacle = _obstacle(wanted, tensors, wanted in differentiable, forms)
     if obstacle and strict:
         raise ValueError(f"backend: expected one that can run here, found {wanted!r}, which {obstacle}")
     return "torch" if obstacle else wanted

@@ -4,7 +4,8 @@ An op is a page with a contract and a plain form in torch, which is the truth. `
 name from the file of the same name in ``_numba/`` or ``_triton/`` where one can run and pays. Such a form takes the
 arguments of the op, one after the other, and may return ``NotImplemented`` for what it was not written for.
 
-- Derivatives: a form ``NAME`` beside which there is ``NAME_gradients`` is an operator with derivatives; those are
+- Derivatives: a form ``NAME`` beside which there is ``NAME_gradients`` is an operator with derivatives; or it calls
+  ``NAME_gradients.operator``, which has them, and whose arguments ``NAME_gradients.adapted(plain)`` takes. Those are
   differentiated again by way of the plain form. Any other form is chosen only where none are asked for.
 - Under ``torch.func``, ``vmap`` and forward mode the plain form runs: no compiled form has rules for them.
 - While a model is exported the plain form runs, so that what is exported needs neither numba nor Triton.
@@ -35,15 +36,16 @@ _forms: dict[tuple[str, str], Callable[..., Any]] = {}
 
 
 def op(
-    *backends: Backend, check: Callable[..., None] | None = None, differentiable: bool = False
+    *backends: Backend, check: Callable[..., None] | None = None, differentiable: bool | Backend = False
 ) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
     """Make an op of its plain form.
 
     Args:
         backends: what it has a fast form in.
         check: takes the arguments of the op, and raises for what its contract refuses; run before any form.
-        differentiable: whether the fast forms have derivatives.
+        differentiable: whether the fast forms have derivatives, or which one of them has.
     """
+    of_these = (backends if differentiable else ()) if isinstance(differentiable, bool) else (differentiable,)
 
     def decorate(plain: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
         parameters = inspect.signature(plain).parameters.values()
@@ -56,7 +58,7 @@ def op(
             if check is not None:
                 check(*arguments, **settings)
             tensors = list(_tensors((*arguments, *settings.values())))
-            chosen = choose_backend(backends, tensors, differentiable=differentiable)
+            chosen = choose_backend(backends, tensors, differentiable=of_these)
             if chosen != "torch":
                 given = {**defaults, **dict(zip(names, arguments, strict=False)), **settings}
                 _load(chosen, page, plain)
@@ -100,8 +102,10 @@ def _load(backend: str, page: str, plain: Callable[..., Any]) -> None:
     module = importlib.import_module(f"mcdenoise.ops._{backend}.{page}")
     form: Callable[..., Any] = getattr(module, name)
     gradients = getattr(module, f"{name}_gradients", None)
-    if gradients is not None and isinstance(form, Operator):
-        _differentiate(form, gradients, plain)
+    operator = getattr(gradients, "operator", form)
+    if gradients is not None and isinstance(operator, Operator):
+        adapted = getattr(gradients, "adapted", _by_position)
+        _differentiate(operator, gradients, adapted(plain))
     _forms[backend, name] = form
 
 
@@ -109,24 +113,34 @@ def _load(backend: str, page: str, plain: Callable[..., Any]) -> None:
 _load._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
+def _by_position(plain: Callable[..., Any]) -> Callable[..., Any]:
+    """The plain form, which takes some of its arguments by name only."""
+    names = list(inspect.signature(plain).parameters)
+    return lambda *arguments: plain(**dict(zip(names, arguments, strict=True)))
+
+
 def _differentiate(operator: Operator, gradients: Callable[..., Any], plain: Callable[..., Any]) -> None:
     """Give an operator its gradients, and gradients of those by way of the plain form.
 
-    Of several results the first has derivatives, and the others have none.
+    Of several results the first has derivatives, and the others have none; unless ``gradients.of_all`` says that all
+    have them, and it takes a gradient of each.
     """
+    of_all = getattr(gradients, "of_all", False)
 
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor | tuple[Tensor, ...]) -> None:
-        if isinstance(output, tuple):
+        if isinstance(output, tuple) and not of_all:
             ctx.mark_non_differentiable(*output[1:])
         leaves, ctx.structure = pytree.tree_flatten(inputs)
         ctx.others = [None if isinstance(leaf, Tensor) else leaf for leaf in leaves]
         ctx.save_for_backward(*(leaf if isinstance(leaf, Tensor) else None for leaf in leaves))
 
-    def first(*tensors: Tensor | None, arguments: Callable[..., Any]) -> Tensor:
-        results: Any = plain(**dict(zip(inspect.signature(plain).parameters, arguments(tensors), strict=True)))
-        return cast(Tensor, results if isinstance(results, Tensor) else results[0])
+    def first(*tensors: Tensor | None, arguments: Callable[..., Any]) -> tuple[Tensor, ...]:
+        results: Any = plain(*arguments(tensors))
+        results = (results,) if isinstance(results, Tensor) else tuple(results)
+        return cast(tuple[Tensor, ...], results if of_all else results[:1])
 
-    def backward(ctx: Any, gradient: Tensor, *_: None) -> tuple[Any, ...]:
+    def backward(ctx: Any, *given: Any) -> tuple[Any, ...]:
+        gradient = given if of_all else given[:1]
         tensors = ctx.saved_tensors
         needed = ctx.needs_input_grad
 
@@ -135,7 +149,7 @@ def _differentiate(operator: Operator, gradients: Callable[..., Any], plain: Cal
             return pytree.tree_unflatten(leaves, ctx.structure)
 
         if not torch.is_grad_enabled():
-            return tuple(gradients(needed, gradient, *arguments(tensors)))
+            return tuple(gradients(needed, *gradient, *arguments(tensors)))
         function = functools.partial(first, arguments=arguments)
         wanted = _plain_gradients(function, tensors, pytree.tree_leaves(needed), gradient)
         return tuple(pytree.tree_unflatten(wanted, ctx.structure))
@@ -144,16 +158,20 @@ def _differentiate(operator: Operator, gradients: Callable[..., Any], plain: Cal
 
 
 def _plain_gradients(
-    function: Callable[..., Tensor], tensors: Sequence[Tensor | None], needed: Sequence[bool], gradient: Tensor
+    function: Callable[..., tuple[Tensor, ...]],
+    tensors: Sequence[Tensor | None],
+    needed: Sequence[bool],
+    gradient: Sequence[Tensor],
 ) -> list[Tensor | None]:
     """Of ``function(*tensors)``, times ``gradient``, for the tensors that need one; on record."""
     with torch.enable_grad():
         # An argument may be computed from another one, and only its direct part is asked for: hence the aliases.
         aliases = [None if tensor is None else tensor.view_as(tensor) for tensor in tensors]
         wanted = [alias for alias, need in zip(aliases, needed, strict=True) if alias is not None and need]
-        found = iter(
-            torch.autograd.grad(function(*aliases), wanted, gradient, create_graph=True, materialize_grads=True)
-        )
+        # A result may depend on nothing that needs a derivative, as a rounded length does.
+        results = [(one, own) for one, own in zip(function(*aliases), gradient, strict=True) if one.requires_grad]
+        outputs, of_outputs = [one for one, _ in results], [own for _, own in results]
+        found = iter(torch.autograd.grad(outputs, wanted, of_outputs, create_graph=True, materialize_grads=True))
         return [
             next(found) if alias is not None and need else None for alias, need in zip(aliases, needed, strict=True)
         ]

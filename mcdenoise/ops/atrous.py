@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, bounded_quotient, check_sigmas, edge_stopping, layouts
+from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._window import accumulator_dtype, offsets, pad, shifted
 from mcdenoise.ops.moments import luminance
 
@@ -132,7 +133,7 @@ def _blurred(variance: Tensor) -> Tensor:
     # All of kornia comes with it, which takes as long to import as a single frame to denoise.
     from kornia.filters import filter2d_separable
 
-    kernel = variance.new_tensor([_GAUSSIAN])
+    kernel = numbers_like(variance, _GAUSSIAN)[None]
     result: Tensor = filter2d_separable(variance, kernel, kernel, border_type="replicate")
     return result
 

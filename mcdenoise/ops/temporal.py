@@ -8,6 +8,7 @@ from torch import Tensor
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._constants import DEPTH_LIMIT, LABEL_WEIGHT, NORMAL_LIMIT_SQUARED, PLANE_LIMIT
 from mcdenoise.ops._module import module_of
+from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._op import op
 from mcdenoise.ops._surface import Rule, Surface, check_surfaces, comparable
 
@@ -26,7 +27,7 @@ def _check_motion(position: Tensor, previous_view_projection: Tensor) -> None:
     check_shapes(position=(position, "B 3 H W"), previous_view_projection=(previous_view_projection, "B 4 4"))
 
 
-@op("numba", check=_check_motion)
+@op("numba", "triton", check=_check_motion)
 def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
     """Where each static surface point was in the previous frame, relative to where it is now.
 
@@ -67,7 +68,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
         clip = clip + point[:, axis : axis + 1] * matrix[:, axis, :, None, None]
     w = clip[:, 3:]
     in_front = hit & (w > 0)
-    scale = torch.tensor([width, height], dtype=dtype, device=position.device).reshape(1, 2, 1, 1)
+    scale = numbers_like(position, [width, height], dtype).reshape(1, 2, 1, 1)
     previous = (clip[:, :2] / torch.where(in_front, w, 1) + 1) / 2 * scale
     centre = _pixel_grid(height, width, position.device, dtype) + 0.5
     return torch.where(in_front, previous - centre, torch.inf)
@@ -147,7 +148,7 @@ def reproject(
     motion = torch.where(known, motion.to(dtype), 0)
     q = _pixel_grid(height, width, motion.device, dtype) + motion
     # Far outside is as good as just outside, and stays exact as an integer.
-    limit = torch.tensor([width + 1, height + 1], dtype=dtype, device=q.device).reshape(1, 2, 1, 1)
+    limit = numbers_like(q, [width + 1, height + 1]).reshape(1, 2, 1, 1)
     base = torch.minimum(torch.maximum(q.detach().floor(), torch.full_like(limit, -2)), limit)
     fraction = q - base
     x0, y0 = base[:, :1].long(), base[:, 1:].long()
@@ -217,7 +218,7 @@ def check_accumulate(
     check_surfaces(surface, previous_surface, previous, rule, position_limit, normal_limit)
 
 
-@op("numba", check=check_accumulate)
+@op("numba", "triton", check=check_accumulate, differentiable="numba")
 def accumulate(
     color: Tensor,
     previous: Tensor,

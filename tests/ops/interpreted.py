@@ -20,11 +20,15 @@ from plain_form import (
     transposed,
 )
 from torch import Tensor
+from torch.utils import _pytree as pytree
 from triton.runtime import interpreter
 
 from mcdenoise import ops
-from mcdenoise.check.cases import Case, Op, map_tensors
-from mcdenoise.ops import _backend
+from mcdenoise.check.cases import OPS, Case, Op, map_tensors
+from mcdenoise.check.step_cases import STEPS
+from mcdenoise.ops import Surface, _backend
+from mcdenoise.ops._op import backends_of
+from mcdenoise.ops._steps import history, network
 from mcdenoise.ops._triton import _filter as _triton_filter
 
 every_op = pytest.mark.parametrize("op", FAST, ids=lambda op: op.name)
@@ -45,7 +49,7 @@ def calls_within_a_kernel_are_plain_calls(monkeypatch: pytest.MonkeyPatch) -> No
     call = interpreter.InterpretedFunction.__call__
 
     def called(function: Any, *given: Any, **named: Any) -> Any:
-        if function.fn.__module__ == _triton_filter.__name__:
+        if function.fn.__module__.startswith("mcdenoise.ops._triton."):
             return function.rewrite()(*given, **named)
         return call(function, *given, **named)
 
@@ -183,3 +187,158 @@ def test_infinite_logits_are_the_limit_of_large_ones() -> None:
 def test_the_interpreter_is_no_default() -> None:
     assert by("triton", _backend.choose_backend)(["triton"], [torch.rand(1, 3, 4, 5)]) == "triton"
     assert _backend.choose_backend(["triton"], [torch.rand(1, 3, 256, 256)]) != "triton"
+
+
+# What has no derivatives: the steps of the models, and what they accumulate with.
+
+WITHOUT = [
+    *(step for step in STEPS if "triton" in backends_of(step.function)),
+    *(op for op in OPS if op.name in ("motion_from_position", "accumulate")),
+]
+STEP_CASES = [(op, case) for op in WITHOUT for case in op.cases if case.kind == "ordinary"]
+
+
+def is_plain(function: Callable[..., Any], tolerance: float, *given: Any, **settings: Any) -> None:
+    """Of what was given in another precision, the plain form's result in float64."""
+
+    def exact(value: Any) -> Any:
+        return value.double() if isinstance(value, Tensor) else value
+
+    with torch.no_grad():
+        found = by("triton", function)(*given, **settings)
+        expected = by("torch", function)(*pytree.tree_map(exact, given), **pytree.tree_map(exact, settings))
+    for one, other in zip(pytree.tree_leaves(found), pytree.tree_leaves(expected), strict=True):
+        torch.testing.assert_close(one.double(), other.double(), rtol=tolerance, atol=tolerance)
+
+
+def test_every_step_of_the_default_model_has_a_form() -> None:
+    # Torch itself has one for what is not among them: the mean of 2x2 pixels, the product with the albedo.
+    names = {op.name for op in WITHOUT}
+    assert names >= {"incoming", "lights", "blend", "depth_scale", "buffers_input", "network_guides", "softplus"}
+    assert names >= {"gated_fusion", "low_frequencies_of", "motion_from_position", "accumulate"}
+
+
+@pytest.mark.parametrize(
+    ("op", "case"), [pytest.param(*pair, id=f"{pair[0].name}-{pair[1].name}") for pair in STEP_CASES]
+)
+def test_result_of_a_step(op: Op, case: Case) -> None:
+    given = case.inputs()
+    found: Any = {}
+    with torch.no_grad():
+        for backend in ("triton", "torch"):
+            found[backend] = pytree.tree_leaves(by(backend, op.function)(**given, **case.settings))
+    for one, other in zip(found["triton"], found["torch"], strict=True):
+        assert one.dtype == other.dtype
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-13, equal_nan=True)
+
+
+def draw(channels: int, height: int = 9, width: int = 37, batch: int = 1, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.rand(batch, channels, height, width, dtype=torch.float64).to(dtype)
+
+
+def seen(dtype: torch.dtype, *, depth: bool = True) -> Surface:
+    """Surfaces of which some pixels are alike, of two labels, with background."""
+    far = (1 + 0.05 * draw(1)).masked_fill(draw(1) < 0.1, torch.inf)
+    buffers = (0.05 * draw(3), torch.nn.functional.normalize(draw(3), dim=1), far if depth else None)
+    return Surface(*(None if each is None else each.to(dtype) for each in (*buffers, (draw(1) > 0.5).double())))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("rule", ["relative", "bmfr"])
+def test_all_of_a_blend(rule: str, dtype: torch.dtype) -> None:
+    limits = {"position_limit": 0.01, "normal_limit": 1.0} if rule == "bmfr" else {}
+    # Half of the pixels see mirrors; motion out of the image, and unknown.
+    motion = 2 * draw(2) - 1
+    motion[..., :2, :2], motion[..., 3, 4] = torch.inf, torch.nan
+    given = {
+        "entering": draw(5),
+        "previous": draw(9),
+        "previous_length": 1 + 12 * draw(1),
+        "motion": motion,
+        "albedo": draw(3) * (draw(1) > 0.5),
+    }
+    given = {name: value.to(dtype) for name, value in given.items()}
+    depth = rule == "relative"
+    surfaces = {"surface": seen(dtype, depth=depth), "previous_surface": seen(dtype, depth=depth)}
+    settings = {"rule": rule, "specular_length": 2.0, "lag_threshold": 0.8, **limits}
+    is_plain(history.blend, 1e-12 if dtype == torch.float64 else 1e-5, **given, **surfaces, **settings)
+
+
+# Without a limit the highest radiance is infinite on its way to the largest number.
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
+@pytest.mark.parametrize("albedo", [True, False])
+@pytest.mark.parametrize("limit", [15.0, 2.0, torch.inf, "of each image"])
+def test_what_enters_a_history(limit: Any, albedo: bool) -> None:
+    limits = torch.tensor([1.5, torch.inf]).double().reshape(2, 1, 1, 1) if isinstance(limit, str) else limit
+    color = draw(3, batch=2) * (draw(1, batch=2) > 0.3) * 10 ** (3 * draw(1, batch=2))
+    tint = draw(3, batch=2) * (draw(1, batch=2) > 0.2) if albedo else None
+    is_plain(history.incoming, 1e-12, color, tint, limits, kernel_size=5)
+    is_plain(history.incoming, 1e-12, color, tint, limits, kernel_size=3, compared=False)
+
+
+def test_lights_across_tiles() -> None:
+    root = draw(1, 13, 40)
+    root[..., 3:9, 28:36] = 4
+    found = by("triton", history.lights)(root)
+    assert found[..., 3:9, 28:36].all()
+    assert found.sum() == 48
+    is_plain(history.lights, 0, root)
+
+
+@pytest.mark.parametrize("logarithms", [True, False])
+def test_a_fusion_with_all_that_it_may_have(logarithms: bool) -> None:
+    fine, coarse = draw(3, batch=2), draw(3, 5, 19, batch=2)
+    weight, bias, top = (
+        torch.randn(1, 6, 3, 3).double(),
+        torch.randn(1).double(),
+        torch.full((2, 1, 1, 1), 0.4).double(),
+    )
+    residual = None if logarithms else draw(3, batch=2, dtype=torch.bfloat16)
+    is_plain(network.gated_fusion, 1e-12, fine, coarse, weight, bias, residual=residual, top=top, logarithms=logarithms)
+
+
+def test_low_frequencies_over_many_blocks() -> None:
+    fine, coarse = draw(3, 27, 41), draw(3, 14, 21)
+    top, exposure = torch.full((1, 1, 1, 1), 0.9).double(), torch.full((1, 1, 1, 1), 2.0).double()
+    is_plain(network.low_frequencies_of, 1e-12, fine, coarse, top, exposure)
+
+
+def test_a_depth_of_more_pixels_than_threads() -> None:
+    depth = (1 + 30 * draw(1, 97, 131, batch=2)).masked_fill(draw(1, 97, 131, batch=2) < 0.2, torch.inf)
+    depth[..., 0, :9] = 1e30
+    depth[1] = torch.inf
+    is_plain(network.depth_scale, 1e-12, depth)
+
+
+def test_the_input_of_a_network_is_as_a_convolution_takes_it() -> None:
+    buffers: dict[str, Any] = {
+        "image": draw(3, dtype=torch.float32),
+        "albedo": channels_last(draw(3, dtype=torch.bfloat16)),
+        "normal": transposed(draw(3, dtype=torch.float32)),
+        "depth": every_other_column(draw(1, dtype=torch.float32)),
+        "current": slice_of_pixels(draw(3, dtype=torch.float32)),
+        "length": None,
+        "exposure": torch.full((1, 1, 1, 1), 3.0),
+        "scale": (torch.full((1, 1, 1, 1), 2.0), torch.full((1, 1, 1, 1), 0.7)),
+    }
+    factor = torch.full((1, 1, 1, 1), 0.3)
+    is_plain(network.buffers_input, 1e-6, **buffers, image_factor=factor)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = by("triton", network.buffers_input)(**buffers, logarithms=False)
+    assert found.dtype == torch.bfloat16
+    assert found.is_contiguous(memory_format=torch.channels_last)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("op", WITHOUT, ids=lambda op: op.name)
+def test_a_step_goes_through_the_compiler(op: Op) -> None:
+    case = op.cases[0]
+    given = case.inputs()
+    torch.compiler.reset()
+    with torch.no_grad():
+        compiled = by("triton", torch.compile(op.function, fullgraph=True, backend="aot_eager"))(
+            **given, **case.settings
+        )
+        plainly = by("triton", op.function)(**given, **case.settings)
+    for one, other in zip(pytree.tree_leaves(compiled), pytree.tree_leaves(plainly), strict=True):
+        assert torch.equal(one, other)

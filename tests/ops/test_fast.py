@@ -313,14 +313,60 @@ def test_accumulation_goes_through_the_compiler() -> None:
         torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_accumulation_with_derivatives_is_plain() -> None:
+def gradients_of_both(backend: Any, case: Case, dtype: torch.dtype, **changed: Any) -> list[Tensor]:
+    inputs = {**case.inputs(dtype), **changed}
+    leaves = leaves_of(inputs, case)
+    results = [each for each in by(backend, ops.accumulate)(**inputs, **case.settings) if each.requires_grad]
+    generator = torch.Generator().manual_seed(1)
+    upstream = [torch.randn(each.shape, generator=generator, dtype=torch.float64).to(dtype) for each in results]
+    return list(torch.autograd.grad(results, leaves, upstream, allow_unused=True, materialize_grads=True))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+@pytest.mark.parametrize(
+    "case", [case for case in ACCUMULATE.cases if case.kind != "extreme"], ids=lambda case: case.name
+)
+def test_derivatives_of_accumulation_are_those_of_the_plain_form(case: Case, dtype: torch.dtype) -> None:
+    found, expected = (gradients_of_both(backend, case, dtype) for backend in ("numba", "torch"))
+    assert [each.dtype for each in found] == [each.dtype for each in expected]
+    # Of a motion the derivative is a difference of the taps, which are as large as they are.
+    largest = max(1.0, *(each.abs().max().item() for each in expected if each.numel()))
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=32 * torch.finfo(dtype).eps * largest)
+
+
+def test_derivatives_of_accumulation_are_the_same_by_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_runtime, "PIXELS_A_THREAD", 1)
+    case = next(case for case in ACCUMULATE.cases if "all buffers, batch" in case.name)
+    threads = torch.get_num_threads()
+    try:
+        found = []
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            found.append(gradients_of_both("numba", case, torch.float64))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(map(torch.equal, *found))
+
+
+def test_accumulation_is_differentiated_twice() -> None:
     case = ACCUMULATE.cases[0]
-    inputs = case.inputs()
-    leaves_of(inputs, case)
-    with pytest.raises(ValueError, match="found 'numba', which has no derivatives of this op"):
-        by("numba", ops.accumulate)(**inputs, **case.settings)
+
+    def second(backend: Any) -> tuple[Tensor, ...]:
+        inputs = case.inputs()
+        leaves = leaves_of(inputs, case)
+        color, length = by(backend, ops.accumulate)(**inputs, **case.settings)
+        first = torch.autograd.grad(color.square().sum() + length.square().sum(), leaves, create_graph=True)
+        return torch.autograd.grad(sum(each.square().sum() for each in first), leaves)
+
+    for one, other in zip(second("numba"), second("torch"), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-11)
+
+
+def test_large_images_are_accumulated_with_compiled_derivatives() -> None:
     color = torch.rand(1, 3, 96, 96, requires_grad=True)
     result, _ = ops.accumulate(color, color.detach(), color.detach()[:, :1] + 1, torch.zeros(1, 2, 96, 96))
+    assert "accumulate_pair" in type(result.grad_fn).__name__
     assert torch.autograd.grad(result.sum(), color)[0].shape == color.shape
 
 

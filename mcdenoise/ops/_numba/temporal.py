@@ -1,4 +1,4 @@
-"""Motion and accumulation as torch operators, without derivatives.
+"""Motion, without derivatives, and accumulation, with them, as torch operators.
 
 Pixel by pixel the taps of a history lie anywhere: there is nothing to vectorise, only forty passes over the image to
 save. So one pass does all that :func:`mcdenoise.ops._steps.history.blend` asks of it, too.
@@ -7,6 +7,7 @@ save. So one pass does all that :func:`mcdenoise.ops._steps.history.blend` asks 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,11 +89,6 @@ class Shorter(NamedTuple):
     still: float = 0.0
 
 
-def accumulate(*arguments: Any) -> tuple[Tensor, Tensor]:
-    """See :func:`mcdenoise.ops.accumulate`."""
-    return blended(*arguments)[:2]
-
-
 def blended(
     color: Tensor,
     previous: Tensor,
@@ -111,15 +107,17 @@ def blended(
     Channels that ``previous`` has more than ``color`` are the second history of the first of them.
     """
     here, there = comparable(surface, previous_surface)
-    if position_limit is None:
-        position_limit = DEPTH_LIMIT if here.position is None else PLANE_LIMIT
-    if normal_limit is None:
-        normal_limit = NORMAL_LIMIT_SQUARED
-    settings = (alpha_min, rule == "bmfr", position_limit, normal_limit, *shorter)
+    settings = (alpha_min, rule == "bmfr", *_limits(here, position_limit, normal_limit), *shorter)
     result: tuple[Tensor, Tensor, Tensor] = _blend(
         color, previous, previous_length, motion, list(here), list(there), *settings
     )
     return result
+
+
+def _limits(here: Surface, position_limit: float | None, normal_limit: float | None) -> tuple[float, float]:
+    if position_limit is None:
+        position_limit = DEPTH_LIMIT if here.position is None else PLANE_LIMIT
+    return position_limit, NORMAL_LIMIT_SQUARED if normal_limit is None else normal_limit
 
 
 @custom_op(
@@ -146,6 +144,29 @@ def _blend(
     still: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The surfaces have the same buffers."""
+    settings = (alpha_min, position_limit, normal_limit, recent_alpha, albedo, longest, still, bmfr)
+    accumulated, length, kept = _pass(color, previous, previous_length, motion, surface, previous_surface, *settings)
+    return accumulated.to(color.dtype), length.to(previous_length.dtype), kept
+
+
+def _pass(
+    color: Tensor,
+    previous: Tensor,
+    previous_length: Tensor,
+    motion: Tensor | None,
+    surface: Sequence[Tensor | None],
+    previous_surface: Sequence[Tensor | None],
+    alpha_min: float,
+    position_limit: float,
+    normal_limit: float,
+    recent_alpha: float,
+    albedo: Tensor | None,
+    longest: float,
+    still: float,
+    bmfr: bool,
+    taps: tuple[Tensor, Tensor] | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Results in the dtype of the sums; of each pixel, into ``taps``, weights and places in ``previous``."""
     dtype = torch.promote_types(color.dtype, torch.float32)
     accumulated = torch.empty(previous.shape, dtype=dtype, device="cpu")
     length = torch.empty(previous_length.shape, dtype=dtype, device="cpu")
@@ -164,9 +185,12 @@ def _blend(
         limits = accumulated.new_tensor(
             [alpha_min, position_limit, normal_limit, LABEL_WEIGHT, recent_alpha, NO_ALBEDO, longest, still]
         ).numpy()
-        arguments = (accumulated.numpy(), length.numpy(), kept.numpy(), *images, *surfaces, *limits, bmfr)
+        if taps is None:
+            taps = nothing.to(dtype), nothing.long()
+        records = tuple(each.numpy() for each in taps)
+        arguments = (accumulated.numpy(), length.numpy(), kept.numpy(), *images, *surfaces, *limits, bmfr, *records)
         share_rows(color, lambda *rows: _accumulate(*arguments, *rows))
-    return accumulated.to(color.dtype), length.to(previous_length.dtype), kept
+    return accumulated, length, kept
 
 
 @_blend.register_fake
@@ -196,11 +220,15 @@ def _accumulate(
     longest: float,
     still: float,
     bmfr: bool,
+    tap_weights: Any,
+    tap_places: Any,
     b: int,
     first: int,
     last: int,
 ) -> None:
     """Rows ``first`` to ``last`` of the result, by the rules of :func:`mcdenoise.ops.reproject`.
+
+    And of their taps, where there is room for them.
 
     In one piece, and with the memory of each image in a variable: handed to other functions, arrays are counted, pixel
     by pixel, which takes ten times as long as all the rest. The taps of a run of pixels are found first and summed
@@ -337,6 +365,11 @@ def _accumulate(
                 lengths[b, 0, y, x] = length
                 alphas[0, i] = alpha
                 alphas[1, i] = one - excess * (one - max(newest, recent_alpha))
+            if tap_weights.shape[0]:
+                for i in range(size):
+                    for tap in range(4):
+                        tap_weights[b, y, x0 + i, tap] = weights[i, tap]
+                        tap_places[b, y, x0 + i, tap] = np.int64(places[i, tap])
             for i in range(size):
                 w0, w1, w2, w3 = weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3]
                 i0, i1, i2, i3 = places[i, 0], places[i, 1], places[i, 2], places[i, 3]
@@ -363,3 +396,194 @@ def _accumulate(
                     near = values[i] - change * (one - alpha[i])
                     out[i] = far if alpha[i] < half else near if alpha[i] < one else values[i]
         counts[b, y] = count
+
+
+# With derivatives.
+
+# Buffer by buffer: lists in which something may be missing have no derivatives.
+_SURFACES = (*Surface._fields, *(f"previous_{name}" for name in Surface._fields))
+_ARGUMENTS = (
+    "Tensor color, Tensor old, Tensor old_length, Tensor? motion, "
+    + "".join(f"Tensor? {name}, " for name in _SURFACES)
+    + "float alpha_min, str rule, float? position_limit, float? normal_limit"
+)
+
+
+@custom_op("mcdenoise::accumulate_pair", device_types="cpu", schema=f"({_ARGUMENTS}) -> (Tensor, Tensor)")
+def _accumulate_pair(*arguments: Any) -> tuple[Tensor, Tensor]:
+    return blended(*_as_called(arguments))[:2]
+
+
+def _as_called(arguments: Sequence[Any]) -> list[Any]:
+    """The arguments of the op of those of the operator; a surface of nothing is none."""
+    surfaces = Surface(*arguments[4:8]), Surface(*arguments[8:12])
+    known = (surface if any(each is not None for each in surface) else None for surface in surfaces)
+    return [*arguments[:4], *known, *arguments[12:]]
+
+
+@_accumulate_pair.register_fake
+def _(color: Tensor, previous: Tensor, previous_length: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
+    return color.new_empty(previous.shape), previous_length.new_empty(previous_length.shape)
+
+
+def accumulate(
+    color: Tensor,
+    previous: Tensor,
+    previous_length: Tensor,
+    motion: Tensor | None,
+    surface: Surface | None,
+    previous_surface: Surface | None,
+    alpha_min: float,
+    rule: str,
+    *limits: float | None,
+) -> Any:
+    """See :func:`mcdenoise.ops.accumulate`."""
+    here, there = comparable(surface, previous_surface)
+    return _accumulate_pair(color, previous, previous_length, motion, *here, *there, alpha_min, rule, *limits)
+
+
+def _by_name(plain: Callable[..., Any], arguments: Sequence[Any]) -> Any:
+    images, settings = arguments[:6], arguments[6:]
+    names = ("alpha_min", "rule", "position_limit", "normal_limit")
+    return plain(*images, **dict(zip(names, settings, strict=True)))
+
+
+class _Gradients:
+    """Of both results: taps are found once more, then each pixel's own gradients, then what its taps get of them."""
+
+    operator, of_all = _accumulate_pair, True
+
+    @staticmethod
+    def adapted(plain: Callable[..., Any]) -> Callable[..., Any]:
+        """The plain form, with the arguments of the operator."""
+        return lambda *arguments: _by_name(plain, _as_called(arguments))
+
+    def __call__(self, needed: Sequence[Any], gradient: Tensor, of_length: Tensor, *arguments: Any) -> tuple[Any, ...]:
+        color, previous, previous_length, motion = arguments[:4]
+        surface, previous_surface, limits = Surface(*arguments[4:8]), Surface(*arguments[8:12]), arguments[-2:]
+        alpha_min, rule = arguments[12:14]
+        dtype = torch.promote_types(color.dtype, torch.float32)
+        batch, channels, height, width = previous.shape
+        images = [image.detach().to(dtype).contiguous() for image in (color, previous, previous_length)]
+        moved = color.new_zeros((0, 0, 0, 0)) if motion is None else motion.detach()
+        found = [torch.zeros_like(image) for image in images] + [torch.zeros_like(moved, dtype=dtype)]
+        if previous.numel():
+            weights = images[0].new_empty((batch, height, width, 4))
+            taps = weights, torch.empty(weights.shape, dtype=torch.int64, device="cpu")
+            settings = (alpha_min, *_limits(surface, *limits), 1.0, None, math.inf, 0.0, rule == "bmfr")
+            _pass(images[0], images[1], images[2], motion, surface, previous_surface, *settings, taps)
+            # What each pixel's history and its length get.
+            shares = images[0].new_empty((batch, channels + 1, height, width))
+            given = [each.to(dtype).contiguous() for each in (gradient, of_length)]
+            arrays = [each.numpy() for each in (*images, moved.to(dtype).contiguous(), *given, *taps, shares)]
+            results = [each.numpy() for each in found]
+            least = images[0].new_tensor([alpha_min]).numpy()[0]
+            handed = (results[0], results[3], *arrays, least, rule == "bmfr")
+            share_rows(color, lambda *rows: _differentiate_pixels(*handed, *rows))
+            # Pixels of many rows may have a tap in common, planes have nothing: so results are the same in every run.
+            planes = shares.flatten(2)[:, None]
+            share_rows(planes, lambda *rows: _spread(results[1], results[2], *arrays[-3:], *rows))
+        inputs = (color, previous, previous_length, moved)
+        own = [each.to(like.dtype) for each, like in zip(found, inputs, strict=True)]
+        return (*own[:3], None if motion is None else own[3], *[None] * len(arguments[4:]))
+
+
+accumulate_gradients = _Gradients()
+
+
+@compiled
+def _differentiate_pixels(
+    of_color: Any,
+    of_motion: Any,
+    color: Any,
+    previous: Any,
+    lengths: Any,
+    motion: Any,
+    gradient: Any,
+    of_length: Any,
+    weights: Any,
+    places: Any,
+    shares: Any,
+    alpha_min: float,
+    bmfr: bool,
+    b: int,
+    first: int,
+    last: int,
+) -> None:
+    """What a pixel's color and motion get, and what its history and that one's length are to share out."""
+    _, channels, height, width = color.shape
+    number = color.dtype.type
+    one, zero = number(1), number(0)
+    moves = motion.size > 0
+    old, spans = previous[b].reshape(channels, height * width), lengths[b].reshape(height * width)
+    values = np.empty(4, color.dtype)
+    for y in range(first, last):
+        for x in range(width):
+            w0, w1, w2, w3 = weights[b, y, x, 0], weights[b, y, x, 1], weights[b, y, x, 2], weights[b, y, x, 3]
+            if not w0 + w1 + w2 + w3 > zero:
+                for c in range(channels):
+                    of_color[b, c, y, x] = gradient[b, c, y, x]
+                    shares[b, c, y, x] = zero
+                shares[b, channels, y, x] = zero
+                continue
+            start = b * channels * height * width
+            p0, p1 = places[b, y, x, 0] - start, places[b, y, x, 1] - start
+            p2, p3 = places[b, y, x, 2] - start, places[b, y, x, 3] - start
+            newest = one / (w0 * spans[p0] + w1 * spans[p1] + w2 * spans[p2] + w3 * spans[p3] + one)
+            alpha = max(newest, alpha_min)
+            of_alpha = zero
+            values[:] = zero
+            for c in range(channels):
+                own, slope = old[c], gradient[b, c, y, x]
+                history = w0 * own[p0] + w1 * own[p1] + w2 * own[p2] + w3 * own[p3]
+                of_alpha += slope * (color[b, c, y, x] - history)
+                of_color[b, c, y, x] = slope * alpha
+                share = slope * (one - alpha)
+                shares[b, c, y, x] = share
+                values[0] += share * own[p0]
+                values[1] += share * own[p1]
+                values[2] += share * own[p2]
+                values[3] += share * own[p3]
+            # A rounded length has no derivative.
+            share = zero if bmfr else of_length[b, 0, y, x]
+            if newest >= alpha_min:
+                share -= of_alpha * newest * newest
+            shares[b, channels, y, x] = share
+            if not moves:
+                continue
+            for tap in range(4):
+                values[tap] += share * spans[places[b, y, x, tap] - start]
+            mean = w0 * values[0] + w1 * values[1] + w2 * values[2] + w3 * values[3]
+            qx, qy = number(x) + motion[b, 0, y, x], number(y) + motion[b, 1, y, x]
+            left, top = np.int64(math.floor(qx)), np.int64(math.floor(qy))
+            fx, fy = qx - number(left), qy - number(top)
+            total = across = along = zero
+            for tap in range(4):
+                place = places[b, y, x, tap] - start
+                # One that stands once more for a tap that was left out.
+                if tap and place == p0:
+                    continue
+                right, below = place % width > left, place // width > top
+                wide, high = fx if right else one - fx, fy if below else one - fy
+                total += wide * high
+                across += (values[tap] - mean) * (high if right else -high)
+                along += (values[tap] - mean) * (wide if below else -wide)
+            of_motion[b, 0, y, x], of_motion[b, 1, y, x] = across / total, along / total
+
+
+@compiled
+def _spread(
+    of_previous: Any, of_length: Any, weights: Any, places: Any, shares: Any, b: int, first: int, last: int
+) -> None:
+    """What every tap gets of the pixels that have it, for some of the planes; the last is that of the length."""
+    _, channels, height, width = of_previous.shape
+    start = b * channels * height * width
+    for c in range(first, last):
+        plane = of_previous[b, c] if c < channels else of_length[b, 0]
+        flat = plane.reshape(height * width)
+        for y in range(height):
+            for x in range(width):
+                share = shares[b, c, y, x]
+                if share != 0:
+                    for tap in range(4):
+                        flat[places[b, y, x, tap] - start] += weights[b, y, x, tap] * share

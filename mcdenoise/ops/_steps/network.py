@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops._constants import BLOCK, DARK, FARTHEST, SHORTEST
+from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._op import op, plain
 from mcdenoise.ops._rows import by_rows
 from mcdenoise.ops._window import accumulator_dtype, corner
@@ -43,7 +44,7 @@ def network_input(image: Tensor, features: Tensor, *, logarithms: bool = True) -
     return torch.cat([torch.log1p(image) if logarithms else image, features], 1)
 
 
-@op("numba")
+@op("numba", "triton")
 def buffers_input(
     image: Tensor,
     albedo: Tensor,
@@ -81,7 +82,7 @@ def buffers_input(
     return plain(network_input)(image, features, logarithms=logarithms)
 
 
-@op("numba")
+@op("numba", "triton")
 def network_guides(normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor]) -> Tensor:
     """Normal and depth as :func:`network_features` has them, to guide a filter.
 
@@ -96,7 +97,7 @@ def network_guides(normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor]) 
     return torch.cat([normal * 0.5 + 0.5, normalized_depth(depth, *scale)], 1)
 
 
-@op("numba")
+@op("numba", "triton")
 def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
     """A near depth to count depths in, and the typical one in that unit: the geometric mean of what was hit.
 
@@ -178,7 +179,7 @@ def network_features(
     return torch.cat([albedo, normal * 0.5 + 0.5, near, torch.log1p(current * exposure), share], 1)
 
 
-@op("numba")
+@op("numba", "triton")
 def gated_fusion(
     fine: Tensor,
     coarse: Tensor,
@@ -228,7 +229,7 @@ def gated_fusion(
     return fused if top is None else torch.expm1(torch.minimum(fused.clamp_min(0), top))
 
 
-@op("numba")
+@op("numba", "triton")
 def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor, exposure: Tensor | None = None) -> Tensor:
     """An image with the means of another in the place of its own, over blocks of 8x8 pixels.
 
@@ -254,7 +255,7 @@ def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor, exposure: Tens
     return torch.minimum(fine * (wanted / found), most)
 
 
-@op("numba")
+@op("numba", "triton")
 def softplus(x: Tensor, units: Sequence[float]) -> Tensor:
     """``F.softplus(x)`` in units of its own for each channel, as contiguous planes of at least float32.
 
@@ -263,4 +264,4 @@ def softplus(x: Tensor, units: Sequence[float]) -> Tensor:
         units: factor of each channel of the result.
     """
     planes = F.softplus(x.to(accumulator_dtype(x.dtype)).contiguous())
-    return planes * planes.new_tensor(units).reshape(-1, 1, 1)
+    return planes * numbers_like(planes, units).reshape(-1, 1, 1)

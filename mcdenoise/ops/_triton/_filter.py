@@ -1,7 +1,5 @@
 """The filter of :mod:`mcdenoise.ops._numba._filter` and its derivatives, in Triton, for NVIDIA GPUs.
 
-Checked with Triton's interpreter, and compiled for several generations of GPUs; not yet timed on a GPU.
-
 Every program has a tile of pixels, one for each thread, and goes through the taps of the window: neighbours of a tile
 lie in the cache, and kernels are read once, in whatever layout and precision they have. Only sums are held, so that the
 ``K*K`` weights exist for one tap at a time; the derivatives compute them once more. Channels and guides are tuples, not

@@ -1,0 +1,325 @@
+"""A step never waits for a device: shown on a processor, where what would wait can be counted.
+
+Three proofs, of every method of the zoo. A dispatch mode sees every operator of torch, and counts those that hand a
+value to the host or whose result has a size that depends on values, and constants that come from the host. Tensors of
+the device ``meta`` have no values at all: whoever asks for one fails, in whatever way it asks. And the images are those
+of a step that looks.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from typing import Any
+
+import kornia  # noqa: F401 - makes constants when it is first imported
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from toys import Same, refused, small, whole_frame
+
+from mcdenoise import Denoiser, Frame, InputError, create_model, ops
+from mcdenoise.models import Accumulated, Demodulated, Journal, Output, list_models, listening, timed
+from mcdenoise.models import _journal as journal_module
+from mcdenoise.models._journal import ask
+from mcdenoise.models._reads import at_hand, out_of_reach
+from mcdenoise.models._stopwatch import Stopwatch
+
+# Open Image Denoise is a library for processors here: images go there and back, which waits.
+ON_THE_HOST = {"oidn", "oidn_pyramid", "oidn_temporal"}
+MODELS = [name for name in list_models() if name not in ON_THE_HOST]
+SIZE = (40, 56)
+
+READS = {
+    *("_local_scalar_dense", "item", "is_nonzero", "equal", "allclose"),
+    # Whose result has as many elements as the values say.
+    *("nonzero", "masked_select", "unique_consecutive", "_unique", "_unique2", "unique_dim", "bincount", "histc"),
+    # A constant that the host made.
+    "lift_fresh",
+}
+
+
+class Reads(TorchDispatchMode):
+    """Counts the operators that would make the host wait for a device."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, function: Any, types: Any, given: Any = (), named: Any = None) -> Any:
+        name = function._schema.name.removeprefix("aten::")
+        by_mask = name in ("index", "index_put", "index_put_", "_index_put_impl_") and any(
+            index is not None and index.dtype in (torch.bool, torch.uint8) for index in given[1]
+        )
+        by_counts = name == "repeat_interleave" and function._overloadname != "self_int"
+        if name in READS or by_mask or by_counts:
+            self.found[name] += 1
+        return function(*given, **(named or {}))
+
+
+def shot(model: Any, count: int = 3) -> list[Frame]:
+    return [whole_frame(model, *SIZE, seed=seed) for seed in range(count)]
+
+
+def as_on_a_gpu(denoiser: Denoiser, frames: list[Frame]) -> tuple[list[Tensor], Counter[str]]:
+    """Images of a shot, and what was read meanwhile; without forms for processors."""
+    images = []
+    with ops.use("torch"), out_of_reach(), Reads() as reads:
+        for frame in frames:
+            images.append(denoiser(frame))
+    return images, reads.found
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_step_reads_nothing(name: str) -> None:
+    model = small(name)
+    images, reads = as_on_a_gpu(Denoiser(model), shot(model))
+    assert not reads
+    assert all(torch.isfinite(image).all() for image in images)
+
+
+def test_a_step_with_layers_alpha_and_stages_reads_nothing() -> None:
+    model = small("cascaded_v2_tiny")
+    denoiser, frames = Denoiser(model, alpha=True), shot(model)
+    with ops.use("torch"), out_of_reach(), Reads() as reads:
+        for frame in frames:
+            layers = {"diffuse": 0.25 * frame.color, "glossy": 0.5 * frame.color}
+            output = denoiser.output(frame.replace(layers=layers, alpha=torch.ones(1, 1, *SIZE)))
+    assert not reads.found
+    assert set(output.layers) == {"diffuse", "glossy"}
+
+
+@pytest.mark.parametrize("name", MODELS)
+@torch.no_grad()
+def test_a_step_runs_without_any_values(name: str) -> None:
+    model: Any = small(name)
+    frames = shot(model)
+    if isinstance(model, nn.Module):
+        model.to("meta")
+    state = None
+    for frame in frames:
+        output, state = model(frame.to("meta").repaired().frame, state)
+        assert output.image.shape == (1, 3, *SIZE)
+        assert output.image.device.type == "meta"
+
+
+class Curious(nn.Module):
+    """Reads values in all the ways that there are."""
+
+    needs = Same.needs
+
+    def __init__(self, way: str) -> None:
+        super().__init__()
+        self.way = way
+
+    def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+        color = frame.color
+        ways = {
+            "item": lambda: color.sum().item(),
+            "bool": lambda: bool((color > 0).any()),
+            "mask": lambda: color[color > 0],
+            "equal": lambda: torch.equal(color, color + 1),
+            "nonzero": lambda: color.nonzero(),
+            "constant": lambda: torch.tensor([1.0, 2.0]),
+            "put": lambda: color.clone().index_put_((color > 3,), torch.zeros_like(color[0, 0, 0, 0])),
+        }
+        ways[self.way]()
+        return Output(color), None
+
+
+@pytest.mark.parametrize("way", ["item", "bool", "mask", "equal", "nonzero", "constant", "put"])
+def test_the_counter_sees_a_read(way: str) -> None:
+    model = Curious(way)
+    assert as_on_a_gpu(Denoiser(model), shot(model, 1))[1]
+
+
+@pytest.mark.parametrize("name", ["cascaded_v2_micro", "kpcn", "nppd", "rae", "bmfr", "joint_bilateral"])
+def test_the_images_are_those_of_a_step_that_looks(name: str) -> None:
+    model = small(name)
+    frames = shot(model)
+    # What stands still, and a cut: nothing of the frame before is seen again.
+    frames += [frames[-1].replace(motion=torch.zeros(1, 2, *SIZE))]
+    frames += [frames[0].replace(motion=torch.full((1, 2, *SIZE), 1e4)), frames[1]]
+    found, _ = as_on_a_gpu(Denoiser(model), frames)
+    denoiser = Denoiser(model, keep_all=True)
+    with ops.use("torch"):
+        expected = [denoiser(frame) for frame in frames]
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_a_report_is_complete_when_it_is_asked_for() -> None:
+    model = create_model("cascaded_v2_micro", pretrained=True)
+    frames = shot(model, 2)
+    frames[1].color[0, :, 5, 6:9] = torch.nan
+    denoiser = Denoiser(model)
+    as_on_a_gpu(denoiser, frames)
+    looking = Denoiser(model, keep_all=True)
+    with ops.use("torch"):
+        for frame in frames:
+            looking(frame)
+    report, expected = denoiser.report, looking.report
+    assert report.replaced_pixels == expected.replaced_pixels == 3
+    assert report.history == pytest.approx(expected.history)
+    assert set(report.milliseconds) == set(expected.milliseconds)
+    assert report.stages["noise-free pixels"] == expected.stages["noise-free pixels"]
+
+
+def test_a_cut_is_told_late() -> None:
+    denoiser = Denoiser(Demodulated(Accumulated(Same())))
+    frames = shot(denoiser.model, 2)
+    as_on_a_gpu(denoiser, [frames[0], frames[1].replace(motion=torch.full((1, 2, *SIZE), 1e4))])
+    assert denoiser.report.reset == "cut"
+
+
+BAD = {
+    "normal": (torch.nan, "buffer 'normal': expected finite values"),
+    "depth": (-1.0, "buffer 'depth': expected values in [0, inf]"),
+    "albedo": (7.0, "buffer 'albedo': expected values in [0, 1]"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_values_are_told_a_frame_late_and_the_history_begins_anew(name: str) -> None:
+    value, message = BAD[name]
+    denoiser = Denoiser(Demodulated(Accumulated(Same())))
+    good = shot(denoiser.model, 3)
+    bad = good[1].replace(**{name: torch.full_like(good[1].buffer(name), value)})
+    with ops.use("torch"), out_of_reach():
+        denoiser(good[0])
+        denoiser(bad)
+        told = refused(lambda: denoiser(good[2]))
+        assert told.startswith(message)
+        assert told.endswith("(of the last frame, told a frame late; the history begins anew)")
+        # Told once.
+        denoiser(good[2])
+        assert denoiser.report.reset == "first frame"
+        denoiser(bad)
+        assert refused(lambda: denoiser.report).startswith(message)
+        assert denoiser.report.history is not None
+
+
+def test_layers_that_are_no_parts_are_told_late() -> None:
+    denoiser = Denoiser(Same())
+    (frame,) = shot(denoiser.model, 1)
+    with out_of_reach():
+        denoiser.output(frame.replace(layers={"twice": 2 * frame.color}))
+    assert refused(lambda: denoiser.report).startswith("layers: expected parts of the color, found twice brighter")
+
+
+def test_an_image_that_is_not_finite_is_told_late() -> None:
+    class Broken(Same):
+        def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+            return Output(frame.color.index_fill(3, torch.tensor([2]), torch.nan)), None
+
+    denoiser = Denoiser(Broken())
+    with out_of_reach():
+        denoiser(shot(denoiser.model, 1)[0])
+    assert f"found {SIZE[0]} NaN or infinite pixels" in refused(lambda: denoiser.report)
+
+
+def test_repairs_are_those_of_validation() -> None:
+    frame = whole_frame(small("cascaded_v2"), *SIZE)
+    frame.color[0, 1, 3, 4] = torch.inf
+    frame.color[0, 0, 20, 30:33] = -1
+    frame = frame.replace(albedo=frame.albedo * 1.9, normal=frame.normal * 1.001, layers={"half": frame.color / 2})
+    expected, count = frame.validate()
+    repaired = frame.repaired()
+    assert repaired.judge(repaired.numbers.tolist()) == count == 4
+    for name, value in expected.items():
+        assert torch.equal(value, repaired.frame.buffer(name)), name
+    assert torch.equal(repaired.frame.layers["half"], expected.layers["half"])
+    late = frame.replace(albedo=torch.where(frame.depth == torch.inf, 9, 0.5).expand(-1, 3, -1, -1)).repaired()
+    with pytest.warns(UserWarning, match="buffer 'albedo': expected values up to 1"):
+        late.judge(late.numbers.tolist())
+
+
+# Time on a device that runs behind: marks are made, and nothing waits for them before somebody asks.
+
+
+class Event:
+    """What ``torch.cuda.Event`` does, of a device that is as fast as this processor."""
+
+    waits = 0
+
+    def __init__(self) -> None:
+        self.time = time.perf_counter() * 1e3
+
+    def synchronize(self) -> None:
+        Event.waits += 1
+
+    def elapsed_time(self, end: Event) -> float:
+        return end.time - self.time
+
+
+class Behind(Stopwatch):
+    """The stopwatch of that device."""
+
+    @property
+    def runs_behind(self) -> bool:
+        return True
+
+    def mark(self) -> Event:
+        return Event()
+
+
+def test_stages_are_timed_without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_module, "Stopwatch", Behind)
+    monkeypatch.setattr(Event, "waits", 0)
+    found, device = Journal(), torch.device("cpu")
+    start = time.perf_counter()
+    with listening(found), timed("outer", device):
+        time.sleep(0.02)
+        for _ in range(2):
+            with timed("inner", device):
+                time.sleep(0.03)
+        with timed("silent", device, unless_told=True), timed("told", device):
+            time.sleep(0.01)
+        with timed("telling", device, unless_told=True):
+            time.sleep(0.01)
+    whole = (time.perf_counter() - start) * 1e3
+    assert (Event.waits, found.milliseconds) == (0, {})
+    found.settle()
+    assert Event.waits > 0
+    assert set(found.milliseconds) == {"outer", "inner", "told", "telling"}
+    # Each counts what is its own; a sleep is never shorter than it was asked for.
+    assert found.milliseconds["outer"] >= 20
+    assert found.milliseconds["inner"] >= 60
+    assert sum(found.milliseconds.values()) <= whole
+    before = dict(found.milliseconds)
+    found.settle()
+    assert found.milliseconds == before
+
+
+def test_a_streamed_frame_waits_for_no_mark(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_module, "Stopwatch", Behind)
+    model = small("cascaded_v2_micro")
+    denoiser = Denoiser(model)
+    frames = shot(model, 2)
+    with ops.use("torch"), out_of_reach():
+        denoiser(frames[0])
+        denoiser.report  # noqa: B018
+        Event.waits = 0
+        denoiser(frames[1])
+        assert Event.waits == 0
+        assert {"validate", "accumulate", "network"} <= denoiser.report.milliseconds.keys()
+        assert Event.waits > 0
+
+
+def test_all_are_told_before_one_that_fails_is_heard() -> None:
+    told: list[list[float]] = []
+
+    def refuse(numbers: Any) -> None:
+        told.append(list(numbers))
+        raise InputError("no")
+
+    found = Journal()
+    with out_of_reach(), listening(found):
+        assert not at_hand(torch.device("cpu"))
+        ask(torch.tensor([1.0, 2.0]), refuse)
+        ask(torch.tensor(True), lambda numbers: told.append(list(numbers)))
+        assert not told
+    assert refused(found.settle) == "no"
+    assert told == [[1.0, 2.0], [1.0]]
