@@ -9,6 +9,7 @@ import io
 import itertools
 import sys
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +122,9 @@ def _check_json(command: Callable[[], int | None]) -> None:
     from mcdenoise.cli._output import check_json
 
     inputs: list[Path] = []
-    for name, value in given.items():
+    # Groups of options hold paths, too.
+    grouped = [each for group in given.values() if is_dataclass(group) for each in vars(group).values()]
+    for name, value in (*given.items(), *(("", each) for each in grouped)):
         if name not in ("json", "out"):
             inputs += (
                 each for each in (value if isinstance(value, list | tuple) else [value]) if isinstance(each, Path)

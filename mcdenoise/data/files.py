@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import secrets
 import shutil
 import time
@@ -72,6 +73,42 @@ def atomic_path(path: Path) -> Iterator[Path]:
             os.unlink(temporary)
         with suppress(OSError):
             os.close(handle)
+
+
+@contextmanager
+def held(folder: Path, work: str) -> Iterator[None]:
+    """Have a folder for oneself; that ends with the process, however that ends.
+
+    Args:
+        folder: where the lock is put, which nobody needs to remove.
+        work: what is done there, one word, for the message.
+
+    Raises:
+        InputError: another process has it, which the message names; or the lock cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with held(Path(tempfile.mkdtemp()), "training"):
+        ...     pass
+    """
+    path = folder / ".lock"
+    with _writing(path):
+        file = path.open("a+", encoding="utf-8")
+    with file:
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.seek(0)
+                raise InputError(
+                    f"{folder}: expected a folder that no other {work} writes to, found {file.read(200).strip()}; "
+                    "wait for it, or choose another folder"
+                ) from error
+        with _writing(path):
+            file.truncate(0)
+            file.write(f"process {os.getpid()} of {platform.node()} at work in it")
+            file.flush()
+        yield
 
 
 @contextmanager

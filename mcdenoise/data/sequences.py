@@ -79,6 +79,23 @@ class Sequence:
         """Where the files lie; what is written has their names, and may not be written there."""
         return self._source.folders
 
+    def files(self, number: int) -> list[Path]:
+        """The files that a frame is made of, each once, sorted: all that lie beside one another for it, cameras too.
+
+        Raises:
+            InputError: there is no such frame.
+        """
+        self._check(number)
+        return sorted(set(self._source.frame_files(number)))
+
+    def part(self, numbers: Sequential[int]) -> Sequence:
+        """Some of its frames, ascending, read as those of the whole are: what was decided of its values stays."""
+        for number in numbers:
+            self._check(number)
+        chosen = set(numbers)
+        referenced = [number for number in self.reference_numbers if number in chosen]
+        return replace(self, numbers=list(numbers), reference_numbers=referenced)
+
     @_any_values
     def frame(
         self,

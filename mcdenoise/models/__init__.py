@@ -7,6 +7,7 @@ from mcdenoise.models._layers import answered, carried, with_carried
 from mcdenoise.models._overview import ModelOverview, overview, users_of
 from mcdenoise.models._precision import PRECISIONS, Precision, fastest_precision
 from mcdenoise.models._registry import build_model, find_model, list_models, register_model
+from mcdenoise.models._remembered import frames_remembered
 from mcdenoise.models._weights import (
     compared_models,
     create_model,
@@ -59,6 +60,7 @@ __all__ = [
     "describe_weights",
     "fastest_precision",
     "find_model",
+    "frames_remembered",
     "list_models",
     "listening",
     "load_weights",
