@@ -24,6 +24,7 @@ Command = Callable[..., int | None]
 COMMANDS = {
     "demo": "Render a short animation at one sample a pixel, denoise it, and show the result.",
     "denoise": "Denoise the frames of a shot, as a renderer wrote them.",
+    "film": "Denoise the shots of a film, by many processes or machines, and resume where they were stopped.",
     "inspect": "Show what would be read of the frames of a shot, and why; denoises nothing.",
     "render": "Render a Mitsuba 3 scene along a camera path to a noisy sequence with references.",
     "generate": "Render random scenes to train on.",

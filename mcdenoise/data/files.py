@@ -205,10 +205,14 @@ def _lock(handle: int) -> bool:
 
 
 def _sweep(folder: Path) -> None:
+    if (place := os.path.realpath(folder)) not in _swept:
+        _swept.add(place)
+        sweep(folder)
+
+
+def sweep(folder: Path) -> None:
     """Remove what processes left over in a folder that were killed while they wrote: nobody holds it any more."""
-    if (place := os.path.realpath(folder)) in _swept:
-        return
-    _swept.add(place)
+    place = os.path.realpath(folder)
     with suppress(OSError), os.scandir(place) as entries:
         for entry in entries:
             ours = entry.name.startswith(_PREFIX) and _MARK in entry.name

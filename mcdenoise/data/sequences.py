@@ -287,6 +287,31 @@ def open_sequence(
     return _wrap(given[0], layout, source, found)
 
 
+def frame_numbers(path: Path | Sequential[Path], frames: str | None = None) -> list[int]:
+    """Which frames are there, by the names of their files alone, whatever is in them.
+
+    Args:
+        path: see :func:`open_sequence`.
+        frames: likewise; numbers of frames that are not there are left out.
+
+    Returns:
+        The frame numbers, ascending; none where names do not tell.
+
+    Raises:
+        InputError: nothing is there, or the choice of frames is no such text.
+    """
+    given = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
+    folder = _bmfr_folder(given)
+    if folder is not None:
+        numbers = set((find_frames(folder) or {"color": {}})["color"])
+    elif find_zips(given):
+        return []
+    else:
+        groups, _ = group_files(find_files(given))
+        numbers = {number for group in groups for number in group.files if number >= 0}
+    return sorted(numbers if frames is None else numbers & set(parse_frames(frames)))
+
+
 def _bmfr_folder(given: Sequential[Path]) -> Path | None:
     """The folder of frames in that layout, if that is what was given; or one ``inputs`` in it."""
     (path, *more) = given
