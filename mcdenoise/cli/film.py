@@ -22,7 +22,7 @@ def film(
     workers: int | None = None,
     ray: str | None = None,
     piece: int = 200,
-    joint: float = 2e-3,
+    joint: float = 1e-2,
 ) -> int | None:
     """Denoise the shots of a film, by any number of processes: writes to OUT/NAME/ what denoise does.
 

@@ -46,7 +46,7 @@ class Film:
     shots: Sequence[Shot]
     out: Path
     piece: int = 200
-    joint: float = 2e-3
+    joint: float = 1e-2
     threads: int | None = None
 
     def order(self, shot: Shot) -> Order:

@@ -334,7 +334,8 @@ def _opened(order: Order) -> _Opened:
     streams = len(sequence) > 1 and denoiser.has_history(sequence.buffers)
     overlap = frames_remembered(denoiser.model, order.joint) if streams else 0
     told = {key: str(value) for key, value in asdict(settings).items() if key not in _SILENT}
-    rows = [str(row) for row in sequence.table]
+    # References change no result.
+    rows = [str(row) for row in sequence.table if row.buffer != "reference"]
     described = digest_text(
         version("mcdenoise"), source_commit(), repr(sorted(told.items())), *_weights(settings), *rows, str(overlap)
     )
