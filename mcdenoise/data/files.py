@@ -210,14 +210,19 @@ def _sweep(folder: Path) -> None:
         sweep(folder)
 
 
-def sweep(folder: Path) -> None:
-    """Remove what processes left over in a folder that were killed while they wrote: nobody holds it any more."""
+def sweep(folder: Path, youngest: float = _YOUNG) -> None:
+    """Remove what processes left over in a folder that were killed while they wrote: nobody holds it any more.
+
+    Args:
+        folder: which need not be there.
+        youngest: seconds since the last change; 0 where nobody writes to the folder now.
+    """
     place = os.path.realpath(folder)
     with suppress(OSError), os.scandir(place) as entries:
         for entry in entries:
             ours = entry.name.startswith(_PREFIX) and _MARK in entry.name
             # What another process has only just made it may not hold yet.
-            if ours and abs(time.time() - entry.stat(follow_symlinks=False).st_mtime) > _YOUNG:
+            if ours and abs(time.time() - entry.stat(follow_symlinks=False).st_mtime) >= youngest:
                 _remove_unless_held(entry.path)
 
 

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from mcdenoise.data.files import held, write_text
+from mcdenoise.data.files import held, sweep, write_text
 from mcdenoise.errors import InputError
 from mcdenoise.film import work
 from mcdenoise.film.engines import Done, Engine
@@ -87,7 +87,7 @@ class ShotResult:
     @property
     def complete(self) -> bool:
         """Whether every frame is there."""
-        return self.found is not None and not self.failed and not self.reason
+        return self.closed is not None and not self.failed and not self.reason
 
     @property
     def rate(self) -> float:
@@ -168,7 +168,12 @@ def run_film(
     try:
         make_folder(film.out / RECORDS)
         with held(film.out / RECORDS, "film"):
-            return _Run(film, engine, on_progress, on_shot).run()
+            run = _Run(film, engine, on_progress, on_shot)
+            try:
+                return run.run()
+            finally:
+                engine.close()
+                run.sweep()
     finally:
         engine.close()
 
@@ -209,6 +214,14 @@ class _Run:
             except InputError as error:
                 self.result.trouble = str(error)
         return self.result
+
+    def sweep(self) -> None:
+        """Remove what processes left over that were ended while they wrote: there are none any more."""
+        for each in self.result.shots:
+            if each.begun:
+                order = self.film.order(each.shot)
+                for folder in (order.folder, order.records):
+                    sweep(folder, youngest=0)
 
     def _submit(self, task: _Task) -> None:
         result = task.result

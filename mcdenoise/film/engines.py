@@ -53,7 +53,7 @@ class Engine(Protocol):
         ...
 
     def close(self) -> None:
-        """End all processes, whatever they do."""
+        """End all processes, whatever they do; again does nothing."""
         ...
 
 
@@ -112,12 +112,14 @@ class LocalEngine:
         """See :class:`Engine`."""
         for pool in self._pools:
             pool.shutdown(wait=False, cancel_futures=True)
+        self._pools = []
         children = set(multiprocessing.active_children()) - self._before
         for child in children if self._running else ():
             child.terminate()
         for child in children if self._running else ():
             child.join(_SECONDS_TO_END / len(children))
             child.kill()
+        self._running = {}
 
     def _pool(self) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(1, self._context, _begin)
@@ -220,8 +222,10 @@ class RayEngine:
         """See :class:`Engine`."""
         for task in self._running:
             self._ray.cancel(task, force=True)
+        self._running = {}
         if self._begun:
             self._ray.shutdown()
+            self._begun = False
 
 
 def _import_ray() -> Any:

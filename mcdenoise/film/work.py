@@ -233,7 +233,7 @@ def close(order: Order) -> Closed:
     report.files = {each.number: Path(each.result[0]) for each in records}
     report.alike = [each.number for each in records if each.alike]
     for folder in (order.folder, order.records):
-        sweep(folder)
+        sweep(folder, youngest=0)
     whole = len(records) == len(opened.sequence.numbers) and not opened.unreadable
     if whole:
         write_report(opened.sequence, order.folder, opened.denoiser, report)
