@@ -12,7 +12,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -24,7 +24,7 @@ from mcdenoise.models import Stage
 
 # Path, size, time of the last change in nanoseconds.
 Stamp = tuple[str, int, int]
-_BLOCK = 1 << 20
+_BLOCK, _REMEMBERED = 1 << 20, 256
 
 
 @dataclass(frozen=True)
@@ -87,27 +87,31 @@ def stamp(path: Path) -> Stamp:
 class Digests:
     """Digests of files, each computed once for a stamp.
 
-    Args:
-        known: digests by stamp.
+    What is computed is remembered of the last files only, of which some are part of many frames; what was written down,
+    as long as this lives.
     """
 
-    def __init__(self, known: Mapping[Stamp, str] | None = None) -> None:
-        self.known = dict(known or {})
+    def __init__(self) -> None:
+        self._written: dict[Stamp, str] = {}
+        self._computed: dict[Stamp, str] = {}
 
     def of(self, path: Path) -> tuple[Stamp, str]:
         """Stamp and digest; of a file that cannot be read the digest is empty."""
         try:
             found = stamp(path)
-            if found not in self.known:
-                self.known[found] = digest_of(path)
-            return found, self.known[found]
+            digest = self._written.get(found) or self._computed.pop(found, "") or digest_of(path)
+            # Last in the order of the dictionary, of which the first go.
+            self._computed[found] = digest
+            if len(self._computed) > _REMEMBERED:
+                del self._computed[next(iter(self._computed))]
+            return found, digest
         except OSError:
             return (str(path), -1, -1), ""
 
     def learn(self, records: Iterable[FrameRecord]) -> None:
         """Believe what was written down."""
         for record in records:
-            self.known.update(record.inputs)
+            self._written.update(record.inputs)
 
 
 def digest_of(path: Path) -> str:

@@ -30,7 +30,7 @@ from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.film.manifest import PICTURES, Shot
 from mcdenoise.film.pieces import Piece
-from mcdenoise.film.record import Digests, FrameRecord, Journal, digest_of, digest_text, read_records, stamp
+from mcdenoise.film.record import Digests, FrameRecord, Journal, Stamp, digest_of, digest_text, read_records, stamp
 from mcdenoise.folder import FrameError, check_apart, make_folder, new_report, write_frames, write_report
 from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.metrics import smape_linear
@@ -148,10 +148,31 @@ class _Opened:
         first = 0 if self.overlap is None else max(0, place - self.overlap)
         return self.sequence.numbers[first : place + 1]
 
-    def key(self, number: int, digests: Digests) -> str:
-        """Of what a frame is made."""
-        paths = [path for each in self.window(number) for path in self.sequence.files(each)]
-        return digest_text(self.settings, *(digests.of(path)[1] for path in paths))
+
+class _Keys:
+    """What frames are made of; frames are asked for in ascending order, and each file is looked at once.
+
+    Args:
+        opened: the shot.
+        digests: of its files.
+    """
+
+    def __init__(self, opened: _Opened, digests: Digests) -> None:
+        self.opened, self.digests = opened, digests
+        self._inputs: dict[int, tuple[tuple[Stamp, str], ...]] = {}
+
+    def inputs(self, number: int) -> tuple[tuple[Stamp, str], ...]:
+        """The files of a frame, with digests."""
+        if number not in self._inputs:
+            self._inputs[number] = tuple(self.digests.of(path) for path in self.opened.sequence.files(number))
+        return self._inputs[number]
+
+    def key(self, number: int) -> str:
+        """Of a frame: what it is made of, and what it remembers."""
+        window = self.opened.window(number)
+        key = digest_text(self.opened.settings, *(digest for each in window for _, digest in self.inputs(each)))
+        self._inputs = {each: found for each, found in self._inputs.items() if each >= window[0]}
+        return key
 
 
 def look(order: Order) -> Found:
@@ -163,10 +184,11 @@ def look(order: Order) -> Found:
     opened = _opened(order)
     records, digests = read_records(order.records), Digests()
     digests.learn(records.values())
+    keys = _Keys(opened, digests)
     done = {
         number
         for number in opened.sequence.numbers
-        if number in records and _is_there(records[number]) and records[number].key == opened.key(number, digests)
+        if number in records and _is_there(records[number]) and records[number].key == keys.key(number)
     }
     return Found(
         opened.shot,
@@ -262,7 +284,7 @@ class _Writer:
 
     def __init__(self, order: Order, opened: _Opened, journal: Journal, joint: int | None, left: set[int]) -> None:
         self.order, self.opened, self.journal, self.joint, self.left = order, opened, journal, joint, left
-        self.digests = _digests()
+        self.keys = _Keys(opened, Digests())
         self.report = new_report(opened.sequence, "")
         self.small: Tensor | None = None
 
@@ -291,9 +313,9 @@ class _Writer:
             return
         record = FrameRecord(
             number,
-            self.opened.key(number, self.digests),
+            self.keys.key(number),
             stamp(self.report.files.pop(number)),
-            tuple(self.digests.of(path) for path in self.opened.sequence.files(number)),
+            self.keys.inputs(number),
             report,
             number in self.report.alike,
             None if before is None else _difference(self.small, before),
@@ -305,12 +327,6 @@ class _Writer:
         """For :func:`close`, when the other piece has made this frame too."""
         pixels = image[0].permute(1, 2, 0).float().cpu().numpy()
         write_exr(_joint_path(self.order, number), pixels, ["R", "G", "B"], half=False)
-
-
-@functools.lru_cache(1)
-def _digests() -> Digests:
-    """Of this process."""
-    return Digests()
 
 
 @functools.lru_cache(1)
