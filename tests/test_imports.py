@@ -62,7 +62,7 @@ ALLOWED: dict[str, set[str]] = {
     "report": LIBRARY | {"evaluate", "results"},
     "benchmark": LIBRARY | {"check", "commit", "evaluate", "interruption", "methods", "results"},
     **dict.fromkeys(TOOLS - REPORTS - {"film"}, LIBRARY | REPORTS | {"commit", "results", "user_cache"}),
-    "film": LIBRARY | {"commit", "folder", "heap", "interruption", "own", "preview", "report", "shot", "threads"},
+    "film": LIBRARY | {"commit", "folder", "heap", "interruption", "methods", "preview", "report", "shot"},
     "cli": LIBRARY | TOOLS | {"heap", "interruption", "results", "shot", "threads"},
     "__main__": {"cli"},
     # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.

@@ -118,7 +118,7 @@ def long_shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         (ShotSettings("accumulated", alpha_min=0.4), 1e-2),
         (ShotSettings("joint_bilateral", alpha_min=0.4), 1e-2),
-        (ShotSettings("svgf(alpha=0.4)"), 3e-2),
+        (ShotSettings("svgf"), 3e-2),
         (ShotSettings("noisy"), 1e-2),
     ],
     ids=lambda value: str(getattr(value, "model", value)),
