@@ -7,7 +7,7 @@ import os
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -31,6 +31,19 @@ from mcdenoise.models import Output, Skipping, Stage, parts_of, summarize
 # Most pixels of a frame, and how much two frames have to correlate to show the same place.
 _MOST, _ALIKE = 0.5, 0.9
 _NUMBERS = re.compile("[0-9]+")
+
+
+class FrameError(InputError):
+    """A frame cannot be denoised: a file of it is damaged, or what is in the file is of no use.
+
+    Args:
+        message: one line.
+        number: of the frame.
+    """
+
+    def __init__(self, message: str, number: int) -> None:
+        super().__init__(message)
+        self.number = number
 
 
 @dataclass
@@ -141,27 +154,93 @@ def denoise_sequence(
             names are written.
     """
     make_folder(out)
-    _check_apart(sequence, out)
+    check_apart(sequence, out)
     # A report stands for a complete result: an old one must not survive a run that fails half-way.
     remove(out / "denoise.json")
+    report = new_report(sequence, model)
+
+    write_frames(
+        sequence,
+        out,
+        denoiser,
+        report,
+        full_float=full_float,
+        output_layer=output_layer,
+        references=references,
+        on_frame=on_frame,
+        on_output=on_output,
+        on_file=on_written
+        and (lambda number, image: on_written(report.files[number].stem, image, sequence.metadata(number))),
+    )
+    write_report(sequence, out, denoiser, report)
+    return report
+
+
+def new_report(sequence: Sequence, model: str) -> SequenceReport:
+    """A report of nothing yet.
+
+    Args:
+        sequence: the frames.
+        model: what to call the model.
+    """
     stored = "with albedo" if sequence.color_has_albedo else "without albedo, which the reader multiplies back"
-    report = SequenceReport(model, f"color is stored {stored}")
+    return SequenceReport(model, f"color is stored {stored}")
+
+
+def write_frames(
+    sequence: Sequence,
+    out: Path,
+    denoiser: Denoiser,
+    report: SequenceReport,
+    *,
+    full_float: bool = False,
+    output_layer: str | None = None,
+    references: bool = False,
+    unwritten: Collection[int] = (),
+    of: int | None = None,
+    on_frame: Callable[[], None] = lambda: None,
+    on_output: Callable[[Frame, Output], None] | None = None,
+    on_file: Callable[[int, Tensor], None] | None = None,
+) -> None:
+    """Denoise frames one after the other and write their files, as :func:`denoise_sequence`, which does a shot so.
+
+    Args:
+        sequence: the frames.
+        out: folder to write to, which exists.
+        denoiser: is reset first.
+        report: takes what is done.
+        full_float: see :func:`denoise_sequence`.
+        output_layer: likewise.
+        references: likewise.
+        unwritten: frames that only give the others their history: of those no file is written.
+        of: how many frames the shot has that these are part of; it ends with them by default.
+        on_frame: see :func:`denoise_sequence`.
+        on_output: likewise.
+        on_file: called with the number and the image ``(1, 3, H, W)`` of each frame, in the thread that writes, after
+            its file is there, if it gets one.
+
+    Raises:
+        FrameError: a frame is damaged, invalid or lacks a buffer, or its result is not finite; those before it are
+            written.
+        InputError: a file cannot be written, or memory is too short.
+    """
 
     def write(number: int, output: Output, done: FrameReport) -> None:
         start = time.perf_counter()
-        report.files[number] = sequence.write(
-            out,
-            number,
-            _pixels(output.image),
-            alpha=None if output.alpha is None else _pixels(output.alpha),
-            lights={name: _pixels(layer) for name, layer in output.layers.items()},
-            output_layer=output_layer,
-            full_float=full_float,
-        )
-        done.beside["write"] = _since(start)
-        if on_written is not None:
+        if number not in unwritten:
+            report.files[number] = sequence.write(
+                out,
+                number,
+                _pixels(output.image),
+                alpha=None if output.alpha is None else _pixels(output.alpha),
+                lights={name: _pixels(layer) for name, layer in output.layers.items()},
+                output_layer=output_layer,
+                full_float=full_float,
+            )
+            done.beside["write"] = _since(start)
+        if on_file is not None:
             start = time.perf_counter()
-            on_written(report.files[number].stem, output.image, sequence.metadata(number))
+            on_file(number, output.image)
             done.beside["show"] = _since(start)
 
     def step(frame: Frame) -> Output:
@@ -170,7 +249,7 @@ def denoise_sequence(
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
         seen: Tensor | None = None
-        for number, frame, times in _read_frames(sequence, denoiser, reference=references):
+        for number, frame, times in _read_frames(sequence, denoiser, reference=references, of=of):
             output = _denoised(step, sequence, number, denoiser, frame, times)
             if on_output is not None:
                 on_output(frame, output)
@@ -191,9 +270,16 @@ def denoise_sequence(
             on_frame()
         if writing is not None:
             writing.result()
+
+
+def write_report(sequence: Sequence, out: Path, denoiser: Denoiser, report: SequenceReport) -> None:
+    """Write ``OUT/denoise.json``, which says that the frames are all there, and how they were made.
+
+    Raises:
+        InputError: it cannot be written.
+    """
     report.older = _of_earlier_runs(out, report.files.values())
     write_text(out / "denoise.json", json.dumps(_as_json(sequence, denoiser, report), indent=2) + "\n")
-    return report
 
 
 def denoised_frames(
@@ -223,12 +309,14 @@ class _Times(NamedTuple):
     waiting: float
 
 
-def _read_frames(sequence: Sequence, denoiser: Denoiser, *, reference: bool) -> Iterator[tuple[int, Frame, _Times]]:
+def _read_frames(
+    sequence: Sequence, denoiser: Denoiser, *, reference: bool, of: int | None = None
+) -> Iterator[tuple[int, Frame, _Times]]:
     """Each frame, and meanwhile the next one is read, if there is room for it. Resets the denoiser."""
     needs = denoiser.model.needs
     wanted = needs.buffers | needs.uses
     buffers = sequence.buffers - (set() if reference else {"reference"}) - (PARTS - wanted)
-    denoiser.reset(buffers, len(sequence), sequence.size, len(sequence.lights))
+    denoiser.reset(buffers, of or len(sequence), sequence.size, len(sequence.lights))
     denoiser.frames_stay = True
     streaming = denoiser.has_history(buffers)
 
@@ -249,7 +337,14 @@ def _read_frames(sequence: Sequence, denoiser: Denoiser, *, reference: bool) -> 
             waiting = _since(start)
             if following is not None and denoiser.has_room_ahead and coming[0].exception() is None:
                 coming.append(reader.submit(read, following))
-            yield _numbered(number, waiting, *coming.popleft().result())
+            yield _numbered(number, waiting, *_got(coming.popleft(), number))
+
+
+def _got(reading: Future[tuple[Frame, float]], number: int) -> tuple[Frame, float]:
+    try:
+        return reading.result()
+    except InputError as error:
+        raise FrameError(str(error), number) from error
 
 
 def _numbered(number: int, waiting: float, frame: Frame, read: float) -> tuple[int, Frame, _Times]:
@@ -270,7 +365,7 @@ def _denoised(
     try:
         result = denoise(frame)
     except InputError as error:
-        raise InputError(f"{sequence.root}, frame {number}: {error}") from error
+        raise FrameError(f"{sequence.root}, frame {number}: {error}", number) from error
     denoiser.report.milliseconds = {"waiting": times.waiting, **denoiser.report.milliseconds}
     denoiser.report.beside["read"] = times.read
     return result
@@ -319,7 +414,7 @@ def make_folder(out: Path) -> None:
         raise InputError(f"{out}: expected a folder that can be written to, found: {error.strerror}") from error
 
 
-def _check_apart(sequence: Sequence, out: Path) -> None:
+def check_apart(sequence: Sequence, out: Path) -> None:
     """Results have the names of what they were made of: they must not take its place, by way of a link either."""
     inputs = {os.path.realpath(folder) for folder in (*sequence.folders, sequence.root)}
     # They may be links themselves, to files elsewhere.

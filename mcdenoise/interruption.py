@@ -30,6 +30,16 @@ def unfinished(path: Path) -> Iterator[None]:
         _unfinished.discard(path)
 
 
+def remove_unfinished() -> None:
+    """Remove what is being written, as the last thing that this process does."""
+    for path in list(_unfinished):
+        with suppress(OSError):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink()
+
+
 @contextmanager
 def deaf_children() -> Iterator[None]:
     """Processes that are started within this do not hear Ctrl+C, from their first moment on.
@@ -143,12 +153,7 @@ class Interruption:
             os.close(nowhere)
 
     def _end(self, number: int) -> None:
-        for path in list(_unfinished):
-            with suppress(OSError):
-                if path.is_dir():
-                    shutil.rmtree(path, ignore_errors=True)
-                else:
-                    path.unlink()
+        remove_unfinished()
         os._exit(128 + number)
 
 

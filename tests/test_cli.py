@@ -23,6 +23,7 @@ from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.models import compared_models, create_model, list_models, pretrained_models, save_weights
 from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
+from mcdenoise.shot import ShotSettings
 from mcdenoise.train import TrainConfig
 
 RGB = ["R", "G", "B"]
@@ -116,7 +117,7 @@ def test_help_names_every_option(run: Callable[..., tuple[int, str, str]], comma
     assert (status, errors) == (0, "")
     parameters = inspect.signature(load_command(command)).parameters
     names = set(parameters) - POSITIONAL - {"export": {"model"}, "calibrate": {"weights"}}.get(command, set())
-    for group, settings in (("config", TrainConfig), ("rendering", RenderOptions)):
+    for group, settings in (("config", TrainConfig), ("rendering", RenderOptions), ("shot", ShotSettings)):
         if group in names:
             names = names - {group} | {field.name for field in dataclasses.fields(settings)}
     for name in names:

@@ -46,7 +46,7 @@ def test_code_for_those_who_come_from_oidn_runs() -> None:
     assert found["color"].grad.isfinite().all()
 
 
-@pytest.mark.parametrize("page", [*PAGES, "from-oidn.md"])
+@pytest.mark.parametrize("page", [*PAGES, "from-oidn.md", "film.md"])
 def test_commands_of_a_page_exist(page: str) -> None:
     lines = [line for block in blocks(page, "sh") for line in block.splitlines() if line.strip()]
     commands = [line.split()[1] for line in lines if not line.startswith("pip ")]

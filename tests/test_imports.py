@@ -30,7 +30,7 @@ LIBRARY = SIGNAL | {
     "denoiser",
 }
 REPORTS = {"benchmark", "check", "evaluate", "folder", "methods", "report"}
-TOOLS = REPORTS | {"budget", "demo", "export", "preview", "suite", "train"}
+TOOLS = REPORTS | {"budget", "demo", "export", "film", "preview", "suite", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),
@@ -55,13 +55,15 @@ ALLOWED: dict[str, set[str]] = {
     # For scripts of a renderer: nothing of the package imports them.
     "integrations": SIGNAL | {"models", "denoiser"},
     "folder": LIBRARY,
+    "shot": LIBRARY | {"budget", "methods"},
     "check": LIBRARY | {"methods", "own"},
     "evaluate": LIBRARY | {"folder"},
     "results": SIGNAL | {"data", "models"},
     "report": LIBRARY | {"evaluate", "results"},
     "benchmark": LIBRARY | {"check", "commit", "evaluate", "interruption", "methods", "results"},
-    **dict.fromkeys(TOOLS - REPORTS, LIBRARY | REPORTS | {"commit", "results", "user_cache"}),
-    "cli": LIBRARY | TOOLS | {"heap", "interruption", "results", "threads"},
+    **dict.fromkeys(TOOLS - REPORTS - {"film"}, LIBRARY | REPORTS | {"commit", "results", "user_cache"}),
+    "film": LIBRARY | {"commit", "folder", "heap", "interruption", "methods", "preview", "report", "shot"},
+    "cli": LIBRARY | TOOLS | {"heap", "interruption", "results", "shot", "threads"},
     "__main__": {"cli"},
     # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.
     "": LIBRARY,

@@ -9,6 +9,7 @@ import io
 import itertools
 import sys
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ Command = Callable[..., int | None]
 COMMANDS = {
     "demo": "Render a short animation at one sample a pixel, denoise it, and show the result.",
     "denoise": "Denoise the frames of a shot, as a renderer wrote them.",
+    "film": "Denoise the shots of a film, by many processes or machines, and resume where they were stopped.",
     "inspect": "Show what would be read of the frames of a shot, and why; denoises nothing.",
     "render": "Render a Mitsuba 3 scene along a camera path to a noisy sequence with references.",
     "generate": "Render random scenes to train on.",
@@ -122,7 +124,9 @@ def _check_json(command: Callable[[], int | None]) -> None:
     from mcdenoise.cli._output import check_json
 
     inputs: list[Path] = []
-    for name, value in given.items():
+    # Groups of options hold paths, too.
+    grouped = [each for group in given.values() if is_dataclass(group) for each in vars(group).values()]
+    for name, value in (*given.items(), *(("", each) for each in grouped)):
         if name not in ("json", "out"):
             inputs += (
                 each for each in (value if isinstance(value, list | tuple) else [value]) if isinstance(each, Path)

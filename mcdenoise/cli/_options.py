@@ -20,19 +20,6 @@ Map = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar
 # On or off, and off without a word: that needs no second option which says so.
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
-# With very many threads torch does not fail but crashes.
-_MOST_THREADS = 1024
-
-
-def check_threads(threads: int) -> None:
-    """See that torch can have so many threads.
-
-    Raises:
-        InputError: it cannot.
-    """
-    if not 1 <= threads <= _MOST_THREADS:
-        raise InputError(f"--threads: expected 1 to {_MOST_THREADS}, found {threads}")
-
 
 def parse_size(text: str) -> tuple[int, int]:
     """Width and height of a ``--size``.

@@ -13,13 +13,14 @@ import tyro
 from mcdenoise.benchmark import Settings, benchmark_ops, choose_methods, parse_sizes, run_benchmark
 from mcdenoise.benchmark.sizes import SIZES
 from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows, skipped_rows
-from mcdenoise.cli._options import Json, check_threads, parse_size
+from mcdenoise.cli._options import Json, parse_size
 from mcdenoise.cli._output import print_rows, progress_bar, say, write_json
 from mcdenoise.cli._suite import SHOWN, score_suite
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.report import check_packages, write_report
+from mcdenoise.shot import check_threads
 
 
 def benchmark(

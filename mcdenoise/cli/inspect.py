@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Sequential
-from pathlib import Path
-
 from mcdenoise.cli._options import Flag, Inputs, Json, Map
 from mcdenoise.cli._output import print_rows, warn, write_json
-from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.data import Sequence
 from mcdenoise.data.readers.diffuse_specular import PARTS
-from mcdenoise.errors import InputError, printable
+from mcdenoise.errors import printable
+from mcdenoise.shot import ShotSettings
 
 
 def inspect(
@@ -30,7 +28,9 @@ def inspect(
         color_with_albedo: it was not.
         json: write what is shown to this file too.
     """
-    opened = open_inputs(inputs, frames, map, without_albedo=color_without_albedo, with_albedo=color_with_albedo)
+    opened = ShotSettings(
+        frames=frames, map=map, color_without_albedo=color_without_albedo, color_with_albedo=color_with_albedo
+    ).open(inputs)
     print_sequence(opened)
     used = _users(opened)
     for buffer, models in used.items():
@@ -59,26 +59,6 @@ def _users(sequence: Sequence) -> dict[str, list[str]]:
     from mcdenoise.models import users_of
 
     return users_of(found)
-
-
-def open_inputs(
-    inputs: Sequential[Path],
-    frames: str | None,
-    map: Sequential[str],
-    *,
-    without_albedo: bool,
-    with_albedo: bool,
-    lights: Sequential[str] = (),
-) -> Sequence:
-    """Open what the command line names.
-
-    Raises:
-        InputError: see :func:`mcdenoise.data.open_sequence`.
-    """
-    if with_albedo and without_albedo:
-        raise InputError("--color-with-albedo, --color-without-albedo: expected one of them, found both")
-    stated = with_albedo if with_albedo or without_albedo else None
-    return open_sequence(inputs, frames, mapping=map, color_has_albedo=stated, lights=lights)
 
 
 def print_sequence(sequence: Sequence) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import secrets
 import shutil
 import time
@@ -72,6 +73,42 @@ def atomic_path(path: Path) -> Iterator[Path]:
             os.unlink(temporary)
         with suppress(OSError):
             os.close(handle)
+
+
+@contextmanager
+def held(folder: Path, work: str) -> Iterator[None]:
+    """Have a folder for oneself; that ends with the process, however that ends.
+
+    Args:
+        folder: where the lock is put, which nobody needs to remove.
+        work: what is done there, one word, for the message.
+
+    Raises:
+        InputError: another process has it, which the message names; or the lock cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with held(Path(tempfile.mkdtemp()), "training"):
+        ...     pass
+    """
+    path = folder / ".lock"
+    with _writing(path):
+        file = path.open("a+", encoding="utf-8")
+    with file:
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.seek(0)
+                raise InputError(
+                    f"{folder}: expected a folder that no other {work} writes to, found {file.read(200).strip()}; "
+                    "wait for it, or choose another folder"
+                ) from error
+        with _writing(path):
+            file.truncate(0)
+            file.write(f"process {os.getpid()} of {platform.node()} at work in it")
+            file.flush()
+        yield
 
 
 @contextmanager
@@ -168,15 +205,24 @@ def _lock(handle: int) -> bool:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove what processes left over in a folder that were killed while they wrote: nobody holds it any more."""
-    if (place := os.path.realpath(folder)) in _swept:
-        return
-    _swept.add(place)
+    if (place := os.path.realpath(folder)) not in _swept:
+        _swept.add(place)
+        sweep(folder)
+
+
+def sweep(folder: Path, youngest: float = _YOUNG) -> None:
+    """Remove what processes left over in a folder that were killed while they wrote: nobody holds it any more.
+
+    Args:
+        folder: which need not be there.
+        youngest: seconds since the last change; 0 where nobody writes to the folder now.
+    """
+    place = os.path.realpath(folder)
     with suppress(OSError), os.scandir(place) as entries:
         for entry in entries:
             ours = entry.name.startswith(_PREFIX) and _MARK in entry.name
             # What another process has only just made it may not hold yet.
-            if ours and abs(time.time() - entry.stat(follow_symlinks=False).st_mtime) > _YOUNG:
+            if ours and abs(time.time() - entry.stat(follow_symlinks=False).st_mtime) >= youngest:
                 _remove_unless_held(entry.path)
 
 

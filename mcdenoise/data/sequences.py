@@ -79,6 +79,23 @@ class Sequence:
         """Where the files lie; what is written has their names, and may not be written there."""
         return self._source.folders
 
+    def files(self, number: int) -> list[Path]:
+        """The files that a frame is made of, each once, sorted: all that lie beside one another for it, cameras too.
+
+        Raises:
+            InputError: there is no such frame.
+        """
+        self._check(number)
+        return sorted(set(self._source.frame_files(number)))
+
+    def part(self, numbers: Sequential[int]) -> Sequence:
+        """Some of its frames, ascending, read as those of the whole are: what was decided of its values stays."""
+        for number in numbers:
+            self._check(number)
+        chosen = set(numbers)
+        referenced = [number for number in self.reference_numbers if number in chosen]
+        return replace(self, numbers=list(numbers), reference_numbers=referenced)
+
     @_any_values
     def frame(
         self,
@@ -268,6 +285,31 @@ def open_sequence(
             lights=lights,
         )
     return _wrap(given[0], layout, source, found)
+
+
+def frame_numbers(path: Path | Sequential[Path], frames: str | None = None) -> list[int]:
+    """Which frames are there, by the names of their files alone, whatever is in them.
+
+    Args:
+        path: see :func:`open_sequence`.
+        frames: likewise; numbers of frames that are not there are left out.
+
+    Returns:
+        The frame numbers, ascending; none where names do not tell.
+
+    Raises:
+        InputError: nothing is there, or the choice of frames is no such text.
+    """
+    given = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
+    folder = _bmfr_folder(given)
+    if folder is not None:
+        numbers = set((find_frames(folder) or {"color": {}})["color"])
+    elif find_zips(given):
+        return []
+    else:
+        groups, _ = group_files(find_files(given))
+        numbers = {number for group in groups for number in group.files if number >= 0}
+    return sorted(numbers if frames is None else numbers & set(parse_frames(frames)))
 
 
 def _bmfr_folder(given: Sequential[Path]) -> Path | None:

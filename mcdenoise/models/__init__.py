@@ -17,10 +17,12 @@ from mcdenoise.models._precision import (
     quantize,
 )
 from mcdenoise.models._registry import build_model, find_model, list_models, register_model
+from mcdenoise.models._remembered import frames_remembered
 from mcdenoise.models._weights import (
     compared_models,
     create_model,
     describe_weights,
+    find_weights,
     load_weights,
     pretrained_models,
     save_weights,
@@ -74,6 +76,8 @@ __all__ = [
     "describe_weights",
     "fastest_precision",
     "find_model",
+    "find_weights",
+    "frames_remembered",
     "list_models",
     "listening",
     "load_weights",

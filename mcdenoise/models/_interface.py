@@ -67,6 +67,10 @@ class Model(Protocol):
     the same from then on. A method whose pixels depend on something of the whole image besides (its exposure, its
     brightest pixel) has a method ``statistics(frame)`` that returns this by name, ``(B, N, 1, 1)`` each, and looks for
     it in ``frame.statistics``: then it can be computed in tiles.
+
+    A method with a state may say how fast it forgets, by an attribute ``persistence``: the largest fraction of what is
+    kept of a shot that one more frame leaves, in [0, 1); ``None`` where nobody knows. See
+    :func:`mcdenoise.models.frames_remembered`.
     """
 
     @property

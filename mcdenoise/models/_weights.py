@@ -41,15 +41,19 @@ def create_model(name: str, *, pretrained: bool = False, weights: Path | str | N
     """
     if weights is not None:
         return load_weights(Path(weights), name, **settings)
-    for folder in (_SHIPPED, _COMPARED):
-        shipped = folder / f"{name}.safetensors"
-        if pretrained and shipped.is_file():
-            return load_weights(shipped, name, **settings)
+    if pretrained and (shipped := find_weights(name)) is not None:
+        return load_weights(shipped, name, **settings)
     model = build_model(name, **settings)
     if pretrained and model.needs.trainable and ":" not in name:
         have = ", ".join([*pretrained_models(), *compared_models()]) or "none"
         raise InputError(f"model '{name}': expected shipped weights, found them only for: {have}; train it first")
     return model.eval() if isinstance(model, nn.Module) else model
+
+
+def find_weights(name: str) -> Path | None:
+    """The file of a model's shipped weights; ``None`` where there are none."""
+    files = [folder / f"{name}.safetensors" for folder in (_SHIPPED, _COMPARED)]
+    return next((path for path in files if path.is_file()), None)
 
 
 def pretrained_models() -> list[str]:

@@ -160,6 +160,11 @@ class Accumulated(Wrapper):
         uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth", "albedo"}
         return Needs(needs.buffers - given, uses, needs.trainable, None)
 
+    @property
+    def persistence(self) -> float:
+        """What one more frame leaves of the history, see :func:`mcdenoise.models.frames_remembered`."""
+        return 1 - self.alpha_min
+
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """None: those of the method inside are of the accumulated radiance."""
         return {}

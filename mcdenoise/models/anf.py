@@ -78,6 +78,10 @@ class Anf(nn.Module):
             self.head.bias[-1] = 1.0  # type: ignore[index]
 
     @property
+    def persistence(self) -> None:
+        """Nobody knows what the network has learnt to remember, see :func:`mcdenoise.models.frames_remembered`."""
+
+    @property
     def needs(self) -> Needs:
         """Color; of use are features, samples, and what tells motion."""
         return Needs(uses=MOTION | {"albedo", "normal", "depth", "samples", "view_projection"})

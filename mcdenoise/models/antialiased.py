@@ -65,6 +65,11 @@ class Antialiased(Wrapper):
         needs = self.inner.needs
         return Needs(needs.buffers, needs.uses | MOTION | {"view_projection"}, needs.trainable, None)
 
+    @property
+    def persistence(self) -> float:
+        """What one more frame leaves of the history, see :func:`mcdenoise.models.frames_remembered`."""
+        return 1 - self.alpha
+
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         inner, shown = own_pair(state, "antialiased")

@@ -118,6 +118,11 @@ class Bmfr(nn.Module):
         buffers = frozenset({"color", "normal", "position", "length"})
         return Needs(buffers, MOTION - {"position"} | {"view_projection"}, trainable=False)
 
+    @property
+    def persistence(self) -> float:
+        """What one more frame leaves of the history, see :func:`mcdenoise.models.frames_remembered`."""
+        return 1 - self.second_alpha
+
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         check_needs(self.needs, frame.buffers)

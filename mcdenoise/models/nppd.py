@@ -208,6 +208,10 @@ class Nppd(nn.Module):
         self.network: ConvUNet | ConvUNeXt = network(6 + 2 * FEATURES, predicted, width)
 
     @property
+    def persistence(self) -> None:
+        """Nobody knows what the network has learnt to remember, see :func:`mcdenoise.models.frames_remembered`."""
+
+    @property
     def needs(self) -> Needs:
         """Means of the whole image, and a history: no tiles."""
         return Needs(uses=MOTION | {"albedo", "normal", "depth", "samples", "view_projection"})

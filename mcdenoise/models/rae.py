@@ -103,6 +103,10 @@ class Rae(nn.Module):
         nn.init.constant_(last, torch.log1p(torch.tensor(_TYPICAL)).item())  # type: ignore[arg-type]
 
     @property
+    def persistence(self) -> None:
+        """Nobody knows what the network has learnt to remember, see :func:`mcdenoise.models.frames_remembered`."""
+
+    @property
     def needs(self) -> Needs:
         """Color; of use are its features, and what tells motion and with it a cut."""
         features = frozenset({"normal", "depth", "roughness", "view_projection"})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Needs, Output, State
@@ -62,6 +62,12 @@ class Recurrent(Wrapper):
         given = frozenset({PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
         uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth"}
         return Needs(needs.buffers - given, uses, needs.trainable, None)
+
+    @property
+    def persistence(self) -> float | None:
+        """Nobody knows what a network has learnt to keep of its images; what blends with them says so itself."""
+        inside = self.inner.modules() if isinstance(self.inner, nn.Module) else ()
+        return 0.0 if any(hasattr(each, "persistence") for each in inside) else None
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

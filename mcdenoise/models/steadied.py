@@ -61,6 +61,11 @@ class Steadied(nn.Module):
         uses = frozenset({NOISY, EXACT, PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
         return Needs(uses=uses, trainable=False, reach=max(_WINDOWS) // 2)
 
+    @property
+    def persistence(self) -> float:
+        """What one more frame leaves of the results before, see :func:`mcdenoise.models.frames_remembered`."""
+        return self.history / (1 + self.history)
+
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image."""
         return {"oidn_exposure": oidn_exposure(frame.color)}

@@ -90,6 +90,11 @@ class Svgf(nn.Module):
         """Normals and depths, at which it stops; whatever tells motion is of use."""
         return Needs(frozenset({"color", "normal", "depth"}), MOTION | {"view_projection"}, trainable=False)
 
+    @property
+    def persistence(self) -> float:
+        """What one more frame leaves of the history, see :func:`mcdenoise.models.frames_remembered`."""
+        return 1 - self.alpha
+
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         check_needs(self.needs, frame.buffers)

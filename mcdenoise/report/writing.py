@@ -73,7 +73,7 @@ def write_report(folder: Path) -> Path:
         "brightest": f"{BRIGHTEST:g}",
     } | _comparer(results, galleries, shown, names)
     path = folder / FILE
-    write_text(path, _render(content))
+    write_text(path, render_page("report.html.jinja", content))
     return path
 
 
@@ -133,15 +133,27 @@ def check_packages() -> None:
         InputError: a package of ``mcdenoise[report]`` is not installed.
     """
     for package in ("jinja2", "matplotlib", "PIL"):
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            raise InputError(
-                f"a report needs {package}, which is not installed; pip install 'mcdenoise[report]'"
-            ) from error
+        _check_package(package)
 
 
-def _render(content: dict[str, Any]) -> str:
+def _check_package(name: str) -> None:
+    try:
+        importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(f"a report needs {name}, which is not installed; pip install 'mcdenoise[report]'") from error
+
+
+def render_page(template: str, content: dict[str, Any]) -> str:
+    """A page in the style of all reports.
+
+    Args:
+        template: name of a file in ``report/page``.
+        content: what it shows; names that it uses and that are not there are errors.
+
+    Raises:
+        InputError: a package of ``mcdenoise[report]`` is not installed.
+    """
+    _check_package("jinja2")
     import jinja2
 
     page = Path(__file__).parent / "page"
@@ -155,7 +167,7 @@ def _render(content: dict[str, Any]) -> str:
     # Methods and frames are in an order of their own.
     environment.policies["json.dumps_kwargs"] = {"sort_keys": False}
     parts = {name: (page / f"report.{name}").read_text(encoding="utf-8") for name in ("css", "js")}
-    return environment.get_template("report.html.jinja").render(**content, **parts)
+    return environment.get_template(template).render(**content, **parts)
 
 
 def _write_plots(folder: Path, results: Results, shown: list[View], names: list[str]) -> dict[str, Any]:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import io
 import json
 import math
 import os
-import platform
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from mcdenoise.data.files import atomic_path, write_text
+from mcdenoise.data.files import atomic_path, held, write_text
 from mcdenoise.errors import InputError
 from mcdenoise.reading import read_bytes, read_text
 
@@ -81,26 +78,13 @@ class RunFolder:
             if not os.path.lexists(path):
                 write_text(path, _json(content))
 
-    @contextmanager
-    def held(self) -> Iterator[None]:
+    def held(self) -> AbstractContextManager[None]:
         """Have the folder for oneself; that ends with the process, however that ends.
 
         Raises:
             InputError: another process has it, which the message names.
         """
-        with (self.out / ".lock").open("a+", encoding="utf-8") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                file.seek(0)
-                raise InputError(
-                    f"{self.out}: expected a folder that no other training writes to, found {file.read(200).strip()}; "
-                    "wait for it, or choose another folder"
-                ) from error
-            file.truncate(0)
-            file.write(f"process {os.getpid()} of {platform.node()} at work in it")
-            file.flush()
-            yield
+        return held(self.out, "training")
 
     def save(self, step: int, provenance: Provenance, *parts: Any) -> None:
         """Replace the checkpoint: the number of steps done, and the states of model, optimizer and scheduler.

@@ -138,6 +138,11 @@ class BmfrFolder:
         """Frames in use that have a reference."""
         return [number for number in self.numbers if number in self.files["reference"]]
 
+    def frame_files(self, number: int) -> list[Path]:
+        """The files of one frame but its references, and those that say how all are read."""
+        own = [files[number] for name, files in self.files.items() if name != "reference" and number in files]
+        return own + [path for path in (self.path / _DESCRIPTION, self.path / MATRICES) if path.is_file()]
+
     def metadata(self, number: int) -> Metadata:
         """Attributes of the color file of one frame."""
         return read_exr_header(self.files["color"][number]).metadata

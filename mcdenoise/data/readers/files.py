@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.data.camera_matrices import Array, CameraMatrices
+from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices
 from mcdenoise.data.exr import Image, Mask, Metadata
 from mcdenoise.data.images import EXR_SUFFIXES, Part, read_channels, read_image_header
 from mcdenoise.data.readers.cameras import convert, fit_camera
@@ -127,6 +127,15 @@ class RenderedFiles:
         """Frames in use that have a reference."""
         layer = self.choice.layers.get("reference")
         return [] if layer is None else [n for n in self.numbers if n in self.groups[layer.group].files]
+
+    def frame_files(self, number: int) -> list[Path]:
+        """The files of one frame that have layers in use, but for references alone."""
+        used = {layer.group for name, layer in self.choice.layers.items() if name != "reference"}
+        used |= {layer.group for layer in (*self.choice.written, *self._lit)}
+        used |= {layer.group for layer in (self.samples.layers.values() if self.samples else ())}
+        own = [self.groups[group].files[number] for group in used if number in self.groups[group].files]
+        cameras = [folder / MATRICES for folder in self.folders] if self.cameras is not None else []
+        return own + [path for path in cameras if path.is_file()]
 
     def metadata(self, number: int) -> Metadata:
         """Attributes of one frame's color file."""

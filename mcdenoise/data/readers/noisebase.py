@@ -119,6 +119,10 @@ class NoisebaseFiles:
         """Frames in use that have a reference: all or none."""
         return self.numbers if "reference" in self.arrays else []
 
+    def frame_files(self, number: int) -> list[Path]:
+        """The zip of one frame, or that of all."""
+        return [self.files[number]]
+
     def metadata(self, number: int) -> Metadata:
         """Nothing: the arrays have no attributes of pictures."""
         return {}

@@ -1,0 +1,79 @@
+"""What it costs to hand out a film: processor time of the one process that does, by the number of Ray nodes.
+
+    python examples/film_scale.py
+    python examples/film_scale.py --nodes 2,4,8 --shots 16 --frames 25 --json scale.json
+
+Writes small shots, starts a Ray cluster on this machine with nodes of one slot each, makes a film of them with a method
+that does nothing, and prints frames a second and the processor time of the driver, per frame and per task. All nodes
+share this machine: frames a second say nothing of a cluster, the driver's time does. Needs `mcdenoise[ray]`.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+from mcdenoise.data.files import write_text
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
+from mcdenoise.film import Film, RayEngine, read_film, run_film
+from mcdenoise.frame import Frame
+from mcdenoise.shot import ShotSettings
+
+
+def measure(nodes: int, shots: Path, out: Path) -> dict[str, float]:
+    """Make the film with so many nodes."""
+    import ray
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    for _ in range(nodes):
+        cluster.add_node(num_cpus=1)
+    ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
+    try:
+        film = Film(read_film(shots / "*", ShotSettings("noisy")), out, threads=1)
+        processor, began = time.process_time(), time.perf_counter()
+        result = run_film(film, RayEngine(cluster.address))
+        processor, taken = time.process_time() - processor, time.perf_counter() - began
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    tasks = 3 * len(film.shots)
+    return {
+        "nodes": nodes,
+        "frames": result.made,
+        "frames_per_second": result.made / taken,
+        "driver_ms_per_frame": processor * 1e3 / result.made,
+        "driver_ms_per_task": processor * 1e3 / tasks,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--nodes", default="2,4,8", metavar="N,...")
+    parser.add_argument("--shots", type=int, default=16)
+    parser.add_argument("--frames", type=int, default=25)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure to this file too")
+    options = parser.parse_args()
+    rows = []
+    print(f"{'nodes':>5}{'frames':>8}{'frames/s':>10}{'driver, ms a frame':>20}{'ms a task':>11}")
+    with tempfile.TemporaryDirectory() as folder:
+        for shot in range(options.shots):
+            for number in range(options.frames):
+                write_bmfr_frame(Path(folder, "shots", f"s{shot:03d}"), number, Frame(torch.rand(1, 3, 16, 16)))
+        for nodes in map(int, options.nodes.split(",")):
+            row = measure(nodes, Path(folder, "shots"), Path(folder, f"out{nodes}"))
+            rows.append(row)
+            print(
+                f"{row['nodes']:>5}{row['frames']:>8}{row['frames_per_second']:>10.2f}"
+                f"{row['driver_ms_per_frame']:>20.2f}{row['driver_ms_per_task']:>11.2f}",
+                flush=True,
+            )
+    if options.json is not None:
+        write_text(options.json, json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""Which shots a film has, and how each is denoised: a TOML file, or a pattern of folders."""
+
+from __future__ import annotations
+
+import difflib
+import glob
+import os
+import tomllib
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from mcdenoise.data.sequences import parse_frames
+from mcdenoise.errors import InputError, printable
+from mcdenoise.methods import WEIGHTS
+from mcdenoise.reading import read_text
+from mcdenoise.shot import ShotSettings
+
+# What stands in the folder of a film beside its shots.
+PICTURES = "film_pictures"
+_TAKEN = {"film.json", "film.html", PICTURES}
+_OWN = ("name", "input")
+_LONGEST_NAME = 200
+_WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A shot of a film.
+
+    Args:
+        name: of its folder in the output.
+        inputs: absolute folders, files or patterns.
+        settings: how it is denoised; paths in it are absolute.
+    """
+
+    name: str
+    inputs: tuple[Path, ...]
+    settings: ShotSettings
+
+
+def read_film(manifest: Path, settings: ShotSettings | None = None) -> list[Shot]:
+    """Read which shots a film has.
+
+    Args:
+        manifest: a TOML file with a table ``[[shot]]`` for each shot, which has ``name``, ``input`` (a folder, a file,
+            a pattern, or a list of these, beside the manifest where they are not absolute), and any setting of
+            :class:`mcdenoise.shot.ShotSettings`; a table ``[every]`` has settings of all shots. Or a pattern of folders
+            such as ``renders/*/beauty``: each is a shot, named by what the pattern leaves open.
+        settings: of all shots, where the manifest does not say otherwise.
+
+    Raises:
+        InputError: the manifest cannot be read, says nothing, or says what nobody understands.
+    """
+    settings = _absolute(settings or ShotSettings(), Path.cwd())
+    shots = _of_file(manifest, settings) if manifest.suffix == ".toml" else _of_pattern(manifest, settings)
+    names: dict[str, Shot] = {}
+    for shot in shots:
+        # Some file systems have one folder for both.
+        other = names.setdefault(shot.name.casefold(), shot)
+        if other is not shot:
+            raise InputError(
+                f"{manifest}: expected a name of its own for each shot, found '{shot.name}' twice; rename one"
+            )
+    return shots
+
+
+def _of_pattern(pattern: Path, settings: ShotSettings) -> list[Shot]:
+    found = sorted(Path(path) for path in glob.glob(str(pattern)) if os.path.isdir(path))
+    if not found:
+        raise InputError(
+            f"{pattern}: expected a manifest (.toml), or a pattern of folders such as 'renders/*', found neither; "
+            "check the path, and put the pattern into quotes"
+        )
+    parts = pattern.parts
+    open_parts = [place for place, part in enumerate(parts) if glob.has_magic(part)] or [len(parts) - 1]
+    return [_shot("_".join(path.parts[p] for p in open_parts), (path,), settings, str(pattern)) for path in found]
+
+
+def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
+    try:
+        content = tomllib.loads(read_text(path))
+    except OSError as error:
+        raise InputError(f"{path}: expected a manifest of a film, found: {error.strerror}; check the path") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: expected TOML, found: {error}; mend it there") from error
+    if unknown := sorted(content.keys() - {"shot", "every"}):
+        raise InputError(
+            f"{path}: expected tables [[shot]] and perhaps [every], found '{unknown[0]}'; settings stand in one of them"
+        )
+    tables, every = content.get("shot"), content.get("every", {})
+    if not isinstance(tables, list) or not tables or not all(isinstance(each, dict) for each in tables):
+        raise InputError(
+            f"{path}: expected a table [[shot]] for each shot, found none; write [[shot]] with name, input"
+        )
+    if not isinstance(every, dict):
+        raise InputError(f"{path}: expected 'every' to be a table, found {_found(every)}; write [every]")
+    settings = _settings(every, settings, f"{path}, [every]", path.parent)
+    shots = []
+    for number, table in enumerate(tables, 1):
+        name = table.get("name")
+        where = f"{path}, shot {number}" + (f" '{name}'" if isinstance(name, str) else "")
+        if not isinstance(name, str):
+            raise InputError(f"{where}: expected 'name', a text, found {_found(name)}; it is that of the folder")
+        own = {key: value for key, value in table.items() if key not in _OWN}
+        inputs = _inputs(table.get("input"), where, path.parent)
+        shots.append(_shot(name, inputs, _settings(own, settings, where, path.parent), where))
+    return shots
+
+
+def _shot(name: str, inputs: tuple[Path, ...], settings: ShotSettings, where: str) -> Shot:
+    plain = name.strip() and not name.startswith(".") and not {"/", "\\", "\0"} & set(name)
+    if not plain or name.casefold() in _TAKEN or len(os.fsencode(name)) > _LONGEST_NAME:
+        raise InputError(
+            f"{where}: expected a name that a folder can have, without slashes or a dot before it, not one of "
+            f"{', '.join(sorted(_TAKEN))}, found {printable(repr(name[:80]))}; choose another"
+        )
+    return Shot(name, tuple(Path(os.path.abspath(path)) for path in inputs), settings)
+
+
+def _inputs(given: Any, where: str, base: Path) -> tuple[Path, ...]:
+    texts = given if isinstance(given, list) else [given]
+    if not texts or not all(isinstance(each, str) and each and "\0" not in each for each in texts):
+        raise InputError(
+            f"{where}: expected 'input', a folder, file or pattern or a list of these, found {_found(given)}; name it"
+        )
+    return tuple(base / each for each in texts)
+
+
+def _settings(table: Mapping[str, Any], settings: ShotSettings, where: str, base: Path) -> ShotSettings:
+    """The settings with those of a table."""
+    kinds = get_type_hints(ShotSettings)
+    changed = {}
+    for key, value in table.items():
+        # As on the command line, or as in Python.
+        name = key.replace("-", "_")
+        if name not in kinds:
+            near = difflib.get_close_matches(name, [*kinds, *_OWN], 1)
+            meant = f"did you mean '{near[0]}'?" if near else "see `mcdenoise denoise --help`"
+            raise InputError(f"{where}: expected a setting of `mcdenoise denoise`, found '{key}'; {meant}")
+        changed[name] = _typed(kinds[name], value, f"{where}, {key}")
+    made = _absolute(replace(settings, **changed), base, changed)
+    try:
+        made.check()
+        if made.frames is not None:
+            parse_frames(made.frames)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    return made
+
+
+def _typed(kind: Any, value: Any, where: str) -> Any:
+    """A value of TOML as the type of a setting."""
+    # None is said by saying nothing.
+    kinds = [each for each in (get_args(kind) if get_origin(kind) not in (tuple, Literal) else [kind]) or [kind]]
+    kind = next(each for each in kinds if each is not type(None))
+    if get_origin(kind) is Literal and value in get_args(kind):
+        return value
+    if get_origin(kind) is tuple:
+        texts = [value] if isinstance(value, str) else value
+        if isinstance(texts, list) and all(isinstance(each, str) for each in texts):
+            return tuple(texts)
+        raise InputError(f"{where}: expected a text or a list of texts, found {_found(value)}; write them in quotes")
+    if get_origin(kind) is Literal:
+        expected = f"one of {', '.join(get_args(kind))}"
+        raise InputError(f"{where}: expected {expected}, found {_found(value)}; choose one")
+    # True and False are whole numbers to Python.
+    fits = isinstance(value, bool) is (kind is bool) and isinstance(
+        value, (int, float) if kind is float else str if kind is Path else kind
+    )
+    if not fits:
+        raise InputError(f"{where}: expected {_WORDS[kind]}, found {_found(value)}; change it")
+    return kind(value)
+
+
+def _absolute(settings: ShotSettings, base: Path, chosen: Collection[str] | None = None) -> ShotSettings:
+    """With paths that mean the same to a process that works elsewhere."""
+    kinds = get_type_hints(ShotSettings)
+    changed: dict[str, Any] = {}
+    for each in fields(settings):
+        value = getattr(settings, each.name)
+        if value is None or (chosen is not None and each.name not in chosen):
+            continue
+        if Path in get_args(kinds[each.name]):
+            changed[each.name] = Path(os.path.abspath(base / value))
+    model = settings.model
+    if model is not None and (chosen is None or "model" in chosen):
+        name = model.partition("(")[0].strip()
+        if name.endswith(WEIGHTS) or ".py:" in name:
+            changed["model"] = os.path.abspath(base / model)
+    return replace(settings, **changed)
+
+
+def _found(value: Any) -> str:
+    text = printable(repr(value))
+    return "nothing" if value is None else text if len(text) <= 80 else f"{text[:77]}..."

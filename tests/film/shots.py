@@ -1,0 +1,81 @@
+"""Small shots, that a camera walks past a wall in, and films of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
+from mcdenoise.data.exr import read_exr
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
+from mcdenoise.frame import Frame
+
+
+def write_shot(folder: Path, frames: int, *, width: int = 32, height: int = 20, seed: int = 0) -> Path:
+    """Frames of one shot, in the BMFR layout."""
+    inputs = folder / "inputs"
+    matrices = np.stack([_matrix(number, width, height) for number in range(frames)])
+    for number in range(frames):
+        write_bmfr_frame(inputs, number, frame(number, width, height, seed))
+    cameras = CameraMatrices(matrices, np.full((frames, 2), 0.5), 0.01, 0.25)
+    write_camera_matrices(inputs / "camera_matrices.h", cameras, "wall")
+    return folder
+
+
+def _matrix(number: int, width: int, height: int) -> np.ndarray:
+    matrix = np.zeros((4, 4))
+    matrix[0, 0], matrix[1, 1], matrix[2, 2], matrix[2, 3] = 1, width / height, 1, 1
+    eye = _eye(number)
+    matrix[3, :3] = -np.array([eye[0], eye[1] * width / height, 0.1])
+    return matrix
+
+
+def _eye(number: int) -> np.ndarray:
+    return np.array([0.03 * number, 0.02 * number, 0.0])
+
+
+def frame(number: int, width: int, height: int, seed: int) -> Frame:
+    """One sample a pixel of a leaning wall: noise as of a lucky path, of mean 1."""
+    generator = torch.Generator().manual_seed(seed * 100_003 + number)
+    eye = torch.from_numpy(_eye(number)).float()
+    rows, columns = torch.arange(height).float(), torch.arange(width).float()
+    ray = torch.ones(3, height, width)
+    ray[0], ray[1] = (2 * columns + 1) / width - 1, ((2 * rows[:, None] + 1) / height - 1) * height / width
+    depth = 4 / (1 + 0.2 * ray[0])
+    position = eye[:, None, None] + ray * depth
+    albedo = 0.3 + 0.4 * (position - position.floor())
+    noise = -torch.log(torch.rand(1, 3, height, width, generator=generator).clamp_min(1e-6))
+    normal = torch.tensor([-0.2, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, height, width) / 1.04**0.5
+    return Frame(
+        color=albedo * noise,
+        albedo=albedo[None],
+        normal=normal,
+        depth=depth[None, None],
+        position=position[None],
+    )
+
+
+def write_manifest(path: Path, shots: dict[str, Path], **every: object) -> Path:
+    """A manifest of shots, with settings of all."""
+    lines = ["[every]", *(f"{key} = {_toml(value)}" for key, value in every.items())]
+    for name, folder in shots.items():
+        lines += ["[[shot]]", f"name = {_toml(name)}", f"input = {_toml(str(folder))}"]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def _toml(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def pixels(folder: Path) -> dict[str, np.ndarray]:
+    """Of every image in a folder."""
+    return {path.name: read_exr(path)[0] for path in sorted(folder.glob("*.exr"))}
+
+
+def same(one: Path, other: Path) -> bool:
+    """Whether two folders hold the same images, bit by bit."""
+    a, b = pixels(one), pixels(other)
+    return a.keys() == b.keys() and bool(a) and all(np.array_equal(a[name], b[name], equal_nan=True) for name in a)

@@ -1,0 +1,179 @@
+"""Processes that are killed while they make a film, by the system or by somebody: nothing is lost or partial."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from shots import pixels, same, write_manifest, write_shot
+
+from mcdenoise.cli import main
+from mcdenoise.film import Film, LocalEngine, read_film, run_film
+from mcdenoise.film.record import read_records
+
+# Of a machine that others use, too.
+SECONDS = 240.0
+
+
+class Killer(threading.Thread):
+    """Kills a process that makes a piece every now and then, whichever it is.
+
+    Of those that have not finished a frame yet it kills no two in a row: on a machine where others work, to begin may
+    take longer than it waits, and then nothing would ever be finished.
+
+    Args:
+        out: of the film, whose journals say which processes there are.
+        pause: seconds between two kills, at most.
+        seed: of the draws.
+    """
+
+    def __init__(self, out: Path, pause: float, seed: int) -> None:
+        super().__init__(daemon=True)
+        self.out, self.pause, self.random = out, pause, random.Random(seed)
+        self.killed = 0
+        self.over = threading.Event()
+
+    def run(self) -> None:
+        early = False
+        while not self.over.wait(self.random.uniform(0.3, 1.0) * self.pause):
+            found = {process: frames for process, frames in self.processes().items() if is_worker(process)}
+            if early or self.random.random() < 0.7:
+                found = {process: frames for process, frames in found.items() if frames}
+            if found:
+                chosen = self.random.choice(sorted(found))
+                os.kill(chosen, signal.SIGKILL)
+                self.killed += 1
+                early = not found[chosen]
+
+    def processes(self) -> dict[int, int]:
+        """How many frames each has finished of what it does now."""
+        found: dict[int, int] = {}
+        for path in sorted(self.out.glob(".film/*/*.jsonl"), key=lambda path: path.stat().st_mtime_ns):
+            lines = path.read_text().splitlines()
+            for line in lines:
+                if line.startswith('{"process"'):
+                    found[int(json.loads(line)["process"])] = sum(each.startswith('{"number"') for each in lines)
+        return found
+
+
+def is_worker(process: int) -> bool:
+    """Whether it is alive, and one of ours; numbers are given again."""
+    try:
+        command = Path(f"/proc/{process}/cmdline").read_bytes()
+    except OSError:
+        return False
+    return (b"forkserver" in command or b"ray::" in command) and process != os.getpid()
+
+
+def make_shots(folder: Path, count: int, frames: int) -> dict[str, Path]:
+    return {f"s{i:02d}": write_shot(folder / f"in{i:02d}", frames, seed=i) for i in range(count)}
+
+
+def check_killed(tmp_path: Path, shots: int, frames: int, pause: float, least: int, model: str) -> None:
+    """A film whose processes are killed is, bit by bit, one that is left alone.
+
+    Shots are no longer than what a method remembers twice over, so that each begins again with its first frame.
+    """
+    manifest = write_manifest(tmp_path / "film.toml", make_shots(tmp_path, shots, frames), model=model)
+    assert run_film(Film(read_film(manifest), tmp_path / "quiet", threads=1), LocalEngine(1)).complete
+    killer = Killer(tmp_path / "out", pause, seed=1)
+    killer.start()
+    try:
+        result = run_film(Film(read_film(manifest), tmp_path / "out", threads=1), LocalEngine(2))
+    finally:
+        killer.over.set()
+        killer.join()
+    assert killer.killed >= least
+    assert result.complete, [each.failures() for each in result.shots]
+    for name in (f"s{i:02d}" for i in range(shots)):
+        assert same(tmp_path / "out" / name, tmp_path / "quiet" / name)
+        assert len(pixels(tmp_path / "out" / name)) == frames
+        assert (tmp_path / "out" / name / "denoise.json").is_file()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
+def test_killed_workers_lose_nothing(tmp_path: Path) -> None:
+    check_killed(tmp_path, shots=3, frames=30, pause=0.6, least=2, model="accumulated")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
+def test_twenty_shots_with_a_worker_killed_every_few_seconds(tmp_path: Path) -> None:
+    check_killed(tmp_path, shots=20, frames=40, pause=4.0, least=3, model="cascaded_v2_micro")
+
+
+def start(manifest: Path, out: Path, *options: str) -> subprocess.Popen[str]:
+    """The command, in a process of its own."""
+    command = [sys.executable, "-m", "mcdenoise", "film", str(manifest), "-o", str(out), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for_frames(out: Path, count: int, process: subprocess.Popen[str]) -> None:
+    until = time.monotonic() + SECONDS
+    while len(list(out.glob("s*/*.exr"))) < count:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
+def test_a_killed_driver_takes_its_workers_along_and_the_next_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shots = make_shots(tmp_path, 1, 90)
+    manifest, out = write_manifest(tmp_path / "film.toml", shots, model="accumulated"), tmp_path / "out"
+    first = start(manifest, out)
+    wait_for_frames(out, 3, first)
+    # A second one says so, and stops.
+    with pytest.raises(SystemExit) as stop:
+        main(["film", str(manifest), "-o", str(out)])
+    assert first.poll() is None
+    message = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert message.startswith(
+        f"mcdenoise film: {out}/.film: expected a folder that no other film writes to, found process"
+    )
+    assert message.count("\n") == 1
+    first.kill()
+    first.communicate()
+    workers = Killer(out, 1, 0).processes()
+    until = time.monotonic() + SECONDS
+    while any(is_worker(process) for process in workers):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    finished = {number for each in shots for number in read_records(out / ".film" / each)}
+    assert 3 <= len(finished) < 90
+    # What is there under its own name is whole.
+    assert len(pixels(out / "s00")) >= 3
+    kept = {number: record.at for number, record in read_records(out / ".film/s00").items()}
+    assert run_film(Film(read_film(manifest), out, threads=1), LocalEngine(1)).complete
+    after = read_records(out / ".film/s00")
+    assert {number: after[number].at for number in kept} == kept
+    assert len(pixels(out / "s00")) == 90
+
+
+@pytest.mark.parametrize(
+    ("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")], ids=["SIGINT", "SIGTERM"]
+)
+def test_a_signal_ends_it_with_one_line(tmp_path: Path, number: signal.Signals, word: str) -> None:
+    manifest = write_manifest(tmp_path / "film.toml", make_shots(tmp_path, 1, 60), model="accumulated")
+    out = tmp_path / "out"
+    process = start(manifest, out, "--workers", "2")
+    wait_for_frames(out, 2, process)
+    process.send_signal(number)
+    message = process.communicate(timeout=SECONDS)[1]
+    assert process.returncode == 128 + number
+    assert message == f"mcdenoise film: {word}; finished files are kept\n"
+    assert not json.loads((out / "film.json").read_text())["complete"]
+    assert pixels(out / "s00")
+    # Nothing half-written is left.
+    assert not [path for path in (out / "s00").iterdir() if path.name.startswith(".")]

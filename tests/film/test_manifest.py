@@ -1,0 +1,159 @@
+"""What a film is made of, and one line for whatever nobody understands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mcdenoise.cli import main
+from mcdenoise.errors import InputError
+from mcdenoise.film import read_film
+from mcdenoise.shot import ShotSettings
+
+GOOD = """
+[every]
+model = "joint_bilateral"
+alpha-min = 0.2
+
+[[shot]]
+name = "010 \\u00e4\\n"
+input = "renders/010"
+frames = "0-3"
+
+[[shot]]
+name = "020"
+input = ["a_####.exr", "b_####.exr"]
+alpha_min = 1
+weights = "mine.safetensors"
+map = "albedo=RGBA.diff"
+anti_lag = false
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "film.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_manifest_says_what_to_denoise_and_how(tmp_path: Path) -> None:
+    first, second = read_film(write(tmp_path, GOOD), ShotSettings(threads=1))
+    assert first.name == "010 ä\n"
+    assert first.inputs == (tmp_path / "renders/010",)
+    assert first.settings == ShotSettings("joint_bilateral", threads=1, alpha_min=0.2, frames="0-3")
+    assert second.inputs == (tmp_path / "a_####.exr", tmp_path / "b_####.exr")
+    # Numbers may be whole, single texts are lists of one, and paths lie beside the manifest.
+    assert second.settings.alpha_min == 1.0
+    assert isinstance(second.settings.alpha_min, float)
+    assert second.settings.map == ("albedo=RGBA.diff",)
+    assert second.settings.weights == tmp_path / "mine.safetensors"
+    assert second.settings.anti_lag is False
+
+
+def test_a_model_of_ones_own_lies_beside_the_manifest(tmp_path: Path) -> None:
+    text = '[[shot]]\nname="a"\ninput="b"\nmodel="mine.py:make(gain=2)"'
+    assert read_film(write(tmp_path, text))[0].settings.model == f"{tmp_path}/mine.py:make(gain=2)"
+
+
+def test_a_pattern_names_shots_by_what_it_leaves_open(tmp_path: Path) -> None:
+    for name in ("s1/010/beauty", "s1/020/beauty", "s2/010/beauty"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "s2/020").write_text("no folder")
+    shots = read_film(tmp_path / "s*" / "0*" / "beauty", ShotSettings("noisy"))
+    assert [shot.name for shot in shots] == ["s1_010", "s1_020", "s2_010"]
+    assert shots[2].inputs == (tmp_path / "s2/010/beauty",)
+    assert {shot.settings.model for shot in shots} == {"noisy"}
+    assert [shot.name for shot in read_film(tmp_path / "s1")] == ["s1"]
+
+
+SHOT = '[[shot]]\nname = "a"\ninput = "b"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "expected a table [[shot]] for each shot, found none"),
+        ("[shot]\nname = 'a'", "expected a table [[shot]] for each shot, found none"),
+        ("shot = 3", "expected a table [[shot]] for each shot, found none"),
+        ("[[shot]\n", "expected TOML, found: "),
+        ("\x00", "expected TOML, found: "),
+        (SHOT + "[shots]\n", "expected tables [[shot]] and perhaps [every], found 'shots'"),
+        ("every = 1\n" + SHOT, "expected 'every' to be a table, found 1"),
+        ('[[shot]]\ninput = "b"', "shot 1: expected 'name', a text, found nothing"),
+        ('[[shot]]\nname = 7\ninput = "b"', "shot 1: expected 'name', a text, found 7"),
+        ('[[shot]]\nname = "a"', "shot 1 'a': expected 'input'"),
+        ('[[shot]]\nname = "a"\ninput = []', "shot 1 'a': expected 'input'"),
+        ('[[shot]]\nname = "a"\ninput = [1]', "expected 'input', a folder, file or pattern or a list of these"),
+        ('[[shot]]\nname = "../a"\ninput = "b"', "expected a name that a folder can have"),
+        ('[[shot]]\nname = ".film"\ninput = "b"', "expected a name that a folder can have"),
+        ('[[shot]]\nname = "film.json"\ninput = "b"', "not one of film.html, film.json"),
+        ('[[shot]]\nname = ""\ninput = "b"', "expected a name that a folder can have"),
+        (f'[[shot]]\nname = "{"a" * 300}"\ninput = "b"', "expected a name that a folder can have"),
+        (SHOT + SHOT.replace('"a"', '"A"'), "expected a name of its own for each shot, found 'A' twice"),
+        (SHOT + "modle = 'x'", "found 'modle'; did you mean 'model'?"),
+        (SHOT + "out = 'x'", "expected a setting of `mcdenoise denoise`, found 'out'"),
+        (SHOT + "alpha_min = 'small'", "shot 1 'a', alpha_min: expected a number, found 'small'"),
+        (SHOT + "alpha_min = 2.0", "shot 1 'a': --alpha-min: expected in (0, 1], found 2.0"),
+        (SHOT + "tile = 64.5", "tile: expected a whole number, found 64.5"),
+        (SHOT + "tile = true", "tile: expected a whole number, found True"),
+        (SHOT + "alpha = 1", "alpha: expected true or false, found 1"),
+        (SHOT + "model = 3", "model: expected a text, found 3"),
+        (SHOT + "weights = 3", "weights: expected a path, found 3"),
+        (SHOT + "precision = 'exact'", "precision: expected one of auto, float32, bfloat16, found 'exact'"),
+        (SHOT + "map = [1]", "map: expected a text or a list of texts, found [1]"),
+        (SHOT + "frames = '3-1'", "shot 1 'a': frames: expected numbers and ascending ranges"),
+        (SHOT + "budget_ms = 5.0\nmodel = 'noisy'", "expected no --model or --weights: they choose it"),
+        (SHOT + "preview_fps = 5.0", "expected together with --preview"),
+    ],
+)
+def test_what_nobody_understands_is_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, expected: str
+) -> None:
+    path, out = write(tmp_path, text), tmp_path / "out"
+    with pytest.raises(SystemExit) as stop:
+        main(["film", str(path), "-o", str(out)])
+    message = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert message.startswith(f"mcdenoise film: {path}")
+    assert expected in message
+    assert message.count("\n") == 1
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda path: None, "expected a manifest of a film, found: No such file"),
+        (lambda path: path.mkdir(), "found: it is a folder"),
+        (lambda path: path.write_bytes(b"name = '\xff'"), "expected TOML, found: "),
+    ],
+    ids=["nothing", "a folder", "no text"],
+)
+def test_a_manifest_that_is_none(tmp_path: Path, make: Callable[[Path], object], expected: str) -> None:
+    make(tmp_path / "film.toml")
+    with pytest.raises(InputError, match=r"film\.toml: expected") as caught:
+        read_film(tmp_path / "film.toml")
+    assert expected in str(caught.value)
+
+
+def test_a_pattern_that_matches_nothing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"expected a manifest .*, or a pattern of folders"):
+        read_film(tmp_path / "x*")
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--piece", "-1"], "--piece: expected at least 0 frames, found -1"),
+        (["--joint", "1"], "--joint: expected a fraction between 0 and 1, found 1"),
+        (["--workers", "0"], "--workers: expected at least 1, found 0"),
+        (["--workers", "2", "--ray", "auto"], "--workers, --ray: expected one of them, found both"),
+    ],
+)
+def test_bad_options(tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: str) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["film", str(write(tmp_path, SHOT)), "-o", str(tmp_path / "out"), *options])
+    assert stop.value.code == 2
+    assert expected in capsys.readouterr().err

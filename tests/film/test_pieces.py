@@ -1,0 +1,167 @@
+"""Shots in pieces: everything is made once, with enough frames before it, wherever one begins again."""
+
+from __future__ import annotations
+
+import math
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from shots import frame, pixels, write_shot
+from torch import nn
+from torch.utils import _pytree as pytree
+
+from mcdenoise.denoiser import Denoiser
+from mcdenoise.errors import InputError
+from mcdenoise.film.manifest import Shot
+from mcdenoise.film.pieces import cut
+from mcdenoise.film.work import Order, close, look, make
+from mcdenoise.metrics import smape_linear
+from mcdenoise.models import Recurrent, create_model, frames_remembered, list_models
+from mcdenoise.shot import ShotSettings
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_every_missing_frame_is_made_once_with_the_frames_before_it(seed: int) -> None:
+    g = random.Random(seed)
+    numbers = sorted(g.sample(range(200), g.randint(1, 120)))
+    missing = {number for number in numbers if g.random() < g.choice([0.02, 0.5, 1.0])}
+    length, overlap = g.choice([0, 1, 7, 30]), g.choice([None, 0, 1, 5, 40])
+    pieces = cut(numbers, missing, length, overlap)
+    made = [number for piece in pieces for number in piece.wanted]
+    assert sorted(made) == sorted(missing)
+    for piece in pieces:
+        places = [numbers.index(number) for number in piece.numbers]
+        # One after the other, without a gap, and nothing behind the last.
+        assert places == list(range(places[0], places[-1] + 1))
+        assert piece.numbers[-1] == piece.wanted[-1]
+        assert len(piece.wanted) <= length or length == 0 or overlap is None
+        for number in piece.wanted:
+            before = numbers.index(number) - places[0]
+            assert before >= (math.inf if overlap is None else overlap) or places[0] == 0
+        first = numbers.index(piece.wanted[0])
+        assert piece.joint == (numbers[first - 1] if first > places[0] else None)
+
+
+def test_what_was_begun_goes_on_from_its_beginning_where_that_is_near() -> None:
+    (near,) = cut(range(100), range(7, 100), length=0, overlap=4)
+    assert near.numbers[0] == 0
+    (far,) = cut(range(100), range(50, 100), length=0, overlap=4)
+    assert (far.numbers[0], far.wanted[0], far.joint) == (46, 50, 49)
+
+
+def test_pieces_do_not_depend_on_what_is_missing() -> None:
+    whole = cut(range(100), range(100), length=30, overlap=5)
+    assert [(piece.numbers[0], piece.wanted[0], piece.wanted[-1]) for piece in whole] == [
+        (0, 0, 24),
+        (20, 25, 49),
+        (45, 50, 74),
+        (70, 75, 99),
+    ]
+    for piece in whole:
+        assert cut(range(100), piece.wanted, length=30, overlap=5) == [piece]
+
+
+def test_an_average_remembers_what_its_alpha_says() -> None:
+    model = create_model("accumulated", alpha_min=0.25)
+    frames = frames_remembered(model, 0.01)
+    assert frames is not None
+    assert 0.75**frames <= 0.01 < 0.75 ** (frames - 1)
+    assert frames_remembered(create_model("noisy"), 0.01) == 0
+    assert frames_remembered(create_model("accumulated", alpha_min=1.0), 0.01) == 1
+    # Each remembers what the one before it remembered.
+    assert frames_remembered(create_model("bmfr", alpha_min=0.5, second_alpha=0.5, taa_alpha=0.5), 0.01) == 3 * 7
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1.0, -1.0, math.nan])
+def test_a_tolerance_that_is_none(tolerance: float) -> None:
+    with pytest.raises(InputError, match="tolerance: expected in"):
+        frames_remembered(create_model("noisy"), tolerance)
+
+
+def test_nobody_knows_what_others_remember() -> None:
+    class Own(nn.Module):
+        needs = create_model("noisy").needs
+
+        def forward(self, frame: Any, state: Any = None) -> Any:
+            raise NotImplementedError
+
+    assert frames_remembered(Own(), 0.01) is None
+    assert frames_remembered(Recurrent(create_model("noisy")), 0.01) is None
+    own = Own()
+    own.persistence = 0.5  # type: ignore[assignment]
+    assert frames_remembered(own, 0.01) == 7
+
+
+@pytest.mark.parametrize("name", list_models())
+def test_a_method_that_keeps_a_state_says_how_long(name: str) -> None:
+    model = create_model(name)
+    remembered = frames_remembered(model, 0.01)
+    if not model.needs.buffers <= frame(0, 32, 32, 0).buffers:
+        pytest.skip("the frame has not what it needs")
+    denoiser = Denoiser(model)
+    for number in range(2):
+        denoiser(frame(number, 32, 32, 0).replace(motion=torch.zeros(1, 2, 32, 32)))
+    keeps = [leaf for leaf in pytree.tree_leaves(denoiser._state) if leaf is not None]
+    assert bool(keeps) == (remembered != 0)
+
+
+@pytest.fixture(scope="module")
+def long_shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_shot(tmp_path_factory.mktemp("long") / "shot", 40, width=48, height=32)
+
+
+@pytest.mark.parametrize(
+    ("settings", "joint"),
+    [
+        (ShotSettings("accumulated", alpha_min=0.4), 1e-2),
+        (ShotSettings("joint_bilateral", alpha_min=0.4), 1e-2),
+        (ShotSettings("svgf"), 3e-2),
+        (ShotSettings("noisy"), 1e-2),
+    ],
+    ids=lambda value: str(getattr(value, "model", value)),
+)
+def test_a_shot_in_pieces_is_the_whole_one_up_to_the_joint(
+    long_shot: Path, tmp_path: Path, settings: ShotSettings, joint: float
+) -> None:
+    shot = Shot("long", (long_shot,), settings)
+    images = {}
+    for name, length in (("whole", 0), ("cut", 20)):
+        order = Order(shot, tmp_path / name, joint, 1)
+        found = look(order)
+        pieces = cut(found.numbers, found.numbers, length, found.overlap)
+        assert len(pieces) == (2 if length else 1)
+        for place, piece in enumerate(pieces):
+            assert not make(order, piece, order.records / f"{place}.jsonl").failed
+        closed = close(order)
+        images[name] = pixels(order.folder)
+    errors = {
+        int(file.removeprefix("denoised").removesuffix(".exr")): float(
+            smape_linear(*(torch.from_numpy(images[name][file]).permute(2, 0, 1)[None] for name in images))
+        )
+        for file in images["whole"]
+    }
+    assert len(errors) == 40
+    # The first piece has all frames before it, and a method without a history none to miss.
+    assert max(errors[number] for number in range(20)) == 0
+    assert max(errors.values()) <= joint
+    if settings.model == "noisy":
+        assert max(errors.values()) == 0
+        assert not closed.joints
+        return
+    # What is told of the joint is what there is: the frame behind it differs by no more than that before it.
+    assert set(closed.joints) == {19}
+    assert 0 < errors[20] <= 2 * closed.joints[19] <= 2 * joint
+    assert not [warning for warning in closed.warnings if "joint" in warning]
+
+
+def test_a_joint_that_shows_is_told(long_shot: Path, tmp_path: Path) -> None:
+    order = Order(Shot("long", (long_shot,), ShotSettings("accumulated")), tmp_path, 0.3, 1)
+    found = look(order)
+    for place, piece in enumerate(cut(found.numbers, found.numbers, 20, 1)):
+        make(order, piece, order.records / f"{place}.jsonl")
+    strict = Order(order.shot, tmp_path, 1e-3, 1)
+    (warning,) = [each for each in close(strict).warnings if each.startswith("joint")]
+    assert "frame 19 differs" in warning

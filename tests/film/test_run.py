@@ -1,0 +1,309 @@
+"""A film gives what `mcdenoise denoise` gives, makes nothing twice, and loses nothing but what is damaged."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Hashable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from shots import pixels, same, write_manifest, write_shot
+
+from mcdenoise.cli import main
+from mcdenoise.data.exr import read_exr, write_exr
+from mcdenoise.data.files import held
+from mcdenoise.errors import InputError
+from mcdenoise.film import Film, FilmResult, RayEngine, read_film, run_film, work, write_page
+from mcdenoise.film.engines import Done
+from mcdenoise.film.record import FrameRecord, read_records
+from mcdenoise.shot import ShotSettings
+
+MODEL = "accumulated"
+
+
+class Inline:
+    """Does every task at once, in this process; loses those that somebody says."""
+
+    def __init__(self, lose: Callable[[str, int], bool] = lambda task, count: False) -> None:
+        self.done: dict[Hashable, Done] = {}
+        self.tasks: list[str] = []
+        self.lose = lose
+
+    def room(self) -> int:
+        return 1
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Hashable:
+        self.tasks.append(function.__name__)
+        handle = len(self.tasks)
+        if self.lose(function.__name__, handle):
+            self.done[handle] = Done(lost="its process ended without a word")
+            return handle
+        try:
+            self.done[handle] = Done(function(*arguments))
+        except Exception as error:
+            self.done[handle] = Done(error=error)
+        return handle
+
+    def finished(self, seconds: float) -> dict[Hashable, Done]:
+        found, self.done = self.done, {}
+        return found
+
+    def close(self) -> None:
+        work._opened.cache_clear()
+
+
+@pytest.fixture
+def shots(tmp_path: Path) -> dict[str, Path]:
+    return {f"s{i}": write_shot(tmp_path / "renders" / f"s{i}", 4 + i, seed=i) for i in range(2)}
+
+
+def run(shots: dict[str, Path], out: Path, engine: Inline | None = None, piece: int = 200, **every: Any) -> FilmResult:
+    manifest = write_manifest(out.parent / "film.toml", shots, **{"model": MODEL, **every})
+    return run_film(Film(read_film(manifest), out, piece), engine or Inline())
+
+
+def edit(path: Path) -> None:
+    image, channels, _ = read_exr(path)
+    write_exr(path, image * 1.5, channels, half=False)
+
+
+def test_it_gives_what_denoise_gives(shots: dict[str, Path], tmp_path: Path) -> None:
+    result = run(shots, tmp_path / "out")
+    assert result.complete
+    assert result.made == 9
+    for name, folder in shots.items():
+        with pytest.raises(SystemExit) as stop:
+            main(["denoise", str(folder), "-o", str(tmp_path / name), "--model", MODEL])
+        assert not stop.value.code
+        assert same(tmp_path / "out" / name, tmp_path / name)
+        film, alone = (
+            json.loads((each / "denoise.json").read_text()) for each in (tmp_path / "out" / name, tmp_path / name)
+        )
+        assert film.keys() == alone.keys()
+        for key in ("model", "sequence", "read", "warnings", "plan", "tiles", "precision"):
+            assert film[key] == alone[key], key
+        for number, about in alone["frames"].items():
+            own = film["frames"][number]
+            assert {**own, "milliseconds": 0, "beside": 0} == {**about, "milliseconds": 0, "beside": 0}
+    # Nothing else is there.
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".film", "film.json", "film_pictures", *shots}
+
+
+def test_it_says_what_it_did(shots: dict[str, Path], tmp_path: Path) -> None:
+    result = run(shots, tmp_path / "out")
+    about = json.loads((tmp_path / "out/film.json").read_text())
+    assert (about["complete"], about["frames_made"]) == (True, 9)
+    assert [shot["name"] for shot in about["shots"]] == ["s0", "s1"]
+    assert about["shots"][1]["frames"] == [0, 1, 2, 3, 4]
+    assert about["shots"][1]["settings"] == {"model": MODEL, "device": "cpu", "precision": "auto", **SETTINGS}
+    assert about["shots"][0]["resets"] == {"0": "first frame"}
+    assert about["shots"][0]["failed"] == []
+    page = write_page(Film([], tmp_path / "out"), result).read_text()
+    for picture in re.findall(r'src="([^"]+)"', page):
+        assert (tmp_path / "out" / picture).is_file()
+    assert page.count("<h2 ") == 3
+
+
+SETTINGS = {"anti_lag": True, "preview_fps": 24.0}
+
+
+def test_finished_frames_are_not_made_again(shots: dict[str, Path], tmp_path: Path) -> None:
+    run(shots, tmp_path / "out")
+    times = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("s*/*.exr")}
+    engine = Inline()
+    result = run(shots, tmp_path / "out", engine)
+    assert (result.complete, result.made) == (True, 0)
+    assert "make" not in engine.tasks
+    assert times == {path: path.stat().st_mtime_ns for path in times}
+    # Files that were copied, and so have other times, are the same files.
+    for path in shots["s0"].glob("inputs/*"):
+        os.utime(path)
+    assert run(shots, tmp_path / "out").made == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "made"),
+    [
+        # A frame of another file, and those that remember it.
+        (lambda shots, out: edit(shots["s1"] / "inputs/color3.exr"), [3, 4]),
+        (lambda shots, out: edit(shots["s1"] / "inputs/albedo0.exr"), [0, 1, 2, 3, 4]),
+        (lambda shots, out: (out / "s1/denoised2.exr").unlink(), [2]),
+        (lambda shots, out: edit(out / "s1/denoised2.exr"), [2]),
+        # What was written down is damaged.
+        (lambda shots, out: truncate(next((out / ".film/s1").glob("*.jsonl"))), [4]),
+        # References change no result.
+        (lambda shots, out: shutil.copy(shots["s1"] / "inputs/color0.exr", shots["s1"] / "inputs/reference0.exr"), []),
+    ],
+    ids=["color", "albedo", "gone", "edited", "record", "reference"],
+)
+def test_what_has_changed_is_made_again(
+    shots: dict[str, Path], tmp_path: Path, change: Callable[[dict[str, Path], Path], object], made: list[int]
+) -> None:
+    run(shots, tmp_path / "out")
+    change(shots, tmp_path / "out")
+    before = {number: record.at for number, record in read_records(tmp_path / "out/.film/s1").items()}
+    result = run({"s1": shots["s1"]}, tmp_path / "out")
+    after = {number: record.at for number, record in read_records(tmp_path / "out/.film/s1").items()}
+    assert result.complete
+    assert [number for number in after if after[number] != before.get(number)] == made
+    assert result.made == len(made)
+    run({"s1": shots["s1"]}, tmp_path / "fresh")
+    assert same(tmp_path / "out/s1", tmp_path / "fresh/s1")
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def test_other_settings_make_all_anew_and_silent_ones_nothing(shots: dict[str, Path], tmp_path: Path) -> None:
+    run(shots, tmp_path / "out")
+    assert run(shots, tmp_path / "out", threads=1).made == 0
+    assert run(shots, tmp_path / "out", alpha_min=0.3).made == 9
+    assert run(shots, tmp_path / "out", model="noisy").made == 9
+
+
+def test_a_film_that_was_stopped_goes_on(shots: dict[str, Path], tmp_path: Path) -> None:
+    run(shots, tmp_path / "whole")
+    # As if it had been killed after three frames.
+    records = sorted(read_records(tmp_path / "whole/.film/s1").values(), key=lambda each: each.number)
+    run({"s1": shots["s1"]}, tmp_path / "out")
+    for path in (tmp_path / "out/.film/s1").glob("*.jsonl"):
+        own = [FrameRecord.of(line) for line in path.read_text().splitlines() if '"number"' in line]
+        path.write_text("\n".join(each.line() for each in own[:3] if each is not None) + "\n{")
+    for number in (3, 4):
+        (tmp_path / f"out/s1/denoised{number}.exr").unlink()
+    assert len(records) == 5
+    result = run({"s1": shots["s1"]}, tmp_path / "out")
+    assert (result.made, result.complete) == (2, True)
+    assert same(tmp_path / "out/s1", tmp_path / "whole/s1")
+
+
+def test_lost_tasks_are_done_again_and_again_but_not_for_ever(shots: dict[str, Path], tmp_path: Path) -> None:
+    quiet = run(shots, tmp_path / "quiet")
+    engine = Inline(lambda task, count: count % 3 == 0)
+    assert run(shots, tmp_path / "out", engine).complete == quiet.complete is True
+    assert all(same(tmp_path / "out" / name, tmp_path / "quiet" / name) for name in shots)
+    result = run(shots, tmp_path / "never", Inline(lambda task, count: task == "make"))
+    assert not result.complete
+    assert result.shots[0].failures() == [("0 to 3 (4)", "its process ended without a word, 5 times in a row")]
+    assert not list((tmp_path / "never").glob("s*/*.exr"))
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_bytes(b"no image at all"),
+    ],
+    ids=["cut off", "empty", "another"],
+)
+def test_a_damaged_frame_fails_alone(shots: dict[str, Path], tmp_path: Path, damage: Callable[[Path], object]) -> None:
+    path = shots["s1"] / "inputs/color2.exr"
+    whole = path.read_bytes()
+    damage(path)
+    result = run(shots, tmp_path / "out")
+    assert not result.complete
+    assert result.shots[0].complete
+    assert set(result.shots[1].failed) == {2}
+    assert "color2.exr" in result.shots[1].failed[2]
+    assert sorted(pixels(tmp_path / "out/s1")) == [f"denoised{n}.exr" for n in (0, 1, 3, 4)]
+    assert not (tmp_path / "out/s1/denoise.json").exists()
+    # It is rendered again; what remembers it is made again too.
+    path.write_bytes(whole)
+    assert run(shots, tmp_path / "out").complete
+    run(shots, tmp_path / "fresh")
+    assert same(tmp_path / "out/s1", tmp_path / "fresh/s1")
+    assert (tmp_path / "out/s1/denoise.json").exists()
+
+
+def test_the_table_of_what_failed_and_status_1(
+    shots: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mcdenoise.cli.film.LocalEngine", lambda workers: Inline())
+    (shots["s1"] / "inputs/color2.exr").write_bytes(b"")
+    manifest = write_manifest(tmp_path / "film.toml", {**shots, "gone": tmp_path / "nowhere"}, model=MODEL)
+    with pytest.raises(SystemExit) as stop:
+        main(["film", str(manifest), "-o", str(tmp_path / "out")])
+    assert stop.value.code == 1
+    printed = capsys.readouterr().out
+    assert re.search(r"gone +│ all +│ .*nowhere: expected a folder", printed)
+    assert re.search(r"s1 +│ 2 +│ .*color2.exr", printed)
+    assert "  s0: 4 frames, 4 made" in printed
+    assert "1 of 3 shots complete, 8 frames made" in printed
+    assert not json.loads((tmp_path / "out/film.json").read_text())["complete"]
+    assert "failed" in (tmp_path / "out/film.html").read_text()
+
+
+def test_a_full_disk_ends_a_piece_and_no_more(
+    shots: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replace, count = os.replace, []
+
+    def full(source: Any, target: Any) -> None:
+        if "/s0/" in str(target):
+            count.append(target)
+            raise OSError(28, "No space left on device")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    result = run(shots, tmp_path / "out")
+    assert not result.complete
+    assert result.shots[1].complete
+    ((frames, why),) = result.shots[0].failures()
+    assert frames == "0 to 3 (4)"
+    assert "No space left on device" in why
+    # One was tried, and not every frame.
+    assert len(count) == 1
+    assert [path.name for path in (tmp_path / "out/s0").iterdir()] == []
+    monkeypatch.undo()
+    assert run(shots, tmp_path / "out").complete
+
+
+def test_a_model_that_fails_is_no_fault_of_the_film(shots: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "def make():\n    def own(color):\n        raise ArithmeticError('no way')\n    return own\n"
+    )
+    result = run(shots, tmp_path / "out", model="mine.py:make")
+    assert result.shots[0].failures() == [("0 to 3 (4)", "ArithmeticError: no way")]
+    assert "mine.py" in result.shots[0].traces[0]
+
+
+def test_two_films_in_one_folder(shots: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "out/.film").mkdir(parents=True)
+    with (
+        held(tmp_path / "out/.film", "film"),
+        pytest.raises(InputError, match=r"no other film writes to, found process"),
+    ):
+        run(shots, tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [".film"]
+
+
+def test_another_version_is_refused(shots: dict[str, Path], tmp_path: Path) -> None:
+    (shot, *_) = read_film(shots["s0"], ShotSettings(MODEL))
+    with pytest.raises(InputError, match=r"expected version 9\.9, as where the film is planned, found"):
+        work.look(work.Order(shot, tmp_path, 0.01, 1, version="9.9"))
+
+
+def test_names_of_any_kind(tmp_path: Path) -> None:
+    names = ("a b", "ä\n\u202e", "[x]", "--", "é" * 60)
+    shots = {name: write_shot(tmp_path / f"in{i}", 2) for i, name in enumerate(names)}
+    lines = "".join(
+        f"[[shot]]\nname = {json.dumps(name)}\ninput = {json.dumps(str(path))}\n" for name, path in shots.items()
+    )
+    (tmp_path / "film.toml").write_text(lines)
+    film = Film(read_film(tmp_path / "film.toml", ShotSettings("noisy")), tmp_path / "out")
+    result = run_film(film, Inline())
+    assert result.complete
+    write_page(film, result)
+    assert all(len(pixels(tmp_path / "out" / name)) == 2 for name in names)
+
+
+def test_without_ray_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    with pytest.raises(InputError, match=r"--ray: expected the package ray, which is not installed; pip install"):
+        RayEngine("auto")
