@@ -24,43 +24,42 @@ SECONDS = 240.0
 
 
 class Killer(threading.Thread):
-    """Kills a process that makes a piece every now and then, whichever it is.
-
-    Of those that have not finished a frame yet it kills no two in a row: on a machine where others work, to begin may
-    take longer than it waits, and then nothing would ever be finished.
+    """Kills a process that makes a piece as soon as it has finished some frames, however fast the machine is.
 
     Args:
         out: of the film, whose journals say which processes there are.
-        pause: seconds between two kills, at most.
+        most: frames that one finishes before it is killed, at most; none, at times, but never of two in a row, with
+            whom nothing would ever be finished.
         seed: of the draws.
     """
 
-    def __init__(self, out: Path, pause: float, seed: int) -> None:
+    def __init__(self, out: Path, most: int, seed: int) -> None:
         super().__init__(daemon=True)
-        self.out, self.pause, self.random = out, pause, random.Random(seed)
+        self.out, self.most, self.random = out, most, random.Random(seed)
         self.killed = 0
         self.over = threading.Event()
 
     def run(self) -> None:
-        early = False
-        while not self.over.wait(self.random.uniform(0.3, 1.0) * self.pause):
+        wanted = 1
+        while not self.over.wait(0.01):
             found = {process: frames for process, frames in self.processes().items() if is_worker(process)}
-            if early or self.random.random() < 0.7:
-                found = {process: frames for process, frames in found.items() if frames}
-            if found:
-                chosen = self.random.choice(sorted(found))
-                os.kill(chosen, signal.SIGKILL)
+            ready = sorted(process for process, frames in found.items() if frames >= wanted)
+            if ready:
+                os.kill(self.random.choice(ready), signal.SIGKILL)
                 self.killed += 1
-                early = not found[chosen]
+                wanted = self.random.randint(0 if wanted else 1, self.most)
 
     def processes(self) -> dict[int, int]:
         """How many frames each has finished of what it does now."""
         found: dict[int, int] = {}
         for path in sorted(self.out.glob(".film/*/*.jsonl"), key=lambda path: path.stat().st_mtime_ns):
-            lines = path.read_text().splitlines()
-            for line in lines:
+            process = 0
+            for line in path.read_text().splitlines():
                 if line.startswith('{"process"'):
-                    found[int(json.loads(line)["process"])] = sum(each.startswith('{"number"') for each in lines)
+                    process = int(json.loads(line)["process"])
+                    found[process] = 0
+                elif line.startswith('{"number"'):
+                    found[process] += 1
         return found
 
 
@@ -77,14 +76,14 @@ def make_shots(folder: Path, count: int, frames: int) -> dict[str, Path]:
     return {f"s{i:02d}": write_shot(folder / f"in{i:02d}", frames, seed=i) for i in range(count)}
 
 
-def check_killed(tmp_path: Path, shots: int, frames: int, pause: float, least: int, model: str) -> None:
+def check_killed(tmp_path: Path, shots: int, frames: int, most: int, least: int, model: str) -> None:
     """A film whose processes are killed is, bit by bit, one that is left alone.
 
     Shots are no longer than what a method remembers twice over, so that each begins again with its first frame.
     """
     manifest = write_manifest(tmp_path / "film.toml", make_shots(tmp_path, shots, frames), model=model)
     assert run_film(Film(read_film(manifest), tmp_path / "quiet", threads=1), LocalEngine(1)).complete
-    killer = Killer(tmp_path / "out", pause, seed=1)
+    killer = Killer(tmp_path / "out", most, seed=1)
     killer.start()
     try:
         result = run_film(Film(read_film(manifest), tmp_path / "out", threads=1), LocalEngine(2))
@@ -101,14 +100,14 @@ def check_killed(tmp_path: Path, shots: int, frames: int, pause: float, least: i
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
 def test_killed_workers_lose_nothing(tmp_path: Path) -> None:
-    check_killed(tmp_path, shots=3, frames=30, pause=0.6, least=2, model="accumulated")
+    check_killed(tmp_path, shots=3, frames=30, most=12, least=4, model="accumulated")
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
 def test_twenty_shots_with_a_worker_killed_every_few_seconds(tmp_path: Path) -> None:
-    check_killed(tmp_path, shots=20, frames=40, pause=4.0, least=3, model="cascaded_v2_micro")
+    check_killed(tmp_path, shots=20, frames=40, most=60, least=3, model="cascaded_v2_micro")
 
 
 def start(manifest: Path, out: Path, *options: str) -> subprocess.Popen[str]:
