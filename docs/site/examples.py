@@ -21,7 +21,9 @@ def pages() -> dict[str, str]:
         rows.append(f"| [`{name}`]({name.removesuffix('.py')}.md) | {first} |")
     table = "\n".join(["| example | what it does |", "|---|---|", *rows])
     scenes = "\n".join(
-        f"- `examples/scenes/{scene.name}`" for scene in sorted((ROOT / "examples" / "scenes").iterdir()) if scene.is_dir()
+        f"- `examples/scenes/{scene.name}`"
+        for scene in sorted((ROOT / "examples" / "scenes").iterdir())
+        if scene.is_dir()
     )
     found["examples/index.md"] = (
         "# Examples\n\nEach is one page of Python in `examples/`, run by a test.\n\n"

@@ -69,7 +69,9 @@ def scene(seed: int = 0) -> Scene:
     normal = torch.where(ball, torch.stack([u, -v, z]), normal)
     depth = torch.where(ball, 2.0 - 0.4 * z, depth)
     albedo = torch.where(ball, torch.tensor([0.75, 0.35, 0.25]).reshape(3, 1, 1), albedo)
-    light = torch.where(ball, 0.25 + 0.9 * (normal * torch.tensor([-0.5, 0.6, 0.6]).reshape(3, 1, 1)).sum(0).clamp_min(0), 0.8)
+    light = torch.where(
+        ball, 0.25 + 0.9 * (normal * torch.tensor([-0.5, 0.6, 0.6]).reshape(3, 1, 1)).sum(0).clamp_min(0), 0.8
+    )
     light = light * (1 - 0.45 * torch.exp(-((x - 0.85).square() / 0.05 + (y - 0.83).square() / 0.004)))
     noise = torch.distributions.Gamma(0.6, 0.6)
     with torch.random.fork_rng():
@@ -96,13 +98,21 @@ def _box(size: int = 7) -> Tensor:
 
 def _kernel_conv() -> Panels:
     light = _light()
-    return {"noisy light": light, "a box everywhere": ops.kernel_conv(light, _box(9)), "kernels by pixel": ops.kernel_conv(light, kernels())}
+    return {
+        "noisy light": light,
+        "a box everywhere": ops.kernel_conv(light, _box(9)),
+        "kernels by pixel": ops.kernel_conv(light, kernels()),
+    }
 
 
 def _kernel_splat() -> Panels:
     sparse = torch.zeros(1, 3, HEIGHT, WIDTH)
     sparse[..., 6::12, 6::12] = scene().clean[..., 6::12, 6::12] * 20
-    return {"some pixels": sparse, "spread by boxes": ops.kernel_splat(sparse, _box()), "by kernels": ops.kernel_splat(sparse, kernels())}
+    return {
+        "some pixels": sparse,
+        "spread by boxes": ops.kernel_splat(sparse, _box()),
+        "by kernels": ops.kernel_splat(sparse, kernels()),
+    }
 
 
 def _softmax_splat() -> Panels:
@@ -158,7 +168,10 @@ def _partition() -> Panels:
 def _learned_upsample() -> Panels:
     half = ops.downsample(scene().clean)
     kernel = torch.tensor([1.0, 3, 3, 1]).outer(torch.tensor([1.0, 3, 3, 1])).reshape(1, 16, 1, 1) / 16
-    return {"half the size": half, "spread": ops.learned_upsample(half, kernel.expand(-1, -1, *half.shape[-2:]).contiguous(), (HEIGHT, WIDTH))}
+    return {
+        "half the size": half,
+        "spread": ops.learned_upsample(half, kernel.expand(-1, -1, *half.shape[-2:]).contiguous(), (HEIGHT, WIDTH)),
+    }
 
 
 def _demodulate() -> Panels:
@@ -176,7 +189,11 @@ def _guide() -> Tensor:
 
 def _grid() -> Panels:
     grid, filled = ops.grid_splat(scene().noisy, _guide(), cell=10, bins=6)
-    return {"noisy": scene().noisy, "guide": _guide().expand(-1, 3, -1, -1), "through the grid": ops.grid_slice(grid, filled, _guide(), cell=10)}
+    return {
+        "noisy": scene().noisy,
+        "guide": _guide().expand(-1, 3, -1, -1),
+        "through the grid": ops.grid_slice(grid, filled, _guide(), cell=10),
+    }
 
 
 def _grid_cells() -> Panels:
@@ -189,12 +206,21 @@ def _fireflies() -> Panels:
     noisy[..., 11::17, 7::19] = 40.0
     blurred = torch.nn.functional.avg_pool2d
     clamped = ops.clamp_fireflies(noisy, limit=3.0)
-    return {"fireflies": noisy, "blurred": blurred(noisy, 5, 1, 2), "clamped": clamped, "then blurred": blurred(clamped, 5, 1, 2)}
+    return {
+        "fireflies": noisy,
+        "blurred": blurred(noisy, 5, 1, 2),
+        "clamped": clamped,
+        "then blurred": blurred(clamped, 5, 1, 2),
+    }
 
 
 def _importance() -> Panels:
     importance = 4 * scene().normal[:, 1:2]
-    return {"noisy light": _light(), "importance": (importance / 4).clamp_min(0).expand(-1, 3, -1, -1), "filtered": ops.importance_filter(_light(), importance, kernel_size=9)}
+    return {
+        "noisy light": _light(),
+        "importance": (importance / 4).clamp_min(0).expand(-1, 3, -1, -1),
+        "filtered": ops.importance_filter(_light(), importance, kernel_size=9),
+    }
 
 
 def _atrous() -> Panels:
@@ -240,26 +266,46 @@ def _regression() -> Panels:
 
 
 FIGURES = {
-    "kernel_conv": Figure("A box blurs across edges; kernels of each pixel's own, here of normals and depth, do not.", _kernel_conv),
+    "kernel_conv": Figure(
+        "A box blurs across edges; kernels of each pixel's own, here of normals and depth, do not.", _kernel_conv
+    ),
     "kernel_splat": Figure("The transpose: single pixels, spread by a box and by kernels of their own.", _kernel_splat),
-    "softmax_splat": Figure("Every pixel spreads over its neighbours, and what arrives is divided by the weights that did.", _softmax_splat),
-    "cross_bilateral_weights": Figure("Weights of some pixels, where they fall: they end at edges of normals and depth.", _weights),
-    "cross_bilateral_filter": Figure("Light is filtered where normals and depth are alike, and the albedo multiplied back.", _filter),
+    "softmax_splat": Figure(
+        "Every pixel spreads over its neighbours, and what arrives is divided by the weights that did.", _softmax_splat
+    ),
+    "cross_bilateral_weights": Figure(
+        "Weights of some pixels, where they fall: they end at edges of normals and depth.", _weights
+    ),
+    "cross_bilateral_filter": Figure(
+        "Light is filtered where normals and depth are alike, and the albedo multiplied back.", _filter
+    ),
     "downsample": Figure("Means of 2x2 pixels.", _downsample),
     "upsample": Figure("Every pixel 2x2 times.", _upsample),
-    "laplacian_fusion": Figure("A fine image keeps its edges and takes its low frequencies from a coarse one.", _fusion),
-    "pyramid_partition": Figure("Light shared among three levels by logits: floor to the finest, walls to the coarsest.", _partition),
-    "learned_upsample": Figure("Every pixel is spread over 4x4 finer ones, here with fixed weights.", _learned_upsample),
+    "laplacian_fusion": Figure(
+        "A fine image keeps its edges and takes its low frequencies from a coarse one.", _fusion
+    ),
+    "pyramid_partition": Figure(
+        "Light shared among three levels by logits: floor to the finest, walls to the coarsest.", _partition
+    ),
+    "learned_upsample": Figure(
+        "Every pixel is spread over 4x4 finer ones, here with fixed weights.", _learned_upsample
+    ),
     "demodulate": Figure("Radiance divided by albedo leaves light, which is smooth but for its noise.", _demodulate),
     "remodulate": Figure("Smooth light times albedo is radiance with all of its texture.", _remodulate),
     "grid_splat": Figure("Means of blocks of pixels, apart by the value of a guide: four bins of a grid.", _grid_cells),
-    "grid_slice": Figure("Splat into a bilateral grid and read out along a guide: smooth, with the guide's edges.", _grid),
+    "grid_slice": Figure(
+        "Splat into a bilateral grid and read out along a guide: smooth, with the guide's edges.", _grid
+    ),
     "clamp_fireflies": Figure("Without the clamp a single bright pixel becomes a blotch.", _fireflies),
-    "importance_filter": Figure("A map gives every pixel its importance; here the floor has more than the walls.", _importance),
+    "importance_filter": Figure(
+        "A map gives every pixel its importance; here the floor has more than the walls.", _importance
+    ),
     "atrous": Figure("Three passes with taps ever farther apart, stopped at edges of normal and depth.", _atrous),
     "affinity_filter": Figure("Weights by the distance of features; here of normals and depth.", _affinity),
     "block_regression": Figure("Each block as the best linear combination of its features.", _regression),
-    "reproject": Figure("The frame before, fetched from 8.5 pixels right and 4 down; the weight says what was found.", _reproject),
+    "reproject": Figure(
+        "The frame before, fetched from 8.5 pixels right and 4 down; the weight says what was found.", _reproject
+    ),
     "accumulate": Figure("A still camera: the average of 1, 4 and 16 frames.", _accumulate),
 }
 

@@ -14,11 +14,12 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(Path(__file__).parent))
 
-import examples  # noqa: E402
 import figures  # noqa: E402
 import methods  # noqa: E402
 import operators  # noqa: E402
 from mkdocs.structure.files import File, Files  # noqa: E402
+
+import examples  # noqa: E402
 
 # Pages that stand elsewhere in the repository.
 MOVED = {
@@ -89,4 +90,6 @@ def within_site(target: str, own: Path, page: str) -> str:
 
 def on_post_page(output: str, page: Any, config: Any) -> str:
     """Take the script that lets a page search from disk from the site itself, and not from a network."""
-    return re.sub(r'"?https://unpkg\.com/iframe-worker/shim"?', f'"{"../" * page.url.count("/")}assets/offline_search.js"', output)
+    return re.sub(
+        r'"?https://unpkg\.com/iframe-worker/shim"?', f'"{"../" * page.url.count("/")}assets/offline_search.js"', output
+    )

@@ -66,20 +66,23 @@ def _overview() -> list[ModelOverview]:
 
 def navigation() -> list[dict[str, list[str]]]:
     """Pages by what makes the image."""
-    found = {title: [f"methods/{each.name}.md" for each in _overview() if each.kind == kind] for kind, title in KINDS.items()}
+    found = {
+        title: [f"methods/{each.name}.md" for each in _overview() if each.kind == kind] for kind, title in KINDS.items()
+    }
     return [{title: places} for title, places in found.items() if places]
 
 
 def index(entries: list[ModelOverview]) -> str:
     """All methods, by what makes their image."""
     parts = [
-        "# Methods\n\nEvery method is a name that `--model` and `Denoiser` take, and one file in `mcdenoise/models/`, to be read "
-        "beside its paper. What it costs are multiply-adds in convolutions; [The zoo](../zoo.md) compares errors, and "
-        "[Results](../results.md) has those of the default. `mcdenoise models` prints this list."
+        "# Methods\n\nEvery method is a name that `--model` and `Denoiser` take, and one file in `mcdenoise/models/`, "
+        "to be read beside its paper. What it costs are multiply-adds in convolutions; [The zoo](../zoo.md) compares "
+        "errors, and [Results](../results.md) has those of the default. `mcdenoise models` prints this list."
     ]
     for kind, title in KINDS.items():
         rows = [
-            f"| [`{entry.name}`]({entry.name}.md) | {entry.description} | {entry.paper or '-'} | {entry.weights} | {cost(entry)} |"
+            f"| [`{entry.name}`]({entry.name}.md) | {entry.description} | {paper(entry)} | {entry.weights} "
+            f"| {cost(entry)} |"
             for entry in entries
             if entry.kind == kind
         ]
@@ -101,7 +104,7 @@ def page(entry: ModelOverview) -> str:
     file = Path(inspect.getsourcefile(module) or "").relative_to(ROOT).as_posix()
     facts = {
         "what": entry.description,
-        "paper": entry.paper or "-",
+        "paper": paper(entry),
         "needs": code(entry.needs),
         "is better with": code(entry.uses),
         "weights": WEIGHTS[entry.weights],
@@ -109,15 +112,29 @@ def page(entry: ModelOverview) -> str:
         "cost": f"{cost(entry)} thousand multiply-adds a pixel in convolutions" if entry.kmacs_per_pixel else "-",
         "source": f"`{file}`",
     }
-    parts = [f"# {entry.name}", "\n".join(["| | |", "|---|---|", *(f"| {name} | {text} |" for name, text in facts.items())])]
+    parts = [f"# {entry.name}", facts_table(facts)]
     if entry.reason:
         parts.append(f"Not available where this page was made: {entry.reason}.")
     parts.append(f"```sh\nmcdenoise denoise shot/ -o clean/ --model {entry.name}\n```")
     parts.append("## How it works\n\n" + as_markdown(inspect.getdoc(module) or ""))
-    parts.append("## Settings\n\n" + f"::: {construct.__module__}.{construct.__qualname__}\n    options:\n      heading_level: 3")
+    parts.append(
+        f"::: {construct.__module__}.{construct.__qualname__}\n"
+        "    options:\n      heading: Settings\n      toc_label: Settings"
+    )
     parts.append(trained(entry))
     parts.append("## Measured\n\n" + measured(entry.name))
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def facts_table(facts: dict[str, str]) -> str:
+    """Two columns without a head of their own."""
+    head, *rows = (f"| {name} | {text} |" for name, text in facts.items())
+    return "\n".join([head, "|---|---|", *rows])
+
+
+def paper(entry: ModelOverview) -> str:
+    """Authors and year, or the link of a DOI."""
+    return re.sub(r"DOI (\S+)", r"[doi:\1](https://doi.org/\1)", entry.paper) or "-"
 
 
 def code(names: list[str]) -> str:
@@ -131,8 +148,12 @@ def trained(entry: ModelOverview) -> str:
         return ""
     folder = Path(mcdenoise.models.__file__).parent / "weights" / ("compared" if entry.weights == "compared" else "")
     header = describe_weights(folder / f"{entry.name}.safetensors")
-    rows = [f"| {name} | {value} |" for name, value in sorted(header.items()) if 0 < len(str(value)) < 400 and "\n" not in str(value)]
-    return "\n".join(["## Weights\n", "The header of the file says:\n", "| | |", "|---|---|", *rows])
+    rows = [
+        f"| {name} | {value} |"
+        for name, value in sorted(header.items())
+        if 0 < len(str(value)) < 400 and "\n" not in str(value)
+    ]
+    return "\n".join(["## Weights\n", "The header of the file says:\n", "| field | value |", "|---|---|", *rows])
 
 
 def as_markdown(text: str) -> str:
@@ -151,7 +172,10 @@ def measured(name: str) -> str:
                 lines = [head, ["---"] + ["--:"] * (len(head) - 1), *own]
                 table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
                 parts.append(f"[{heading}](../{source}):\n\n{table}")
-    return "\n\n".join(parts) or "It stands in no table; `mcdenoise benchmark SEQUENCE -o OUT --models NAME` measures it on your frames."
+    return (
+        "\n\n".join(parts)
+        or f"It stands in no table; `mcdenoise benchmark SEQUENCE -o OUT --models {name}` measures it on your frames."
+    )
 
 
 def method_of(cell: str) -> str:

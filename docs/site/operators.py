@@ -8,8 +8,8 @@ from pathlib import Path
 import figures
 from methods import as_markdown
 
-from mcdenoise.check.cases import OPS
 from mcdenoise.check.case import Op
+from mcdenoise.check.cases import OPS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -31,8 +31,8 @@ def index() -> str:
     return "\n".join(
         [
             "# Operators\n",
-            "Functions of `mcdenoise.ops`: tensors in, tensors out, no weights and no files. Each is differentiable, to any "
-            "order; half precision is summed in float32. [Kornia](../kornia.md) says what each stands on, and "
+            "Functions of `mcdenoise.ops`: tensors in, tensors out, no weights and no files. Each is differentiable, "
+            "to any order; half precision is summed in float32. [Kornia](../kornia.md) says what each stands on, and "
             "[Compose your own](../compose.md) puts them together. `mcdenoise ops` prints this list with errors.\n",
             "| operator | what it does | Module twin |",
             "|---|---|---|",
@@ -54,11 +54,14 @@ def module(op: Op) -> str:
 
 def page(op: Op) -> str:
     """One operator."""
-    parts = [f"# {op.name}", summary(op)]
+    parts = [f"# {op.name}"]
     if op.name in figures.FIGURES:
-        parts.append(f"![{figures.FIGURES[op.name].text}](figures/{op.name}.png){{ .pixels }}\n\n{figures.FIGURES[op.name].text}")
+        parts.append(
+            f"![{figures.FIGURES[op.name].text}](figures/{op.name}.png){{ .pixels }}\n\n{figures.FIGURES[op.name].text}"
+        )
     parts.append(
-        f"::: {op.function.__module__}.{op.function.__name__}\n    options:\n      heading_level: 2\n      show_source: false"
+        f"::: {op.function.__module__}.{op.function.__name__}\n"
+        "    options:\n      heading: Contract\n      toc_label: Contract\n      show_source: false"
     )
     if op.module is not None:
         parts.append(f"The Module twin `mcdenoise.ops.{op.module.__name__}` stores the settings and calls it.")
