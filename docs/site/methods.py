@@ -49,6 +49,7 @@ NAMES = {
     "OIDN": "oidn",
     "OIDN, best of 36 settings": "oidn",
 }
+PAPER = "*The paper*, where no other is named, is [doi:10.1007/s00371-023-02951-6](https://doi.org/10.1007/s00371-023-02951-6)."
 MEASURED = ("results.md", "unseen_scenes.md", "zoo.md", "layers.md")
 
 
@@ -117,6 +118,8 @@ def page(entry: ModelOverview) -> str:
         parts.append(f"Not available where this page was made: {entry.reason}.")
     parts.append(f"```sh\nmcdenoise denoise shot/ -o clean/ --model {entry.name}\n```")
     parts.append("## How it works\n\n" + as_markdown(inspect.getdoc(module) or ""))
+    if "paper" in (inspect.getdoc(module) or ""):
+        parts.append(PAPER)
     parts.append(
         f"::: {construct.__module__}.{construct.__qualname__}\n"
         "    options:\n      heading: Settings\n      toc_label: Settings"

@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 import figures
-from methods import as_markdown
+from methods import PAPER, as_markdown
 
 from mcdenoise.check.case import Op
 from mcdenoise.check.cases import OPS
@@ -63,6 +63,8 @@ def page(op: Op) -> str:
         f"::: {op.function.__module__}.{op.function.__name__}\n"
         "    options:\n      heading: Contract\n      toc_label: Contract\n      show_source: false"
     )
+    if "the paper" in (op.function.__doc__ or ""):
+        parts.append(PAPER)
     if op.module is not None:
         parts.append(f"The Module twin `mcdenoise.ops.{op.module.__name__}` stores the settings and calls it.")
     parts.append("## Cost\n\n" + cost(op.name))

@@ -163,7 +163,7 @@ def closed(frame: Frame) -> Frame:
     if excess > _MOST_EXCESS:
         raise InputError(
             f"layers: expected parts of the color, found {', '.join(frame.layers)} brighter than it together, by "
-            f"{float(excess):.0%} of their light; leave out what is not a part of it"
+            f"{float(excess):.0%} of their light; give only layers that are a part of it"
         )
     rest = frame.color - total
     least = _ROUNDING * frame.color + (len(frame.layers) + 1) * _SMALLEST_HALF
