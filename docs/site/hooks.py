@@ -90,6 +90,14 @@ def within_site(target: str, own: Path, page: str) -> str:
 
 def on_post_page(output: str, page: Any, config: Any) -> str:
     """Take the script that lets a page search from disk from the site itself, and not from a network."""
-    return re.sub(
-        r'"?https://unpkg\.com/iframe-worker/shim"?', f'"{"../" * page.url.count("/")}assets/offline_search.js"', output
-    )
+    return _with_own_search(output, page.url.count("/"))
+
+
+def on_post_template(output: str, template_name: str, config: Any) -> str:
+    """Likewise for the page of links that lead nowhere."""
+    return _with_own_search(output, 0)
+
+
+def _with_own_search(output: str, depth: int) -> str:
+    own = f'"{"../" * depth}assets/offline_search.js"'
+    return re.sub(r'"?https://unpkg\.com/iframe-worker/shim"?', own, output)

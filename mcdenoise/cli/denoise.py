@@ -93,7 +93,8 @@ def denoise(
         results: folder of a finished benchmark to take errors from; those of the sequence's references by default.
         preview: write a PNG of each file to OUT/preview too, on the sRGB curve, and OUT/preview.mp4 of several frames.
         preview_fps: frames per second of that video.
-        preview_exposure: exposure of the previews in stops; by default the first frame decides for all: its typical radiance is middle grey.
+        preview_exposure: exposure of the previews in stops; by default the first frame decides for all: its typical
+            radiance is middle grey.
         json: write the run times to this file too.
     """
     keep_heap()

@@ -1,4 +1,4 @@
-"""The light of an image divided among the levels of a pyramid, and upsampling with predicted weights that adds it up."""
+"""The light of an image divided among the levels of a pyramid, and learned upsampling that adds it up."""
 
 from __future__ import annotations
 
