@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format clean
+.PHONY: help demo test docs lint format clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -16,6 +16,10 @@ demo: $(VENV)/.stamp-fast,render,peers,report ## render a short sequence, denois
 # more must not spin, which on a busy machine makes torch many times slower.
 test: $(VENV)/.stamp-dev ## run every test that is not marked slow or attack, on up to four cores
 	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=0 $(BIN)/pytest -m "not slow and not attack" --numprocesses auto --maxprocesses 4
+
+docs: $(VENV)/.stamp-fast,oidn,docs ## build the documentation as a site that opens from disk: build/site/index.html
+	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=0 $(BIN)/mkdocs build --quiet
+	@echo "build/site/index.html"
 
 lint: $(VENV)/.stamp-dev ## check style, format and types; change nothing
 	$(BIN)/ruff check

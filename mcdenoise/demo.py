@@ -15,11 +15,12 @@ from torch import Tensor
 from mcdenoise.benchmark import BASELINES, Score, Settings, choose_methods, run_benchmark, scores_of
 from mcdenoise.data import open_sequence
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
+from mcdenoise.denoiser import Denoiser
 from mcdenoise.folder import SequenceReport, denoise_sequence, make_folder
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.metrics import display_codes
-from mcdenoise.models import DEFAULT, Output
+from mcdenoise.models import DEFAULT, Output, find_model
 from mcdenoise.report import check_packages, write_report
 from mcdenoise.results import FILE
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
@@ -41,7 +42,8 @@ class DemoResult:
         scores: errors of the noisy and the accumulated image, those on the way and the result, over the frames with
             references.
         report: run times by stage, and what was done.
-        picture: noisy, accumulated, denoised and reference side by side, with close-ups.
+        picture: noisy, accumulated, by Open Image Denoise where that is installed, denoised and reference side by side,
+            with close-ups.
         denoised: folder of the clean EXRs.
         page: the report of error against run time of all methods.
     """
@@ -130,10 +132,18 @@ def _sheet(frame: Frame, output: Output) -> Picture:
     shown = {
         "1 sample a pixel": frame.color,
         "accumulated": output.stages.get("accumulated"),
-        "denoised": output.image,
+        "Open Image Denoise": _peer(frame),
+        "mcdenoise": output.image,
         f"reference, {REFERENCE_SPP} samples": frame.reference,
     }
     return np.concatenate([_column(text, image) for text, image in shown.items() if image is not None], 1)
+
+
+def _peer(frame: Frame) -> Tensor | None:
+    """The frame by Open Image Denoise, in its best quality, where its package is installed."""
+    if not find_model("oidn").installed:
+        return None
+    return Denoiser("oidn", quality="high", auxiliary="clean")(frame)
 
 
 def _column(text: str, image: Tensor) -> Picture:

@@ -352,7 +352,7 @@ class Frame:
         return self.replace(depth=torch.where(depth > 0, depth, torch.inf))
 
     def without_past(self) -> Frame:
-        """The same frame without the buffers that only a frame with a past needs."""
+        """The same frame without the buffers that only a frame with a history needs."""
         return self.replace(**dict.fromkeys(MOTION))
 
     def validate(self) -> tuple[Frame, int]:
@@ -602,10 +602,10 @@ def _check_buffer(name: str, value: object) -> None:
 
 
 def _check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]]:
-    """The values, clamped, and their extremes."""
+    """The values, clamped, and their minimum and maximum."""
     spec = _spec_of(name)
     low, high = (float(extreme) for extreme in torch.aminmax(value.detach()))
-    # A NaN comes through the extremes and fails the comparison; only then is it worth to look at every value again.
+    # A NaN passes through minimum and maximum and fails the comparison; only then is every value checked again.
     if not -_UNBOUNDED < low <= high < _UNBOUNDED and (bad := _illegal(spec, value)).any():
         where = bad.nonzero()[0].tolist()
         place = f"first at row {where[2]}, column {where[3]}" if len(where) == 4 else f"first at {where[1:]}"

@@ -26,14 +26,16 @@ class ShotSettings:
             or a model of your own, path/to/file.py:factory or package.module:factory. By default cascaded_v2, or the
             model that the weights are of.
         weights: safetensors file of your own weights for that model.
-        frames: which frames, such as 0-59,70; all by default.
-        device: cpu or cuda.
+        frames: frames to denoise, such as 0-59,70; all by default.
+        device: where the model runs, cpu or cuda.
         threads: CPU threads; torch's choice by default.
-        precision: of the network's convolutions; auto takes bfloat16 where the processor has it and it is faster, which
-            is measured once on each machine; int8 is for models that are calibrated for it, see `mcdenoise calibrate`.
-        map: layer of a buffer whose name does not tell, such as albedo=RGBA.diff; 'motion=' for none.
+        precision: precision of the network's convolutions; auto takes bfloat16 where the processor has it and it is
+            faster, which is measured once on each machine; int8 is for models that are calibrated for it, see
+            `mcdenoise calibrate`.
+        map: the layer to read a buffer from where names do not tell, such as albedo=RGBA.diff; 'motion=' reads none.
         color_without_albedo: the noisy color was divided by the albedo, which is multiplied back.
-        color_with_albedo: it was not; by default its values tell, and if they do not, it was not.
+        color_with_albedo: the noisy color has the albedo in it. By default its values decide, and where they tell
+            nothing, the color is taken to have it.
         output_layer: add the result as a layer of this name, and replace nothing.
         layers: layers of light to denoise with it, by the same kernels, so that they still add up: names such as
             DiffDir or Combined_*, or all.
@@ -42,19 +44,21 @@ class ShotSettings:
         anti_lag: give up the history where the light has changed.
         full_float: write the result as 32-bit floats, even where it was stored as half floats.
         keep_all: skip nothing, whether the sequence needs it or not.
-        tolerance: noise, or change, relative to its mean, below which a tile of a still shot is not denoised again;
-            0 skips only what makes no difference.
+        tolerance: noise, or change, relative to the mean of a tile, below which a tile of a still shot is skipped;
+            0 skips only tiles whose image stays the same.
         tile: run the network on tiles of at most so many pixels a side, a multiple of 32 from 64 on; the result is that
             of whole frames, to rounding. By default, frames are tiled where the network's features would take more than
             2 GB.
-        max_memory: of this process, in GB; chooses the tiles, and whether the next frame is read meanwhile.
-        budget_ms: take the shipped model and precision with the least error (or, where no error is known, the
-            slowest) that needs no more milliseconds a frame on this machine, measured once and without files.
-        max_error: take the fastest one with an SMAPE that is no larger.
+        max_memory: maximum memory of this process in GB; it decides the tiles, and whether the next frame is read
+            meanwhile.
+        budget_ms: take the shipped model and precision with the smallest error (or, where no error is known, the
+            slowest) that need at most so many milliseconds a frame on this machine, measured once and without files.
+        max_error: take the fastest model and precision whose SMAPE is at most this.
         results: folder of a finished benchmark to take errors from; those of the sequence's references by default.
         preview: write a PNG of each file to OUT/preview too, on the sRGB curve, and OUT/preview.mp4 of several frames.
         preview_fps: frames per second of that video.
-        preview_exposure: in stops; by default the first frame decides for all: its typical radiance is middle grey.
+        preview_exposure: exposure of the previews in stops; by default the first frame decides for all: its typical
+            radiance is middle grey.
     """
 
     model: str | None = None

@@ -1,39 +1,67 @@
-"""The pages of docs/ do what they say: their code runs, block after block, in an empty folder."""
+"""The pages of docs/, and the README, do what they say: code runs in an empty folder, commands are understood."""
 
 from __future__ import annotations
 
+import importlib
 import re
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from mcdenoise.cli import COMMANDS
+from mcdenoise.check.cases import OPS
+from mcdenoise.cli import COMMANDS, parse
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
-PAGES = ("bring-your-own-model.md", "bring-your-own-op.md")
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+TEXTS = [*sorted(DOCS.glob("*.md")), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "training/README.md"))]
+# Run by tests of their own, with the files that they need.
+ELSEWHERE = {"from-your-renderer.md", "from-oidn.md", "performance.md"}
+# A first block that is a file, which the other blocks import.
 FILES = {"bring-your-own-model.md": "mine", "bring-your-own-op.md": "my_ops"}
+# Names that stand for what a reader puts there.
+STANDS_FOR = {"SCENE.xml": "scene.xml", "...": "", "N": "1"}
 
 
-def blocks(page: str, language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
+def blocks(page: Path | str, language: str) -> list[str]:
+    text = (DOCS / page).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_code_of_a_page_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def commands(path: Path) -> list[str]:
+    """Lines of shell blocks that start `mcdenoise`, with their continuations."""
+    shell = blocks(path, "(?:sh)?")
+    lines = [line.strip() for block in shell for line in block.replace("\\\n", "").splitlines()]
+    return [line for line in lines if line.startswith("mcdenoise ")]
+
+
+CODE = [path for path in TEXTS if blocks(path, "python") and path.name not in ELSEWHERE]
+COMMAND_LINES = [(path.name, line) for path in TEXTS for line in commands(path)]
+
+
+def test_no_page_with_code_is_forgotten() -> None:
+    assert {path.name for path in CODE} >= {"README.md", "index.md", "compose.md", "layers.md", "kornia.md", *FILES}
+    assert {path.name for path in TEXTS} >= ELSEWHERE
+
+
+@pytest.mark.parametrize("path", CODE, ids=[path.name for path in CODE])
+def test_code_of_a_page_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
-    first, *others = blocks(page, "python")
-    name = FILES[page]
-    assert first.startswith(f"# {name}.py\n")
-    (tmp_path / f"{name}.py").write_text(first)
-    # A module of that name may be there from another test.
-    monkeypatch.delitem(sys.modules, name, raising=False)
-    assert others
-    for number, block in enumerate(others):
-        exec(compile(block, f"{page}, block {number + 1}", "exec"), {"__name__": "page"})
-    sys.modules.pop(name, None)
+    code = blocks(path, "python")
+    name = FILES.get(path.name)
+    if name:
+        monkeypatch.syspath_prepend(tmp_path)
+        first, *code = code
+        assert first.startswith(f"# {name}.py\n")
+        (tmp_path / f"{name}.py").write_text(first)
+        # A module of that name may be there from another test.
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    assert code
+    for number, block in enumerate(code):
+        exec(compile(block, f"{path.name}, block {number + 1}", "exec"), {"__name__": "page"})
+    sys.modules.pop(name or "", None)
 
 
 def test_code_for_those_who_come_from_oidn_runs() -> None:
@@ -46,14 +74,57 @@ def test_code_for_those_who_come_from_oidn_runs() -> None:
     assert found["color"].grad.isfinite().all()
 
 
-@pytest.mark.parametrize("page", [*PAGES, "from-oidn.md", "film.md"])
-def test_commands_of_a_page_exist(page: str) -> None:
-    lines = [line for block in blocks(page, "sh") for line in block.splitlines() if line.strip()]
-    commands = [line.split()[1] for line in lines if not line.startswith("pip ")]
-    assert commands
-    assert set(commands) <= set(COMMANDS)
+def test_code_about_threads_runs_before_torch() -> None:
+    """In a process of its own, since torch is here already."""
+    import subprocess
+
+    (code,) = blocks("performance.md", "python")
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+
+
+@pytest.mark.parametrize(
+    ("page", "line"), COMMAND_LINES, ids=[f"{page}-{i}" for i, (page, _) in enumerate(COMMAND_LINES)]
+)
+def test_a_command_is_understood(page: str, line: str) -> None:
+    words = [STANDS_FOR.get(word, word) for word in shlex.split(line, comments=True)]
+    _, name, *arguments = [word.removesuffix("...") for word in words if word]
+    assert name in COMMANDS, (page, line)
+    parse(name, arguments)
+
+
+def test_every_command_is_in_the_table() -> None:
+    named = set(re.findall(r"^\| `mcdenoise ([a-z]+)", (DOCS / "commands.md").read_text(), re.MULTILINE))
+    assert named == set(COMMANDS)
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=[path.name for path in TEXTS])
+def test_every_local_link_exists(path: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    targets = [target for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)", text) if "://" not in target]
+    # These pages are made with the site.
+    generated = re.compile(r"^(methods|operators)/index\.md$")
+    assert [t for t in targets if not (path.parent / t).exists() and not generated.match(t)] == []
 
 
 def test_the_file_of_twenty_lines_has_about_that_many() -> None:
     lines = [line for line in blocks("bring-your-own-model.md", "python")[0].splitlines() if line.strip()]
     assert len(lines) <= 20
+
+
+def test_every_operator_is_in_the_table_of_kornia_and_every_function_there_exists() -> None:
+    text = (DOCS / "kornia.md").read_text()
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| `")]
+    assert [row[0].strip("`") for row in rows] == [op.name for op in OPS]
+    tests = "".join(path.read_text() for path in (ROOT / "tests" / "ops").glob("*.py"))
+    for row in rows:
+        for name in re.findall(r"`((?:kornia|torch)\.[\w.]+)`", " ".join(row)):
+            module, _, function = name.rpartition(".")
+            assert hasattr(importlib.import_module(module), function), name
+        for name in re.findall(r"`(?:kornia|torch)\.[\w.]*?(\w+)`", row[-1]):
+            assert re.search(rf"\b{name}\(", tests), name
+
+
+def test_words_of_the_glossary_stand_in_order() -> None:
+    words = re.findall(r"^\| (?!word|-)(.+?) \|", (DOCS / "glossary.md").read_text(), re.MULTILINE)
+    assert len(words) > 40
+    assert words == sorted(words, key=str.lower)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import torch
 from forked import Server
 from torch import nn
 
+from mcdenoise import Frame
 from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.models import create_model, save_weights
 
@@ -478,3 +480,22 @@ def test_layers_of_a_shot_of_blender_are_compared(tmp_path: Path) -> None:
     ]
     together, apart = (float(line.rstrip(" |").rpartition("|")[2]) for line in lines[3:])
     assert together < 1e-6 < apart
+
+
+def test_kornia_containers() -> None:
+    motions = re.search(r"motion in x \[(.*)\]", run("kornia_containers.py"))
+    assert motions
+    assert sorted(float(each) for each in motions[1].split(",")) == [-1.0, 1.0]
+
+
+def test_a_frame_is_augmented_with_all_its_buffers() -> None:
+    from kornia.augmentation import RandomHorizontalFlip
+
+    names = runpy.run_path(str(EXAMPLES / "kornia_containers.py"))
+    images = {name: torch.rand(2, channels, 5, 6) for name, channels in names["BUFFERS"].items()}
+    moved = names["augment"](Frame(**images), RandomHorizontalFlip(p=1.0))
+    sign = torch.tensor([-1.0, 1.0]).reshape(1, 2, 1, 1)
+    for name, image in images.items():
+        expected = image.flip(-1) * (sign if name == "motion" else 1)
+        torch.testing.assert_close(getattr(moved, name), expected, rtol=0, atol=0)
+    assert names["preview"](4)(images["color"]).shape == (2, 3, 4, 4)

@@ -112,3 +112,13 @@ def test_no_code_reads_a_pickle(files: list[Path]) -> None:
         for line in unpicklers(text_of(path))
     ]
     assert not found, "\n".join(found)
+
+
+def test_the_source_archive_holds_every_file(files: list[Path]) -> None:
+    """What is neither of the package nor named in MANIFEST.in is missing outside of a clone, such as test data."""
+    lines = [line.split() for line in (ROOT / "MANIFEST.in").read_text(encoding="utf-8").splitlines()]
+    grafted = {"mcdenoise", *(name for words in lines if words[:1] == ["graft"] for name in words[1:])}
+    # The build adds these by itself; the last ones belong to a clone.
+    included = {name for words in lines if words[:1] == ["include"] for name in words[1:]}
+    included |= {"pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", ".gitignore", ".ci"}
+    assert {path.relative_to(ROOT).parts[0] for path in files} <= grafted | included

@@ -64,7 +64,7 @@ def score_suite(
         return 0
     found = rows_there(rows, data)
     if not found:
-        raise InputError(f"{data}: expected frames of the suite, found none; leave out --no-render to render them")
+        raise InputError(f"{data}: expected frames of the suite, found none; omit --no-render to render them")
     missing = [row.name for row in rows if row not in found]
     with progress_bar() as progress:
         task = progress.add_task("score", total=None)

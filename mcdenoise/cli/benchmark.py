@@ -62,20 +62,20 @@ def benchmark(
             "oidn(quality=fast|high)"; weights files; file.py:factory; "pretrained" for all with shipped weights; "all"
             for every name there is, saying which have no weights yet; or none. By default those with shipped weights,
             filters, and other denoisers. Doing nothing and accumulation alone are always there.
-        precisions: of the convolutions of models that learn: float32, bfloat16, and int8 of those calibrated for it.
-        frames: which frames of each sequence, such as 0-59,70; all by default.
+        precisions: precisions of the convolutions of models that learn: float32, bfloat16, and int8 where calibrated.
+        frames: frames of each sequence to denoise, such as 0-59,70; all by default.
         rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.
         threads: CPU threads of all methods; torch's choice by default.
         busy: cores that other processes keep busy while times are measured, as a renderer beside a denoiser does.
         device: cpu or cuda.
-        sizes: of images of which only the cost is measured, such as 1280x720,3840x2160, or none.
-        pictures: of how many frames of each scene images are kept.
+        sizes: sizes of random images whose cost alone is measured, such as 1280x720,3840x2160, or none.
+        pictures: number of frames of each scene whose images are kept.
         keep_all: measure each method that skips anything a second time, skipping nothing, to see what that saves.
         ops: measure the operators.
-        size: of the images with --ops, WIDTHxHEIGHT.
+        size: size of the images with --ops, WIDTHxHEIGHT.
         suite: render and score the suite of this name.
         data: folder of the suite's frames.
-        rows: which of the suite, such as "cycles-*,mitsuba-parlour-box-4"; all by default.
+        rows: rows of the suite to score, such as "cycles-*,mitsuba-parlour-box-4"; all by default.
         blender_python: a Python that has Blender's module bpy, to render the suite's rows of Cycles; by default that
             of the environment variable BLENDER_PYTHON, or else this one.
         render: --no-render scores the rows that are in the folder of --data and renders nothing.

@@ -32,7 +32,7 @@ def evaluate(
         images: folder of one EXR a frame, such as denoised12.exr or frame.0012.exr, scene-linear RGB.
         model: compare this model instead: a name with settings, a weights file, or file.py:factory, as of `denoise`.
         protocol: how a publication computed its numbers; they are printed beside the strict ones.
-        frames: which frames, such as 0-59,70; all that have a reference by default.
+        frames: frames to compare, such as 0-59,70; all that have a reference by default.
         device: where the model runs: cpu or cuda.
         json: write the printed figures to this file too.
     """

@@ -38,7 +38,7 @@ def export(
             of --check, or else all that the model is better with.
         format: onnx, or torch for torch.export.load; by default that of the file's ending.
         check: folder of a sequence: run the ONNX graph by onnxruntime over its frames, and print the differences.
-        frames: how many of them.
+        frames: number of frames to check.
         json: write the names of inputs and outputs, and the differences, to this file too.
     """
     made = create_model(model, pretrained=weights is None, weights=weights)

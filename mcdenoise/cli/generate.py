@@ -46,10 +46,10 @@ def generate(
     Args:
         out: folder of the sequences; finished frames in it are kept.
         rendering: samples, references, size and processors.
-        seeds: which scenes, such as 0-99,200.
+        seeds: seeds of the scenes, such as 0-99,200.
         frames: frames of each sequence.
         zoom: render the middle of an image that is so many times as wide and high.
-        noise_seed: of the noise of all scenes; by default each has the noise of its own seed.
+        noise_seed: seed of the noise of all scenes; by default each scene takes its own seed.
         wild: frames as renderers' users have them: coats, mirrors, glass and metal in every scene, --sampling mixed,
             --stills 0.5, and for each sequence its own number of samples, from 1 to 64 instead of --spp.
         sampling: every sample at the pixel centre, with features without noise (centre, the default); or as Mitsuba
@@ -62,8 +62,8 @@ def generate(
         cycles_spp: samples a pixel of Cycles' noisy colors; by default drawn from the seed, 1 for half of the scenes.
         blender_python: a Python that has Blender's module bpy; by default that of the environment variable
             BLENDER_PYTHON, or else this one.
-        parts: of Cycles: also write diffuse and specular light, which add up to each noisy color.
-        threads: of Cycles; all processors by default.
+        parts: with Cycles, also write diffuse and specular light, which add up to each noisy color.
+        threads: threads of Cycles; all processors by default.
     """
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")

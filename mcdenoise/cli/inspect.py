@@ -22,10 +22,10 @@ def inspect(
 
     Args:
         inputs: a folder; files; or a pattern, as for `mcdenoise denoise`.
-        frames: which frames, such as 0-59,70; all by default.
+        frames: frames to look at, such as 0-59,70; all by default.
         map: layer of a buffer whose name does not tell, such as albedo=RGBA.diff; 'motion=' for none.
         color_without_albedo: the noisy color was divided by the albedo.
-        color_with_albedo: it was not.
+        color_with_albedo: the noisy color has the albedo in it.
         json: write what is shown to this file too.
     """
     opened = ShotSettings(

@@ -21,10 +21,10 @@ class RenderOptions:
 
     Args:
         spp: samples a pixel of the noisy color.
-        realisations: noisy colors of each frame, with independent noise.
+        realisations: noisy colors of each frame, each with a noise seed of its own.
         reference_spp: samples a pixel of the references; 0 renders none. With --noise-level the most.
         noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
-        reference_frames: which frames get a reference, such as 8-11; all by default.
+        reference_frames: frames that get a reference, such as 8-11; all by default.
         size: WIDTHxHEIGHT in pixels.
         workers: processes that render frames side by side; of use with scalar_rgb.
         variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
@@ -82,7 +82,7 @@ def render(
         rendering: samples, references, size and processors.
         frames: render the first so many cameras; all by default.
         every: take only every n-th camera of the path.
-        seed: of the noise.
+        seed: seed of the noise.
     """
     if every < 1:
         raise InputError(f"--every: expected at least 1, found {every}")

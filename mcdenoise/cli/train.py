@@ -44,8 +44,8 @@ def train(
         out: folder of the run: checkpoint, log, TensorBoard events, and at the end the weights.
         config: what to train.
         recipe: TOML file that says all this, and how the sequences are generated, which are rendered first.
-        runs: of a recipe of several, the names of those to train; each has a folder of its name in the output. All by
-            default.
+        runs: names of the runs to train, of a recipe that has several; each has a folder of its name in the output. All
+            by default.
         data: folder of what a recipe renders, which several may share; OUT/data by default.
         validation: folders of sequences that are used for nothing but validation.
         cache: folder of the decoded sequences, which several runs may share; OUT/cache by default.

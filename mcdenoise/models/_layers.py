@@ -166,7 +166,7 @@ def closed(frame: Frame) -> Frame:
         if excess[0] > _MOST_EXCESS:
             raise InputError(
                 f"layers: expected parts of the color, found {names} brighter than it together, by {excess[0]:.0%} of "
-                "their light; leave out what is not a part of it"
+                "their light; give only layers that are a part of it"
             )
 
     ask(excess, refuse)

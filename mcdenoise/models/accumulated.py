@@ -415,7 +415,7 @@ def motion_unless_still(
 
 
 def comparable(surface: Surface, previous: Surface) -> tuple[Surface, Surface]:
-    """Two surfaces for the relative test: depth tells how far positions may be apart, without it they are left out."""
+    """Two surfaces for the relative test: without a depth, positions are not compared."""
     if surface.depth is not None and previous.depth is not None:
         return surface, previous
     return surface._replace(position=None), previous._replace(position=None)

@@ -41,7 +41,7 @@ class Antialiased(Wrapper):
     Radiance is gamma-mapped, ``x^(1 / 2.2)``, and brought back afterwards; it is not cut off at 1, so that the result
     is radiance like any other, and scales with the exposure. In YCoCg, the result before is clamped to the mean of the
     range of the 3x3 pixels and of the range of the cross of five among them; ``result = alpha image + (1 - alpha)
-    before``. Surfaces are not compared, and no cut is looked for: the clamp is all that holds the past off.
+    before``. Surfaces are not compared, and no cut is looked for: only the clamp limits the weight of the history.
 
     Layers and alpha are those of the method.
 

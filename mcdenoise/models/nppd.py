@@ -1,4 +1,4 @@
-"""Neural partitioning pyramids: a network shares out each pixel's light over five scales and splats it there.
+"""Neural partitioning pyramids: a network divides each pixel's light among five scales and splats it there.
 
 Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", SIGGRAPH, and its public code
 (balintio/nppd), which this page follows: steps, layers and weights are the code's. A step is
@@ -8,7 +8,7 @@ Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Rend
 2. encode every sample, and average: ``f = mean_s E(depth, normal, albedo, log(1 + radiance / mean radiance))``;
 3. predict all weights from ``log(1 + (c', c) / mean of both)``, ``f'`` and ``f``: 6 + 32 + 32 = 70 channels;
 4. ``c <- lambda c' + (1 - lambda) c`` and ``f <- lambda f' + (1 - lambda) f`` with one sigmoid ``lambda`` a pixel;
-5. share out ``c`` over K = 5 levels by a softmax, average each part down to its level, splat it there by a 5x5 softmax,
+5. divide ``c`` among K = 5 levels by a softmax, average each part down to its level, splat it there by a 5x5 softmax,
    and sum from coarse to fine, each coarse image upsampled by 4x4 weights, 4 times a softmax;
 6. splat ``o'`` by a 5x5 softmax, and mix both by a sigmoid: ``o = mu o' + (1 - mu) d``.
 

@@ -43,7 +43,7 @@ def cross_bilateral_filter(
 
     ``out[p] = sum_t w'[t, p] * image[p + o_t]`` with the weights ``w'`` of :func:`cross_bilateral_weights`: it is
     ``kernel_conv(image, cross_bilateral_weights(kernel, guides, ...))``, except that the weights are never rounded to
-    half precision. The fast form never stores them either, and computes them once more for the derivatives.
+    half precision. The fast backends never store them either, and compute them once more for the derivatives.
 
     Args:
         image: ``(B, C, H, W)``, any unit and range.
@@ -80,7 +80,7 @@ def cross_bilateral_filter(
     weights = cross_bilateral_weights(
         kernel.to(accumulator_dtype(kernel.dtype)), guides, scales, distance_scale, normalize=normalize, border=border
     )
-    # What a softmax leaves out has the weight 0, and the others have the sum 1 already.
+    # A tap that the softmax rejects has weight 0, and the weights of the others sum to 1 already.
     left_out = border == "renormalize" and normalize == "softmax"
     return plain(kernel_conv)(image, weights, border="zeros" if left_out else border)
 

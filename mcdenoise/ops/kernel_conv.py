@@ -85,7 +85,7 @@ def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate")
         image: ``(B, C, H, W)``, any unit and range.
         kernel: ``(B, K*K, H, W)`` weights, odd ``K``: tap ``t`` of pixel ``p`` says how much of ``p`` goes to
             ``p + o_t``.
-        border: where a share goes that leaves the image: ``"replicate"`` to the nearest edge pixel, ``"zeros"``
+        border: where light goes that leaves the image: ``"replicate"`` to the nearest edge pixel, ``"zeros"``
             nowhere; ``"renormalize"`` first divides each pixel's weights by the sum of those inside the image, so
             that all of every pixel stays inside.
 

@@ -36,24 +36,24 @@ def history_lag(
 
     The variance must come from more than the window of ``recent``: where light arrives in few, large samples, a window
     that none has hit looks dark and free of noise. And radiance itself is a poor ``y``, since one firefly hides all
-    else: a history is compared by means of its fourth root, with the variance over the past.
+    else: a history is compared by means of its fourth root, with the variance over the history.
 
     Args:
-        history: ``(B, C, H, W)`` mean over a long past, finite, any unit.
-        recent: ``(B, C, H, W)`` the same of a shorter past or of the current frame, with more noise and less lag.
+        history: ``(B, C, H, W)`` mean over a long history, finite, any unit.
+        recent: ``(B, C, H, W)`` mean over a shorter history, or the current frame, with more noise and less lag.
         variance: ``(B, 1, H, W)`` of the noise of ``recent``'s channel mean, at least 0, in its unit squared.
         threshold: standard errors up to which a difference is taken for noise, above 0.
         kernel_size: side of the window in pixels, odd, at least 3.
 
     Returns:
-        ``(B, 1, H, W)`` share in [0, 1] in the dtype of ``history``: ``lerp(history, recent, lag)`` has no lag. Half
+        ``(B, 1, H, W)`` fraction in [0, 1] in the dtype of ``history``: ``lerp(history, recent, lag)`` has no lag. Half
         precision is computed in float32. Below 1e-15 of the image's largest value nothing counts as lag.
 
     Raises:
         TypeError: an argument is no floating-point tensor.
         ValueError: a shape or a setting does not fit.
 
-    Differentiable in all three images, to any order, where the share is not exactly at its limits.
+    Differentiable in all three images, to any order, where the fraction is not exactly at its limits.
 
     Source: the idea of Schied et al. 2018, "Gradient estimation for real-time adaptive temporal filtering" (A-SVGF),
     and of the fast history of NVIDIA's ReLAX; with a test of means in place of re-shaded samples and of color boxes.

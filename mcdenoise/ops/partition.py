@@ -1,4 +1,4 @@
-"""A pyramid of images that share out the light of one, and upsampling with predicted weights that puts it together."""
+"""The light of an image divided among the levels of a pyramid, and learned upsampling that adds it up."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ def reproject(
 
     Returns:
         ``(B, C, H, W)`` value in the dtype of ``previous``, and ``(B, 1, H, W)`` kept weight in [0, 1].
-        Holds for any motion, known or not, and whatever is in a tap that is left out; a place in the image is known to
+        Holds for any motion, known or not, and whatever is in a rejected tap; a place in the image is known to
         eps times its size.
 
     Raises:
@@ -185,7 +185,7 @@ def reproject(
     source = previous.to(dtype).flatten(2)
     for index, kept, bilinear in taps:
         value = source.gather(2, index.expand(-1, source.shape[1], -1)).reshape(values.shape)
-        # A tap that is left out may hold anything, NaN too.
+        # A rejected tap may be NaN, and 0 * NaN is NaN.
         values = values + bilinear * torch.where(kept, value, 0)
         weight = weight + bilinear
     found = weight > 0

@@ -1,0 +1,206 @@
+"""A page for each method of the zoo, made of the register, its docstring, its weights, and the tables of the docs."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from functools import cache
+from pathlib import Path
+
+import mcdenoise.models
+from mcdenoise.models import ModelOverview, describe_weights, find_model, overview
+
+ROOT = Path(__file__).resolve().parents[2]
+KINDS = {
+    "kernel": "Predict kernels",
+    "pixel": "Predict pixels",
+    "grid": "Bilateral grids",
+    "recurrent": "Recurrent networks",
+    "filter": "Filters without weights",
+    "peer": "Open Image Denoise",
+    "other": "Others",
+}
+WEIGHTS = {
+    "shipped": "in the package, trained for hours",
+    "compared": "in the package, trained for minutes, to be compared on equal terms",
+    "its own": "found by itself, in another package",
+    "to train": "none; to be trained",
+    "none": "it has none",
+}
+# How the tables of measurements call the methods.
+NAMES = {
+    "NBGD": "nbgd",
+    "RAE (for ONND)": "rae",
+    "KP": "kp",
+    "MRKP": "mrkp",
+    "WSKP": "wskp",
+    "P+K": "cascaded",
+    "KPCN": "kpcn",
+    "SBMC": "sbmc",
+    "layered": "layered",
+    "ANF": "anf",
+    "NPPD": "nppd",
+    "SVGF": "svgf",
+    "A-SVGF": "asvgf",
+    "BMFR": "bmfr",
+    "joint bilateral": "joint_bilateral",
+    "joint bilateral, best of 20 settings": "joint_bilateral",
+    "OIDN": "oidn",
+    "OIDN, best of 36 settings": "oidn",
+}
+PAPER = "*The paper*, where no other is named, is [doi:10.1007/s00371-023-02951-6](https://doi.org/10.1007/s00371-023-02951-6)."
+MEASURED = ("results.md", "unseen_scenes.md", "zoo.md", "layers.md")
+
+
+def pages() -> dict[str, str]:
+    """Pages by their place in the site."""
+    entries = _overview()
+    found = {f"methods/{entry.name}.md": page(entry) for entry in entries}
+    return found | {"methods/index.md": index(entries)}
+
+
+@cache
+def _overview() -> list[ModelOverview]:
+    return overview()
+
+
+def navigation() -> list[dict[str, list[str]]]:
+    """Pages by what makes the image."""
+    found = {
+        title: [f"methods/{each.name}.md" for each in _overview() if each.kind == kind] for kind, title in KINDS.items()
+    }
+    return [{title: places} for title, places in found.items() if places]
+
+
+def index(entries: list[ModelOverview]) -> str:
+    """All methods, by what makes their image."""
+    parts = [
+        "# Methods\n\nEvery method is a name that `--model` and `Denoiser` take, and one file in `mcdenoise/models/`, "
+        "to be read beside its paper. What it costs are multiply-adds in convolutions; [The zoo](../zoo.md) compares "
+        "errors, and [Results](../results.md) has those of the default. `mcdenoise models` prints this list."
+    ]
+    for kind, title in KINDS.items():
+        rows = [
+            f"| [`{entry.name}`]({entry.name}.md) | {entry.description} | {paper(entry)} | {entry.weights} "
+            f"| {cost(entry)} |"
+            for entry in entries
+            if entry.kind == kind
+        ]
+        if rows:
+            head = "| method | what | paper | weights | kMAC a pixel |\n|---|---|---|---|--:|"
+            parts.append("\n".join([f"## {title}\n", head, *rows]))
+    return "\n\n".join(parts) + "\n"
+
+
+def cost(entry: ModelOverview) -> str:
+    """Thousands of multiply-adds a pixel."""
+    return "-" if entry.kmacs_per_pixel is None else f"{entry.kmacs_per_pixel:.1f}"
+
+
+def page(entry: ModelOverview) -> str:
+    """One method."""
+    construct = find_model(entry.name).construct
+    module = importlib.import_module(construct.__module__)
+    file = Path(inspect.getsourcefile(module) or "").relative_to(ROOT).as_posix()
+    facts = {
+        "what": entry.description,
+        "paper": paper(entry),
+        "needs": code(entry.needs),
+        "is better with": code(entry.uses),
+        "weights": WEIGHTS[entry.weights],
+        "parameters": f"{entry.parameters:,}" if entry.parameters else "-",
+        "cost": f"{cost(entry)} thousand multiply-adds a pixel in convolutions" if entry.kmacs_per_pixel else "-",
+        "source": f"`{file}`",
+    }
+    parts = [f"# {entry.name}", facts_table(facts)]
+    if entry.reason:
+        parts.append(f"Not available where this page was made: {entry.reason}.")
+    parts.append(f"```sh\nmcdenoise denoise shot/ -o clean/ --model {entry.name}\n```")
+    parts.append("## How it works\n\n" + as_markdown(inspect.getdoc(module) or ""))
+    if "paper" in (inspect.getdoc(module) or ""):
+        parts.append(PAPER)
+    parts.append(
+        f"::: {construct.__module__}.{construct.__qualname__}\n"
+        "    options:\n      heading: Settings\n      toc_label: Settings"
+    )
+    parts.append(trained(entry))
+    parts.append("## Measured\n\n" + measured(entry.name))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def facts_table(facts: dict[str, str]) -> str:
+    """Two columns without a head of their own."""
+    head, *rows = (f"| {name} | {text} |" for name, text in facts.items())
+    return "\n".join([head, "|---|---|", *rows])
+
+
+def paper(entry: ModelOverview) -> str:
+    """Authors and year, or the link of a DOI."""
+    return re.sub(r"DOI (\S+)", r"[doi:\1](https://doi.org/\1)", entry.paper) or "-"
+
+
+def code(names: list[str]) -> str:
+    """Names of buffers as code."""
+    return ", ".join(f"`{name}`" for name in names) or "-"
+
+
+def trained(entry: ModelOverview) -> str:
+    """What the header of the weights says of their making."""
+    if entry.weights not in ("shipped", "compared"):
+        return ""
+    folder = Path(mcdenoise.models.__file__).parent / "weights" / ("compared" if entry.weights == "compared" else "")
+    header = describe_weights(folder / f"{entry.name}.safetensors")
+    rows = [
+        f"| {name} | {value} |"
+        for name, value in sorted(header.items())
+        if 0 < len(str(value)) < 400 and "\n" not in str(value)
+    ]
+    return "\n".join(["## Weights\n", "The header of the file says:\n", "| field | value |", "|---|---|", *rows])
+
+
+def as_markdown(text: str) -> str:
+    """A docstring's roles and double backticks as Markdown."""
+    text = re.sub(r":(?:func|class|meth|data|mod|attr):`~?([^`]+)`", r"`\1`", text)
+    return re.sub(r"``(.+?)``", r"`\1`", text)
+
+
+def measured(name: str) -> str:
+    """The rows of this method in the tables of the docs, each under the heading that it has there."""
+    parts = []
+    for source in MEASURED:
+        for heading, head, rows in tables(ROOT / "docs" / source):
+            own = [row for row in rows if method_of(row[0]) == name]
+            if own and len(head) > 1:
+                lines = [head, ["---"] + ["--:"] * (len(head) - 1), *own]
+                table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+                parts.append(f"[{heading}](../{source}):\n\n{table}")
+    return (
+        "\n\n".join(parts)
+        or f"It stands in no table; `mcdenoise benchmark SEQUENCE -o OUT --models {name}` measures it on your frames."
+    )
+
+
+def method_of(cell: str) -> str:
+    """The method that the first cell of a row names, if it names one."""
+    plain = cell.replace("*", "").replace("`", "").strip()
+    return NAMES.get(plain, plain)
+
+
+def tables(path: Path) -> list[tuple[str, list[str], list[list[str]]]]:
+    """Heading, column names and rows of each table of a page."""
+    found: list[tuple[str, list[str], list[list[str]]]] = []
+    heading, inside = "", False
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if line.startswith("#"):
+            heading = line.lstrip("# ").strip()
+        if not line.startswith("|"):
+            inside = False
+            continue
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if not inside:
+            found.append((heading, cells, []))
+            inside = True
+        elif set(line) - set("|-: "):
+            found[-1][2].append(cells)
+    return found
