@@ -19,6 +19,7 @@ from torch import nn
 from mcdenoise import Frame
 from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.models import create_model, save_weights
+from mcdenoise.nn.int8 import has_int8
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 RENDERERS = Path(__file__).parent / "data" / "renderers"
@@ -249,7 +250,8 @@ def test_run_time_prints_a_line_for_each_method(tmp_path: Path) -> None:
     arguments = ("--models", *models, "--size", "64x36", "--threads", "1", "--rounds", "2", "--json", file)
     lines = run("run_time.py", *arguments).splitlines()
     tiny = "cascaded_v2_tiny(alpha_min=0.2)"
-    names = ["accumulated", tiny, f"{tiny}, bfloat16", "compose_denoiser.py:method"]
+    integers = [f"{tiny}, int8"] if has_int8() else []
+    names = ["accumulated", tiny, f"{tiny}, bfloat16", *integers, "compose_denoiser.py:method"]
     assert [line[:44].strip() for line in lines[2:]] == names
     assert lines[2].endswith(" 1.00")
     written = json.loads(file.read_text())
@@ -433,6 +435,7 @@ def test_training_speed_times_both_forms_in_both_precisions(small_sequence: Path
             assert float(line.split()[2]) == pytest.approx(sum(values) / 2, abs=0.51)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory as Linux tells it")
 def test_large_frames_prints_what_a_pixel_costs(tmp_path: Path) -> None:
     file = tmp_path / "costs.json"

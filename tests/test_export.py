@@ -156,7 +156,7 @@ def test_a_state_of_several_resolutions_and_images_of_any_size(tmp_path: Path) -
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
-@pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
+@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
 def test_a_compiled_step_is_the_step(backend: str, mine: str) -> None:
     if backend == "inductor":
         pytest.importorskip("torch._inductor")

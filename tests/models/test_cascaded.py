@@ -285,6 +285,7 @@ def test_accumulation_is_the_published_average() -> None:
         torch.testing.assert_close(output.stages["accumulated"], expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_large_images_have_the_pixels_of_small_ones() -> None:
     """Where the compiled form of the filter is chosen, with each way of normalising."""

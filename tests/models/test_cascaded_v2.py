@@ -60,6 +60,7 @@ def test_the_width_of_the_kernel_network_can_be_set() -> None:
     assert widths("cascaded_v2_small", width=8, kernel_width=None) == (8, 8)
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_full_width_at_180x320() -> None:
     output, _ = create_model("cascaded_v2")(frame_of(180, 320))
@@ -69,7 +70,7 @@ def test_full_width_at_180x320() -> None:
 
 
 @pytest.mark.parametrize("precision", [torch.float32, torch.bfloat16], ids=str)
-@pytest.mark.parametrize("name", ["cascaded_v2", "cascaded_v2_tiny"])
+@pytest.mark.parametrize("name", [pytest.param("cascaded_v2", marks=pytest.mark.slow), "cascaded_v2_tiny"])
 def test_weights_and_filter_in_one_give_the_same_image(
     name: str, precision: torch.dtype, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -187,6 +188,7 @@ def test_a_constant_guide_is_no_guide(size: tuple[int, int]) -> None:
     assert not torch.allclose(network(frame)[0].image, expected, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_large_images_have_the_derivatives_of_the_plain_form() -> None:
     """Large enough for compiled forms, some of which have no derivatives."""
     gradients = []

@@ -107,6 +107,7 @@ def test_layers_sum_to_the_image_in_float64_and_have_derivatives(name: str) -> N
         assert bool(gradient.any()) is not (name in ("oidn_pyramid", "rae") and frame is second)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 @torch.no_grad()
 def test_layers_of_tiles_are_those_of_the_image(name: str) -> None:

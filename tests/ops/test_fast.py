@@ -405,6 +405,7 @@ def test_motion_of_what_was_not_seen_is_infinite() -> None:
     assert motion.isinf().all(1).flatten().tolist() == [False, True, True, True, True, True]
 
 
+@pytest.mark.slow
 def test_without_a_folder_for_compiled_code_it_is_compiled_anew() -> None:
     code = (
         "import numba.core.caching as caching, torch\n"
