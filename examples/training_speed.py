@@ -30,7 +30,7 @@ from mcdenoise.benchmark.machine import describe_machine, fix_threads
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
-from mcdenoise.models import DEFAULT, Precision, create_model
+from mcdenoise.models import DEFAULT, FloatPrecision, create_model
 from mcdenoise.train import TrainConfig
 from mcdenoise.train.cache import Shot
 from mcdenoise.train.clips import ClipSampler
@@ -95,8 +95,8 @@ def main() -> None:
             raise InputError(f"--{name}: expected at least {lowest}, found {getattr(options, name)}")
     fix_threads(options.threads)
     keep_heap()
-    ways: dict[tuple[Precision, str], Callable[[int], None]] = {}
-    for precision in get_args(Precision):
+    ways: dict[tuple[FloatPrecision, str], Callable[[int], None]] = {}
+    for precision in get_args(FloatPrecision):
         config = TrainConfig(
             model=options.model,
             batch=options.batch,
@@ -113,7 +113,7 @@ def main() -> None:
         for form in ("fast", "plain"):
             ways[precision, form] = steps(config, sampler, form == "plain")
 
-    times: dict[tuple[Precision, str], list[float]] = {way: [] for way in ways}
+    times: dict[tuple[FloatPrecision, str], list[float]] = {way: [] for way in ways}
     for number in range(WARM_UP + options.rounds):
         for way, step in ways.items():
             start = time.perf_counter()
