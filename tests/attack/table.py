@@ -171,6 +171,7 @@ COMMANDS = {
     "reader camera_matrices": Command("reader camera_matrices shot/inputs/camera_matrices.h", ("shot",), printed),
     "reader camera_path": Command("reader camera_path path.json", ("path.json",), printed),
     "reader recipe": Command("reader recipe recipe.toml", ("recipe.toml",), printed),
+    "reader film": Command("reader film film.toml", ("film.toml", "shot"), printed),
     "reader weights": Command("reader weights weights.safetensors", ("weights.safetensors",), printed),
     "reader results": Command("reader results results", ("results",), printed),
     "reader run": Command("reader run run", ("run",), printed),
@@ -194,6 +195,12 @@ def read_recipe(path: Path) -> object:
 
     recipe = Recipe.read(path, options_of("generate"))
     return [recipe.data, recipe.validation, recipe.credits, recipe.chosen([])]
+
+
+def read_film(path: Path) -> object:
+    from mcdenoise.film import read_film
+
+    return read_film(path)
 
 
 def read_weights(path: Path) -> object:
@@ -259,6 +266,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "camera_matrices": read_matrices,
     "camera_path": read_path,
     "recipe": read_recipe,
+    "film": read_film,
     "weights": read_weights,
     "results": read_results,
     "run": read_run,
@@ -378,6 +386,7 @@ KINDS = {
     "png": Kind("still.png", partial(pixels, suffix=".png"), {"reader png": 80}),
     "zip": Kind("frame0.zip", entries, {"denoise zip": 100, "reader zip": 100}),
     "recipe": Kind("recipe.toml", toml, {"reader recipe": 200}),
+    "film": Kind("film.toml", toml, {"reader film": 200}),
     "camera path": Kind("path.json", json.loads, {"reader camera_path": 200}),
     "results.json": Kind("results/results.json", json.loads, {"reader results": 160, "models": 10, "report": 10}),
     "earlier denoise.json": Kind("out/denoise.json", exactly, {"denoise again": 100}),

@@ -49,6 +49,16 @@ smape = 0.5
 tolerance = 0.1
 """
 
+FILM = """\
+[every]
+threads = 1
+
+[[shot]]
+name = "wall"
+input = "shot"
+alpha_min = 0.2
+"""
+
 SCENE = """\
 <scene version="3.0.0">
   <shape type="rectangle"><bsdf type="diffuse"><rgb name="reflectance" value="0.5, 0.4, 0.3"/></bsdf></shape>
@@ -77,6 +87,9 @@ def build(folder: Path) -> None:
     weights = save_weights(create_model(MODEL, pretrained=True), MODEL, {}, {"licence": "Apache-2.0"})
     (folder / "weights.safetensors").write_bytes(weights)
     (folder / "recipe.toml").write_text(RECIPE)
+    (folder / "film.toml").write_text(
+        '[every]\nthreads = 1\n\n[[shot]]\nname = "wall"\ninput = "shot"\nalpha_min = 0.2\n'
+    )
     # Its folder is the scene's name.
     (folder / "scene").mkdir()
     (folder / "scene/scene.xml").write_text(SCENE)
