@@ -25,8 +25,11 @@ from mcdenoise.shot import ShotSettings
 
 def measure(nodes: int, shots: Path, out: Path) -> dict[str, float]:
     """Make the film with so many nodes."""
-    import ray
-    from ray.cluster_utils import Cluster
+    try:
+        import ray
+        from ray.cluster_utils import Cluster
+    except ImportError as error:
+        raise SystemExit("film_scale.py: expected Ray, found none; pip install 'mcdenoise[ray]'") from error
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
     for _ in range(nodes):

@@ -78,6 +78,13 @@ def test_every_example_is_tested_and_says_how_to_run_it() -> None:
         assert f"python examples/{path.name}" in path.read_text()
 
 
+def test_film_scale_measures_what_the_driver_takes(tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="films on a cluster need Ray: pip install 'mcdenoise[ray]'")
+    file = tmp_path / "scale.json"
+    run("film_scale.py", "--nodes", "2", "--shots", "1", "--frames", "2", "--json", file, alone=True)
+    assert json.loads(file.read_text())
+
+
 def test_composed_denoiser_improves_on_its_input(small_sequence: Path) -> None:
     lines = run("compose_denoiser.py", small_sequence, "--last", "2").splitlines()[1:]
     assert len(lines) == 2
@@ -155,6 +162,7 @@ def test_fitted_filter_is_better_on_a_scene_it_has_not_seen() -> None:
     assert after < 0.8 * before
 
 
+@pytest.mark.slow
 def test_unseen_scenes_compares_every_image(small_sequence: Path, weights: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
     pytest.importorskip("flip_evaluator", reason="FLIP is in the extra mcdenoise[peers]")

@@ -46,7 +46,7 @@ def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
 # bfloat16 and float16 take the same way through the ops; `mcdenoise stability` tries them all.
 # Second derivatives of 25 taps take half a minute.
 # Whose many taps, or cases, take many seconds.
-LONG = {"atrous", "softmax_splat", "affinity_filter"}
+LONG = {"atrous", "softmax_splat", "affinity_filter", "importance_filter"}
 TRIED = [
     pytest.param(op, dtype, marks=[pytest.mark.slow] if op.name in LONG or dtype == torch.float16 else [])
     for op in OPS
