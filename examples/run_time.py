@@ -18,6 +18,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -32,9 +33,9 @@ from mcdenoise.models import (
     Accumulated,
     Precision,
     Skipping,
-    can_quantize,
     computing_in,
     parts_of,
+    precisions_of,
     pretrained_models,
     quantize,
 )
@@ -64,13 +65,11 @@ def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], o
         with torch.no_grad(), computing_in(precision, cpu):
             return model(frame)
 
-    calls: dict[str, Callable[[], object]] = {spelling.name: lambda: call("float32")}
-    if model.needs.trainable:
-        calls[f"{spelling.name}, bfloat16"] = lambda: call("bfloat16")
-    if can_quantize(model):
+    precisions = precisions_of(model) if model.needs.trainable else ("float32",)
+    if "int8" in precisions:
         quantize(model, cpu)
-        calls[f"{spelling.name}, int8"] = lambda: call("int8")
-    return calls
+    names = {precision: "" if precision == "float32" else f", {precision}" for precision in precisions}
+    return {f"{spelling.name}{mark}": partial(call, precision) for precision, mark in names.items()}
 
 
 def interleaved(calls: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:

@@ -17,7 +17,7 @@ from mcdenoise.data import Sequence
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import FLOATS, PRECISIONS, Precision, can_quantize, create_model, pretrained_models
+from mcdenoise.models import Precision, create_model, precisions_of, pretrained_models
 from mcdenoise.reading import read_text
 from mcdenoise.results import Results
 from mcdenoise.user_cache import cache_file, keep
@@ -120,7 +120,7 @@ def _timed(size: tuple[int, int], device: str, cache: Path, on_step: Callable[[i
     choices = [
         Choice(model, precision, 0.0)
         for model in pretrained_models()
-        for precision in (PRECISIONS if can_quantize(create_model(model, pretrained=True)) else FLOATS)
+        for precision in precisions_of(create_model(model, pretrained=True))
     ]
     measured = []
     for done, choice in enumerate(choices, start=1):

@@ -19,9 +19,9 @@ from mcdenoise.models import (
     PRECISIONS,
     Output,
     Skipping,
-    can_quantize,
     list_models,
     parts_of,
+    precisions_of,
     pretrained_models,
 )
 from mcdenoise.models._stopwatch import Moment, Stopwatch
@@ -177,8 +177,7 @@ def _variants(method: Method, model: Any, precisions: list[str], keep_all: bool)
         return
     weights = sum(parameter.numel() for parameter in model.parameters()) if isinstance(model, nn.Module) else None
     whole = (False, True) if keep_all and next(parts_of(model, Skipping), None) else (False,)
-    possible = PRECISIONS if can_quantize(model) else FLOATS
-    for precision in possible:
+    for precision in precisions_of(model):
         for everything in whole if precision in precisions else ():
             name = method.name if precision == "float32" else f"{method.name}, {precision}"
             name += KEEP_ALL if everything else ""

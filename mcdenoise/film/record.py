@@ -53,10 +53,7 @@ class FrameRecord:
 
     def line(self) -> str:
         """As JSON, in one line."""
-        found = asdict(self)
-        # What a journal keeps for itself while it is written is no part of a record.
-        found["report"] = {name: value for name, value in found["report"].items() if not name.startswith("_")}
-        return json.dumps(found)
+        return json.dumps(asdict(self))
 
     @classmethod
     def of(cls, line: str) -> FrameRecord | None:

@@ -11,9 +11,9 @@ from mcdenoise.models._precision import (
     FloatPrecision,
     Precision,
     calibrating,
-    can_quantize,
     computing_in,
     fastest_precision,
+    precisions_of,
     quantize,
 )
 from mcdenoise.models._registry import build_model, find_model, list_models, register_model
@@ -68,7 +68,6 @@ __all__ = [
     "as_model",
     "build_model",
     "calibrating",
-    "can_quantize",
     "carried",
     "compared_models",
     "computing_in",
@@ -84,6 +83,7 @@ __all__ = [
     "note",
     "overview",
     "parts_of",
+    "precisions_of",
     "prepared",
     "pretrained_models",
     "quantize",

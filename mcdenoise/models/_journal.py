@@ -77,10 +77,13 @@ class Journal:
     reset: str = ""
     tiles: str = ""
     history: float | None = None
-    _open: list[_Span] = field(default_factory=list, init=False, repr=False, compare=False)
-    _spans: list[_Span] = field(default_factory=list, init=False, repr=False, compare=False)
-    _asked: list[tuple[Tensor, Tell]] = field(default_factory=list, init=False, repr=False, compare=False)
-    _sent: tuple[Tensor, Stopwatch, Moment] | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        # No fields: whoever writes a report down has no use for what it is made from.
+        self._open: list[_Span] = []
+        self._spans: list[_Span] = []
+        self._asked: list[tuple[Tensor, Tell]] = []
+        self._sent: tuple[Tensor, Stopwatch, Moment] | None = None
 
     def note(self, name: str, reason: str, skipped: float = 0.0, *, exact: bool = True) -> None:
         """Add a :class:`Stage`; the last word on each counts."""

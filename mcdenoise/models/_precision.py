@@ -14,11 +14,11 @@ from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from torch import nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.models._interface import Model
 from mcdenoise.models._stopwatch import Stopwatch
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.nn import UNet
 from mcdenoise.nn.int8 import has_int8, integers
 from mcdenoise.reading import read_text
@@ -69,10 +69,9 @@ def fastest_precision(device: torch.device) -> Chosen:
     return Chosen(precision, f"a convolution in bfloat16 takes {1 / ratio:.2f} of the time in float32 here")
 
 
-def can_quantize(model: Model) -> bool:
-    """Whether a model has what :func:`quantize` needs, and this machine too."""
-    unets = _unets(model)
-    return has_int8() and bool(unets) and all(unet.ranges is not None for unet in unets)
+def precisions_of(model: Model) -> tuple[Precision, ...]:
+    """Those in which a model can run on this machine's processor."""
+    return PRECISIONS if has_int8() and _is_calibrated(model) else FLOATS
 
 
 def quantize(model: Model, device: torch.device) -> None:
@@ -86,13 +85,14 @@ def quantize(model: Model, device: torch.device) -> None:
             "precision: expected a processor with dot products of 8-bit integers (VNNI) for int8, found none; "
             "take bfloat16 or float32"
         )
-    if not can_quantize(model):
-        found = "one that is not" if _unets(model) else "one without a U-Net that could be"
+    unets = list(parts_of(model, UNet))
+    if not _is_calibrated(model):
+        found = "one that is not" if unets else "one without a U-Net that could be"
         raise InputError(
             f"precision: expected a model that is calibrated for int8, found {found}; "
             "see `mcdenoise calibrate --help`, or take bfloat16 or float32"
         )
-    for unet in _unets(model):
+    for unet in unets:
         try:
             unet.quantize()
         except ValueError as error:
@@ -106,7 +106,7 @@ def calibrating(model: Model) -> Iterator[None]:
     Raises:
         InputError: it has none.
     """
-    unets = _unets(model)
+    unets = list(parts_of(model, UNet))
     if not unets:
         raise InputError("model: expected one with a U-Net of `mcdenoise.nn`, found none; no other is computed in int8")
     handles = [unet.register_forward_pre_hook(lambda own, given: own.calibrate(*given)) for unet in unets]
@@ -125,8 +125,9 @@ def computing_in(precision: Precision, device: torch.device) -> Iterator[None]:
         yield
 
 
-def _unets(model: Model) -> list[UNet]:
-    return [module for module in model.modules() if isinstance(module, UNet)] if isinstance(model, nn.Module) else []
+def _is_calibrated(model: Model) -> bool:
+    ranges = [unet.ranges for unet in parts_of(model, UNet)]
+    return bool(ranges) and all(each is not None for each in ranges)
 
 
 def _has_bfloat16(device: torch.device) -> bool:

@@ -151,7 +151,7 @@ class UNet(nn.Module):
         return _padded(x, [(side + self.multiple - 1) // self.multiple * self.multiple for side in x.shape[-2:]])
 
     def _beside(self, x: Tensor, coarse: Sequence[Tensor]) -> list[Tensor]:
-        """The same of what each level is given besides."""
+        """The same of what each level is given besides; not in a graph, which knows sizes by its tensors alone."""
         sizes = ([side // (self.stride << level) for side in x.shape[-2:]] for level in range(1, self.levels))
         return [_padded(given, size) for given, size in zip(coarse, sizes, strict=False)]
 

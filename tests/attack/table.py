@@ -73,17 +73,18 @@ def printed(_: Path, out: str) -> object:
 
 def weights(folder: Path, _: str) -> object:
     """Checksum of the tensors."""
-    from safetensors import safe_open
-
-    with safe_open(folder / f"run/{MODEL}.safetensors", framework="pt") as file:
-        return file.metadata()["sha256"]
+    return tensors(folder / f"run/{MODEL}.safetensors")
 
 
 def calibrated(folder: Path, _: str) -> object:
     """Checksum of the tensors, and of the ranges with them."""
+    return tensors(folder / "out.safetensors")
+
+
+def tensors(path: Path) -> object:
     from safetensors import safe_open
 
-    with safe_open(folder / "out.safetensors", framework="pt") as file:
+    with safe_open(path, framework="pt") as file:
         return file.metadata()["sha256"]
 
 
