@@ -6,6 +6,7 @@ import csv
 import functools
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -31,6 +32,7 @@ from mcdenoise.benchmark import (
     parse_sizes,
     run_benchmark,
 )
+from mcdenoise.benchmark.machine import _SPIN, busy_machine
 from mcdenoise.benchmark.memory import peak_memory
 from mcdenoise.benchmark.run import kept_frames
 from mcdenoise.benchmark.scoring import Errors
@@ -275,44 +277,90 @@ def test_nothing_is_left_of_a_run_that_is_interrupted(small_sequence: Path, out:
     assert sorted(out.parent.iterdir()) == before
 
 
+def _spinning() -> list[str]:
+    """States of the processes that keep a core busy."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if folder.joinpath("cmdline").read_bytes().split(b"\0")[-2:-1] == [_SPIN.encode()]:
+                found.append(folder.joinpath("stat").read_text().rpartition(")")[2].split()[0])
+        except OSError:
+            continue
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs the process table of Linux")
 def test_cores_are_kept_busy_while_times_are_measured(small_sequence: Path, out: Path) -> None:
-    def slowly(frame: Frame) -> Tensor:
-        time.sleep(0.2)
+    states: list[list[str]] = []
+
+    def count(frame: Frame) -> Tensor:
+        # The first pass over both frames is not timed. Processes take a moment to start.
+        expected = 0 if len(states) < 2 else 2
+        deadline = time.monotonic() + 20
+        while len(running := [state for state in _spinning() if state == "R"]) < expected:
+            assert time.monotonic() < deadline
+        states.append(running)
         return frame.color
 
-    def run(busy: int) -> tuple[Results, float]:
-        before = os.times().children_user
-        settings = Settings(rounds=1, busy=busy, memory=False)
-        results = run_benchmark(
-            [open_sequence(small_sequence, "0-1")], [scripted("A", slowly)], out / str(busy), settings
-        )
-        return results, os.times().children_user - before
-
-    out.mkdir()
-    quiet, alone = run(0)
-    noted, beside = run(2)
-    # Others start processes, too, which do next to nothing.
-    assert beside > alone + 0.1
-    assert (quiet.notes, noted.notes) == ([], ["measured beside 2 processes, each of which keeps a core busy"])
+    settings = Settings(rounds=1, busy=2, memory=False)
+    results = run_benchmark([open_sequence(small_sequence, "0-1")], [scripted("A", count)], out, settings)
+    assert [len(running) for running in states] == [0, 0, 2, 2]
+    assert results.notes == ["measured beside 2 processes, each of which keeps a core busy"]
+    assert not _spinning()
 
 
-def test_no_core_stays_busy_when_the_benchmark_is_killed() -> None:
+def test_a_command_runs_beside_and_begins_again(small_sequence: Path, out: Path, tmp_path: Path) -> None:
+    def slowly(frame: Frame) -> Tensor:
+        time.sleep(0.5)
+        return frame.color
+
+    ran = tmp_path / "ran"
+    command = shlex.join([sys.executable, "-I", "-S", "-c", f"open({str(ran)!r}, 'a').write('x')"])
+    settings = Settings(rounds=2, beside=command, memory=False)
+    results = run_benchmark([open_sequence(small_sequence, "0-1")], [scripted("A", slowly)], out, settings)
+    assert len(ran.read_text()) > 1
+    assert results.notes == [f"measured beside: {command}"]
+
+
+def test_a_command_that_does_not_exist_or_fails_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--beside: expected a command, found 'no-such-program'"):
+        busy_machine(0, "no-such-program -x").__enter__()
+    failed = tmp_path / "failed"
+    command = [sys.executable, "-I", "-S", "-c", f"open({str(failed)!r}, 'w'); raise SystemExit(3)"]
+    machine = busy_machine(0, shlex.join(command))
+    machine.__enter__()
+    while not failed.exists():
+        time.sleep(0.05)
+    time.sleep(2)
+    with pytest.raises(InputError, match="found status 3; run it by itself"):
+        machine.__exit__(None, None, None)
+
+
+def test_nothing_stays_busy_when_the_benchmark_is_killed(tmp_path: Path) -> None:
+    written = tmp_path / "pid"
+    command = shlex.join(
+        [
+            sys.executable,
+            "-I",
+            "-S",
+            "-c",
+            f"import os, time; open({str(written)!r}, 'w').write(str(os.getpid())); time.sleep(60)",
+        ]
+    )
     code = (
-        "import os, subprocess\n"
-        "from mcdenoise.benchmark.machine import busy_cores\n"
-        "started = []\n"
-        "popen = subprocess.Popen\n"
-        "subprocess.Popen = lambda *a, **k: started.append(popen(*a, **k)) or started[-1]\n"
-        "with busy_cores(1):\n"
-        "    print(started[0].pid, flush=True)\n"
+        "import os, sys, time\n"
+        "from mcdenoise.benchmark.machine import busy_machine\n"
+        "with busy_machine(0, sys.argv[1]):\n"
+        "    while not os.path.exists(sys.argv[2]) or not os.path.getsize(sys.argv[2]):\n"
+        "        time.sleep(0.05)\n"
         "    os._exit(9)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    done = subprocess.run([sys.executable, "-c", code, command, str(written)])
     assert done.returncode == 9
     deadline = time.monotonic() + 20
     while True:
         try:
-            os.kill(int(done.stdout), 0)
+            os.kill(int(written.read_text()), 0)
         except ProcessLookupError:
             break
         assert time.monotonic() < deadline

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import platform
+import shlex
+import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -20,6 +23,20 @@ from mcdenoise.interruption import deaf_children
 from mcdenoise.results import Machine
 
 _PACKAGES = ("torch", "kornia", "numpy", "openimageio", "pyoidn", "flip-evaluator")
+# Keeps a core busy.
+_SPIN = "while True: sum(range(100_000))"
+# Runs a command again and again, until it fails or the process that asked for it is gone, however that ended.
+_REPEAT = """
+import os, signal, subprocess, sys, time
+command = None
+while os.getppid() == int(sys.argv[1]):
+    if command is None or command.poll() == 0:
+        command = subprocess.Popen(sys.argv[2:])
+    if command.poll():
+        sys.exit(command.returncode % 256)
+    time.sleep(0.05)
+os.killpg(0, signal.SIGKILL)
+"""
 _CGROUP = Path("/sys/fs/cgroup")
 
 
@@ -43,19 +60,44 @@ def fix_threads(threads: int) -> None:
 
 
 @contextmanager
-def busy_cores(count: int) -> Iterator[None]:
-    """Keep cores busy meanwhile, as a renderer beside this process does: a process for each, which never waits."""
-    # One that is left over, whatever became of this process, ends by itself.
-    code = f"import os\nwhile os.getppid() == {os.getpid()}:\n    sum(range(100_000))"
+def busy_machine(cores: int, command: str = "") -> Iterator[None]:
+    """Run other processes meanwhile: some that each keep a core busy, and a command, which begins again when it ends.
+
+    Args:
+        cores: processes that never wait.
+        command: as a shell splits it; its output is dropped. Empty for none.
+
+    Raises:
+        InputError: the command does not exist, or ended with a status other than 0.
+    """
+    arguments = shlex.split(command)
+    if arguments and shutil.which(arguments[0]) is None:
+        raise InputError(f"--beside: expected a command, found '{arguments[0]}', which is no program; give its path")
+    commands = [[sys.executable, "-I", "-S", "-c", _SPIN]] * cores + ([arguments] if arguments else [])
     started: list[subprocess.Popen[bytes]] = []
     try:
-        for _ in range(count):
+        for each in commands:
             with deaf_children():
-                started.append(subprocess.Popen([sys.executable, "-I", "-S", "-c", code]))
+                started.append(
+                    subprocess.Popen(
+                        [sys.executable, "-I", "-S", "-c", _REPEAT, str(os.getpid()), *each],
+                        stdin=subprocess.DEVNULL,
+                        stdout=subprocess.DEVNULL,
+                        stderr=subprocess.DEVNULL,
+                        start_new_session=True,
+                    )
+                )
         yield
+        for process in started:
+            if process.poll() is not None:
+                raise InputError(
+                    f"--beside: expected a command that goes on or ends with status 0, found status "
+                    f"{process.returncode}; run it by itself to see why"
+                )
     finally:
         for process in started:
-            process.kill()
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
             process.wait()
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from mcdenoise.benchmark.machine import busy_cores, check_device, describe_machine, fix_threads
+from mcdenoise.benchmark.machine import busy_machine, check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.memory import Peaks
 from mcdenoise.benchmark.methods import Timed, make_method, one_line
 from mcdenoise.benchmark.scoring import Errors
@@ -45,6 +45,7 @@ class Settings:
         rounds: how often each method denoises each frame, and an image of each size, without warming up; with 0, errors
             are all that is measured.
         busy: cores that other processes keep busy while times are measured.
+        beside: a command that runs meanwhile, again and again.
         threads: of torch, of methods that do not ask torch, and of reading and writing EXRs.
         device: ``"cpu"`` or ``"cuda"``.
         sizes: widths and heights for the cost over pixels, see :func:`mcdenoise.benchmark.parse_sizes`.
@@ -61,6 +62,7 @@ class Settings:
 
     rounds: int = 3
     busy: int = 0
+    beside: str = ""
     threads: int = 1
     device: str = "cpu"
     sizes: tuple[Size, ...] = ()
@@ -77,6 +79,11 @@ class Settings:
                 option = name.replace("_", "-")
                 raise InputError(f"--{option}: expected at least {least}, found {getattr(self, name)}")
         check_device(self.device)
+
+    @property
+    def load(self) -> tuple[int, str]:
+        """What runs while times are measured, as :func:`mcdenoise.benchmark.machine.busy_machine` takes it."""
+        return self.busy, self.beside
 
 
 def run_benchmark(
@@ -136,7 +143,7 @@ def run_benchmark(
             skipped |= run.errors.skipped
             scenes.append(scene)
             cells += own
-        with busy_cores(settings.busy if sizes else 0):
+        with busy_machine(*(settings.load if sizes else (0, ""))):
             costs, fits = measure_sizes(
                 [method for method in made.methods if method.model != _NOTHING],
                 made.denoisers,
@@ -149,6 +156,8 @@ def run_benchmark(
         notes = [f"{name} is skipped where it cannot be computed: {reason}" for name, reason in skipped.items()]
         if settings.busy:
             notes.insert(0, f"measured beside {settings.busy} processes, each of which keeps a core busy")
+        if settings.beside:
+            notes.insert(0, f"measured beside: {settings.beside}")
         results = Results(
             command=settings.command,
             created=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -221,7 +230,7 @@ class _SceneRun:
         """The scene, and a cell for each method that is not missing."""
         try:
             self._warm_up(on_step)
-            with busy_cores(self._settings.busy):
+            with busy_machine(*self._settings.load):
                 for _ in range(self._settings.rounds):
                     self._round(on_step)
         except InputError as error:

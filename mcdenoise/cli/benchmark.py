@@ -32,6 +32,7 @@ def benchmark(
     rounds: int | None = None,
     threads: int | None = None,
     busy: int = 0,
+    beside: str = "",
     device: str = "cpu",
     sizes: str = SIZES,
     pictures: int = 4,
@@ -67,6 +68,7 @@ def benchmark(
         rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.
         threads: CPU threads of all methods; torch's choice by default.
         busy: cores that other processes keep busy while times are measured, as a renderer beside a denoiser does.
+        beside: a command that runs while times are measured, such as a rendering; it begins again when it ends.
         device: cpu or cuda.
         sizes: sizes of random images whose cost alone is measured, such as 1280x720,3840x2160, or none.
         pictures: number of frames of each scene whose images are kept.
@@ -129,6 +131,7 @@ def benchmark(
         rounds=rounds,
         threads=threads,
         busy=busy,
+        beside=beside,
         device=device,
         sizes=tuple(parse_sizes(sizes)),
         pictures=pictures,
@@ -143,6 +146,7 @@ def benchmark(
             rounds=rounds,
             threads=threads,
             busy=busy or None,
+            beside=beside or None,
             device=device,
             sizes=sizes,
             pictures=pictures,
