@@ -1,7 +1,7 @@
 """Time whole processes side by side: one frame from EXR to EXR, with this package and with Open Image Denoise.
 
     python examples/start_up.py
-    python examples/start_up.py --size 640x360 --rounds 9 --model cascaded_v2_tiny --precision float32
+    python examples/start_up.py --size 640x360 --rounds 9 --model cascaded_v2_tiny --precisions auto,int8
 
 Every round starts each process once, one after the other, so that whatever else the machine does hits all alike; the
 first round, in which files come from the disk and kernels are compiled, is not counted. Prints the median and the
@@ -77,7 +77,7 @@ def seconds(command: list[str]) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--model", default="cascaded_v2_tiny")
-    parser.add_argument("--precision", default="float32", choices=["float32", "bfloat16"])
+    parser.add_argument("--precisions", default="auto,float32", help="of mcdenoise, separated by commas")
     parser.add_argument("--quality", default="balanced", choices=["fast", "balanced", "high"], help="of the peer")
     parser.add_argument("--size", default="1280x720", metavar="WxH")
     parser.add_argument("--threads", type=int, default=2)
@@ -100,10 +100,13 @@ def main() -> None:
         commands = {
             f"pyoidn, {options.quality}": [sys.executable, "-c", PEER, *peer, "as it is"],
             f"pyoidn, {options.quality}, without torch": [sys.executable, "-c", PEER, *peer, "without torch"],
-            f"mcdenoise denoise, {options.model}, {options.precision}": [
-                *(sys.executable, "-m", "mcdenoise", *own),
-                *("--precision", options.precision, "--threads", threads),
-            ],
+            **{
+                f"mcdenoise denoise, {options.model}, {precision}": [
+                    *(sys.executable, "-m", "mcdenoise", *own),
+                    *("--precision", precision, "--threads", threads),
+                ]
+                for precision in options.precisions.split(",")
+            },
             "import torch": [sys.executable, "-c", "import torch"],
         }
         times: dict[str, list[float]] = {name: [] for name in commands}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import inspect
 import json
 import os
@@ -18,9 +19,11 @@ import numpy as np
 import pytest
 import torch
 
+from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.cli import COMMANDS, load_command, main
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data import open_sequence, read_exr, write_exr
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.models import compared_models, create_model, list_models, pretrained_models, save_weights
 from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
 from mcdenoise.shot import ShotSettings
@@ -813,3 +816,27 @@ def test_a_json_may_lie_in_the_folder_that_the_command_makes(small_sequence: Pat
         main(["denoise", str(small_sequence), "-o", str(out), "--model", "noisy", "--json", str(out / "times.json")])
     assert stop.value.code == 0
     assert json.loads((out / "times.json").read_text())["model"] == "noisy"
+
+
+@pytest.mark.parametrize(
+    ("frames", "loaded"), [(1, "[]"), (2, "['numba']")], ids=["a still starts without it", "a sequence pays for it"]
+)
+def test_a_small_still_is_denoised_without_loading_the_compiler(tmp_path: Path, frames: int, loaded: str) -> None:
+    if importlib.util.find_spec("numba") is None:
+        pytest.skip("needs numba: pip install 'mcdenoise[fast]'")
+    # Images of fewer pixels are never worth a compiled kernel.
+    width, height = 128, 80
+    for number in range(frames):
+        write_bmfr_frame(tmp_path / "frames", number, synthetic_frame(width, height))
+    code = (
+        "import sys\n"
+        "from mcdenoise.cli import main\n"
+        "try:\n"
+        "    main(sys.argv[1:])\n"
+        "finally:\n"
+        "    print(sorted({'kornia', 'numba'} & set(sys.modules)))"
+    )
+    command = ["denoise", str(tmp_path / "frames"), "-o", str(tmp_path / "out")]
+    arguments = [*command, "--model", "cascaded_v2_micro", "--precision", "float32"]
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, [loaded]), done.stderr
