@@ -17,6 +17,7 @@ from mcdenoise.suite import (
     SHOWN,
     Stage,
     choose_rows,
+    error_against_time,
     error_lines,
     markdown,
     open_row,
@@ -36,6 +37,7 @@ def score_suite(
     settings: Settings,
     patterns: str | None,
     models: str | None,
+    precisions: str,
     blender_python: Path | None,
     *,
     render: bool,
@@ -46,7 +48,7 @@ def score_suite(
     if out is None and not render:
         raise InputError("--out: expected a folder to write to with --no-render, found none; give one with -o")
     # What is wrong with the methods is said before hours of rendering.
-    methods = choose_methods(f"{models or DEFAULT},{PEERS}", precisions="float32", baselines=("noisy",))
+    methods = choose_methods(f"{models or DEFAULT},{PEERS}", precisions=precisions, baselines=("noisy",))
     if out is not None:
         check_packages()
     with progress_bar() as progress:
@@ -76,7 +78,7 @@ def score_suite(
             on_step=lambda done, total: progress.update(task, completed=done, total=total),
         )
     lines, curves = suite_lines(results, found), error_lines(results, found)
-    text = markdown(lines, curves)
+    text = markdown(lines, curves, *error_against_time(results, found))
     write_text(out / "suite.md", text)
     content = {"lines": [asdict(line) for line in lines], "curves": [asdict(line) for line in curves]}
     write_json(out / "suite.json", content)

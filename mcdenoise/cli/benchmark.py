@@ -27,7 +27,7 @@ def benchmark(
     sequences: tyro.conf.Positional[list[Path]] = [],  # noqa: B006 - tyro reads it
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None,
     models: str | None = None,
-    precisions: str = "float32,bfloat16",
+    precisions: str | None = None,
     frames: str | None = None,
     rounds: int | None = None,
     threads: int | None = None,
@@ -63,7 +63,8 @@ def benchmark(
             "oidn(quality=fast|high)"; weights files; file.py:factory; "pretrained" for all with shipped weights; "all"
             for every name there is, saying which have no weights yet; or none. By default those with shipped weights,
             filters, and other denoisers. Doing nothing and accumulation alone are always there.
-        precisions: precisions of the convolutions of models that learn: float32, bfloat16, and int8 where calibrated.
+        precisions: precisions of the convolutions of models that learn: float32, bfloat16, and int8 where calibrated;
+            float32,bfloat16 by default, with --suite float32.
         frames: frames of each sequence to denoise, such as 0-59,70; all by default.
         rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.
         threads: CPU threads of all methods; torch's choice by default.
@@ -91,7 +92,16 @@ def benchmark(
             raise InputError("--suite: expected neither folders of sequences nor --ops beside it, found one")
         if data is None:
             raise InputError("--data: expected the folder of the suite's frames, found none; give one")
-        command = _command_line("benchmark", suite=suite, data=data, rows=rows, models=models, threads=threads, out=out)
+        command = _command_line(
+            "benchmark",
+            suite=suite,
+            data=data,
+            rows=rows,
+            models=models,
+            precisions=precisions,
+            threads=threads,
+            out=out,
+        )
         settings = Settings(
             rounds=1 if rounds is None else rounds,
             threads=threads,
@@ -101,7 +111,9 @@ def benchmark(
             memory=False,
             command=command,
         )
-        return score_suite(data, out, settings, rows, models, blender_python, render=render, json=json)
+        return score_suite(
+            data, out, settings, rows, models, precisions or "float32", blender_python, render=render, json=json
+        )
     if ops == bool(sequences):
         raise InputError("expected the folders of sequences, or --ops, and not both; see `mcdenoise benchmark --help`")
     rounds = rounds if rounds is not None else 5 if ops else 3
@@ -127,6 +139,7 @@ def benchmark(
         raise InputError("--out: expected a folder to write to, found none; give one with -o")
     if rounds < 1:
         raise InputError(f"--rounds: expected at least 1, found {rounds}")
+    precisions = precisions or "float32,bfloat16"
     settings = Settings(
         rounds=rounds,
         threads=threads,

@@ -3,17 +3,29 @@
 from mcdenoise.suite.close_ups import write_close_ups
 from mcdenoise.suite.rendering import Stage, open_row, render_suite, rows_there
 from mcdenoise.suite.rows import SHOTS, Row, Shot, choose_rows
-from mcdenoise.suite.tables import PEERS, SHOWN, Line, error_lines, markdown, sample_curves, suite_lines
+from mcdenoise.suite.tables import (
+    PEERS,
+    SHOWN,
+    Line,
+    MethodMean,
+    error_against_time,
+    error_lines,
+    markdown,
+    sample_curves,
+    suite_lines,
+)
 
 __all__ = [
     "PEERS",
     "SHOTS",
     "SHOWN",
     "Line",
+    "MethodMean",
     "Row",
     "Shot",
     "Stage",
     "choose_rows",
+    "error_against_time",
     "error_lines",
     "markdown",
     "open_row",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from statistics import geometric_mean
 
 from mcdenoise.evaluate import METRICS
 from mcdenoise.results import Cell, Method, Results
@@ -112,6 +112,60 @@ def _shown(cell: Cell) -> dict[str, float]:
     return {name: cell.errors[name] for name in SHOWN if name in cell.errors}
 
 
+@dataclass(frozen=True)
+class MethodMean:
+    """What a method costs and leaves wrong, in the mean of rows.
+
+    Args:
+        method: its name.
+        error: geometric mean of its SMAPE over that of the noisy input.
+        milliseconds: geometric mean of its times a frame.
+        beaten_by: a method that is neither slower nor worse; empty for those on the Pareto front.
+    """
+
+    method: str
+    error: float
+    milliseconds: float
+    beaten_by: str = ""
+
+
+def error_against_time(results: Results, rows: Iterable[Row]) -> tuple[list[MethodMean], int]:
+    """Each method in the mean of the rows of the table, fastest first, and how many rows these are.
+
+    A method without any result is skipped; a row counts where all others have an error and a time.
+    """
+    names = [
+        method.name
+        for method in results.methods
+        if method.kind != "baseline" and any(cell.method == method.name and not cell.failure for cell in results.cells)
+    ]
+    points: list[dict[str, tuple[float, float]]] = []
+    for row in rows:
+        found = {name: point for name in names if (point := _point(results, row, name)) is not None}
+        if not row.shot.curve and len(found) == len(names):
+            points.append(found)
+    means: list[MethodMean] = []
+    for name in names if points else ():
+        errors, times = zip(*(point[name] for point in points), strict=True)
+        means.append(MethodMean(name, geometric_mean(errors), geometric_mean(times)))
+    means.sort(key=lambda mean: (mean.milliseconds, mean.error))
+    for i, mean in enumerate(means):
+        best = min(means[:i], key=lambda other: other.error, default=mean)
+        if best.error <= mean.error and best is not mean:
+            means[i] = replace(mean, beaten_by=best.method)
+    return means, len(points)
+
+
+def _point(results: Results, row: Row, method: str) -> tuple[float, float] | None:
+    """Error over that of the noisy input, and milliseconds."""
+    noisy, cell = _cell(results, row, "noisy"), _cell(results, row, method)
+    if noisy is None or cell is None or cell.computing is None:
+        return None
+    if SMAPE not in cell.errors or not noisy.errors.get(SMAPE):
+        return None
+    return cell.errors[SMAPE] / noisy.errors[SMAPE], cell.computing.median
+
+
 def _milliseconds(cell: Cell) -> float | None:
     return None if cell.computing is None else cell.computing.median
 
@@ -126,9 +180,19 @@ def _best(results: Results, row: Row, peers: list[Method]) -> dict[str, Best]:
     return found
 
 
-def markdown(lines: list[Line], curves: list[Line]) -> str:
-    """The tables as text: one for each model with its wins and losses, and one of error over samples."""
+def markdown(lines: list[Line], curves: list[Line], means: Sequence[MethodMean] = (), counted: int = 0) -> str:
+    """The tables as text: error against time, one for each model with its wins and losses, and error over samples.
+
+    Args:
+        lines: see :func:`suite_lines`.
+        curves: see :func:`error_lines`.
+        means: see :func:`error_against_time`.
+        counted: rows that these are means of.
+    """
     parts = []
+    if means:
+        about = f"SMAPE over that of the noisy input, and milliseconds a frame: geometric means of {counted} rows."
+        parts += ["## Error against time", "", about, "", *_means_table(means), ""]
     for model in dict.fromkeys(line.model for line in lines):
         own = [line for line in lines if line.model == model]
         parts += [f"## {model}", "", *_table(own), "", *(f"- {each}" for each in verdict(own)), ""]
@@ -164,8 +228,9 @@ def verdict(lines: list[Line]) -> list[str]:
             text = f"{metric}: ahead of OIDN's best setting in {len(both) - len(behind)} of {len(both)} rows"
             said.append(text + (f"; behind in {'; '.join(behind)}" if behind else ""))
     ratios = [line.values[SMAPE] / line.best[SMAPE].value for line in judged]
-    mean = math.exp(sum(map(math.log, ratios)) / len(ratios))
-    said.append(f"SMAPE over that of OIDN's best setting, geometric mean of {len(ratios)} rows: {mean:.3f}")
+    said.append(
+        f"SMAPE over that of OIDN's best setting, geometric mean of {len(ratios)} rows: {geometric_mean(ratios):.3f}"
+    )
     unclear = [
         line.row for line in judged if line.reference_noise and line.reference_noise > _NOISY * line.best[SMAPE].value
     ]
@@ -190,6 +255,22 @@ def _table(lines: list[Line]) -> list[str]:
         "reference",
     ]
     return _rows(heads, ([line.row, *_figures(line)] for line in lines))
+
+
+def _means_table(means: Sequence[MethodMean]) -> list[str]:
+    heads = ["method", "SMAPE", "ms", "on the Pareto front"]
+    return _rows(
+        heads,
+        (
+            [
+                mean.method,
+                _number(mean.error, ".4f"),
+                _number(mean.milliseconds, ".0f"),
+                f"no: {mean.beaten_by}" if mean.beaten_by else "yes",
+            ]
+            for mean in means
+        ),
+    )
 
 
 def _figures(line: Line) -> list[str]:

@@ -22,6 +22,7 @@ from mcdenoise.suite import (
     Row,
     Shot,
     choose_rows,
+    error_against_time,
     error_lines,
     markdown,
     open_row,
@@ -240,6 +241,27 @@ def test_each_row_is_against_the_best_setting_of_that_row() -> None:
     assert said[2] == "SMAPE over that of OIDN's best setting, geometric mean of 2 rows: 1.000"
     text = markdown([first, second], [])
     assert "| a | 0.1000 | 0.2000 | 0.500 | 90.00 | 80.00 |  |  | 7 | 7 | (quality=fast) | 0.0100 |" in text
+
+
+def test_error_against_time_is_of_rows_that_all_have_and_names_who_is_beaten() -> None:
+    results, rows = _results([0.1, 0.2, 0.05], [0.2, 0.2, 0.1], [0.1, 0.4, 0.1])
+    times = {"noisy": 1.0, "ours": 10.0, "oidn(quality=fast)": 5.0, "oidn(quality=high)": 40.0}
+    results.cells[:] = [
+        dataclasses.replace(cell, computing=Spread(times[cell.method], 0, 0, 1))
+        for cell in results.cells
+        if (cell.scene, cell.method) != ("c", "ours")
+    ]
+    means, counted = error_against_time(results, rows)
+    assert counted == 2
+    assert [(each.method, each.milliseconds, each.beaten_by) for each in means] == [
+        ("oidn(quality=fast)", pytest.approx(5), ""),
+        ("ours", pytest.approx(10), ""),
+        ("oidn(quality=high)", pytest.approx(40), "ours"),
+    ]
+    # Of the noisy input's 0.5: 0.2 and 0.4.
+    assert means[1].error == pytest.approx((0.2 * 0.4) ** 0.5)
+    assert "| oidn(quality=high) | 0.4000 | 40 | no: ours |" in markdown([], [], means, counted)
+    assert error_against_time(results, []) == ([], 0)
 
 
 def test_a_reference_with_much_of_the_error_is_named() -> None:
