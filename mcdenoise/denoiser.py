@@ -272,7 +272,7 @@ class Denoiser:
                 report.tiles = self._tiles.divide(self._shot(frame))
             noisy = frame.color
             precision = computing_in(self.precision, self.device)
-            with precision, self._explained(dtype), timed("model", self.device, unless_told=True):
+            with precision, self._explained(dtype), timed("model", self.device, unless_detailed=True):
                 output, state = checked_step(self.model, frame, self._state, self._shape)
             with timed("validate", self.device):
                 # A renderer may write its next frame into the same buffers, and a user change an image in place.
