@@ -25,12 +25,12 @@ _PAGES = {
 
 
 def __getattr__(name: str) -> Any:
-    # torch is imported by whoever uses it first: a command first decides how its threads wait, which cannot be changed
-    # later, and what needs no torch starts at once.
+    # Import torch only when it is used: a command has to decide first how threads wait, and commands without torch
+    # start at once.
     if name == "ops":
         return importlib.import_module("mcdenoise.ops")
     if name == "__version__":
-        # Looking it up takes longer than all else here.
+        # Looking up the version takes longer than everything else here.
         return importlib.import_module("importlib.metadata").version("mcdenoise")
     if name not in _PAGES:
         raise AttributeError(f"module 'mcdenoise' has no attribute '{name}'")

@@ -1,4 +1,4 @@
-"""Which model to take, so that a frame takes no longer, or is no worse, than was asked for on this machine."""
+"""Choosing a model that meets a time budget or an error limit on this machine."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from mcdenoise.results import Results
 from mcdenoise.user_cache import cache_file, keep
 
 _ROUNDS = 3
-# Frames with a reference that errors are measured on, and frames before the first of them.
+# Number of frames with a reference on which errors are measured, and of frames before the first of them.
 _SCORED = 4
 _HISTORY = 8
 
 
 @dataclass(frozen=True)
 class Choice:
-    """A model that could be taken.
+    """A candidate model.
 
     Args:
-        model: its name.
-        precision: of its convolutions.
-        milliseconds: of a frame in memory on this machine, measured with everything kept.
-        error: SMAPE of scene-linear radiance, where it is known.
+        model: name of the model.
+        precision: precision of its convolutions.
+        milliseconds: run time per frame in memory on this machine, with nothing skipped.
+        error: SMAPE of scene-linear radiance; ``None`` if it is unknown.
     """
 
     model: str
@@ -46,7 +46,7 @@ class Choice:
 
     @property
     def name(self) -> str:
-        """As a benchmark calls it."""
+        """Name in a benchmark."""
         return self.model if self.precision == "float32" else f"{self.model}, {self.precision}"
 
     def __str__(self) -> str:
@@ -64,23 +64,23 @@ def choose_model(
     cache: Path | None = None,
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Choice:
-    """The cheapest shipped model and precision with an error no larger than ``max_error``, if that is given.
+    """Choose the fastest shipped model and precision with an error of at most ``max_error``, if that is given.
 
-    With a budget alone it is the model with the least error of those that keep to it; where no errors are known, the
-    slowest of them, which does most.
+    With a budget alone, choose the smallest error among the models within the budget. If no errors are known, choose
+    the slowest of these models, which usually has the best quality.
 
     Args:
-        sequence: what is to be denoised.
-        budget: milliseconds a frame, without reading and writing files.
+        sequence: the sequence to denoise.
+        budget: milliseconds per frame, without reading and writing files.
         max_error: SMAPE of scene-linear radiance.
-        results: folder of a finished benchmark, whose errors (mean over its scenes) are taken; without it they are
+        results: folder of a finished benchmark, whose errors (mean over its scenes) are used; without it errors are
             measured on the last frames of the sequence that have a reference.
-        device: where to run.
-        cache: file of run times that were measured earlier; by default ``run_times.json`` in the user's cache folder.
-        on_step: called with the number of models that were measured, and that of all of them.
+        device: device to run on.
+        cache: file of earlier run times; by default ``run_times.json`` in the user's cache folder.
+        on_step: called with the number of measured models and the number of all models.
 
     Raises:
-        InputError: no model meets what is asked for, or no errors are known and ``max_error`` is given.
+        InputError: no model meets the limits, or ``max_error`` is given and no errors are known.
     """
     for name, value in (("--budget-ms", budget), ("--max-error", max_error)):
         if value is not None and not value > 0:
@@ -111,7 +111,7 @@ def choose_model(
 
 
 def _timed(size: tuple[int, int], device: str, cache: Path, on_step: Callable[[int, int], None]) -> list[Choice]:
-    """All shipped models in all precisions, the fastest first."""
+    """All shipped models in all precisions, fastest first."""
     height, width = size
     machine = f"{platform.node()}, {platform.machine()}, {device}, {torch.get_num_threads()} threads"
     key = f"{machine}, mcdenoise {version('mcdenoise')}, torch {torch.__version__}, {width}x{height}"
@@ -166,7 +166,7 @@ def _with_errors(choices: list[Choice], sequence: Sequence, results: Path | None
 
 
 def _error(choice: Choice, sequence: Sequence, device: str) -> float:
-    """On the last frames that have a reference, with a history."""
+    """Error on the last frames that have a reference, with a history."""
     scored = sequence.reference_numbers[-_SCORED:]
     numbers = [number for number in sequence.numbers if scored[0] - _HISTORY <= number <= scored[-1]]
     denoiser = Denoiser(choice.model, precision=choice.precision, device=device)

@@ -1,4 +1,4 @@
-"""The commit of the source tree, for records of what computed something."""
+"""The commit of the source tree, recorded with results."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 
 
 def source_commit() -> str:
-    """The commit of the source tree, with ``-dirty`` where files differ from it; ``"unknown"`` outside a checkout."""
+    """The commit of the source tree, with ``-dirty`` if files differ from it; ``"unknown"`` outside a checkout."""
     source = Path(__file__)
     try:
-        # An installed package may lie inside somebody else's checkout.
+        # An installed package may lie inside the checkout of another project.
         _git(source.parent, "ls-files", "--error-unmatch", source.name)
         return _git(source.parent, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
     except (OSError, subprocess.CalledProcessError):

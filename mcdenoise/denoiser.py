@@ -1,4 +1,4 @@
-"""Streaming denoising: a frame in, a clean image out; and a still, from arrays to an array."""
+"""Denoising frame by frame, with a history; and denoising of a single image from arrays to an array."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
 
 @dataclass
 class FrameReport(Journal):
-    """What happened to one frame.
+    """Report of one frame.
 
     Args:
-        precision: why the convolutions run in the precision that they run in.
-        replaced_pixels: pixels of the noisy color that were NaN, infinite, negative or above 1e16.
-        missing: buffers that the method is better with and the frame has not.
-        beside: milliseconds of what is done while another frame is denoised: read, write.
+        precision: the reason for the precision of the convolutions.
+        replaced_pixels: number of pixels of the noisy color that were NaN, infinite, negative or above 1e16.
+        missing: buffers that would improve the result and that the frame lacks.
+        beside: milliseconds of work that overlaps with denoising another frame: read, write.
     """
 
     precision: str = ""
@@ -60,39 +60,41 @@ class FrameReport(Journal):
 
 
 class Denoiser:
-    """Denoises the frames of a shot one after the other: checks each, keeps the state of the method, and measures.
+    """Denoises the frames of a shot one after the other, and keeps the method's state.
 
     Args:
-        model: a model's name in the zoo (its shipped weights are loaded), ``path/to/file.py:factory`` or
-            ``package.module:factory`` of your own, a :class:`mcdenoise.models.Model`, or a module or function that
-            takes images by the names of buffers, see :class:`mcdenoise.models.FromBuffers`. A module of yours is moved
-            to the device, made channels-last and put into evaluation mode.
+        model: the name of a model in the zoo (its shipped weights are loaded), your own ``path/to/file.py:factory`` or
+            ``package.module:factory``, a :class:`mcdenoise.models.Model`, or a module or function whose parameters are
+            named like buffers, see :class:`mcdenoise.models.FromBuffers`. A module of yours is moved to the device,
+            made channels-last and put into evaluation mode.
         weights: a safetensors file of other weights for a model given by name.
-        device: where to run; frames may come from anywhere and images stay here.
-        precision: of convolutions; everything else stays in float32. ``"bfloat16"`` is about twice as fast on
-            processors that compute with it. ``"auto"`` takes it for a model of the zoo that learns, where it pays on
-            this machine (see :func:`mcdenoise.models.fastest_precision`), and float32 otherwise: for a model of yours,
-            and where ``differentiable``. ``"int8"`` computes the U-Nets of a model that is calibrated for it in 8-bit
-            integers, on processors with dot products of these; what that costs is in docs/performance.md. The attribute
-            ``precision`` is the one that runs, the report says why.
-        keep_all: skip nothing, whether a scene needs it or not.
-        tile: compute tiles of at most so many pixels a side, a multiple of 32 from 64 on. The result is that of the
-            whole image, up to the rounding of convolutions; the margins that tiles share cost time. By default they are
-            as large as memory allows, and an image is in one piece where that takes no more than 2 GB (on a GPU: 0.4 of
-            its memory) for a network's features, whatever is free: the same frames give the same images.
-        max_memory: of the process on a CPU, or else of what torch holds on the device, in GB of 1e9 bytes. Tiles are
-            so small that all keeps below it: what is there when the denoiser is made, the images of a frame and those
-            of the history. Frames that you keep, beside the one that is denoised, are your own.
-        differentiable: keep the graph, through the state too, so that ``backward`` reaches every earlier frame of the
-            shot. Decisions are held fixed: which pixels have a history, how much of one is given up, the exposure. The
-            images are the same. Frames of float64 are computed in float64 where the weights are, too.
-        alpha: denoise the alpha of frames, too, with the kernels of the color; a method without kernels keeps it, and
+        device: device to run on. Frames may come from any device; images are returned on this one.
+        precision: precision of convolutions; everything else stays in float32. ``"bfloat16"`` is about twice as fast on
+            processors that support it. ``"auto"`` chooses it for a trained model of the zoo if it is faster on this
+            machine (see :func:`mcdenoise.models.fastest_precision`), and float32 otherwise: for a model of yours, and
+            with ``differentiable``. ``"int8"`` computes the U-Nets of a calibrated model in 8-bit integers, on
+            processors with 8-bit dot products; docs/performance.md measures the loss of quality. The attribute
+            ``precision`` holds the chosen precision, and the report the reason.
+        keep_all: skip nothing, even if the scene does not need it.
+        tile: largest side of a tile in pixels, a multiple of 32 that is at least 64. The result is that of the whole
+            image, up to the rounding of convolutions; overlapping margins cost time. By default tiles are as large as
+            memory allows, and the image is not tiled if a network's features take no more than 2 GB (on a GPU: 0.4 of
+            its memory). This does not depend on the free memory: the same frames give the same images.
+        max_memory: maximum memory in GB of 1e9 bytes: of the process on a CPU, otherwise of torch's allocations on the
+            device. Tiles are made small enough to keep below it everything in memory when the denoiser is created, the
+            images of a frame, and those of the history. It does not include frames that you keep, except the current
+            one.
+        differentiable: keep the autograd graph, also through the state, so that ``backward`` reaches every earlier
+            frame of the shot. Decisions are treated as constants: which pixels have a history, how much history is
+            discarded, and the exposure. The images do not change. Frames of float64 are computed in float64 if the
+            weights are, too.
+        alpha: also denoise the alpha of frames, with the kernels of the color; a method without kernels keeps it, and
             the report says so.
-        settings: for the model's constructor, such as ``alpha_min=0.2``; see the model's own page.
+        settings: arguments for the model's constructor, such as ``alpha_min=0.2``; see the model's own page.
 
     Raises:
-        InputError: the model is unknown, has no weights or no such setting, the device is not there, the precision is
-            unknown, the tiles or the memory are no such number, or the model computes no tiles.
+        InputError: the model is unknown, has no weights or no such setting, the device is not available, the precision
+            is unknown, ``tile`` or ``max_memory`` is invalid, or the model cannot be computed in tiles.
 
     Example:
         >>> denoiser = Denoiser("cascaded_v2_micro")
@@ -144,7 +146,7 @@ class Denoiser:
                 raise InputError("precision: expected float32 or bfloat16 with differentiable, found int8")
             quantize(self.model, self.device)
         self._report = FrameReport()
-        # Set by who never writes into a frame again that was handed over: then nothing of it is copied.
+        # Set by a caller that never writes into a frame again after passing it: then no buffer is copied.
         self.frames_stay = False
         self._tiles = Division(self.model, tile, max_memory, self.device, bfloat16=self.precision != "float32")
         self.reset()
@@ -165,17 +167,18 @@ class Denoiser:
         size: tuple[int, int] | None = None,
         layers: int = 0,
     ) -> None:
-        """Forget the history: the next frame is the first of a shot. A cut and a change of size do so by themselves.
+        """Discard the history: the next frame begins a shot. A cut and a change of size do this automatically.
 
         Args:
-            buffers: names of the buffers that every frame of the shot will have, where that is known.
-            frames: how many frames there will be, where that is known.
-            size: their height and width, where that and the buffers are known. Then ``has_room_ahead`` says whether
-                there is memory to read the next frame while one is denoised.
-            layers: how many layers every frame will have.
+            buffers: names of the buffers that every frame of the shot will have, if they are known.
+            frames: number of frames of the shot, if it is known.
+            size: their height and width, if it is known together with the buffers. Then ``has_room_ahead`` tells
+                whether memory allows reading the next frame while one is denoised.
+            layers: number of layers of every frame.
 
         Raises:
-            InputError: frames of this size cannot be denoised within ``max_memory``; the message says with what.
+            InputError: frames of this size cannot be denoised within ``max_memory``; the message says how much is
+                needed.
         """
         _check_kind("frames", frames, (int, NoneType), "a whole number")
         _check_kind("layers", layers, (int,), "a whole number")
@@ -183,71 +186,71 @@ class Denoiser:
         self._shape: tuple[int, ...] = ()
         self._layers: tuple[str, ...] = ()
         self._count, self._frames, self._buffers = 0, frames, buffers
-        # Of one frame there is nothing ahead.
+        # A single frame has no next one to read.
         self.has_room_ahead = size is not None and frames != 1
         if buffers is not None and size is not None:
             streaming = self.has_history(buffers)
-            # With what is in none of them.
+            # One more for the remainder.
             carried = layers + (layers > 0) + (self.alpha and "alpha" in buffers)
             shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else MOTION), streaming, carried=carried)
             self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
 
     @property
     def report(self) -> FrameReport:
-        """What happened to the last frame. On a GPU, asking for it waits until that is done.
+        """The report of the last frame. On a GPU, this waits until the frame is done.
 
         Raises:
-            InputError: on a GPU, what a call raises on a processor: the frame was bad. The history begins anew.
+            InputError: on a GPU, the error that the call would raise on a CPU: the frame was invalid. The history is
+                reset.
         """
         self._settle()
         return self._report
 
     def detach(self) -> None:
-        """Cut the graph of the history, for truncated backpropagation: ``backward`` from later frames ends here."""
+        """Detach the history from the graph, for truncated backpropagation: later ``backward`` ends here."""
         self._state = pytree.tree_map_only(Tensor, Tensor.detach, self._state)
 
     def has_history(self, buffers: Collection[str]) -> bool:
-        """Whether a frame with these buffers may have a history, or be one: else what tells motion is of no use."""
+        """Whether frames with these buffers can have a history; otherwise motion is not needed."""
         return self.keep_all or (self._frames != 1 and tells_motion(buffers))
 
     def __call__(self, frame: Frame) -> Tensor:
         """Denoise the next frame of the shot.
 
         Args:
-            frame: a renderer's outputs, any float dtype; pixels of ``color`` that are NaN, infinite, negative or above
-                1e16 are replaced and counted. Its layers are for :meth:`output`, and not looked at here. Nothing of
-                it is kept, so that the next frame may be written into the same buffers.
+            frame: a renderer's outputs, any float dtype. Pixels of ``color`` that are NaN, infinite, negative or above
+                1e16 are replaced and counted. Layers are used by :meth:`output` only. The denoiser keeps no reference
+                to the buffers, so the next frame may be written into them.
 
         Returns:
             ``(B, 3, H, W)`` float32 (or float64, see ``differentiable``) scene-linear radiance on the denoiser's
-            device, a tensor of its own; ``report`` says what was done.
+            device, in its own memory; ``report`` holds the details.
 
         Raises:
-            InputError: a buffer that the model needs is missing, another holds NaN, an illegal infinity or a value far
-                out of range; the result is no finite image; or there is too little memory, see :meth:`reset`. After
-                this error, as after any other, the history is that of the frame before. On a GPU, which is not waited
-                for, what is wrong with the values of a frame is told by the next call, or by ``report``, and the
-                history begins anew.
+            InputError: a buffer that the model needs is missing; a buffer holds NaN, an illegal infinity or a value far
+                out of range; the result is not finite; or memory is insufficient, see :meth:`reset`. After an error the
+                history is that of the previous frame. On a GPU, for which the call does not wait, invalid values are
+                reported by the next call or by ``report``, and the history is reset.
         """
         _check_kind("frame", frame, (Frame,), "a Frame, such as Frame(color=...)")
         return self._step(frame.replace(layers={}) if frame.layers else frame, stages=False).image
 
     def output(self, frame: Frame, *, stages: bool = True) -> Output:
-        """As calling the denoiser, with what comes with the image.
+        """Denoise the next frame, and also return stages, layers and alpha.
 
         Args:
-            frame: as of a call. Of ``frame.layers`` any parts of the color may be there, the same in all frames of a
-                shot; a negative or infinite value in one makes its pixel invalid.
-            stages: whether to hand out the images on the way to the result: ``noisy`` first.
+            frame: see :meth:`__call__`. ``frame.layers`` may hold any parts of the color, with the same names in all
+                frames of a shot; a negative or infinite value in a layer makes its pixel invalid.
+            stages: whether to return the intermediate images, beginning with ``noisy``.
 
         Returns:
-            The image, the stages, a denoised layer for each of the frame's, and the alpha if the denoiser was made to
-            denoise it. With those that add up to ``color``, the layers add up to the image. The report says how they
-            were denoised, as the stage ``layers``: with the kernels of the color, or, of a method that has none, by
-            splitting its image.
+            The image, the stages, a denoised layer for each of the frame's, and the alpha if the denoiser was created
+            with ``alpha``. If the frame's layers add up to ``color``, the denoised layers add up to the image. The
+            stage ``layers`` of the report tells how they were denoised: with the kernels of the color, or, for a method
+            without kernels, by splitting its image.
 
         Raises:
-            InputError: as a call; or layers are no parts of the color, or others than those of the frame before.
+            InputError: see :meth:`__call__`; or layers are not parts of the color, or their names have changed.
         """
         return self._step(frame, stages=stages)
 
@@ -272,22 +275,22 @@ class Denoiser:
                 report.tiles = self._tiles.divide(self._shot(frame))
             noisy = frame.color
             precision = computing_in(self.precision, self.device)
-            with precision, self._explained(dtype), timed("model", self.device, unless_told=True):
+            with precision, self._explained(dtype), timed("model", self.device, unless_detailed=True):
                 output, state = checked_step(self.model, frame, self._state, self._shape)
             with timed("validate", self.device):
-                # A renderer may write its next frame into the same buffers, and a user change an image in place.
+                # A renderer may write its next frame into the same buffers, and a user may change an image in place.
                 state = state if self.frames_stay else owned(state, [given, noisy])
                 if stages:
                     output = output._replace(stages={"noisy": noisy, **output.stages})
                 output = completed(frame, output._replace(image=output.image.to(dtype)))
                 result: Output = owned(opened(output), [given, noisy, state])
-        # Only now: a frame that was refused leaves no trace.
+        # Only now, so that a rejected frame does not change the state.
         self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1
         self._layers = self._carried(frame)
         return result
 
     def _inspected(self, frame: Frame, report: FrameReport) -> Frame:
-        """The frame with valid values; what was wrong with it is raised, or where that would wait, found out later."""
+        """The frame with valid values. An invalid one raises an error, on a GPU only when the numbers have arrived."""
         if at_hand(self.device):
             frame, report.replaced_pixels, _ = frame.inspect()
             return frame
@@ -300,7 +303,7 @@ class Denoiser:
         return repaired.frame
 
     def _settle(self) -> None:
-        """Learn what is not known yet of the last frame; without its history if that is bad."""
+        """Complete the report of the last frame; discard the history if that frame was invalid."""
         try:
             self._report.settle()
         except InputError as error:
@@ -316,12 +319,12 @@ class Denoiser:
             raise InputError(f"layers: expected those of the frame before, {before}, found {now}; reset the denoiser")
 
     def _carried(self, frame: Frame) -> tuple[str, ...]:
-        """Names of what has a history beside the color."""
+        """Names of the channels that are accumulated together with the color."""
         return (*frame.layers, *(() if alpha_of(frame) is None else ("alpha",)))
 
     @contextmanager
     def _explained(self, dtype: torch.dtype) -> Iterator[None]:
-        """Say why a model fails whose weights are of more digits than its frame."""
+        """Add an explanation to the error of a model whose weights have a higher precision than its frame."""
         try:
             yield
         except RuntimeError as error:
@@ -329,8 +332,8 @@ class Denoiser:
             if dtype == torch.float64 or all(each.dtype != torch.float64 for each in weights):
                 raise
             raise InputError(
-                f"model: expected float32 weights for frames of float32, found float64, with which it fails "
-                f"({' '.join(str(error).split())}); call its float(), or have derivatives of float64 frames"
+                f"model: expected float32 weights for float32 frames, found float64 weights, with which it fails "
+                f"({' '.join(str(error).split())}); call its float(), or pass float64 frames with differentiable"
             ) from error
 
     def _dtype(self, frame: Frame) -> torch.dtype:
@@ -344,7 +347,7 @@ class Denoiser:
         return Frames(frame.size, frame.buffers, streaming, self.has_room_ahead, batch, carried)
 
     def _is_last(self) -> bool:
-        """Whether no frame that follows can have a history."""
+        """Whether no later frame can have a history."""
         if self._frames is not None and self._count + 1 >= self._frames:
             return True
         return self._buffers is not None and not self.has_history(self._buffers)
@@ -363,28 +366,29 @@ def denoise(
     extra: Mapping[str, ArrayLike] | None = None,
     **others: Any,
 ) -> NDArray[np.float32]:
-    """Denoise a still: arrays in, an array out.
+    """Denoise a single image: arrays in, an array out.
 
-    The model is made anew in each call, and nothing is kept: for the frames of a shot, which have a history, and for
-    many stills take a :class:`Denoiser` and :meth:`mcdenoise.Frame.from_numpy`.
+    The model is created in each call, and no state is kept. For the frames of a shot, which have a history, and for
+    many images use a :class:`Denoiser` and :meth:`mcdenoise.Frame.from_numpy`.
 
     Args:
         color: ``(H, W, 3)`` in the layout ``"HWC"``, ``(3, H, W)`` in ``"CHW"``: scene-linear radiance of any float
             dtype. Pixels that are NaN, infinite, negative or above 1e16 are replaced, see :class:`Denoiser`.
-        layout: of every array, the result's too. It is never guessed: an array of another layout is refused.
-        albedo: like ``color``, in [0, 1]; this and the following are what the renderer wrote besides, all optional.
+        layout: layout of every array, including the result. It is never guessed: an array of another layout is
+            rejected.
+        albedo: like ``color``, in [0, 1]; this and the following buffers are optional.
         normal: like ``color``, in [-1, 1].
-        depth: ``(H, W)`` or with the axis of the channel.
-        model: as of :class:`Denoiser`.
-        device: where to run; the result comes back from it.
-        precision: as of :class:`Denoiser`.
+        depth: ``(H, W)``, or with a channel axis.
+        model: see :class:`Denoiser`.
+        device: device to run on; the result is copied back from it.
+        precision: see :class:`Denoiser`.
         extra: further buffers by name.
         others: further buffers of :class:`mcdenoise.Frame`, such as ``position``, see
             :meth:`mcdenoise.Frame.from_numpy`; further arguments of :class:`Denoiser`, such as ``weights``; and
             settings of the model.
 
     Returns:
-        The clean image, float32 whatever the dtype of ``color``, in its layout, contiguous, with memory of its own.
+        The denoised image, float32 whatever the dtype of ``color``, in the same layout, contiguous, in its own memory.
 
     Raises:
         InputError: an array has another layout, size or number of channels, holds no floats or illegal values, or the
@@ -402,13 +406,13 @@ def denoise(
     denoiser = Denoiser(model, device=device, precision=precision, **settings)
     denoiser.reset(frames=1)
     image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()
-    # What was wrong with the values, of a device that is read late.
+    # Raises an error for invalid values, which a GPU reports late.
     denoiser._settle()
     return np.ascontiguousarray(image if layout == "CHW" else image.transpose(1, 2, 0))
 
 
 def _check_kind(name: str, value: object, kinds: tuple[type, ...], expected: str) -> None:
-    # True and False are whole numbers to Python, and no such number of anything to people.
+    # Python counts True and False as integers; here they are not.
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
         raise InputError(f"{name}: expected {expected}, found {type(value).__name__} {reprlib.repr(value)}")
 

@@ -1,16 +1,16 @@
-"""The one error that a person's input can cause."""
+"""The errors caused by invalid input."""
 
 from __future__ import annotations
 
-# Names of channels may have 255 bytes each, and a path 4096.
+# A channel name may have 255 bytes, and a path 4096.
 _LONGEST = 1500
 
 
 class InputError(ValueError):
-    """Input that cannot be used: its message is one line that says what, where, expected, found and what to do.
+    """Invalid input. The message is one line that says what and where, what was expected and found, and what to do.
 
-    The command line prints the message and exits with status 2; in Python it is a ``ValueError``. Names in files and of
-    files become :func:`printable`.
+    The command line prints the message and exits with status 2; in Python it is a ``ValueError``. The message is made
+    :func:`printable`, since it may contain names of files and names stored in files.
     """
 
     def __init__(self, message: str = "") -> None:
@@ -21,11 +21,11 @@ class InputError(ValueError):
 
 
 class MissingBufferError(InputError):
-    """A frame lacks a buffer that a method cannot do without."""
+    """A frame lacks a buffer that a method needs."""
 
 
 def printable(text: str) -> str:
-    r"""The text without what a terminal would obey and without line breaks: such characters are spelled out.
+    r"""Escape control characters, which a terminal would obey, and line breaks.
 
     Example:
         >>> printable("sky\x1b[2J")

@@ -1,4 +1,4 @@
-"""A method as one graph for another runtime: a step whose state goes in and out, for images of any size."""
+"""Export of a method as a graph for another runtime: one step with the state as input and output, for any size."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from mcdenoise.models._contract import check_needs
 Format = Literal["onnx", "torch"]
 SUFFIXES: dict[Format, str] = {"onnx": ".onnx", "torch": ".pt2"}
 
-# Odd and of unlike remainders, so that no size of the example is one that only some images have.
+# Odd, with different remainders, so that the tracer does not specialize to a property of these sizes.
 _SIZE, _OTHER_SIZE, _BATCH, _OTHER_BATCH = (61, 91), (54, 77), 2, 3
-# What a camera and positions say, the motion says alone.
+# The motion carries the same information as cameras and positions.
 _CAMERA = frozenset({"position", "previous_position", "view_projection"})
-# Accumulation in another order of sums: a result differs by rounding, see `Exported.check`.
+# The order of sums differs in accumulation, so results differ by rounding, see `Exported.check`.
 _NO_HISTORY_TOLERANCE = 1e-3
 
 
@@ -39,11 +39,11 @@ class Step(nn.Module):
 
     Args:
         model: the method.
-        buffers: names of the buffers that it is given.
+        buffers: names of the buffers that the method receives.
 
     Raises:
-        InputError: the method needs another buffer, or its state is none of tensors, or has no structure that is the
-            same for every frame.
+        InputError: the method needs another buffer, or its state contains something other than tensors or changes its
+            structure from frame to frame.
     """
 
     def __init__(self, model: Model, buffers: Collection[str]) -> None:
@@ -53,7 +53,7 @@ class Step(nn.Module):
         self.given += tuple(sorted(set(buffers) - set(self.given)))
         check_needs(model.needs, self.given)
         self.axes = _axes(self._example, self.given)
-        # The structure is that of a state after the first frame, which a graph keeps from then on.
+        # Use the structure of a state after the first frame; the graph keeps it.
         small, large = self._state_of(_SIZE, _BATCH), self._state_of(_OTHER_SIZE, _OTHER_BATCH)
         paths, self._spec = pytree.tree_flatten_with_path(small)
         self._names: list[str | None] = _names([path if isinstance(leaf, Tensor) else None for path, leaf in paths])
@@ -71,12 +71,12 @@ class Step(nn.Module):
         return {name: _example(name, size, batch) for name in self.given}
 
     def example(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Buffers of a frame, and the state of no frame."""
+        """Buffers of an example frame, and the state before the first frame."""
         buffers = self._example(_SIZE, _BATCH)
         return buffers, self.no_history(buffers)
 
     def no_history(self, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The state before the first frame of a shot like this: zeros."""
+        """The state before the first frame of a shot with such buffers: zeros."""
         color = buffers["color"]
         size, batch = (int(color.shape[-2]), int(color.shape[-1])), len(color)
         leaves = pytree.tree_leaves(self._state_of(size, batch))
@@ -84,11 +84,11 @@ class Step(nn.Module):
         return {name: torch.zeros_like(leaf, device=color.device) for name, leaf in named if name is not None}
 
     def forward(self, buffers: dict[str, Tensor], state: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """A step.
+        """Run a step.
 
         Args:
             buffers: by name, with valid values (:meth:`mcdenoise.frame.Frame.validate`).
-            state: of the frame before by name, zeros for the first one.
+            state: state after the previous frame, by name; zeros for the first frame.
 
         Returns:
             The image, and the state for the next frame.
@@ -101,7 +101,7 @@ class Step(nn.Module):
         return output.image, {name: leaf for name, leaf in zip(self._names, leaves, strict=True) if name is not None}
 
     def frame(self, buffers: Mapping[str, Tensor]) -> Frame:
-        """The frame that buffers by name are."""
+        """Build the frame from buffers by name."""
         known: dict[str, Any] = {
             name: buffer
             for name, buffer in buffers.items()
@@ -113,13 +113,13 @@ class Step(nn.Module):
 
 @dataclass(frozen=True)
 class Exported:
-    """What was exported.
+    """An exported graph.
 
     Args:
         path: the file.
         inputs: names in order: buffers, then ``state.NAME``.
         outputs: names in order: ``image``, then ``next_state.NAME``.
-        nodes: how many operators the graph has.
+        nodes: number of operators in the graph.
     """
 
     path: Path
@@ -129,17 +129,17 @@ class Exported:
 
 
 def default_buffers(model: Model) -> frozenset[str]:
-    """The buffers that a method needs or is better with; a motion rather than positions and cameras."""
+    """The buffers that a method needs or uses; motion instead of positions and cameras."""
     wanted = model.needs.buffers | model.needs.uses
     return wanted - (_CAMERA - model.needs.buffers if "motion" in wanted else frozenset())
 
 
 def traced(step: Step) -> torch.export.ExportedProgram:
-    """The graph of a step, for frames of any number, height and width.
+    """Trace a step to a graph for any batch size, height and width.
 
     Raises:
-        InputError: the method cannot be traced (it decides by the values of tensors, or by the size of the image), or a
-            state of zeros is not, to it, the state of no frame.
+        InputError: the method cannot be traced (it branches on the values of tensors or on the size of the image), or a
+            state of zeros does not act as the state before the first frame.
     """
     buffers, state = step.example()
     dynamic = (
@@ -169,27 +169,27 @@ def export_model(
     format: Format | None = None,
     name: str = "",
 ) -> Exported:
-    """Write a method as one graph: a step with the state as inputs and outputs, for frames of any size.
+    """Write one step of a method as a graph, with the state as inputs and outputs, for frames of any size.
 
-    The inputs are the buffers by name and the tensors of the state as ``state.NAME``; the outputs ``image`` and
-    ``next_state.NAME``. A state of zeros is that of no frame: begin a shot with that, and feed each frame what the one
-    before returned. Number, height and width of frames are free. Frames must be valid: what is not finite or negative
-    in ``color`` is for :meth:`mcdenoise.frame.Frame.validate` to mend.
+    The inputs are the buffers by name and the tensors of the state as ``state.NAME``; the outputs are ``image`` and
+    ``next_state.NAME``. Begin a shot with a state of zeros, and pass each frame the state that the previous one
+    returned. Batch size, height and width are free. Frames must be valid: :meth:`mcdenoise.frame.Frame.validate`
+    repairs NaN, infinite and negative values of ``color``.
 
     Args:
         model: the method; it runs in float32 on the CPU while it is traced.
         path: the file.
-        buffers: names of those that frames will have; :func:`default_buffers` by default.
-        format: ``"onnx"``, or ``"torch"`` for ``torch.export.load``, whose program takes a dict of buffers and one of
-            the state, and returns the image and such a dict; by default that of the path's suffix.
-        name: of the model, kept in the file.
+        buffers: names of the buffers that frames will have; :func:`default_buffers` by default.
+        format: ``"onnx"``, or ``"torch"`` for ``torch.export.load``, whose program takes two dicts, buffers and state,
+            and returns the image and a dict; by default determined by the suffix of the path.
+        name: name of the model, stored in the file.
 
     Raises:
-        InputError: as :func:`traced`; a package is missing, the suffix or a buffer is unknown, or the file cannot be
-            written. Nothing is written then.
+        InputError: see :func:`traced`; or a package is missing, the suffix or a buffer is unknown, or the file cannot
+            be written. In each case no file is written.
     """
     kind = _format_of(path, format)
-    # Before minutes are spent.
+    # Check this first, because tracing takes minutes.
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path}: cannot be written: expected its folder to exist, found none")
     if kind == "onnx":
@@ -206,17 +206,17 @@ def export_model(
 
 
 def differences(exported: Exported, model: Model, sequence: Sequence, frames: int = 5) -> Iterator[tuple[int, float]]:
-    """How far onnxruntime, running an exported graph, is from torch, running the method, over the frames of a shot.
+    """Compare onnxruntime running an exported graph with torch running the method, over the frames of a shot.
 
     Args:
-        exported: of :func:`export_model`, in ONNX.
+        exported: result of :func:`export_model`, in ONNX.
         model: the method.
         sequence: frames with the buffers that the graph takes.
-        frames: how many of them.
+        frames: number of frames to compare.
 
     Yields:
-        For each frame its number, and the largest difference of a pixel, relative where the image is bright, and of
-        its mean where it is dark.
+        Number of each frame, and the largest difference of a pixel, relative to the pixel or to the image's mean,
+        whichever is larger.
 
     Raises:
         InputError: onnxruntime is missing, or the frames lack a buffer.
@@ -228,10 +228,10 @@ def differences(exported: Exported, model: Model, sequence: Sequence, frames: in
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    # Of errors only: what could be folded is of no interest here.
+    # Log errors only; warnings about constant folding do not matter here.
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(str(exported.path), options, providers=["CPUExecutionProvider"])
-    # A graph decides nothing by what a scene has, so nothing may be skipped beside it.
+    # A graph does not skip anything, so the comparison must not skip either.
     denoiser = Denoiser(model, precision="float32", keep_all=True)
     step = Step(denoiser.model, names)
     state: dict[str, Any] = {}
@@ -241,7 +241,7 @@ def differences(exported: Exported, model: Model, sequence: Sequence, frames: in
         expected = denoiser(step.frame(given))
         state = state or {f"state.{key}": value.numpy() for key, value in step.no_history(given).items()}
         feeds = {name: buffer.numpy() for name, buffer in given.items()} | state
-        # What makes no difference to the result, the graph does not take.
+        # The exporter removes inputs that do not influence the result.
         feeds = {each.name: feeds[each.name] for each in session.get_inputs()}
         image, *after = session.run(list(exported.outputs), feeds)
         state = {
@@ -258,7 +258,7 @@ def _difference(found: Tensor, expected: Tensor) -> float:
 def _check_no_history(
     step: Step, program: torch.export.ExportedProgram, buffers: dict[str, Tensor], state: dict[str, Tensor]
 ) -> None:
-    # Guards are of layouts in memory and the like, and none of the result.
+    # The guards concern memory layouts, which do not influence the result.
     with torch.no_grad():
         found = program.module(check_guards=False)(buffers, state)[0]
         expected = step.model(step.frame(buffers))[0].image
@@ -306,7 +306,7 @@ def _write_torch(
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the warnings and the log of torch's exporters, which are of their own code."""
+    """Suppress the warnings and logs that torch's exporters cause themselves."""
     import logging
 
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")]
@@ -341,7 +341,7 @@ def _check_packages(*names: str) -> None:
 
 
 def _example(name: str, size: tuple[int, int], batch: int) -> Tensor:
-    """A valid buffer; its values are of no importance, but that something moves."""
+    """A valid buffer with arbitrary values and non-zero motion."""
     drawn = torch.Generator().manual_seed(0)
     if name == "view_projection":
         return torch.eye(4).roll(-1, 1).expand(batch, 4, 4).clone() + 0.01 * torch.eye(4)
@@ -359,13 +359,13 @@ def _axes(example: Callable[[tuple[int, int], int], dict[str, Tensor]], names: t
 
 
 def _free_axes(small: Tensor, large: Tensor) -> dict[int, Any]:
-    """The axes that are others for frames of another number and size."""
+    """The axes whose sizes differ between two examples of different batch and image size."""
     pairs = enumerate(zip(small.shape, large.shape, strict=True))
     return {axis: torch.export.Dim.DYNAMIC for axis, (a, b) in pairs if a != b}
 
 
 def _names(paths: list[Any]) -> list[str | None]:
-    """A readable name of each path: that of its fields, without positions where names are unique so."""
+    """A readable name for each path: its field names, with indices only where needed for uniqueness."""
     short = [None if path is None else ".".join(_part(key) for key in path if not _is_index(key)) for path in paths]
     if len({name for name in short if name}) == sum(path is not None for path in paths):
         return short

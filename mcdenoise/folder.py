@@ -1,4 +1,4 @@
-"""From the files of a shot to the same files, clean, with a report of what was done and how long each stage took."""
+"""Denoising the files of a shot to files of the same names, with a report of skipped work and run times."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from torch import Tensor
 from mcdenoise.data import Sequence
 from mcdenoise.data.exr import Image, Metadata
 from mcdenoise.data.files import remove, write_text
-from mcdenoise.data.readers.diffuse_specular import PARTS
+from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
 from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import Output, Skipping, Stage, parts_of, summarize
 
-# Most pixels of a frame, and how much two frames have to correlate to show the same place.
+# Largest fraction of pixels without a history, and smallest correlation of two images of the same place.
 _MOST, _ALIKE = 0.5, 0.9
 _NUMBERS = re.compile("[0-9]+")
 
 
 class FrameError(InputError):
-    """A frame cannot be denoised: a file of it is damaged, or what is in the file is of no use.
+    """A frame cannot be denoised: one of its files is damaged, or its contents are invalid.
 
     Args:
         message: one line.
-        number: of the frame.
+        number: number of the frame.
     """
 
     def __init__(self, message: str, number: int) -> None:
@@ -48,15 +48,15 @@ class FrameError(InputError):
 
 @dataclass
 class SequenceReport:
-    """What was done to a sequence.
+    """Report of denoising a sequence.
 
     Args:
-        model: name of the model, with its settings, or path of its weights.
+        model: name of the model with its settings, or path of its weights.
         reading: how the sequence stores its color.
-        frames: what happened to each frame, by number; its run times include waiting for the disk.
-        files: what was written, by number.
-        alike: frames that look like the one before and find no history in it.
-        older: names of files of other frames that were there before, and still are.
+        frames: report of each frame, by number; run times include waiting for the disk.
+        files: the written file of each frame, by number.
+        alike: frames that look like the previous one but have no history.
+        older: names of files of other frames that existed before and still exist.
     """
 
     model: str
@@ -68,41 +68,41 @@ class SequenceReport:
 
     @property
     def milliseconds(self) -> dict[str, float]:
-        """Median run time of each stage over the frames after the first, which pays for warming up."""
+        """Median run time of each stage over all frames but the first, which includes warming up."""
         return _medians([report.milliseconds for report in self.frames.values()])
 
     @property
     def beside(self) -> dict[str, float]:
-        """The same of reading and writing, which go on while another frame is denoised."""
+        """Median run times of reading and writing, which overlap with denoising another frame."""
         return _medians([report.beside for report in self.frames.values()])
 
     @property
     def tiles(self) -> str:
-        """The parts of the image on which the network ran, and why those."""
+        """How the image was divided into tiles for the network, and why."""
         return next((report.tiles for report in self.frames.values()), "")
 
     @property
     def precision(self) -> str:
-        """Why the convolutions ran in the precision that they ran in."""
+        """The reason for the precision of the convolutions."""
         return next((report.precision for report in self.frames.values()), "")
 
     @property
     def plan(self) -> list[dict[str, Any]]:
-        """For each stage whether it was kept, how much of it was skipped, and why, see :func:`summarize`."""
+        """For each stage, whether it was computed, how much of it was skipped, and why, see :func:`summarize`."""
         read = Stage("read", 0.0, self.reading)
         return summarize([[read, *report.stages.values()] for report in self.frames.values()])
 
     @property
     def warnings(self) -> list[str]:
-        """What is probably wrong."""
+        """Probable mistakes in the input or output."""
         found = []
-        # A shot has its cuts; what begins anew with every other frame has none.
+        # A shot may contain cuts, but not at every second frame.
         if len(self.alike) * 4 > len(self.frames):
             found.append(
                 f"history: in {len(self.alike)} of {len(self.frames)} frames most pixels find nothing in the frame "
                 "before, though the two look alike; check motion and cameras with `mcdenoise inspect`"
             )
-        # They may be of other frames of the same shot, and hours of work: nobody but their owner removes them.
+        # These files may be other frames of the same shot and hours of work: only the user may remove them.
         if self.older:
             names = ", ".join(self.older if len(self.older) <= 4 else [self.older[0], "...", self.older[-1]])
             found.append(
@@ -130,32 +130,31 @@ def denoise_sequence(
     on_output: Callable[[Frame, Output], None] | None = None,
     on_written: Callable[[str, Tensor, Metadata], None] | None = None,
 ) -> SequenceReport:
-    """Denoise a sequence and write its files, clean (:meth:`mcdenoise.data.Sequence.write`), and ``OUT/denoise.json``.
+    """Denoise a sequence, and write its files (:meth:`mcdenoise.data.Sequence.write`) and ``OUT/denoise.json``.
 
-    While a frame is denoised, the next one is read and the one before is written, unless memory is too short for that
+    While a frame is denoised, the next one is read and the previous one is written, unless memory is limited
     (``Denoiser(max_memory=...)``).
 
     Args:
         sequence: the frames.
-        out: folder to write to; made if it does not exist.
-        denoiser: is reset first.
-        model: what to call the model in the report.
-        full_float: write the radiance as 32-bit floats, whatever it was before.
-        output_layer: name of a layer to be added; then nothing is replaced.
-        references: read references too, for ``on_output``.
+        out: folder to write to; created if it does not exist.
+        denoiser: the denoiser; it is reset first.
+        model: name of the model in the report.
+        full_float: write the radiance as 32-bit floats, whatever its type was before.
+        output_layer: name of a layer to add; no layer is replaced then.
+        references: also read references, for ``on_output``.
         on_frame: called after each denoised frame.
-        on_output: called with each frame and its image with those on the way to it, which take memory of their own.
-        on_written: called with the name of each written file, without ``.exr``, its image ``(1, 3, H, W)`` and its
-            metadata, one after the other in the thread that writes; ``Preview.add`` is one.
+        on_output: called with each frame and its output including stages, which need additional memory.
+        on_written: called with the name of each written file without ``.exr``, its image ``(1, 3, H, W)`` and its
+            metadata, in the order of the frames, in the writing thread; such as ``Preview.add``.
 
     Raises:
-        InputError: a file is damaged, a buffer has invalid values or one that the model needs is missing, the result is
-            not finite, the folder cannot be written to, or memory is too short. Frames before the one that the message
-            names are written.
+        InputError: a file is damaged, a buffer is missing or has invalid values, the result is not finite, the folder
+            cannot be written to, or memory is insufficient. Frames before the one that the message names are written.
     """
     make_folder(out)
     check_apart(sequence, out)
-    # A report stands for a complete result: an old one must not survive a run that fails half-way.
+    # A report stands for a complete result: remove an old one, in case this run fails.
     remove(out / "denoise.json")
     report = new_report(sequence, model)
 
@@ -177,11 +176,11 @@ def denoise_sequence(
 
 
 def new_report(sequence: Sequence, model: str) -> SequenceReport:
-    """A report of nothing yet.
+    """An empty report.
 
     Args:
         sequence: the frames.
-        model: what to call the model.
+        model: name of the model.
     """
     stored = "with albedo" if sequence.color_has_albedo else "without albedo, which the reader multiplies back"
     return SequenceReport(model, f"color is stored {stored}")
@@ -202,27 +201,27 @@ def write_frames(
     on_output: Callable[[Frame, Output], None] | None = None,
     on_file: Callable[[int, Tensor], None] | None = None,
 ) -> None:
-    """Denoise frames one after the other and write their files, as :func:`denoise_sequence`, which does a shot so.
+    """Denoise frames one after the other and write their files; :func:`denoise_sequence` does this for a whole shot.
 
     Args:
         sequence: the frames.
-        out: folder to write to, which exists.
-        denoiser: is reset first.
-        report: takes what is done.
+        out: existing folder to write to.
+        denoiser: the denoiser; it is reset first.
+        report: the report to fill in.
         full_float: see :func:`denoise_sequence`.
-        output_layer: likewise.
-        references: likewise.
-        unwritten: frames that only give the others their history: of those no file is written.
-        of: how many frames the shot has that these are part of; it ends with them by default.
+        output_layer: see :func:`denoise_sequence`.
+        references: see :func:`denoise_sequence`.
+        unwritten: frames that are denoised only to give the others their history; no files are written for them.
+        of: number of frames of the whole shot, if these are its beginning; by default the shot ends with them.
         on_frame: see :func:`denoise_sequence`.
-        on_output: likewise.
-        on_file: called with the number and the image ``(1, 3, H, W)`` of each frame, in the thread that writes, after
-            its file is there, if it gets one.
+        on_output: see :func:`denoise_sequence`.
+        on_file: called with the number and the image ``(1, 3, H, W)`` of each frame, in the writing thread, after its
+            file has been written, if it gets one.
 
     Raises:
-        FrameError: a frame is damaged, invalid or lacks a buffer, or its result is not finite; those before it are
+        FrameError: a frame is damaged, invalid or lacks a buffer, or its result is not finite; the frames before it are
             written.
-        InputError: a file cannot be written, or memory is too short.
+        InputError: a file cannot be written, or memory is insufficient.
     """
 
     def write(number: int, output: Output, done: FrameReport) -> None:
@@ -273,10 +272,10 @@ def write_frames(
 
 
 def write_report(sequence: Sequence, out: Path, denoiser: Denoiser, report: SequenceReport) -> None:
-    """Write ``OUT/denoise.json``, which says that the frames are all there, and how they were made.
+    """Write ``OUT/denoise.json``, which records that the result is complete, and how it was made.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     report.older = _of_earlier_runs(out, report.files.values())
     write_text(out / "denoise.json", json.dumps(_as_json(sequence, denoiser, report), indent=2) + "\n")
@@ -285,25 +284,25 @@ def write_report(sequence: Sequence, out: Path, denoiser: Denoiser, report: Sequ
 def denoised_frames(
     sequence: Sequence, denoiser: Denoiser, *, reference: bool = True
 ) -> Iterator[tuple[int, Frame, Tensor]]:
-    """Denoise frame after frame, each while the next one is read.
+    """Denoise frame after frame, while the next one is read.
 
     Args:
         sequence: the frames.
-        denoiser: is reset first.
-        reference: read references too.
+        denoiser: the denoiser; it is reset first.
+        reference: also read references.
 
     Yields:
-        The number of each frame, the frame, and its image; the denoiser's report includes the time to read.
+        Number, frame and image; the denoiser's report includes the time of reading.
 
     Raises:
-        InputError: as :func:`denoise_sequence`; the message names the frame.
+        InputError: see :func:`denoise_sequence`; the message names the frame.
     """
     for number, frame, times in _read_frames(sequence, denoiser, reference=reference):
         yield number, frame, _denoised(denoiser, sequence, number, denoiser, frame, times)
 
 
 class _Times(NamedTuple):
-    """Milliseconds that reading a frame took, and those of them that were waited for."""
+    """Milliseconds of reading a frame, and the part of them that denoising had to wait."""
 
     read: float
     waiting: float
@@ -312,10 +311,10 @@ class _Times(NamedTuple):
 def _read_frames(
     sequence: Sequence, denoiser: Denoiser, *, reference: bool, of: int | None = None
 ) -> Iterator[tuple[int, Frame, _Times]]:
-    """Each frame, and meanwhile the next one is read, if there is room for it. Resets the denoiser."""
+    """Read each frame, and the next one ahead if memory allows. Resets the denoiser."""
     needs = denoiser.model.needs
     wanted = needs.buffers | needs.uses
-    buffers = sequence.buffers - (set() if reference else {"reference"}) - (PARTS - wanted)
+    buffers = sequence.buffers - (set() if reference else {"reference"}) - (LIGHT_PARTS - wanted)
     denoiser.reset(buffers, of or len(sequence), sequence.size, len(sequence.lights))
     denoiser.frames_stay = True
     streaming = denoiser.has_history(buffers)
@@ -323,11 +322,11 @@ def _read_frames(
     def read(number: int) -> tuple[Frame, float]:
         start = time.perf_counter()
         frame = sequence.frame(number, reference=reference, buffers=wanted)
-        # A depth may be that of the positions.
-        return frame if streaming else frame.with_depth().without_past(), _since(start)
+        # Depth may be computed from the positions.
+        return frame if streaming else frame.with_depth().without_history(), _since(start)
 
     with ThreadPoolExecutor(1) as reader:
-        # No frame has a name here: whoever gets it decides when it goes.
+        # Keep no reference to a frame here, so that the caller can free it.
         coming: deque[Future[tuple[Frame, float]]] = deque()
         for number, following in zip_longest(sequence.numbers, sequence.numbers[1:]):
             start = time.perf_counter()
@@ -372,19 +371,19 @@ def _denoised(
 
 
 def _pixels(image: Tensor) -> Image:
-    """``(H, W, C)`` of a batch of one."""
+    """``(H, W, C)`` pixels of a batch of one."""
     pixels: Image = image[0].permute(1, 2, 0).float().cpu().numpy()
     return pixels
 
 
 def _thumbnail(frame: Frame) -> Tensor:
-    """A small image of what a frame shows, with little noise."""
+    """A small image of the scene with little noise."""
     shown = torch.log1p(frame.color.nan_to_num(0, 0, 0).clamp(0, 1e3)) if frame.albedo is None else frame.albedo
     return F.adaptive_avg_pool2d(shown, (min(16, frame.size[0]), min(16, frame.size[1])))
 
 
 def _finds_nothing(done: FrameReport, frame: Frame) -> bool:
-    """Whether most pixels that show something have no history. Where nothing is hit, there may be none."""
+    """Whether most pixels with a hit have no history. Pixels without a hit may have none."""
     hit = frame.color.amax(1) > 0 if frame.depth is None else frame.depth.isfinite()
     return done.history is not None and done.history < _MOST * float(hit.float().mean())
 
@@ -401,13 +400,13 @@ def _since(start: float) -> float:
 
 def _medians(frames: list[dict[str, float]]) -> dict[str, float]:
     frames = frames[1:] or frames
-    # A model may do without a stage in some frames.
+    # A model may skip a stage in some frames.
     stages = dict.fromkeys(stage for times in frames for stage in times)
     return {stage: sorted(times.get(stage, 0.0) for times in frames)[len(frames) // 2] for stage in stages}
 
 
 def make_folder(out: Path) -> None:
-    """Make a folder to write results to; ``InputError`` where that cannot be."""
+    """Create a folder for results; raise ``InputError`` if that is impossible."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -415,9 +414,9 @@ def make_folder(out: Path) -> None:
 
 
 def check_apart(sequence: Sequence, out: Path) -> None:
-    """Results have the names of what they were made of: they must not take its place, by way of a link either."""
+    """Raise an error if results, which have the names of the inputs, would overwrite inputs, also through a link."""
     inputs = {os.path.realpath(folder) for folder in (*sequence.folders, sequence.root)}
-    # They may be links themselves, to files elsewhere.
+    # Inputs may themselves be links to files elsewhere.
     inputs |= {os.path.realpath(path) for folder in sequence.folders for path in _links(folder)}
     if os.path.realpath(out) in inputs:
         raise InputError(
@@ -436,7 +435,7 @@ def _links(folder: Path) -> list[Path]:
     """The symbolic links in a folder.
 
     Raises:
-        InputError: it cannot be listed.
+        InputError: the folder cannot be listed.
     """
     try:
         return [path for path in folder.iterdir() if path.is_symlink()]
@@ -445,7 +444,7 @@ def _links(folder: Path) -> list[Path]:
 
 
 def _of_earlier_runs(out: Path, written: Iterable[Path]) -> list[str]:
-    """Names of files as those that were written, but for the numbers in them, that were not."""
+    """Names of files that differ from the written ones only in their numbers."""
     own = {path.name for path in written}
     kinds = {_NUMBERS.sub("#", name) for name in own}
     return sorted(name for name in os.listdir(out) if name not in own and _NUMBERS.sub("#", name) in kinds)

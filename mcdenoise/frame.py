@@ -1,4 +1,4 @@
-"""The vocabulary of the project: what a renderer hands over for one frame, in which layout, unit and range."""
+"""The buffers of a frame: names, layout, unit and range of everything that a renderer provides."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from torch.utils import _pytree as pytree
 from mcdenoise.errors import InputError
 from mcdenoise.ops._rows import by_rows
 
-# How far half floats and a renderer's own arithmetic may lead out of a range.
+# Half floats and a renderer's own arithmetic may exceed a range by this.
 _ROUNDING = 1e-2
-# Largest radiance that counts as such, in whatever unit. Divided by the smallest albedo (0.04), squared, and summed
-# over the 3 x 1024 numbers of the largest window of squares, it stays below the largest float32: (25e16)^2 3072 = 2e38.
+# Largest valid radiance, in any unit. Divided by the smallest albedo (0.04), squared, and summed over the 3 x 1024
+# values of the largest window, it stays below the largest float32: (25e16)^2 3072 = 2e38.
 LARGEST_RADIANCE = 1e16
-# Of the pixels: a layer with more unusable ones is no radiance, and would take the color with it.
+# A layer with a larger fraction of invalid pixels is not radiance; replacing them would damage the color.
 _MOST_BROKEN = 0.1
 
 
 @dataclass(frozen=True)
 class BufferSpec:
-    """What a buffer holds: its channels, range and meaning.
+    """Channels, range and meaning of a buffer.
 
     Args:
         channels: number of channels.
@@ -35,8 +35,8 @@ class BufferSpec:
         high: largest legal value.
         meaning: unit and convention, for messages and documentation.
         infinite: whether infinity is legal, within the range (nothing was hit, or there is no previous position).
-        slack: how far values may overshoot ``high`` before they are refused; up to there they are clamped.
-        forgiven: whether those of less than half of a buffer are clamped beyond it, too, with a warning.
+        slack: values may exceed ``high`` by this before they are rejected; they are clamped.
+        forgiven: whether larger values are also clamped, with a warning, if they are less than half of the buffer.
     """
 
     channels: int
@@ -82,15 +82,15 @@ BUFFERS: dict[str, BufferSpec] = {
 }
 
 
-# The buffers of radiance, which a scene with twice the light has twice of; samples have it in their first channels.
+# Buffers of radiance, which scale with the light of a scene; the first three channels of samples also do.
 RADIANCE = ("color", "current", "diffuse", "specular", "emission")
 
-# The buffers that say where a pixel was in the frame before, and nothing else: of no use without a history.
+# Buffers that only tell where a pixel was in the previous frame: they are not needed without a history.
 MOTION = frozenset({"position", "motion", "previous_position"})
 
 
 def tells_motion(buffers: Collection[str]) -> bool:
-    """Whether buffers of these names say where a pixel was in the frame before: motion, or positions and cameras."""
+    """Whether these buffers tell where a pixel was in the previous frame: motion, or positions and cameras."""
     return "motion" in buffers or {"position", "view_projection"} <= set(buffers)
 
 
@@ -104,15 +104,15 @@ _ANYTHING = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "anything", infinite=True)
 
 
 class Hints(NamedTuple):
-    """What is known of a frame besides its pixels. Nothing of it changes an image by more than a tolerance.
+    """Facts about a frame besides its pixels. They change an image by a tolerance at most.
 
     Args:
-        still: nothing moves in the image since the frame before.
-        last: no frame follows, so that nothing needs to be remembered.
-        alone: no frame goes before either.
-        stages: the images on the way to the result are asked for, too.
-        keep_all: nothing is to be skipped, whether the scene needs it or not.
-        alpha: the alpha is to be denoised, too, with the kernels of the color; else it is not looked at.
+        still: nothing in the image has moved since the previous frame.
+        last: no frame follows, so that no state needs to be kept.
+        alone: there is no previous frame either.
+        stages: the intermediate images are also requested.
+        keep_all: nothing may be skipped, even if the scene does not need it.
+        alpha: the alpha is also to be denoised, with the kernels of the color; otherwise it is ignored.
     """
 
     still: bool = False
@@ -131,8 +131,8 @@ class Skip(NamedTuple):
 
     Args:
         mask: ``(B, 1, H, W)`` bool, true where the result is known.
-        images: ``(B, 3, H, W)`` results by stage, ``"image"`` for the last, which stands for those that are not there;
-            finite everywhere, used where ``mask`` is.
+        images: ``(B, 3, H, W)`` results by stage; ``"image"`` is the final one, and replaces missing stages. They are
+            finite everywhere and used where ``mask`` is true.
     """
 
     mask: Tensor
@@ -148,8 +148,8 @@ class Skip(NamedTuple):
 class Frame:
     """One frame of a renderer's outputs: every buffer is ``(B, C, H, W)``, all of the same batch, size and device.
 
-    Only ``color`` is required. Constructing a frame checks shapes, dtypes and devices (cheap); :meth:`validate` also
-    looks at every value. A frame is a pytree: ``torch.func``, ``torch.export`` and ``torch.compile`` take it apart.
+    Only ``color`` is required. The constructor checks shapes, dtypes and devices, which is fast; :meth:`validate`
+    checks every value. A frame is a pytree, so ``torch.func``, ``torch.export`` and ``torch.compile`` accept it.
 
     Args:
         color: ``(B, 3, H, W)`` noisy radiance, scene-linear, non-negative, unclamped.
@@ -160,8 +160,8 @@ class Frame:
         motion: ``(B, 2, H, W)`` pixels, x right and y down, ``previous_position = current_position + motion``;
             infinite where there is no previous position.
         previous_position: ``(B, 3, H, W)`` world-space position, in the previous frame, of the surface point that is
-            seen now; equal to ``position`` where nothing moves. The normal that this point had then is not kept: what
-            compares normals across frames compares the current one, as if objects only moved and did not turn.
+            visible now; equal to ``position`` where nothing moves. The previous normal of this point is not stored:
+            comparisons of normals across frames use the current one, as if objects moved without rotating.
         view_projection: ``(B, 4, 4)`` row-vector world-to-clip matrix, ``clip = [x y z 1] @ M``; clip y points down.
         diffuse: ``(B, 3, H, W)`` noisy radiance by diffuse reflection.
         specular: ``(B, 3, H, W)`` noisy radiance by specular reflection.
@@ -169,19 +169,19 @@ class Frame:
         roughness: ``(B, 1, H, W)`` in [0, 1]; 0 is a mirror.
         hit_distance: ``(B, 1, H, W)`` length of the first bounce in scene units.
         emission: ``(B, 3, H, W)`` radiance of the surface itself, without noise.
-        variance: ``(B, 3, H, W)`` variance of the mean of the samples that ``color`` is.
+        variance: ``(B, 3, H, W)`` variance of ``color`` as a mean of samples.
         alpha: ``(B, 1, H, W)`` coverage in [0, 1].
         samples: ``(B, S, C, H, W)`` single samples; the first three channels are radiance.
         reference: ``(B, 3, H, W)`` converged radiance of the same pixels.
-        current: ``(B, 3, H, W)`` radiance of this frame alone, where ``color`` is accumulated: added by the wrapper
+        current: ``(B, 3, H, W)`` radiance of the current frame, if ``color`` is accumulated: added by the wrapper
             :class:`mcdenoise.models.Accumulated`.
-        length: ``(B, 1, H, W)`` history length of ``color`` in frames, at least 1; added likewise.
+        length: ``(B, 1, H, W)`` history length of ``color`` in frames, at least 1; added by the same wrapper.
         extra: further ``(B, C, H, W)`` buffers by name.
-        layers: ``(B, 3, H, W)`` radiance that adds up to ``color``, such as diffuse and glossy light, by name: parts
-            that are to be denoised with it so that they still add up. A method is given all of ``color`` in layers;
-            :class:`mcdenoise.denoiser.Denoiser` adds what is missing.
-        statistics: what is computed of the whole image before it is cut to tiles, ``(B, N, 1, 1)`` by name.
-        skip: pixels whose result is known, see :class:`Skip`.
+        layers: ``(B, 3, H, W)`` radiance by name, such as diffuse and glossy light, which adds up to ``color``: parts
+            to denoise so that they still add up. A method receives layers that add up to all of ``color``;
+            :class:`mcdenoise.denoiser.Denoiser` adds the remainder.
+        statistics: values computed from the whole image before it is divided into tiles, ``(B, N, 1, 1)`` by name.
+        skip: pixels with a known result, see :class:`Skip`.
         hints: see :class:`Hints`.
 
     Raises:
@@ -253,22 +253,22 @@ class Frame:
         extra: Mapping[str, ArrayLike] | None = None,
         **buffers: ArrayLike | None,
     ) -> Frame:
-        """A frame of one image, as a renderer's Python interface hands over its buffers: arrays without a batch.
+        """Make a frame of one image from arrays without a batch axis, as renderers' Python interfaces provide them.
 
-        Arrays are of any float dtype, which is kept (``longdouble`` becomes float64), of any strides and byte order. A
-        tensor shares the memory of its array wherever torch can: where that is writable, in native byte order and
-        without negative strides; otherwise it is a copy.
+        Arrays may have any float dtype, which is kept (``longdouble`` becomes float64), any strides and byte order. A
+        tensor shares the memory of its array if that is writable, in native byte order and without negative strides;
+        otherwise it is a copy.
 
         Args:
             color: ``(H, W, 3)`` in the layout ``"HWC"``, ``(3, H, W)`` in ``"CHW"``.
-            layout: of every array. It is never guessed: an array of another layout is refused.
-            extra: further buffers by name, each ``(H, W)`` or of any number of channels.
-            buffers: those of :class:`Frame` by their names, such as ``albedo``, in the same layout; one channel may be
+            layout: layout of every array. It is never guessed: an array of another layout is rejected.
+            extra: further buffers by name, each ``(H, W)`` or with any number of channels.
+            buffers: buffers of :class:`Frame` by name, such as ``albedo``, in the same layout; a single channel may be
                 ``(H, W)``, samples are ``(S, H, W, C)`` or ``(S, C, H, W)``, ``view_projection`` is ``(4, 4)``.
 
         Raises:
-            InputError: an array has another layout, size or number of channels, or holds no floats, or there is no
-                buffer of that name; the message names it, in the shapes of the layout.
+            InputError: an array has another layout, size or number of channels, or does not hold floats, or the name of
+                a buffer is unknown; the message names the buffer, and gives shapes in the layout.
 
         Example:
             >>> import numpy as np
@@ -315,7 +315,7 @@ class Frame:
         yield from self.extra.items()
 
     def buffer(self, name: str) -> Tensor | None:
-        """A buffer of the vocabulary or of ``extra`` by its name; ``None`` where the frame has none."""
+        """A buffer by name, also one of ``extra``; ``None`` if the frame does not have it."""
         found: Tensor | None = getattr(self, name) if name in _NAMES else self.extra.get(name)
         return found
 
@@ -344,38 +344,38 @@ class Frame:
         return replace(self, **cropped, extra=extra, layers=layers, skip=None)
 
     def with_depth(self) -> Frame:
-        """The same frame; without a depth but with positions and a camera, its depth is the clip w of the positions."""
+        """The frame with a depth computed from positions and a camera (clip w), if it has these but no depth."""
         if self.depth is not None or self.position is None or self.view_projection is None:
             return self
         column = self.view_projection[:, :, 3, None, None]
         depth = (self.position * column[:, :3]).sum(1, keepdim=True) + column[:, 3:]
         return self.replace(depth=torch.where(depth > 0, depth, torch.inf))
 
-    def without_past(self) -> Frame:
-        """The same frame without the buffers that only a frame with a history needs."""
+    def without_history(self) -> Frame:
+        """The frame without the buffers that are only needed with a history."""
         return self.replace(**dict.fromkeys(MOTION))
 
     def validate(self) -> tuple[Frame, int]:
-        """Look at every value: repair what is a renderer's daily bread, refuse what would spoil the result.
+        """Check every value: repair NaN, infinite and negative radiance; reject any other invalid buffer.
 
-        Pixels of ``color`` with NaN, infinity, a negative value or one above 1e16 get the mean of their usable 3x3
-        neighbours (0 if there is none), so that they never spread. A pixel that has such a value in a layer counts as
-        one of them, and all layers are replaced where ``color`` is, in the same way: what added up still does.
-        Values of ``albedo`` and ``normal`` that overshoot their range by rounding are clamped, and so are albedos up to
-        2 (rough conductors evaluated at the normal). What is brighter is no reflectance; where that is less
-        than half of the buffer, it is clamped, too, with a warning.
+        Pixels of ``color`` with NaN, infinity, a negative value or one above 1e16 are replaced by the mean of their
+        valid 3x3 neighbours (0 if there is none), so that these values do not spread. A pixel that has such a value in
+        a layer is treated in the same way. All layers are replaced where ``color`` is, so that they still add up.
+        Values of ``albedo`` and ``normal`` that exceed their range by rounding are clamped, and so are albedos up to 2
+        (rough conductors evaluated at the normal). Albedos above 2 are clamped, with a warning, if they are less than
+        half of the buffer.
 
         Returns:
-            The clean frame, and the number of pixels of ``color`` that were replaced.
+            The valid frame, and the number of replaced pixels of ``color``.
 
         Raises:
             InputError: another buffer holds NaN, an illegal infinity or a value far outside its range; or a layer has
-                unusable values in more than a tenth of the pixels in which ``color`` has none.
+                invalid values in more than a tenth of the pixels in which ``color`` is valid.
         """
         return self.inspect()[:2]
 
     def inspect(self) -> Inspected:
-        """As :meth:`validate`, and say what was seen of the features."""
+        """Like :meth:`validate`, and also return the ranges of the other buffers."""
         changes: dict[str, Any] = {}
         ranges: dict[str, tuple[float, float]] = {}
         (color, *layers), replaced = _replace_invalid(self.color, self.layers)
@@ -389,18 +389,19 @@ class Frame:
         return Inspected(self.replace(**changes) if changes else self, replaced, ranges)
 
     def repaired(self) -> Unread:
-        """As :meth:`validate` on a device that is not to be waited for: repair everything, and read nothing.
+        """Like :meth:`validate` without waiting for the device: repair everything, and read nothing.
 
         Returns:
-            The frame, the numbers that tell how it was, and what judges them when they were read: it raises what
-            :meth:`validate` raises. What that refuses is in the frame as it was, but for what is out of range.
+            The frame, numbers that tell which values were invalid, and a function that judges these numbers once they
+            have been read: it raises the errors of :meth:`validate`. The frame keeps values that would be rejected,
+            except that they are clamped to their range.
         """
         return _repaired(self)
 
 
 _OF_HOSTS = ("extra", "layers", "statistics", "skip")
 _NAMES = tuple(each.name for each in fields(Frame) if each.name not in (*_OF_HOSTS, "hints"))
-# What a renderer hands over beside the color; the rest is what wrappers add.
+# Buffers that a renderer provides in addition to the color; the others are added by wrappers.
 OF_RENDERERS = frozenset(_NAMES) - {"color", "current", "length"}
 
 
@@ -416,7 +417,7 @@ def _flatten_with_keys(frame: Frame) -> tuple[list[tuple[Any, Any]], tuple[tuple
 
 
 def _unflatten(children: Any, context: Any) -> Frame:
-    # A tree of anything, such as shapes or gradients: nothing of it is checked.
+    # The leaves may be anything, such as shapes or gradients, so they are not checked.
     present, hints = context
     values: dict[str, Any] = dict.fromkeys((*_NAMES, *_OF_HOSTS)) | dict(zip(present, children, strict=True))
     frame = object.__new__(Frame)
@@ -437,12 +438,12 @@ pytree.register_pytree_node(
 
 
 class Inspected(NamedTuple):
-    """A frame that was looked at.
+    """A validated frame, and its ranges.
 
     Args:
         frame: with valid values.
         replaced: number of pixels of ``color`` that were replaced.
-        ranges: smallest and largest value of every buffer but ``color``, by name.
+        ranges: minimum and maximum of every buffer but ``color``, by name.
     """
 
     frame: Frame
@@ -451,16 +452,16 @@ class Inspected(NamedTuple):
 
 
 def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
-    """Replace pixels with NaN, infinite, negative or absurdly large radiance by the mean of usable 3x3 neighbours.
+    """Replace pixels with NaN, infinite, negative or too large radiance by the mean of their valid 3x3 neighbours.
 
-    Absurdly large is what is above :data:`LARGEST_RADIANCE` (1e16), from which on arithmetic in float32 overflows: of
-    one such number a network makes an image of NaN.
+    Too large is radiance above :data:`LARGEST_RADIANCE` (1e16), for which float32 arithmetic may overflow: one such
+    value would make a network return an image of NaN.
 
     Args:
         color: ``(B, C, H, W)`` radiance.
 
     Returns:
-        The clean radiance (``color`` itself where nothing was wrong), and the number of pixels that were replaced.
+        The valid radiance (``color`` itself if nothing was replaced), and the number of replaced pixels.
 
     Example:
         >>> color = torch.ones(1, 3, 3, 3)
@@ -474,7 +475,7 @@ def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
 
 
 def _replace_invalid(color: Tensor, layers: Mapping[str, Tensor]) -> tuple[list[Tensor], int]:
-    """:func:`replace_invalid` of a color and its layers: the same pixels of each."""
+    """Apply :func:`replace_invalid` to a color and its layers: the same pixels of each are replaced."""
     images = [color, *layers.values()]
     if all(map(_is_valid, images)):
         return images, 0
@@ -483,11 +484,11 @@ def _replace_invalid(color: Tensor, layers: Mapping[str, Tensor]) -> tuple[list[
         of_layer = by_rows(_usable, layer)
         _refuse_broken(name, float(_broken(usable, of_layer)))
         usable = usable & of_layer
-    return [by_rows(_mended, image, usable, reach=1) for image in images], int((~usable).sum())
+    return [by_rows(_filled, image, usable, reach=1) for image in images], int((~usable).sum())
 
 
 def _broken(usable: Tensor, of_layer: Tensor) -> Tensor:
-    """The fraction of the pixels that a layer alone spoils."""
+    """The fraction of the pixels that are invalid only because of a layer."""
     return (usable & ~of_layer).float().mean()
 
 
@@ -500,12 +501,12 @@ def _refuse_broken(name: str, broken: float) -> None:
 
 
 def scale_samples(samples: Tensor, factor: Tensor) -> Tensor:
-    """Samples ``(B, S, C, H, W)`` with their radiance times a factor that is like ``(B, 3, H, W)``; the rest stays."""
+    """Multiply the radiance of samples ``(B, S, C, H, W)`` by a ``(B, 3, H, W)`` factor; keep other channels."""
     return torch.cat([samples[:, :, :3] * factor[:, None], samples[:, :, 3:]], 2)
 
 
 def _is_valid(image: Tensor) -> bool:
-    # One pass sees whether there is anything to look for: a NaN comes through.
+    # A single pass suffices to detect invalid values, because NaN propagates.
     low, high = torch.aminmax(image)
     return bool(low >= 0 and high <= LARGEST_RADIANCE and high < torch.inf)
 
@@ -515,9 +516,9 @@ def _usable(color: Tensor) -> Tensor:
     return valid.all(dim=1, keepdim=True)
 
 
-def _mended(color: Tensor, usable: Tensor) -> Tensor:
+def _filled(color: Tensor, usable: Tensor) -> Tensor:
     zeroed = torch.where(usable, color, 0)
-    # Divided before they are summed, and never in half precision: bright neighbours must not add up to infinity.
+    # Divide before summing, and not in half precision, so that bright neighbours do not overflow.
     dtype = torch.promote_types(color.dtype, torch.float32)
     total = torch.nn.functional.avg_pool2d(zeroed.to(dtype) / 9, 3, stride=1, padding=1, divisor_override=1)
     count = torch.nn.functional.avg_pool2d(usable.to(dtype), 3, stride=1, padding=1, divisor_override=1)
@@ -525,13 +526,13 @@ def _mended(color: Tensor, usable: Tensor) -> Tensor:
 
 
 def _of_array(name: str, value: ArrayLike, layout: Layout, size: tuple[int, int] | None) -> Tensor:
-    """A buffer of an array, with a batch of one; ``size`` is that of color, and not there for color itself."""
+    """Convert an array to a buffer with a batch of one; ``size`` is that of color, and ``None`` for color itself."""
     array = _floats(name, value)
     if name == _MATRIX_NAME:
         if array.shape != (4, 4):
             raise InputError(f"buffer '{name}': expected shape (4, 4), found {array.shape}")
         return torch.from_numpy(array)[None]
-    # A buffer that is not in the vocabulary has any number of channels, and so have samples.
+    # Buffers outside the vocabulary, and samples, may have any number of channels.
     wanted = BUFFERS[name].channels if name in BUFFERS else None
     axis, axes = -1 if layout == "HWC" else -3, 4 if name == "samples" else 3
     found = array.shape
@@ -550,7 +551,7 @@ def _of_array(name: str, value: ArrayLike, layout: Layout, size: tuple[int, int]
 
 
 def _advice(color: NDArray[Any], axis: int) -> str:
-    """What to do with an array that is no color."""
+    """Advice for an array that has not the shape of a color."""
     if color.ndim == 4:
         return "; pass one image, or tensors (B, C, H, W) to Frame itself"
     if color.ndim == 3 and color.shape[axis] == 4:
@@ -561,7 +562,7 @@ def _advice(color: NDArray[Any], axis: int) -> str:
 
 
 def _floats(name: str, value: ArrayLike) -> NDArray[Any]:
-    """An array of floats that torch can share the memory of: a copy where it cannot."""
+    """An array of floats whose memory torch can share, or a copy."""
     if isinstance(value, Tensor):
         raise InputError(f"buffer '{name}': expected a numpy array, found a torch.Tensor; Frame itself takes tensors")
     try:
@@ -602,10 +603,10 @@ def _check_buffer(name: str, value: object) -> None:
 
 
 def _check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]]:
-    """The values, clamped, and their minimum and maximum."""
+    """The clamped values, and their minimum and maximum."""
     spec = _spec_of(name)
     low, high = (float(extreme) for extreme in torch.aminmax(value.detach()))
-    # A NaN passes through minimum and maximum and fails the comparison; only then is every value checked again.
+    # NaN propagates through minimum and maximum and fails the comparison; only then is every value checked again.
     if not -_UNBOUNDED < low <= high < _UNBOUNDED and (bad := _illegal(spec, value)).any():
         where = bad.nonzero()[0].tolist()
         place = f"first at row {where[2]}, column {where[3]}" if len(where) == 4 else f"first at {where[1:]}"
@@ -621,7 +622,7 @@ def _spec_of(name: str) -> BufferSpec:
 
 
 def _limit(spec: BufferSpec) -> float:
-    """Up to which values are clamped; the largest radiance itself is rounded."""
+    """Values up to this are clamped; it includes the rounding of the largest radiance."""
     return spec.high + max(spec.slack, 1e-6 * spec.high)
 
 
@@ -644,9 +645,9 @@ def _refuse_illegal(name: str, count: int, place: str = "") -> None:
 
 
 def _refuse_range(name: str, low: float, high: float, above: float) -> None:
-    """Refuse extremes out of range, or warn where the fraction ``above`` the limit is small enough to be forgiven."""
+    """Reject a range, or warn if the fraction ``above`` the limit is small enough to be clamped."""
     spec = _spec_of(name)
-    # A lamp's radiance among reflectances is a pixel's fault; all of them are another unit, or another buffer.
+    # Single large reflectances are the fault of a pixel; if most are large, the buffer has another unit or content.
     forgiven = high > _limit(spec) and spec.forgiven and above < 0.5
     if forgiven:
         warnings.warn(
@@ -662,15 +663,15 @@ def _refuse_range(name: str, low: float, high: float, above: float) -> None:
 
 
 class Unread(NamedTuple):
-    """A frame that was repaired, whatever is in it, and what tells how it was: nothing of it has been read.
+    """A repaired frame, and numbers that tell which of its values were invalid; nothing has been read from the device.
 
     Args:
-        frame: with valid values, where they are of a kind that can be repaired.
+        frame: with valid values, as far as they can be repaired.
         numbers: ``(N,)`` on the frame's device.
-        judge: takes the numbers once they were read, and returns how many pixels of ``color`` were replaced.
+        judge: takes the numbers after they have been read, and returns the number of replaced pixels of ``color``.
 
     Raises:
-        InputError: of ``judge``, what :meth:`Frame.validate` raises.
+        InputError: raised by ``judge``, with the errors of :meth:`Frame.validate`.
     """
 
     frame: Frame
@@ -687,7 +688,7 @@ def _repaired(frame: Frame) -> Unread:
         of_layer = by_rows(_usable, layer)
         numbers.append(_broken(usable, of_layer))
         usable = usable & of_layer
-    color, *mended = (by_rows(_mended, image, usable, reach=1) for image in images)
+    color, *mended = (by_rows(_filled, image, usable, reach=1) for image in images)
     numbers.append((~usable).sum())
     changes: dict[str, Any] = {"color": color, "layers": dict(zip(layers, mended, strict=True))}
     names = [name for name, _ in frame.items() if name != "color"]
@@ -713,6 +714,6 @@ def _repaired(frame: Frame) -> Unread:
                 _refuse_range(name, low, high, above)
         return replaced
 
-    # On the device by itself: a number of the host would be waited for.
+    # Created on the device, because copying a number from the host would wait.
     dtype = torch.promote_types(frame.color.dtype, torch.float32)
     return Unread(frame.replace(**changes), torch.stack([number.to(dtype) for number in numbers]), judge)

@@ -1,4 +1,4 @@
-"""Ctrl+C and its like: one line, and the exit status that shells expect, whatever the process is doing."""
+"""Handling of Ctrl+C and other signals: one line of output and the conventional exit status, in any situation."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from pathlib import Path
 from types import FrameType
 
 _WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up"}
-# Seconds in which the process may end by itself.
+# Time in seconds for an orderly shutdown.
 _GRACE = 1.25
-# Files and folders that are being written, and are to go where that does not come to its end.
+# Incomplete files and folders, to be removed if the process ends early.
 _unfinished: set[Path] = set()
 
 
 @contextmanager
 def unfinished(path: Path) -> Iterator[None]:
-    """Within this, a file or folder is removed by who ends this process at once."""
+    """Remove a file or folder if the process is ended by a signal inside this block."""
     _unfinished.add(path)
     try:
         yield
@@ -31,7 +31,7 @@ def unfinished(path: Path) -> Iterator[None]:
 
 
 def remove_unfinished() -> None:
-    """Remove what is being written, as the last thing that this process does."""
+    """Remove all incomplete files, as the last action of the process."""
     for path in list(_unfinished):
         with suppress(OSError):
             if path.is_dir():
@@ -42,10 +42,10 @@ def remove_unfinished() -> None:
 
 @contextmanager
 def deaf_children() -> Iterator[None]:
-    """Processes that are started within this do not hear Ctrl+C, from their first moment on.
+    """Start child processes inside this block that ignore Ctrl+C from the beginning.
 
-    A terminal sends it to all processes of a command. The first one tells the others what to do; what they would print,
-    while they import modules, is of no use.
+    A terminal sends Ctrl+C to all processes of a command. The main process tells its children what to do; tracebacks
+    from children that are still importing modules would not help.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -54,24 +54,24 @@ def deaf_children() -> Iterator[None]:
     try:
         yield
     finally:
-        # One that has come meanwhile is delivered now.
+        # A signal that arrived in the meantime is delivered now.
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class Interruption:
-    """What a command does at SIGINT, SIGTERM and SIGHUP: one line on stderr, and status 128 and the signal's number.
+    """Handles SIGINT, SIGTERM and SIGHUP: prints one line to stderr, and exits with 128 plus the signal's number.
 
-    The main thread gets a ``KeyboardInterrupt``, so that all ``with`` and ``finally`` do their work. But what is not
-    Python's, or is called by what is not, may swallow it, turn it into another exception, print it, or not return for
-    minutes. So nothing else is printed from then on; whatever becomes of the exception the status is that of the
-    signal; and a thread ends the process, after removing what is unfinished, where that takes longer than a moment.
+    The main thread gets a ``KeyboardInterrupt``, so that all ``with`` and ``finally`` blocks run. But native code, or
+    Python code called by it, may swallow the exception, convert or print it, or not return for minutes. Therefore
+    nothing else is printed afterwards; the exit status is that of the signal whatever happens to the exception; and if
+    the shutdown takes too long, a thread removes incomplete files and ends the process.
 
     Args:
-        name: of the command, for the line.
+        name: name of the command, printed in the line.
 
     Attributes:
-        number: of the signal that has come; 0 if none has.
-        listening: whether a ``KeyboardInterrupt`` would be caught. Where not, the process ends at once.
+        number: number of the received signal; 0 if there was none.
+        listening: whether a ``KeyboardInterrupt`` would be caught. If not, the process ends at once.
     """
 
     def __init__(self, name: str) -> None:
@@ -83,8 +83,8 @@ class Interruption:
         self._pipe: tuple[int, int] | None = None
 
     def start(self) -> None:
-        """Begin to obey signals; those that the process was told to ignore stay ignored, as by ``nohup``."""
-        # Only there can it be done.
+        """Install the handlers; signals that the process was told to ignore, as by ``nohup``, stay ignored."""
+        # Python allows this in the main thread only.
         if threading.current_thread() is not threading.main_thread():
             return
         self._pipe = reading, writing = os.pipe()
@@ -94,31 +94,31 @@ class Interruption:
         for number in [getattr(signal, name) for name in _WORDS if hasattr(signal, name)]:
             if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                 self._before[number] = signal.signal(number, self._heard)
-        # The last thing before the interpreter is taken apart: then all is done, and nobody is there to obey.
+        # Runs last before the interpreter shuts down: all work is done then.
         atexit.register(self._ignore)
         if hasattr(os, "register_at_fork"):
             os.register_at_fork(after_in_child=self.stop)
 
     def stop(self) -> None:
-        """Leave signals to what obeyed them before."""
+        """Restore the previous handlers."""
         if self._pipe is None:
             return
         signal.set_wakeup_fd(-1)
         for number, handler in self._before.items():
             signal.signal(number, handler)
         atexit.unregister(self._ignore)
-        # Its end ends the thread.
+        # Closing the pipe ends the thread.
         os.close(self._pipe[1])
         self._pipe = None
 
     def status(self, otherwise: int) -> int:
-        """The exit status: of the signal, if there was one."""
+        """The exit status: that of the signal, if there was one, else the given one."""
         return 128 + self.number if self.number else otherwise
 
     def _heard(self, number: int, frame: FrameType | None) -> None:
         again, self.number = bool(self.number), number
         self._say(number)
-        # What is imported has nothing to tidy up, and is the least prepared for exceptions.
+        # An import has nothing to clean up, and modules rarely handle exceptions while they are imported.
         if again or not self.listening or _is_importing(frame):
             self._end(number)
         raise KeyboardInterrupt
@@ -129,7 +129,7 @@ class Interruption:
                 signal.signal(number, signal.SIG_IGN)
 
     def _watch(self, reading: int) -> None:
-        """In a thread of its own: what holds up the main thread does not hold up this one."""
+        """Wait for a signal in a separate thread, which works even if the main thread is blocked."""
         while heard := os.read(reading, 1):
             if heard[0] in self._before:
                 time.sleep(_GRACE)
@@ -138,13 +138,13 @@ class Interruption:
         os.close(reading)
 
     def _say(self, number: int) -> None:
-        """Say it, once, and let nobody else say anything any more."""
+        """Print the line once, and suppress all further output."""
         # A handler may interrupt itself.
         if not self._said.acquire(blocking=False):
             return
-        # The terminal may be gone.
+        # The terminal may have been closed.
         with suppress(OSError):
-            # A progress bar hides it.
+            # Restore the cursor, which a progress bar hides.
             cursor = "\x1b[?25h\n" if os.isatty(2) else ""
             os.write(2, f"{cursor}{self._line.format(_WORDS[signal.Signals(number).name])}".encode())
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""Methods as people spell them: ``name``, ``name(setting=value, ...)``, a weights file, or a factory of one's own."""
+"""Parsing of methods given as text: ``name``, ``name(setting=value, ...)``, a weights file, or a user's factory."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from mcdenoise.errors import InputError
 from mcdenoise.models import describe_weights, find_model
 
 WEIGHTS = ".safetensors"
-# A name, or a path, and settings in brackets at the end.
+# A name or path, optionally followed by settings in parentheses.
 _SPELLING = re.compile(r"(?P<name>[^()]+|.+?)(?:\((?P<settings>[^()]*)\))?", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class Spelling:
-    """What a method's spelling says.
+    """A parsed method.
 
     Args:
-        model: name of the zoo, or ``path/to/file.py:factory``, or ``package.module:factory``.
-        weights: file of other weights than the shipped ones.
-        settings: for the model's constructor.
+        model: name in the zoo, or ``path/to/file.py:factory``, or ``package.module:factory``.
+        weights: weights file that replaces the shipped weights.
+        settings: arguments for the model's constructor.
     """
 
     model: str
@@ -35,7 +35,7 @@ class Spelling:
 
     @property
     def name(self) -> str:
-        """For tables: settings as they were spelt, files without their folders."""
+        """Short name for tables: settings as given, files without folders."""
         name = self.model if self.weights is None else self.weights.stem
         if ":" in name:
             path, _, factory = name.rpartition(":")
@@ -51,7 +51,7 @@ class Spelling:
         """A denoiser with this method.
 
         Args:
-            options: of :class:`mcdenoise.denoiser.Denoiser`, and settings beside those that were spelt.
+            options: arguments of :class:`mcdenoise.denoiser.Denoiser`, and settings in addition to the parsed ones.
 
         Raises:
             InputError: see :class:`mcdenoise.denoiser.Denoiser`.
@@ -60,14 +60,14 @@ class Spelling:
 
 
 def parse_method(text: str) -> Spelling:
-    """Read a method's spelling.
+    """Parse a method.
 
     Args:
         text: such as ``"cascaded_v2(alpha_min=0.2)"``, ``"oidn(quality=fast)"``, ``"run/mine.safetensors"`` or
-            ``"mine.py:make"``. Values are numbers, ``True``, ``False``, ``None``, or words.
+            ``"mine.py:make"``. Values are numbers, ``True``, ``False``, ``None``, or unquoted strings.
 
     Raises:
-        InputError: the text is something else, or a weights file cannot be read.
+        InputError: the text has another form, or a weights file cannot be read.
 
     Example:
         >>> parse_method("joint_bilateral(sigma_color=0.1, sigma_space=4)").settings
@@ -89,13 +89,13 @@ def parse_method(text: str) -> Spelling:
 
 
 def split_methods(text: str) -> list[str]:
-    """Spellings separated by commas, each with all combinations of its alternatives.
+    """Split methods at commas, and expand alternatives to all combinations.
 
     Args:
         text: such as ``"noisy,oidn(quality=fast|high, source=raw)"``.
 
     Raises:
-        InputError: one is empty, or given twice.
+        InputError: a method is empty, or given twice.
 
     Example:
         >>> split_methods("noisy, oidn(quality=fast|high,source=raw)")
@@ -103,7 +103,7 @@ def split_methods(text: str) -> list[str]:
     """
     found: list[str] = []
     for part in re.split(r",(?![^(]*\))", text):
-        # Every second piece is a list of alternatives.
+        # Every second part is a list of alternatives.
         pieces = re.split(r"(?<==)([^,=()]*\|[^,=()]*)(?=[,)])", part.strip())
         choices = [[piece] for piece in pieces]
         choices[1::2] = [[each.strip() for each in piece.split("|")] for piece in pieces[1::2]]

@@ -1,4 +1,4 @@
-"""Somebody's own: what ``path/to/file.py:attribute`` or ``package.module:attribute`` names."""
+"""Importing a user's own object, given as ``path/to/file.py:attribute`` or ``package.module:attribute``."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from mcdenoise.errors import InputError
 
 
 def load_own(name: str, kind: str, thing: str) -> tuple[Any, ModuleType]:
-    """Import what somebody wrote outside the package.
+    """Import an object from outside the package.
 
-    A file is run anew at each call, as a module of its own.
+    A file is executed at each call, as a new module.
 
     Args:
         name: ``path/to/file.py:attribute`` or ``package.module:attribute``.
-        kind: what it is for, such as ``"model"``; for messages.
-        thing: what the attribute is, such as ``"factory"``; for messages.
+        kind: what the object is used as, such as ``"model"``; for messages.
+        thing: what the attribute should be, such as ``"factory"``; for messages.
 
     Returns:
-        The attribute, and the module that it is in.
+        The attribute, and the module that defines it.
 
     Raises:
-        InputError: there is no such file or module, it cannot be imported, or it has no such attribute.
+        InputError: the file or module does not exist, cannot be imported, or has no such attribute.
     """
     place, _, attribute = name.rpartition(":")
     try:
@@ -42,7 +42,7 @@ def load_own(name: str, kind: str, thing: str) -> tuple[Any, ModuleType]:
 
 
 def in_one_line(error: Exception) -> str:
-    """Kind and message of an error that somebody's own code raised."""
+    """Type and message of an error raised by a user's code, in one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
@@ -50,13 +50,13 @@ def _module_of_file(path: Path, kind: str, thing: str) -> ModuleType:
     if not path.is_file():
         wanted = f"a {thing}" if thing == kind else f"a {thing} of a {kind}"
         raise InputError(f"{path}: expected a Python file with {wanted}, found no such file")
-    # Its own name, so that a file beside it that is called alike is another module.
+    # A unique name, so that files of the same name are different modules.
     module_name = f"mcdenoise_own_{path.stem}_{abs(hash(path.resolve()))}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     if spec is None or spec.loader is None:
         raise InputError(f"{path}: expected a Python file, found something else")
     module = importlib.util.module_from_spec(spec)
-    # Dataclasses and the like look their module up.
+    # Dataclasses look up their module in ``sys.modules``.
     sys.modules[module_name] = module
     spec.loader.exec_module(module)
     return module

@@ -1,4 +1,4 @@
-"""Reading files that people name, or that lie where one looks for them: they may be anything."""
+"""Safe reading of files from users, which may be anything."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import os
 import stat
 from pathlib import Path
 
-# Far more than any text of ours takes.
+# Far larger than any valid text file of the package.
 LARGEST_TEXT = 64 << 20
-# Some files of the system say that they are empty, and are not.
+# Some system files report a size of zero but have contents.
 _UNSAID = 1 << 20
 
 
 def check_file(path: Path) -> None:
-    """See that there is a file: a pipe would wait for ever for who writes into it, and a device has no end.
+    """Check that a path is a regular file: opening a pipe would block, and a device has no end.
 
     Raises:
-        OSError: there is none; its ``strerror`` says what there is.
+        OSError: it is not; ``strerror`` says what it is.
     """
     mode = os.stat(path).st_mode
     if not stat.S_ISREG(mode):
@@ -25,16 +25,16 @@ def check_file(path: Path) -> None:
 
 
 def read_bytes(path: Path, largest: int = LARGEST_TEXT) -> bytes:
-    """What is in a file, of at most so many bytes.
+    """Read a file of at most ``largest`` bytes.
 
     Raises:
-        OSError: as :func:`check_file`; or it is larger, or cannot be read.
+        OSError: see :func:`check_file`; or the file is larger, or cannot be read.
     """
     check_file(path)
-    # What has become a pipe meanwhile does not wait either.
+    # Do not block even if the file was replaced by a pipe in the meantime.
     with open(os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)), "rb") as file:
         size = os.fstat(file.fileno()).st_size
-        # Memory for all that is asked for is taken at once.
+        # ``read`` allocates the requested size at once, so request no more than the file's size.
         content = b"" if size > largest else file.read(min(largest, max(size, _UNSAID)) + 1)
         larger = size > largest or len(content) > largest
     if larger:
@@ -43,10 +43,10 @@ def read_bytes(path: Path, largest: int = LARGEST_TEXT) -> bytes:
 
 
 def read_text(path: Path, largest: int = LARGEST_TEXT, errors: str = "strict") -> str:
-    """The text of a UTF-8 file, of at most so many bytes.
+    """Read a UTF-8 file of at most ``largest`` bytes.
 
     Raises:
-        OSError: as :func:`read_bytes`.
-        UnicodeDecodeError: it is no such text.
+        OSError: see :func:`read_bytes`.
+        UnicodeDecodeError: the file is not valid UTF-8.
     """
     return read_bytes(path, largest).decode("utf-8", errors)

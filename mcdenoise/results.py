@@ -1,4 +1,4 @@
-"""What a benchmark found out, as it is stored in ``results.json`` and shown by the report."""
+"""The results of a benchmark, as stored in ``results.json`` and shown by the report."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ OPS_FILE = "ops.json"
 IMAGES = "images"
 VERSION = 2
 STAGES = ("read", "accumulate", "network", "filter", "write")
-# Ends the name of a method that skips nothing, beside the same method that does.
+# Suffix of a method's name if it skips nothing, for comparing it with the same method that does.
 KEEP_ALL = ", keep all"
-# Beyond any figure that is measured; what is squared is finite still, and what is drawn.
+# Larger than any measured value; its square is still finite, and it can be plotted.
 _LARGEST = 1e100
 Kind = Literal["trainable", "fixed", "baseline"]
 
@@ -34,10 +34,10 @@ class Spread:
     """Median and quartiles of repeated measurements.
 
     Args:
-        median: half of them are below.
+        median: median of the measurements.
         lower: first quartile.
         upper: third quartile.
-        count: how many there were.
+        count: number of measurements.
     """
 
     median: float
@@ -47,7 +47,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: list[float]) -> Spread:
-        """Of at least one value.
+        """Compute the spread of at least one value.
 
         Example:
             >>> Spread.of([1.0, 2.0, 3.0, 4.0, 100.0])
@@ -59,16 +59,16 @@ class Spread:
 
 @dataclass(frozen=True)
 class Machine:
-    """Where it was measured.
+    """The machine of a measurement.
 
     Args:
         processor: model of the CPU.
         cores: logical cores that the process may use.
         memory: gibibytes.
         device: ``cpu``, or the name of the GPU.
-        threads: of torch and of every method.
+        threads: number of threads of torch and of every method.
         system: operating system and its version.
-        packages: versions by name, those that were measured.
+        packages: versions of the measured packages by name.
     """
 
     processor: str
@@ -82,17 +82,17 @@ class Machine:
 
 @dataclass(frozen=True)
 class Scene:
-    """One sequence that was denoised.
+    """A sequence of the benchmark.
 
     Args:
         name: unique among the scenes.
-        width: pixels.
-        height: pixels.
+        width: in pixels.
+        height: in pixels.
         frames: numbers of the frames that were denoised and timed.
-        scored: numbers of those that have a reference.
-        pictures: numbers of those whose images are kept, as ``images/SCENE/METHOD/N.exr`` and, for the reference,
+        scored: numbers of the frames that have a reference.
+        pictures: numbers of the frames whose images are kept, as ``images/SCENE/METHOD/N.exr`` and, for the reference,
             ``images/SCENE/reference/N.exr``; methods are ordered as in :attr:`Results.methods`.
-        reference_noise: the references' own SMAPE against the truth, where the renderer has stored it.
+        reference_noise: SMAPE of the references against the truth, if the renderer has stored it.
     """
 
     name: str
@@ -106,20 +106,19 @@ class Scene:
 
 @dataclass(frozen=True)
 class Method:
-    """One way to get an image: a model with settings, as :class:`mcdenoise.denoiser.Denoiser` takes it.
+    """A method of the benchmark: a model with settings, as passed to :class:`mcdenoise.denoiser.Denoiser`.
 
     Args:
         name: unique, such as ``cascaded_v2`` or ``oidn(quality=fast)``.
-        kind: a model that learns, one that does not, or a baseline (``noisy`` does nothing, ``accumulated`` only
-            accumulates).
+        kind: a trained model, another model, or a baseline (``noisy`` does nothing, ``accumulated`` only accumulates).
         folder: name of its folder in ``images/SCENE``.
-        model: its name, or ``path/to/file.py:factory``; what is of one model is coloured alike.
-        settings: for the model's constructor.
+        model: name of the model, or ``path/to/file.py:factory``; methods of one model have the same colour in plots.
+        settings: arguments of the model's constructor.
         weights: path of the weights file; empty for the shipped weights, or none.
-        precision: of convolutions.
+        precision: precision of convolutions.
         keep_all: whether nothing is skipped.
-        parameters: number of weights of a network, where that is known.
-        missing: why it could not be run at all, such as a package that is not installed; else ``""``.
+        parameters: number of weights of a network, if it is known.
+        missing: why the method could not run at all, such as a package that is not installed; else ``""``.
     """
 
     name: str
@@ -136,23 +135,23 @@ class Method:
 
 @dataclass(frozen=True)
 class Cell:
-    """One method on one scene.
+    """The measurements of one method on one scene.
 
     Args:
-        scene: name.
-        method: name.
+        scene: name of the scene.
+        method: name of the method.
         errors: mean over the scored frames, by name in :data:`mcdenoise.evaluate.METRICS`.
         errors_spread: median and quartiles over the scored frames, by the same names.
-        whole: milliseconds a frame, from reading to writing.
-        stages: milliseconds a frame of each stage that a method has, by name in :data:`STAGES`.
-        memory: peak memory in mebibytes that making the method and denoising two frames added, in a process of its own
-            (on a GPU: there), where it could be measured; of the first scene of this size.
-        failure: why the method failed on this scene; nothing else is known then.
-        computing: milliseconds a frame of what happens in memory, without reading and writing files; measured around
-            all of it, so that the stages may add up to a little less.
+        whole: milliseconds per frame, from reading to writing.
+        stages: milliseconds per frame of each stage of the method, by name in :data:`STAGES`.
+        memory: peak memory in mebibytes for creating the method and denoising two frames in a separate process (on a
+            GPU: of the device), if it could be measured; for the first scene of this size.
+        failure: why the method failed on this scene; then all other values are unknown.
+        computing: milliseconds per frame in memory, without reading and writing files; measured as a whole, so that the
+            stages may add up to slightly less.
         plan: what was skipped of the scene and why, see :func:`mcdenoise.models.summarize`.
-        on_the_way: errors of the images on the way to the result, by stage, where they were asked for.
-        lacking: whether the failure is that the scene has not what the method needs, which is the fault of neither.
+        on_the_way: errors of the intermediate images, by stage, if they were requested.
+        lacking: whether the method failed because the scene lacks buffers that it needs, which is no error of either.
     """
 
     scene: str
@@ -170,21 +169,21 @@ class Cell:
 
     @property
     def reason(self) -> str:
-        """Why nothing else is known; empty if more is."""
+        """The reason if there are no measurements; empty otherwise."""
         return self.failure and f"{'skipped' if self.lacking else 'failed'}: {self.failure}"
 
 
 @dataclass(frozen=True)
 class Skipped:
-    """What a method skipped of a scene, and what that brought.
+    """The stages that a method skipped on a scene, and the effect.
 
     Args:
-        scene: name.
-        method: name.
-        stages: what was skipped, and how much of it.
-        saved: milliseconds a frame less than the same method that skips nothing, without files; ``None`` where that was
-            not measured.
-        change: by name of a metric, by how much the error differs from that of the other.
+        scene: name of the scene.
+        method: name of the method.
+        stages: the skipped stages, and the skipped fraction of each.
+        saved: milliseconds per frame saved against the same method that skips nothing, without files; ``None`` if that
+            was not measured.
+        change: difference of the error from that of the same method that skips nothing, by metric.
     """
 
     scene: str
@@ -196,14 +195,14 @@ class Skipped:
 
 @dataclass(frozen=True)
 class Cost:
-    """What one method costs at one size of image.
+    """The cost of one method at one image size.
 
     Args:
-        method: name.
-        width: pixels.
-        height: pixels.
-        milliseconds: a frame, without files; ``None`` where it failed.
-        failure: why, such as too little memory.
+        method: name of the method.
+        width: in pixels.
+        height: in pixels.
+        milliseconds: per frame, without files; ``None`` if the method failed.
+        failure: why it failed, such as insufficient memory.
     """
 
     method: str
@@ -217,7 +216,7 @@ class Cost:
 class Fit:
     """How cost grows with the number of pixels: ``milliseconds = fixed + per_megapixel * megapixels``.
 
-    The line through the medians with the least squares of relative deviations: each size counts the same.
+    The line is fitted to the medians by least squares of relative deviations, so that all sizes have the same weight.
 
     Args:
         method: name.
@@ -234,20 +233,20 @@ class Fit:
 
 @dataclass(frozen=True)
 class Results:
-    """Everything one run of the benchmark found out.
+    """The results of one run of the benchmark.
 
     Args:
-        command: the command line that measured it.
+        command: the command line of the run.
         created: UTC time in ISO format.
-        machine: where.
-        rounds: how often each frame was denoised by each method, without the warm-up.
+        machine: the machine of the run.
+        rounds: number of times that each method denoised each frame, without the warm-up.
         scenes: in the order in which they were named.
         methods: in the order in which they are shown.
-        cells: of each scene and each method that is not missing.
+        cells: one for each scene and each method that is not missing.
         costs: by method and size.
         fits: by method.
-        version: of this format.
-        notes: what to know about the run as a whole, such as a metric that was not computed, and why.
+        version: version of this format.
+        notes: remarks on the run as a whole, such as a metric that was not computed, and why.
     """
 
     command: str
@@ -264,15 +263,15 @@ class Results:
 
     @property
     def failed(self) -> bool:
-        """Whether a method failed on a scene that has what it needs."""
+        """Whether a method failed on a scene that has all buffers that it needs."""
         return any(one.failure and not one.lacking for one in self.cells)
 
     def cell(self, scene: str, method: str) -> Cell | None:
-        """What is known of a method on a scene."""
+        """The measurements of a method on a scene."""
         return next((one for one in self.cells if (one.scene, one.method) == (scene, method)), None)
 
     def skipped(self) -> list[Skipped]:
-        """What each method skipped of each scene, where it did."""
+        """One entry for each scene and method that skipped anything."""
         rows = []
         for cell in self.cells:
             fractions = {row["stage"]: row["skipped"] for row in cell.plan if row["skipped"] > 0}
@@ -290,7 +289,7 @@ class Results:
         return rows
 
     def megapixels_per_second(self, cell: Cell) -> float | None:
-        """How many pixels a method denoises, without reading and writing files."""
+        """Megapixels per second that a method denoises, without reading and writing files."""
         scene = next(one for one in self.scenes if one.name == cell.scene)
         return scene.width * scene.height / 1e3 / cell.computing.median if cell.computing else None
 
@@ -298,17 +297,17 @@ class Results:
         """Write ``results.json``.
 
         Raises:
-            InputError: it cannot be written.
-            ValueError: a number is NaN or infinite, which is no JSON.
+            InputError: the file cannot be written.
+            ValueError: a number is NaN or infinite, which JSON does not allow.
         """
         _write(folder / FILE, self)
 
     @classmethod
     def read(cls, folder: Path) -> Results:
-        """Read ``results.json`` of a folder.
+        """Read ``results.json`` from a folder.
 
         Raises:
-            InputError: the file is missing, damaged, or of another version.
+            InputError: the file is missing, damaged, or of another version of the format.
         """
         path = folder / FILE
         expected = f"{path}: expected the results of `mcdenoise benchmark`, found"
@@ -333,24 +332,24 @@ class Results:
 
 @dataclass(frozen=True)
 class OpCost:
-    """What one op costs in one backend and dtype, and how exact it is.
+    """Cost and accuracy of one operator with one backend and dtype.
 
     Args:
         op: name in :mod:`mcdenoise.ops`.
-        backend: ``torch`` for plain torch.
+        backend: ``torch`` for the reference in torch, or another backend.
         dtype: such as ``float32``.
-        case: of the op's cases, the one that was enlarged.
-        milliseconds: of one call; ``None`` where it failed.
-        error: largest relative error over the op's ordinary cases, against its equation in float64 on the same inputs;
-            ``None`` where it failed.
-        mebibytes: inputs and outputs together, each once: what must move at least.
-        copy: milliseconds that a copy takes which moves as much.
-        with_derivatives: milliseconds of one call and of its derivatives in all floating-point inputs; ``None`` where
-            it has none.
-        mebibytes_with_derivatives: what must move at least: with the inputs read once more, the results' derivatives
-            read and those of the inputs written.
-        copy_with_derivatives: milliseconds that a copy takes which moves as much.
-        failure: why there is no result.
+        case: name of the enlarged test case of the operator.
+        milliseconds: per call; ``None`` if it failed.
+        error: largest relative error over the operator's ordinary cases, against its equation in float64 on the same
+            inputs; ``None`` if it failed.
+        mebibytes: size of inputs and outputs together: the minimum memory traffic.
+        copy: milliseconds for copying as much memory.
+        with_derivatives: milliseconds per call and its derivatives with respect to all floating-point inputs; ``None``
+            if it has no derivatives.
+        mebibytes_with_derivatives: minimum memory traffic with derivatives: inputs are read again, gradients of the
+            outputs are read, and gradients of the inputs are written.
+        copy_with_derivatives: milliseconds for copying as much memory.
+        failure: why there are no measurements.
     """
 
     op: str
@@ -368,30 +367,30 @@ class OpCost:
 
     @property
     def over_copy(self) -> float | None:
-        """How many times as long as that copy it takes; 1 is as fast as memory is."""
+        """Run time relative to the copy; 1 is the speed of memory."""
         return self.milliseconds.median / self.copy if self.milliseconds and self.copy else None
 
     @property
     def over_copy_with_derivatives(self) -> float | None:
-        """Likewise with the derivatives."""
+        """The same with derivatives."""
         both = self.with_derivatives, self.copy_with_derivatives
         return both[0].median / both[1] if both[0] and both[1] else None
 
 
 @dataclass(frozen=True)
 class OpResults:
-    """What ``mcdenoise benchmark --ops`` found out.
+    """The results of ``mcdenoise benchmark --ops``.
 
     Args:
-        command: the command line that measured it.
+        command: the command line of the run.
         created: UTC time in ISO format.
-        machine: where.
-        width: pixels.
-        height: pixels.
-        rounds: calls of each, without the warm-up.
-        bandwidth: of a copy in the same run, gigabytes (1e9) a second, read and written.
-        costs: by op, backend and dtype.
-        version: of this format.
+        machine: the machine of the run.
+        width: in pixels.
+        height: in pixels.
+        rounds: number of calls, without the warm-up.
+        bandwidth: of a copy in the same run, gigabytes (1e9) per second, read and written.
+        costs: by operator, backend and dtype.
+        version: version of this format.
     """
 
     command: str
@@ -408,8 +407,8 @@ class OpResults:
         """Write ``ops.json``.
 
         Raises:
-            InputError: it cannot be written.
-            ValueError: a number is NaN or infinite, which is no JSON.
+            InputError: the file cannot be written.
+            ValueError: a number is NaN or infinite, which JSON does not allow.
         """
         _write(folder / OPS_FILE, self)
 
@@ -423,10 +422,10 @@ def _refuse(name: str) -> float:
 
 
 def _made(kind: Any, value: Any, where: str) -> Any:
-    """A value as the type that a field is annotated with, to any depth.
+    """Convert a JSON value to the annotated type of a field, recursively.
 
     Raises:
-        ValueError: it is of another.
+        ValueError: the value has another type.
     """
     if isinstance(kind, types.UnionType):
         return None if value is None else _made(get_args(kind)[0], value, where)
@@ -439,10 +438,10 @@ def _made(kind: Any, value: Any, where: str) -> Any:
         return {key: _made(inner[1], one, f"{where}.{key}") for key, one in value.items()}
     if holder is Literal and isinstance(value, str) and value in inner:
         return value
-    # Whole numbers may be written where others are meant, but for true and false, which Python counts among them.
+    # JSON writes some floats as integers. Python counts true and false as integers; here they are not.
     if kind is float and type(value) in (int, float) and abs(value) <= _LARGEST:
         return float(value)
-    # Beyond that they cannot be counted with.
+    # Larger values would overflow in computations.
     if kind is int and type(value) is int and abs(value) < 2**53:
         return value
     if kind is Any or (kind in (str, bool) and type(value) is kind):
@@ -451,7 +450,7 @@ def _made(kind: Any, value: Any, where: str) -> Any:
     raise ValueError(f"{where} is {reprlib.repr(value)} in place of {known}")
 
 
-# It takes longer than all else, and there are hundreds of cells.
+# Cached, because this takes longer than everything else and there are hundreds of cells.
 _hints = functools.cache(get_type_hints)
 
 
@@ -468,10 +467,10 @@ def _made_of_fields(kind: Any, value: Any, where: str) -> Any:
 
 
 def _check(results: Results) -> None:
-    """See that what the parts say of one another is true, and that figures are such as are measured.
+    """Check that the parts are consistent with one another, and that values are in a plausible range.
 
     Raises:
-        ValueError: something is not.
+        ValueError: they are not.
     """
 
     def check(holds: bool, what: str) -> None:
@@ -483,7 +482,7 @@ def _check(results: Results) -> None:
         check(bool(names), f"there are no {kind}")
         check(len(set(names)) == len(names), f"two {kind} have one name")
     for part in (*(scene.name for scene in results.scenes), *(method.folder for method in results.methods)):
-        # Pictures are looked for in folders of these names.
+        # Images are read from folders of these names.
         plain = part not in ("", ".", "..") and not {"/", "\\", "\0"} & set(part) and part.isprintable()
         check(plain and len(part.encode(errors="replace")) <= 255, f"{reprlib.repr(part)} is no name of a folder")
     for scene in results.scenes:

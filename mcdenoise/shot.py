@@ -1,4 +1,4 @@
-"""How a shot is denoised: the settings that `mcdenoise denoise` has as options, and each shot of a film."""
+"""The settings for denoising a shot: the options of `mcdenoise denoise`, and of each shot of a film."""
 
 from __future__ import annotations
 
@@ -13,52 +13,52 @@ from mcdenoise.errors import InputError
 from mcdenoise.methods import Spelling, parse_method
 from mcdenoise.models import DEFAULT, describe_weights
 
-# With very many threads torch does not fail but crashes.
+# With very many threads torch crashes instead of raising an error.
 _MOST_THREADS = 1024
 
 
 @dataclass(frozen=True)
 class ShotSettings:
-    """How a shot is read, denoised and written.
+    """The settings for reading, denoising and writing a shot.
 
     Args:
-        model: a name, see `mcdenoise models`, with settings if need be, such as "oidn(quality=fast)"; a weights file;
-            or a model of your own, path/to/file.py:factory or package.module:factory. By default cascaded_v2, or the
-            model that the weights are of.
+        model: a name from `mcdenoise models`, optionally with settings, such as "oidn(quality=fast)"; a weights file;
+            or your own model, path/to/file.py:factory or package.module:factory. The default is cascaded_v2, or the
+            model that the weights are for.
         weights: safetensors file of your own weights for that model.
         frames: frames to denoise, such as 0-59,70; all by default.
         device: where the model runs, cpu or cuda.
         threads: CPU threads; torch's choice by default.
-        precision: precision of the network's convolutions; auto takes bfloat16 where the processor has it and it is
-            faster, which is measured once on each machine; int8 is for models that are calibrated for it, see
-            `mcdenoise calibrate`.
-        map: the layer to read a buffer from where names do not tell, such as albedo=RGBA.diff; 'motion=' reads none.
-        color_without_albedo: the noisy color was divided by the albedo, which is multiplied back.
-        color_with_albedo: the noisy color has the albedo in it. By default its values decide, and where they tell
-            nothing, the color is taken to have it.
+        precision: precision of the network's convolutions; auto chooses bfloat16 if the processor supports it and it is
+            faster, which is measured once per machine; int8 is for calibrated models, see `mcdenoise calibrate`.
+        map: the layer to read a buffer from if names do not tell, such as albedo=RGBA.diff; 'motion=' reads none.
+        color_without_albedo: the noisy color was divided by the albedo, and has to be multiplied by it.
+        color_with_albedo: the noisy color includes the albedo. By default this is determined from the values; if they
+            do not tell, the color is assumed to include it.
         output_layer: add the result as a layer of this name, and replace nothing.
-        layers: layers of light to denoise with it, by the same kernels, so that they still add up: names such as
+        layers: layers of light to denoise with the same kernels as the color, so that they still add up: names such as
             DiffDir or Combined_*, or all.
-        alpha: denoise the alpha too, by the same kernels; else it stays as it was.
+        alpha: also denoise the alpha with the same kernels; otherwise it is not changed.
         alpha_min: smallest weight of the current frame in the accumulation, in (0, 1]; the model's own by default.
-        anti_lag: give up the history where the light has changed.
+        anti_lag: discard history where the light has changed.
         full_float: write the result as 32-bit floats, even where it was stored as half floats.
-        keep_all: skip nothing, whether the sequence needs it or not.
-        tolerance: noise, or change, relative to the mean of a tile, below which a tile of a still shot is skipped;
-            0 skips only tiles whose image stays the same.
-        tile: run the network on tiles of at most so many pixels a side, a multiple of 32 from 64 on; the result is that
-            of whole frames, to rounding. By default, frames are tiled where the network's features would take more than
-            2 GB.
-        max_memory: maximum memory of this process in GB; it decides the tiles, and whether the next frame is read
-            meanwhile.
-        budget_ms: take the shipped model and precision with the smallest error (or, where no error is known, the
-            slowest) that need at most so many milliseconds a frame on this machine, measured once and without files.
-        max_error: take the fastest model and precision whose SMAPE is at most this.
-        results: folder of a finished benchmark to take errors from; those of the sequence's references by default.
-        preview: write a PNG of each file to OUT/preview too, on the sRGB curve, and OUT/preview.mp4 of several frames.
+        keep_all: skip nothing, even if the sequence does not need it.
+        tolerance: noise or change relative to the mean of a tile, below which a tile of a still shot is skipped; 0
+            skips only tiles whose image does not change.
+        tile: largest side of a tile in pixels, a multiple of 32 that is at least 64; the result is that of whole
+            frames, up to rounding. By default, frames are tiled if the network's features would take more than 2 GB.
+        max_memory: maximum memory of this process in GB; it determines the size of tiles, and whether the next frame is
+            read ahead.
+        budget_ms: choose the shipped model and precision with the smallest error (or, if no errors are known, the
+            slowest) that need at most this many milliseconds per frame on this machine, measured once and without
+            files.
+        max_error: choose the fastest model and precision whose SMAPE is at most this.
+        results: folder of a finished benchmark to take errors from; by default they are measured on the sequence's
+            references.
+        preview: also write a PNG of each file to OUT/preview, on the sRGB curve, and OUT/preview.mp4 of several frames.
         preview_fps: frames per second of that video.
-        preview_exposure: exposure of the previews in stops; by default the first frame decides for all: its typical
-            radiance is middle grey.
+        preview_exposure: exposure of the previews in stops; by default the typical radiance of the first frame becomes
+            middle grey.
     """
 
     model: str | None = None
@@ -88,10 +88,10 @@ class ShotSettings:
     preview_exposure: float | None = None
 
     def check(self) -> None:
-        """See that the settings agree with one another; what they say of files is seen when those are opened.
+        """Check that the settings agree with one another; those that depend on files are checked when these are opened.
 
         Raises:
-            InputError: they do not, or one is out of its range.
+            InputError: settings contradict one another, or one is out of its range.
         """
         if self.threads is not None:
             check_threads(self.threads)
@@ -116,7 +116,7 @@ class ShotSettings:
             inputs: folders, files or patterns.
 
         Raises:
-            InputError: see :func:`mcdenoise.data.open_sequence`; or the frames have not what is asked for.
+            InputError: see :func:`mcdenoise.data.open_sequence`; or the frames lack a requested buffer.
         """
         self.check()
         stated = self.color_with_albedo if self.color_with_albedo or self.color_without_albedo else None
@@ -132,18 +132,18 @@ class ShotSettings:
     def chosen(
         self, sequence: Sequence, on_step: Callable[[int, int], None] = lambda done, total: None
     ) -> tuple[ShotSettings, str]:
-        """The same settings with the model that ``budget_ms`` or ``max_error`` chooses, and that in words.
+        """Choose the model by ``budget_ms`` or ``max_error``; return the settings with it, and a description.
 
         Args:
             sequence: the frames.
-            on_step: called with how many models have been measured, and of how many.
+            on_step: called with the number of measured models, and the number of all models.
 
         Raises:
-            InputError: no model is that fast, or that good.
+            InputError: no model meets the limits.
         """
         if not self.is_budgeted:
             return self, ""
-        # Here because it brings the benchmark, which takes its time to load.
+        # Imported here because it loads the benchmark, which takes time.
         from mcdenoise.budget import choose_model
 
         choice = choose_model(
@@ -159,10 +159,10 @@ class ShotSettings:
 
     @property
     def spelling(self) -> Spelling:
-        """The model that is asked for, or that the weights are of, or the default.
+        """The requested model, the model that the weights are for, or the default.
 
         Raises:
-            InputError: there is no such model, or its weights cannot be read.
+            InputError: the model is unknown, or its weights cannot be read.
         """
         if self.weights is None:
             return parse_method(self.model or DEFAULT)
@@ -176,7 +176,7 @@ class ShotSettings:
         Raises:
             InputError: see :class:`mcdenoise.denoiser.Denoiser`.
         """
-        # What is not asked for is not passed on: a model of another kind has no such setting.
+        # Pass only the given settings, because other models do not have all of them.
         asked = {
             "alpha_min": self.alpha_min,
             "anti_lag": None if self.anti_lag else False,
@@ -194,10 +194,10 @@ class ShotSettings:
 
 
 def check_threads(threads: int) -> None:
-    """See that torch can have so many threads.
+    """Check that torch supports this number of threads.
 
     Raises:
-        InputError: it cannot.
+        InputError: it does not.
     """
     if not 1 <= threads <= _MOST_THREADS:
         raise InputError(f"--threads: expected 1 to {_MOST_THREADS}, found {threads}")

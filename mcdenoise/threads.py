@@ -1,22 +1,23 @@
-"""How threads wait for one another."""
+"""How OpenMP's threads wait for one another."""
 
 from __future__ import annotations
 
 import os
 
-# Whatever of these a user has set is what the user wants.
+# Variables by which a user chooses the behaviour.
 _SAID = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
 
 
 def wait_passively() -> None:
-    """Let OpenMP's threads sleep where they have to wait, instead of spinning.
+    """Make OpenMP's threads sleep while they wait, instead of spinning.
 
-    Spinning threads take the processor from a renderer beside them, and wait for threads that cannot run meanwhile: on
-    two cores, one of them busy, single frames took up to eight times as long. On a quiet machine nothing is lost.
+    Spinning threads take processor time from a renderer that runs at the same time, and from the threads that they wait
+    for: on two cores, one of them busy, single frames took up to eight times as long. On an idle machine there is no
+        loss.
 
-    OpenMP reads this when torch is imported, so that it is to be said before. It is a setting of the whole process and
-    so a decision of whoever owns it: commands make it, the library does not. Does nothing where one of the environment
-    variables OMP_WAIT_POLICY, GOMP_SPINCOUNT and KMP_BLOCKTIME is set.
+    OpenMP reads the setting when torch is imported, so call this before. The setting applies to the whole process, so
+    commands call this function and the library does not. It has no effect if one of the environment variables
+    OMP_WAIT_POLICY, GOMP_SPINCOUNT and KMP_BLOCKTIME is set.
     """
     if not any(name in os.environ for name in _SAID):
         os.environ["OMP_WAIT_POLICY"] = "PASSIVE"

@@ -1,4 +1,4 @@
-"""What is measured once on a machine and kept in the user's cache folder."""
+"""Files in the user's cache folder, for values that are measured once on a machine."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from mcdenoise.errors import InputError
 
 
 def cache_file(name: str) -> Path:
-    """Where a file of the user's cache is, whether or not there is one."""
+    """Path of a file in the user's cache folder; the file need not exist."""
     folder = os.environ.get("XDG_CACHE_HOME")
     return (Path(folder) if folder else Path("~/.cache").expanduser()) / "mcdenoise" / name
 
 
 def keep(path: Path, text: str) -> None:
-    """Write a file of a cache, whole or not at all; where there is no place for it, it is measured again next time."""
-    # Here because it brings the readers of files, which take their time to load.
+    """Write a cache file atomically; if that fails, the value is measured again next time."""
+    # Imported here because it loads the readers of files, which takes time.
     from mcdenoise.data.files import write_text
 
     with suppress(OSError, InputError):

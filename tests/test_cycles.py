@@ -28,7 +28,7 @@ from mcdenoise.scenes.cycles.process import PYTHON_VARIABLE
 from mcdenoise.scenes.cycles.sequence import _prolonged, _View
 from mcdenoise.scenes.cycles.shapes import Mesh, tessellate
 from mcdenoise.scenes.random import RandomScene, random_scene
-from mcdenoise.scenes.random.stage import place, rgb, rotate
+from mcdenoise.scenes.random.builder import place, rgb, rotate
 
 PYTHON = os.environ.get(PYTHON_VARIABLE)
 GRAY = {"type": "diffuse", "reflectance": rgb((0.5, 0.5, 0.5))}

@@ -358,7 +358,7 @@ def test_depth_is_the_clip_w_of_positions() -> None:
 
 
 def test_what_tells_motion_can_be_left_behind() -> None:
-    frame = full_frame().without_past()
+    frame = full_frame().without_history()
     assert frame.buffers == {*BUFFERS, "view_projection"} - MOTION
 
 

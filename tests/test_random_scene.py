@@ -16,8 +16,8 @@ import pytest
 
 from mcdenoise.data.camera_path import Camera, check_moves, pixel_rays
 from mcdenoise.scenes.random import RandomScene, cameras, random_scene
+from mcdenoise.scenes.random.builder import SceneBuilder, bounds, box
 from mcdenoise.scenes.random.materials import diffuse
-from mcdenoise.scenes.random.stage import Stage, bounds, box
 from mcdenoise.scenes.render.tracer import Tracer, scene_digest
 
 SEEDS = range(40)
@@ -204,14 +204,14 @@ def test_every_frame_of_a_path_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
         return lambda view, frame: replace(view, origin=view.origin + frame % 8 * aside)
 
     monkeypatch.setattr(cameras, "_way_to_move", way)
-    stage = Stage((-6, 0, -6), (6, 3, 6))
-    gray = stage.material(diffuse((0.5, 0.5, 0.5)))
-    stage.add(box((x, 1.5, z), (0.3, 3, 0.3), gray) for x in range(-6, 7, 2) for z in range(-6, 7, 2))
-    stage.points.append(np.array((0, 1, 0)))
-    lows, highs = stage.boxes()
+    builder = SceneBuilder((-6, 0, -6), (6, 3, 6))
+    gray = builder.material(diffuse((0.5, 0.5, 0.5)))
+    builder.add(box((x, 1.5, z), (0.3, 3, 0.3), gray) for x in range(-6, 7, 2) for z in range(-6, 7, 2))
+    builder.points.append(np.array((0, 1, 0)))
+    lows, highs = builder.boxes()
     moving = 0
     for seed in range(10):
-        shot = cameras.shoot(stage, np.random.default_rng(seed), 17)
+        shot = cameras.shoot(builder, np.random.default_rng(seed), 17)
         eyes = np.array([camera.to_world[:3, 3] for camera in shot])[:, None]
         assert not ((eyes > lows - CLOSE) & (eyes < highs + CLOSE)).all(axis=-1).any(), seed
         moving += bool((eyes[0] != eyes[1]).any())

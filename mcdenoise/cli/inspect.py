@@ -5,7 +5,7 @@ from __future__ import annotations
 from mcdenoise.cli._options import Flag, Inputs, Json, Map
 from mcdenoise.cli._output import print_rows, warn, write_json
 from mcdenoise.data import Sequence
-from mcdenoise.data.readers.diffuse_specular import PARTS
+from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
 from mcdenoise.errors import printable
 from mcdenoise.shot import ShotSettings
 
@@ -53,7 +53,7 @@ def inspect(
 
 def _users(sequence: Sequence) -> dict[str, list[str]]:
     """The models that look at what few do: parts of the light and samples."""
-    if not (found := sorted(PARTS & sequence.buffers)):
+    if not (found := sorted(LIGHT_PARTS & sequence.buffers)):
         return {}
     # Here because it imports every model, which takes its time.
     from mcdenoise.models import users_of

@@ -1,4 +1,4 @@
-"""Files in and out: EXR images, and sequences of frames in known folder layouts."""
+"""Reading and writing files: EXR images, and sequences of frames."""
 
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import Sequence, open_sequence

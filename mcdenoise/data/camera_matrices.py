@@ -21,9 +21,9 @@ Array: TypeAlias = NDArray[np.float64]
 
 MATRICES = "camera_matrices.h"
 _LARGEST_FILE = 50 * 2**20
-# A comment that is never closed swallows the rest, so that whatever it hides counts as missing.
+# An unclosed comment hides the rest of the file, so that variables in it count as missing.
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?(?:\*/|\Z)", re.DOTALL)
-# Nothing is tried twice: the time is that of the length, whatever the text.
+# The patterns do not backtrack: the run time is linear in the length of any text.
 _NUMBER = re.compile(r"[-+]?(?:[0-9]++(?:\.[0-9]*+)?+|\.[0-9]++)(?:[eE][-+]?[0-9]++)?+")
 _LITERAL = re.compile(rf"\s*(?:([{{}},])|({_NUMBER.pattern})[fF]?(?![\w.]))")
 
@@ -58,7 +58,7 @@ class CameraMatrices:
                   M'_{:,1} = M_{:,1} + \frac{2 o_y - 1}{H} M_{:,3}
 
         Args:
-            index: which frame, from 0.
+            index: number of the frame, from 0.
             size: height and width of the image in pixels.
 
         Returns:
@@ -77,12 +77,12 @@ def read_camera_matrices(path: Path) -> CameraMatrices:
 
     Args:
         path: the C header with ``camera_matrices[N][4][4]``, ``pixel_offsets[N][2]``, ``position_limit_squared`` and
-            ``normal_limit_squared``. Comments and the suffix ``f`` are understood; nothing is computed.
+            ``normal_limit_squared``. Comments and the suffix ``f`` are accepted; expressions are not.
 
     Raises:
-        InputError: the file is missing, too large, incomplete, or holds something that is no finite number.
+        InputError: the file is missing, too large, incomplete, or contains something other than finite numbers.
     """
-    # A link to nothing is told below; a pipe would wait for ever, a device never end.
+    # A missing file is reported below; opening a pipe would block, and a device has no end.
     if os.path.exists(path) and not os.path.isfile(path):
         raise InputError(f"{path}: expected a text file, found a folder, a device or a pipe; remove it")
     try:
@@ -104,14 +104,14 @@ def read_camera_matrices(path: Path) -> CameraMatrices:
 
 
 def find_camera_matrices(folder: Path, last: int) -> CameraMatrices | None:
-    """Read the ``camera_matrices.h`` of a folder; ``None`` where there is none.
+    """Read the ``camera_matrices.h`` of a folder; return ``None`` if there is none.
 
     Args:
-        folder: of the frames.
-        last: number of the last frame that is used.
+        folder: folder of the frames.
+        last: number of the last frame in use.
 
     Raises:
-        InputError: as :func:`read_camera_matrices`; or there is no matrix for that frame.
+        InputError: see :func:`read_camera_matrices`; or there is no matrix for the last frame.
     """
     path = folder / MATRICES
     if not os.path.lexists(path):
@@ -126,12 +126,12 @@ def find_camera_matrices(folder: Path, last: int) -> CameraMatrices | None:
 
 
 def write_camera_matrices(path: Path, cameras: CameraMatrices, comment: str = "") -> None:
-    """Write a ``camera_matrices.h``, whole or not at all; numbers keep single precision.
+    """Write a ``camera_matrices.h`` atomically, in single precision.
 
     Args:
-        path: the file to be written. Its folder must exist.
-        cameras: what to write.
-        comment: one line for the head of the file.
+        path: the file. Its folder must exist.
+        cameras: the cameras to write.
+        comment: one line for the beginning of the file.
 
     Raises:
         InputError: the file cannot be written.
@@ -150,7 +150,7 @@ def write_camera_matrices(path: Path, cameras: CameraMatrices, comment: str = ""
 def _read_variable(path: Path, text: str, name: str, shape: tuple[int, ...]) -> Array:
     expected = "numbers " + "".join(f"[{n}]" if n >= 0 else "[N]" for n in shape) if shape else "a number"
     word = re.compile(rf"\b{name}\b")
-    # What no semicolon ends is no statement. Each is looked at once, however often the name is in it.
+    # A statement ends with a semicolon. Each statement is examined once, however often it contains the name.
     statements = (statement.partition("=") for statement in text.split(";")[:-1])
     initialiser = next((value for head, equals, value in statements if equals and word.search(head)), None)
     if initialiser is None:
@@ -161,7 +161,7 @@ def _read_variable(path: Path, text: str, name: str, shape: tuple[int, ...]) -> 
         raise _malformed(path, name, expected, "something else") from error
     if values.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, values.shape, strict=True)):
         raise _malformed(path, name, expected, f"shape {values.shape}")
-    # Single precision is what the header declares and what frames hold.
+    # The header declares single precision, and frames store it.
     if not (np.abs(values) <= np.finfo(np.float32).max).all():
         raise _malformed(path, name, expected, "a number too large for single precision")
     return values

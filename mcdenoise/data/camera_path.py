@@ -1,4 +1,4 @@
-"""Cameras, and shots: where each frame of a sequence is seen from, and where its objects are."""
+"""Cameras and shots: the camera and the placement of moving objects for each frame of a sequence."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mcdenoise.reading import read_text
 
 Array: TypeAlias = NDArray[np.float64]
 
-# A text, which is kept as it is, or a comma that nothing follows.
+# A string, which is kept, or a trailing comma, which is removed.
 _LAST_COMMA = re.compile(r'("(?:[^"\\]|\\.?)*+(?:"|\Z))|,(?=\s*+[}\]])', re.DOTALL)
 _SMALLEST_VOLUME = 1e-12
 
@@ -63,12 +63,12 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """What changes from frame to frame.
+    """The values that change from frame to frame.
 
     Args:
         cameras: one camera per frame.
-        moves: for each object of the scene that moves, by its id, ``(T, 4, 4)`` float64: for each of the T frames the
-            world-space transform (column vectors) that is applied to the object where the scene places it.
+        moves: for each moving object of the scene, by id, ``(T, 4, 4)`` float64: for each of T frames the world-space
+            transform (column vectors) to apply to the object after the scene has placed it.
     """
 
     cameras: list[Camera]
@@ -76,9 +76,9 @@ class Shot:
 
 
 def load_shot(path: Path) -> Shot:
-    """Read a camera path, and with it the paths of objects.
+    """Read a camera path, including the paths of objects.
 
-    These JSON layouts are known; a comma after the last element is forgiven:
+    The following JSON layouts are supported; a trailing comma after the last element is accepted:
 
     - ``{"fov": ..., "to_world": [4x4, ...]}``, with matrices as in :class:`Camera`;
     - ``{"fov": ..., "frames": [{"position": ..., "look_at": ..., "up": ...}, ...]}``; a frame may have its own
@@ -91,10 +91,10 @@ def load_shot(path: Path) -> Shot:
     one matrix per frame, as in :class:`Shot`.
 
     Args:
-        path: the file; or a folder of ``*.json`` files, which are taken in the order of the last number in their names.
+        path: the file, or a folder of ``*.json`` files, which are sorted by the last number in their names.
 
     Raises:
-        InputError: the file is missing, no JSON, or a camera or an object in it is unusable.
+        InputError: the file is missing or not JSON, or a camera or object in it is invalid.
     """
     path = Path(path)
     content: Any
@@ -140,11 +140,11 @@ def load_shot(path: Path) -> Shot:
 
 
 def check_moves(moves: Mapping[str, Any], frames: int) -> dict[str, Array]:
-    """Transforms of objects as :class:`Shot` holds them.
+    """Check transforms of objects, and convert them to the form in :class:`Shot`.
 
     Args:
         moves: for each id, ``frames`` matrices of shape ``(4, 4)`` or ``(3, 4)``.
-        frames: how many there have to be.
+        frames: the required number of matrices.
 
     Raises:
         InputError: a matrix is missing, not finite, not affine or cannot be inverted.
@@ -204,7 +204,7 @@ class PixelRays:
     """Rays through the pixel centres, row by row from the top left, in world space.
 
     Args:
-        origin: ``(3,)`` where they all start.
+        origin: ``(3,)`` common origin.
         directions: ``(H*W, 3)`` unit vectors.
     """
 
@@ -213,7 +213,7 @@ class PixelRays:
 
 
 def pixel_rays(camera: Camera, width: int, height: int) -> PixelRays:
-    """The rays that a camera sees along, one for each of ``width`` x ``height`` pixels."""
+    """The camera rays through the centres of ``width`` x ``height`` pixels."""
     tan_x, tan_y = _half_extent(camera, width, height)
     x = (1 - (2 * np.arange(width) + 1) / width) * tan_x  # camera x points left, camera y up
     y = (1 - (2 * np.arange(height) + 1) / height) * tan_y

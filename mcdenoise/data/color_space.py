@@ -1,4 +1,4 @@
-"""Colours of other primaries: what an EXR says of its own, brought to those that every metric assumes."""
+"""Conversion of colours from the primaries stated in an EXR to Rec. 709, which every metric assumes."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from torch import Tensor
 from mcdenoise.data.exr import Metadata
 from mcdenoise.errors import InputError
 
-# Red, green, blue and white of Rec. 709, as OpenEXR stores them; a file without the attribute has these.
+# Red, green, blue and white of Rec. 709 in OpenEXR's order; a file without the attribute has these primaries.
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-# Far below a visible difference, and above the rounding of what writers store.
+# Far below a visible difference, and above writers' rounding errors.
 _CLOSE = 1e-3
 
 
 def to_rec709(image: Tensor, metadata: Metadata) -> Tensor:
-    """Scene-linear RGB with the primaries of Rec. 709, and so of sRGB.
+    """Convert scene-linear RGB to the primaries of Rec. 709, which are those of sRGB.
 
     Args:
         image: ``(..., 3, H, W)`` scene-linear radiance.
-        metadata: of its file: ``chromaticities`` has x and y of red, green, blue and white. Without it, and where these
-            are Rec. 709's to 0.001, the image is returned as it is.
+        metadata: metadata of its file: ``chromaticities`` holds x and y of red, green, blue and white. Without it, or
+            if it equals Rec. 709 to 0.001, the image is returned unchanged.
 
     Returns:
         The same shape and dtype; the white is adapted by the Bradford transform. Saturated colours may be negative.
 
     Raises:
-        InputError: the chromaticities are no colour space.
+        InputError: the chromaticities do not define a colour space.
     """
     stored = metadata.get("chromaticities", _REC709)
     if isinstance(stored, tuple) and len(stored) == 8 and np.isfinite(stored).all():
@@ -49,7 +49,7 @@ def to_rec709(image: Tensor, metadata: Metadata) -> Tensor:
 
 
 def _matrix(points: np.ndarray[Any, Any]) -> Tensor | None:
-    """``(3, 3)`` RGB to Rec. 709; ``None`` where the primaries span no colours."""
+    """``(3, 3)`` matrix from RGB to Rec. 709; ``None`` if the primaries are collinear."""
     colour = import_colour()
     target = colour.RGB_COLOURSPACES["ITU-R BT.709"]
     try:
@@ -61,10 +61,10 @@ def _matrix(points: np.ndarray[Any, Any]) -> Tensor | None:
 
 
 def import_colour() -> Any:
-    """The package colour-science; loading it takes a second, and few files need it."""
+    """Import colour-science lazily, because it takes a second and few files need it."""
     modules: dict[str, Any] = sys.modules
     with warnings.catch_warnings():
-        # It warns of packages for plots that it does not find.
+        # It warns about missing plotting packages.
         warnings.simplefilter("ignore")
         # It would keep OpenImageIO alive to the end of the process, which prints pages of leaks then.
         modules["OpenImageIO"] = None

@@ -22,19 +22,19 @@ Metadata: TypeAlias = dict[str, MetadataValue]
 
 LARGEST_HALF = 65504.0
 LARGEST_PIXEL_COUNT = 2**28
-# Converted and compressed at a time: enough for all cores, and little beside a large image.
+# Bytes to convert and compress at a time: enough for all cores, and little compared with a large image.
 _ROWS = 256
-# Black pixels in a byte of file: zlib's limit is 1032, and PXR24 drops a quarter before; DWA leaves one number of 64,
-# or of a run of 128 bytes two.
+# Largest number of black pixels per byte of a file: zlib's limit is 1032, and PXR24 first drops a quarter; DWA stores
+# one number for 64, or two bytes for a run of 128.
 _LARGEST_RATIO, _LARGEST_DWA_RATIO = 2_000, 70_000
-# These describe how one file stores its pixels, not what they show; the next file has its own.
+# These attributes describe how one file stores its pixels, not the picture; the written file has its own.
 _STORAGE_PREFIXES = ("oiio:", "openexr:", "compression", "textureformat")
 _TUPLE_TYPES = {"FramesPerSecond": "rational", "smpte:TimeCode": "timecode"}
 
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """What an EXR file says about its image before any pixel is read.
+    """Header of an EXR file.
 
     Args:
         size: height and width of the data window in pixels.
@@ -50,13 +50,13 @@ class ExrHeader:
 
 
 def read_exr_header(path: Path) -> ExrHeader:
-    """Read the header of an EXR file.
+    """Read the header of an EXR file without its pixels.
 
     Args:
-        path: the file. Of a file with several parts, the first one is read.
+        path: the file. If it has several parts, the first one is read.
 
     Raises:
-        InputError: as :func:`read_exr`, except for damaged pixels, which are not looked at.
+        InputError: see :func:`read_exr`; damaged pixels are not detected.
     """
     file, header = _open(path)
     file.close()
@@ -67,14 +67,14 @@ def read_exr(path: Path) -> tuple[Image, list[str], Metadata]:
     """Read an EXR file.
 
     Args:
-        path: the file. Of a file with several parts, the first one is read.
+        path: the file. If it has several parts, the first one is read.
 
     Returns:
-        The pixels of the data window as float32 ``(H, W, C)``, top row first; the C channel names; the attributes
+        The pixels of the data window as float32 ``(H, W, C)``, top row first; the C channel names; and the attributes
         that describe the picture.
 
     Raises:
-        InputError: the file is missing, no EXR, deep, damaged or of absurd size.
+        InputError: the file is missing, not an EXR, deep, damaged or unreasonably large.
     """
     file, header = _open(path)
     try:
@@ -84,7 +84,7 @@ def read_exr(path: Path) -> tuple[Image, list[str], Metadata]:
         pixels, reason = None, "not enough memory"
     finally:
         file.close()
-    # A file cut short has an intact header, and its missing rows would otherwise be black.
+    # A truncated file has an intact header; without this check its missing rows would be black.
     if pixels is None or reason:
         raise _unreadable(path, f"damaged or missing pixels ({reason})", "render or copy the file again")
     return np.asarray(pixels, dtype=np.float32).reshape(*header.size, -1), header.channels, header.metadata
@@ -98,18 +98,18 @@ def write_exr(
     half: bool = True,
     metadata: Mapping[str, MetadataValue] | None = None,
 ) -> None:
-    """Write an EXR file with ZIP compression, whole or not at all.
+    """Write an EXR file with ZIP compression, atomically.
 
     Args:
-        path: the file to be written. Its folder must exist.
+        path: the file. Its folder must exist.
         image: ``(H, W, C)`` pixels, top row first.
         channels: C channel names.
-        half: store half floats; values beyond 65504 are stored as 65504. Otherwise 32-bit floats.
+        half: store half floats, clamped to 65504; otherwise 32-bit floats.
         metadata: attributes to keep, as :func:`read_exr` returns them.
 
     Raises:
         InputError: the file cannot be written.
-        ValueError: ``image`` and ``channels`` do not fit together.
+        ValueError: ``image`` and ``channels`` do not match.
     """
     if image.ndim != 3 or 0 in image.shape or image.shape[2] != len(channels):
         raise ValueError(
@@ -130,7 +130,7 @@ def write_exr(
 
 
 def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
-    # os.path, because Path.is_file raises for a name that is too long or a folder that may not be entered.
+    # Not Path.is_file, which raises an error for a name that is too long or a folder without access.
     if not os.path.isfile(path):
         raise _unreadable(path, what_is_at(path), "check the path")
     check_name(path)
@@ -147,7 +147,7 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
     elif spec.nchannels < 1:
         found = "no channels"
     elif any(str(kind) in ("uint", "int") for kind in (spec.format, *spec.channelformats)):
-        # Which OpenImageIO would scale by 2^-32.
+        # OpenImageIO would scale integers by 2^-32.
         found = "whole numbers"
     elif {"RY", "BY"} <= set(spec.channelnames):
         found = "luminance and chroma (Y, RY, BY), not R, G, B"
@@ -156,7 +156,7 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
     elif min(spec.width, spec.height) < 1 or spec.width * spec.height > LARGEST_PIXEL_COUNT:
         found = f"{spec.width} x {spec.height} pixels"
     elif is_hollow(path, spec, spec.width * spec.height * int(spec.pixel_bytes(True))):
-        # Told before memory is taken for them.
+        # Checked before memory is allocated.
         found = f"{spec.width} x {spec.height} pixels of {spec.nchannels} channels, but not the data for them"
     if found:
         file.close()
@@ -166,7 +166,7 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
 
 
 def what_is_at(path: Path) -> str:
-    """What is there in place of a file, for people."""
+    """Describe what is at a path instead of a file, for messages."""
     if os.path.isdir(path):
         return "a folder"
     if os.path.exists(path):
@@ -175,10 +175,10 @@ def what_is_at(path: Path) -> str:
 
 
 def check_name(path: Path) -> None:
-    """Refuse a name that OpenImageIO cannot be told.
+    """Reject a name that cannot be passed to OpenImageIO.
 
     Raises:
-        InputError: the bytes of the name are no UTF-8.
+        InputError: the name is not valid UTF-8.
     """
     try:
         str(path).encode()
@@ -187,14 +187,14 @@ def check_name(path: Path) -> None:
 
 
 def is_hollow(path: Path, spec: oiio.ImageSpec, promised: int) -> bool:
-    """Whether a header promises more bytes of pixels than its file can hold, however it is compressed."""
+    """Whether a header declares more pixels than its file can hold, whatever the compression."""
     dwa = str(spec.getattribute("compression")).startswith("dwa")
     ratio = _LARGEST_DWA_RATIO if dwa else _LARGEST_RATIO
     return promised > ratio * os.path.getsize(path)
 
 
 def picture_metadata(spec: oiio.ImageSpec) -> Metadata:
-    """The attributes that describe the picture, not how the file stores it."""
+    """The attributes that describe the picture rather than its storage."""
     kept: Metadata = {}
     for attribute in spec.extra_attribs:
         value = attribute.value
@@ -208,7 +208,7 @@ def picture_metadata(spec: oiio.ImageSpec) -> Metadata:
 
 
 def _as_text(text: str) -> str:
-    """Bytes that are no UTF-8 come as surrogates: old systems write Latin-1."""
+    """Decode bytes that are not UTF-8, and arrive as surrogates, as Latin-1, which old systems write."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -224,7 +224,7 @@ def _set_attribute(spec: oiio.ImageSpec, name: str, value: MetadataValue) -> Non
 
 
 def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], half: bool) -> str:
-    """Write the file and return why that failed, or an empty text."""
+    """Write the file; return the reason of a failure, or an empty text."""
     file = oiio.ImageOutput.create("openexr")
     if file is None:
         return pending_error(oiio)
@@ -239,7 +239,7 @@ def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], half: bool) ->
     reason = pending_error(file)
     if not file.close() or not written:
         return reason or "writing failed"
-    # OpenImageIO does not notice when the last few kilobytes no longer fit on the disk: see whether they are there.
+    # OpenImageIO does not report a full disk for the last few kilobytes, so read them back.
     check = oiio.ImageInput.open(str(path))
     if check is None:
         return f"incomplete: {pending_error(oiio)}"
@@ -250,16 +250,16 @@ def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], half: bool) ->
 
 
 def within_half(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Pixels that a half float can hold; NaN stays NaN.
+    """Clamp pixels to the range of half floats; NaN is kept.
 
-    Rounding would turn a firefly into infinity, which spreads through every filter downstream.
+    Otherwise rounding would turn a firefly into infinity, which spreads through every later filter.
     """
     clipped: NDArray[Any] = np.clip(pixels, -LARGEST_HALF, LARGEST_HALF)
     return clipped
 
 
 def pending_error(source: Any) -> str:
-    """The pending error of OpenImageIO in one line; a damaged header can put bytes into it that are no text."""
+    """OpenImageIO's pending error in one line; a damaged header can make it contain invalid text."""
     try:
         lines = source.geterror().split("\n")
     except UnicodeDecodeError:

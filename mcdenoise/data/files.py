@@ -1,4 +1,4 @@
-"""Writing files so that a file with its final name is always complete."""
+"""Atomic writing: a file with its final name is always complete."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from mcdenoise.interruption import unfinished
 try:
     import fcntl
 except ImportError:
-    # A system without such locks: what is left over there stays.
+    # On a system without such locks, leftovers are not removed.
     fcntl = None  # type: ignore[assignment]
 
-# What is being written has names that nothing else has, and is locked by whoever writes it.
+# Incomplete files have unique names, and are locked by the process that writes them.
 _PREFIX, _MARK = ".mcdenoise-", ".tmp"
 _YOUNG = 1.0  # seconds
-# Folders in which this process has looked for what others left over.
+# Folders that this process has already cleaned of leftovers.
 _swept: set[str] = set()
 
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside ``path`` to write to, and rename it to ``path`` if the block succeeds.
+    """Yield a temporary path beside ``path``, and rename it to ``path`` if the block succeeds.
 
-    A reader of ``path`` sees the old file or the whole new one, also after a power cut; if the block fails or is
-    interrupted, the temporary file is removed, and if the process is killed, the next one that writes to the folder
-    removes it. Several processes, on whatever machines, may write to one folder.
+    A reader of ``path`` sees the old file or the complete new one, also after a power failure. If the block fails or is
+    interrupted, the temporary file is removed; if the process is killed, the next process that writes to the folder
+    removes it. Several processes, also on different machines, may write to one folder.
 
     Args:
-        path: the file to be written. Its folder must exist.
+        path: the file. Its folder must exist.
 
     Yields:
         A path in the same folder with the same suffix.
 
     Raises:
-        InputError: ``path`` is something other than a file, or the operating system refused to write.
+        InputError: ``path`` is not a file, or the operating system refuses to write.
 
     Example:
         >>> import tempfile
@@ -52,11 +52,11 @@ def atomic_path(path: Path) -> Iterator[Path]:
         >>> path.read_text(), len(list(path.parent.iterdir()))
         ('1 2 3', 1)
     """
-    # Renaming must replace what a link points to, not the link, and never a device such as /dev/stdout.
+    # Replace the target of a link, not the link, and never a device such as /dev/stdout.
     target = Path(os.path.realpath(path))
     if os.path.lexists(target) and not os.path.isfile(path):
         raise InputError(f"{path}: expected a file to write, found a folder or a device; choose another path")
-    # By its suffix a library tells the format: that of the name it was given, not of what that may be a link to.
+    # Libraries choose the format by the suffix, so keep that of the given name, not of the link's target.
     temporary = target.with_name(f"{_PREFIX}{secrets.token_hex(8)}{_MARK}{path.suffix[:64]}")
     handle = -1
     try:
@@ -68,7 +68,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
             _to_disk(temporary)
             os.replace(temporary, target)
     finally:
-        # Gone already after a successful rename; a folder that refuses this refused the file too.
+        # After a successful rename it no longer exists. A folder that forbids removing has also forbidden creating it.
         with suppress(OSError):
             os.unlink(temporary)
         with suppress(OSError):
@@ -77,14 +77,14 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def held(folder: Path, work: str) -> Iterator[None]:
-    """Have a folder for oneself; that ends with the process, however that ends.
+    """Lock a folder for this process; the lock is released when the process ends in any way.
 
     Args:
-        folder: where the lock is put, which nobody needs to remove.
-        work: what is done there, one word, for the message.
+        folder: folder that gets the lock file, which may remain there.
+        work: the kind of work, one word, for the message.
 
     Raises:
-        InputError: another process has it, which the message names; or the lock cannot be written.
+        InputError: another process holds the lock (the message names it), or the lock file cannot be written.
 
     Example:
         >>> import tempfile
@@ -113,18 +113,18 @@ def held(folder: Path, work: str) -> Iterator[None]:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Give a temporary folder beside ``path`` to write to, and rename it to ``path`` if the block succeeds.
+    """Yield a temporary folder beside ``path``, and rename it to ``path`` if the block succeeds.
 
-    If the block fails or is interrupted, the temporary folder is removed with all that is in it.
+    If the block fails or is interrupted, the temporary folder is removed with its contents.
 
     Args:
-        path: the folder to be made; nothing may be there.
+        path: the folder to create; nothing may exist there.
 
     Yields:
-        An empty folder in the same place.
+        An empty folder in the same parent folder.
 
     Raises:
-        InputError: there is something at ``path``, or the operating system refused to write.
+        InputError: ``path`` exists, or the operating system refuses to write.
     """
     if os.path.lexists(path):
         raise InputError(f"{path}: expected nothing there yet, found something; choose a new folder, or remove it")
@@ -137,7 +137,7 @@ def new_folder(path: Path) -> Iterator[Path]:
             _lock(handle)
             _sweep(temporary.parent)
             yield temporary
-            # Over a folder that has come meanwhile, unless it is empty, this fails.
+            # This fails if a non-empty folder has been created there in the meantime.
             os.rename(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -146,11 +146,11 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file, whole or not at all.
+    """Write a UTF-8 text file atomically.
 
     Args:
-        path: the file to be written. Its folder must exist.
-        text: its content.
+        path: the file. Its folder must exist.
+        text: the content.
 
     Raises:
         InputError: the file cannot be written.
@@ -160,27 +160,27 @@ def write_text(path: Path, text: str) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """See that a file can be written, and change nothing: before work of hours, not after it.
+    """Check that a file can be written, without changing anything, before hours of work.
 
     Args:
         path: the file. Its folder must exist.
 
     Raises:
-        InputError: as :func:`atomic_path`.
+        InputError: see :func:`atomic_path`.
     """
     with suppress(_Tried), atomic_path(path):
         raise _Tried
 
 
 class _Tried(Exception):
-    """Writing would have begun."""
+    """Raised in place of writing, by :func:`check_writable`."""
 
 
 def remove(path: Path) -> None:
-    """Remove a file, if it is there.
+    """Remove a file if it exists.
 
     Raises:
-        InputError: it is no file, or the operating system refused.
+        InputError: it is not a file, or the operating system refuses.
     """
     try:
         path.unlink(missing_ok=True)
@@ -193,13 +193,13 @@ def remove(path: Path) -> None:
 
 
 def _lock(handle: int) -> bool:
-    """Hold an open file or folder until it is closed, or the process ends; false if another process holds it."""
+    """Lock an open file or folder until it is closed; return false if another process has locked it."""
     if fcntl is None:
         return False
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
-        # Held, or on a file system without locks.
+        # Already locked, or on a file system without locks.
         return False
     return True
 
@@ -211,24 +211,24 @@ def _sweep(folder: Path) -> None:
 
 
 def sweep(folder: Path, youngest: float = _YOUNG) -> None:
-    """Remove what processes left over in a folder that were killed while they wrote: nobody holds it any more.
+    """Remove temporary files of killed processes from a folder: those that no process has locked.
 
     Args:
-        folder: which need not be there.
-        youngest: seconds since the last change; 0 where nobody writes to the folder now.
+        folder: the folder; it need not exist.
+        youngest: smallest age in seconds; 0 if no process is writing to the folder now.
     """
     place = os.path.realpath(folder)
     with suppress(OSError), os.scandir(place) as entries:
         for entry in entries:
             ours = entry.name.startswith(_PREFIX) and _MARK in entry.name
-            # What another process has only just made it may not hold yet.
+            # A process may not yet have locked a file that it has just created.
             if ours and abs(time.time() - entry.stat(follow_symlinks=False).st_mtime) >= youngest:
                 _remove_unless_held(entry.path)
 
 
 def _remove_unless_held(path: str) -> None:
     with suppress(OSError):
-        # Opened in this way a pipe of the same name would not wait for anybody.
+        # Opened without blocking, in case a pipe has this name.
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
         try:
             if _lock(handle):
@@ -241,7 +241,7 @@ def _remove_unless_held(path: str) -> None:
 
 
 def _to_disk(path: Path) -> None:
-    """Wait until what was written is on the disk: without that, a power cut after the renaming leaves an empty file."""
+    """Flush a file to the disk; otherwise a power failure after the rename could leave an empty file."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -251,7 +251,7 @@ def _to_disk(path: Path) -> None:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """One line for what the operating system refuses."""
+    """Convert errors of the operating system to an ``InputError``."""
     try:
         yield
     except OSError as error:

@@ -1,7 +1,7 @@
-"""Images of every kind that renderers write, through OpenImageIO: what is in a file, and some of its channels.
+"""Reading images in all formats of renderers through OpenImageIO: headers, and selected channels.
 
-An EXR of several parts, each with channels of its own, or one picture as `.hdr`, `.pfm`, `.tif` or `.png`. Pixels come
-as 32-bit floats; every failure is told in one line.
+Supported are EXR files with several parts, each with its own channels, and `.hdr`, `.pfm`, `.tif` or `.png` files with
+one image. Pixels are returned as 32-bit floats; every failure is an error of one line.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mcdenoise.data.exr import (
 )
 from mcdenoise.errors import InputError
 
-# Those that are opened, by the names of OpenImageIO.
+# Supported formats by OpenImageIO's names.
 FORMATS = {
     ".exr": "openexr",
     ".sxr": "openexr",
@@ -42,30 +42,30 @@ FORMATS = {
     ".png": "png",
 }
 _LARGEST_PARTS, _LARGEST_CHANNELS = 1024, 4096
-# Rows that are decoded at a time, with all channels, of which few are wanted: those of a chunk, or several. More would
-# cost a frame of 60 channels twice the time, and hundreds of megabytes; fewer would decode a chunk again.
+# Rows to decode at a time, with all channels, although few are requested: one chunk or several. More rows would double
+# the time for a frame of 60 channels and take hundreds of megabytes; fewer would decode a chunk repeatedly.
 _ROWS = {"none": 16, "rle": 16, "zips": 16, "zip": 16, "pxr24": 16, "piz": 32, "b44": 32, "b44a": 32, "dwaa": 32}
 _MOST_ROWS = 256
 EXR_SUFFIXES = {suffix for suffix, name in FORMATS.items() if name == "openexr"}
 _PNG = b"\x89PNG\r\n\x1a\n"
 _INTEGERS = {"uint", "int"}
-# Chroma of an image that is stored as luminance and chroma: without its luminance no color, and subsampled mostly.
+# Chroma channels of a luminance-chroma image: useless without the luminance, and usually subsampled.
 _CHROMA = {"ry", "by"}
-# Beyond what OpenImageIO reads by default: a shot with all passes of 300 lights has more.
+# More than OpenImageIO's default limit: a shot with all passes of 300 lights exceeds that.
 oiio.attribute("limits:channels", _LARGEST_CHANNELS)
 
 
 @dataclass(frozen=True)
 class Part:
-    """One image of a file.
+    """One image (part) of a file.
 
     Args:
-        name: of the part, empty where the file gives none.
+        name: name of the part, empty if the file has none.
         size: height and width of the data window in pixels.
         origin: row and column of its first pixel in the display window.
-        channels: their names, R, G, B first.
-        integers: those that are stored as whole numbers, such as identities of objects.
-        display_referred: whether the samples are display values (sRGB), such as in an 8-bit PNG.
+        channels: names of the channels, R, G, B first.
+        integers: channels that are stored as integers, such as object ids.
+        display_referred: whether the pixels are display values (sRGB), as in an 8-bit PNG.
     """
 
     name: str
@@ -78,10 +78,10 @@ class Part:
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What a file says about its images before any pixel is read.
+    """Header of an image file.
 
     Args:
-        format: the container, as OpenImageIO calls it, such as ``openexr``.
+        format: the format, by OpenImageIO's name, such as ``openexr``.
         parts: at least one.
         metadata: attributes of the first part that describe the picture.
     """
@@ -95,7 +95,7 @@ def read_image_header(path: Path) -> ImageHeader:
     """Read the headers of all parts of a file.
 
     Raises:
-        InputError: the file is missing, of another format, deep, damaged or of absurd size.
+        InputError: the file is missing, has another format, or is deep, damaged or unreasonably large.
     """
     file, header = _open(path)
     file.close()
@@ -103,19 +103,20 @@ def read_image_header(path: Path) -> ImageHeader:
 
 
 def read_channels(path: Path, wanted: Mapping[int, Sequence[str]], rows: slice = slice(None)) -> dict[int, Image]:
-    """Read some channels of a file.
+    """Read selected channels of a file.
 
     Args:
         path: the file.
-        wanted: names of channels, by the index of their part.
-        rows: of the data window, one after the other; others need not be decoded.
+        wanted: names of channels, by part index.
+        rows: contiguous rows of the data window to read.
 
     Returns:
-        For each part float32 ``(H, W, C)`` pixels of its data window, top row first, channels in the order of
+        For each part float32 ``(H, W, C)`` pixels of its data window, top row first, with channels in the order of
         ``wanted``.
 
     Raises:
-        InputError: as :func:`read_image_header`; a part or channel is not there; pixels are damaged or missing.
+        InputError: see :func:`read_image_header`; or a part or channel does not exist, or pixels are damaged or
+            missing.
     """
     file, header = _open(path)
     try:
@@ -132,12 +133,12 @@ def read_channels(path: Path, wanted: Mapping[int, Sequence[str]], rows: slice =
 
 
 def read_picture(path: Path) -> tuple[oiio.ImageSpec, Part, Image]:
-    """Read all channels of the first image of a file, and what says how it is stored, to the library and to us.
+    """Read all channels of the first image of a file; also return OpenImageIO's and our own description of it.
 
-    Not through ``oiio.ImageBuf``, which reads a PFM upside down.
+    This does not use ``oiio.ImageBuf``, which reads a PFM upside down.
 
     Raises:
-        InputError: as :func:`read_channels`.
+        InputError: see :func:`read_channels`.
     """
     file, header = _open(path)
     try:
@@ -175,7 +176,7 @@ def _read(
         reason = pending_error(file)
     except MemoryError:
         found, reason = None, "not enough memory"
-    # A file cut short has an intact header, and its missing rows would otherwise be black.
+    # A truncated file has an intact header; without this check its missing rows would be black.
     if found is None or reason:
         raise InputError(
             f"{path}: expected whole images, found damaged or missing pixels ({reason}); render or copy the file again"
@@ -184,7 +185,7 @@ def _read(
 
 
 def _open(path: Path) -> tuple[oiio.ImageInput, ImageHeader]:
-    # os.path, because Path.is_file raises for a name that is too long or a folder that may not be entered.
+    # Not Path.is_file, which raises an error for a name that is too long or a folder without access.
     if not os.path.isfile(path):
         raise InputError(f"{path}: expected an image, found {what_is_at(path)}; check the path")
     check_name(path)
@@ -213,19 +214,19 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ImageHeader]:
 
 
 def as_stored() -> oiio.ImageSpec:
-    """A configuration for OpenImageIO to hand out samples as they are: of a PNG, alpha is not multiplied in."""
+    """OpenImageIO settings for reading pixels as stored: without multiplying a PNG's color by its alpha."""
     config = oiio.ImageSpec()
     config.attribute("oiio:RawColor", 1)
     config.attribute("oiio:UnassociatedAlpha", 1)
-    # Portable float maps begin with the lowest row; without the hint, OpenImageIO may leave it at the top.
+    # A PFM begins with the lowest row; without this hint, OpenImageIO may not flip it.
     config.attribute("pnm:pfmflip", 1)
     return config
 
 
 def _png_is_whole(path: Path) -> bool:
-    """Whether all chunks of a PNG are there and have their checksums; what is none is left to others.
+    """Whether all chunks of a PNG are present with valid checksums; true for other files.
 
-    The library says of damaged chunks what it has to say on the screen, and does not miss the last ones.
+    The library prints its errors about damaged chunks to the terminal, and does not notice missing chunks at the end.
     """
     try:
         left = os.path.getsize(path) - len(_PNG)
@@ -235,7 +236,7 @@ def _png_is_whole(path: Path) -> bool:
             while left >= 12:
                 length, kind = struct.unpack(">I4s", file.read(8))
                 left -= length + 12
-                # Told before memory is taken for them.
+                # Checked before memory is allocated.
                 if left < 0:
                     return False
                 content = file.read(length)
@@ -274,12 +275,12 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
         if min(spec.width, spec.height) < 1 or pixels > LARGEST_PIXEL_COUNT or spec.depth > 1:
             raise _refused(path, f"{spec.width} x {spec.height} pixels")
         bytes_promised += pixels * int(spec.pixel_bytes(True))
-        # Told before memory is taken for them.
+        # Checked before memory is allocated.
         if is_hollow(path, spec, bytes_promised):
             raise _refused(
                 path, f"{spec.width} x {spec.height} pixels of {spec.nchannels} channels, but not their data"
             )
-        # The library that writes cannot read them, and coarser levels would be those of the noisy image still.
+        # OpenEXR's module cannot write such files, and the coarser levels would still show the noisy image.
         if name == "openexr" and file.seek_subimage(len(parts), 1):
             raise _refused(path, "a texture of several resolutions", "write the largest one alone")
         integers = frozenset(c for c, kind in zip(channels, kinds, strict=True) if kind in _INTEGERS)

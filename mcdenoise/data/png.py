@@ -1,4 +1,4 @@
-"""PNG pictures through OpenImageIO, for people to look at: single ones, and images side by side with captions."""
+"""Writing PNG files: single pictures, captions and close-ups."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from mcdenoise.errors import InputError
 Picture = NDArray[np.uint8]
 
 _CAPTION_HEIGHT = 28
-# The last chunk of every PNG, which is empty, and its checksum.
+# Every PNG ends with this empty chunk and its checksum.
 _END = b"IEND\xae\x42\x60\x82"
 
 
 def write_png(path: Path, picture: Picture) -> None:
-    """Write an 8-bit picture, whole or not at all.
+    """Write an 8-bit picture atomically.
 
     Args:
-        path: the file to be written. Its folder must exist.
+        path: the file. Its folder must exist.
         picture: ``(H, W, 3)``.
 
     Raises:
@@ -36,10 +36,10 @@ def write_png(path: Path, picture: Picture) -> None:
 
 
 def read_png(path: Path) -> Picture:
-    """Read an 8-bit picture that :func:`write_png` has written.
+    """Read an 8-bit picture written by :func:`write_png`.
 
     Args:
-        path: of the file.
+        path: the file.
 
     Returns:
         ``(H, W, 3)``.
@@ -59,12 +59,12 @@ def read_png(path: Path) -> Picture:
 
 
 def _write(path: Path, picture: Picture) -> str:
-    """Write the file and return why that failed, or an empty text."""
+    """Write the file; return the reason of a failure, or an empty text."""
     height, width, channels = picture.shape
     spec = oiio.ImageSpec(width, height, channels, "uint8")
-    # The default of 6 takes more than twice as long, and saves 6 % of the bytes.
+    # The default level of 6 takes more than twice as long and saves 6 % of the bytes.
     spec.attribute("png:compressionLevel", 4)
-    # Not an ImageBuf: of each file a note stays in OpenImageIO's cache, and with it a hole in the heap.
+    # Not ImageBuf, which leaves an entry per file in OpenImageIO's cache and fragments the heap.
     file = oiio.ImageOutput.create("png")
     if file is None or not file.open(str(path), spec):
         return _reason(file or oiio)
@@ -72,17 +72,17 @@ def _write(path: Path, picture: Picture) -> str:
     reason = _reason(file)
     if not file.close() or not written:
         return reason or "writing failed"
-    # OpenImageIO does not notice a full disk: see whether the end is there.
+    # OpenImageIO does not report a full disk, so check the end of the file.
     return "" if path.read_bytes().endswith(_END) else "incomplete"
 
 
 def _reason(source: Any) -> str:
-    """The pending error of OpenImageIO in one line."""
+    """OpenImageIO's pending error in one line."""
     return str(source.geterror()).strip().split("\n")[0]
 
 
 def caption(picture: Picture, text: str) -> Picture:
-    """The picture with a line of white text on black above it."""
+    """Add a line of white text on black above the picture."""
     width = picture.shape[1]
     band = oiio.ImageBuf(oiio.ImageSpec(width, _CAPTION_HEIGHT, 3, "uint8"))
     oiio.ImageBufAlgo.zero(band)
@@ -92,5 +92,5 @@ def caption(picture: Picture, text: str) -> Picture:
 
 
 def enlarge(picture: Picture, factor: int) -> Picture:
-    """Every pixel as a square of ``factor`` pixels, so that a close-up shows what is there."""
+    """Enlarge every pixel to ``factor`` x ``factor`` pixels."""
     return picture.repeat(factor, 0).repeat(factor, 1)

@@ -1,4 +1,4 @@
-"""Sequences: frames of a shot in whatever files a renderer wrote, opened and checked in one call."""
+"""Sequences: the frames of a shot, in any supported files, opened and checked by one call."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 
-# Files may hold any values, also infinite ones, which are checked where a frame is used: numpy need not warn of them.
+# Files may contain any values, also infinite ones, which are checked when a frame is used: suppress numpy's warnings.
 _any_values = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 _LARGEST_FRAME_COUNT = 1_000_000
 
@@ -35,23 +35,21 @@ class Sequence:
     """The frames of one shot.
 
     Args:
-        root: the folder, file or pattern as it was given.
+        root: the folder, file or pattern that was passed.
         name: the name of the scene's folder, or of its only file.
-        layout: the layout that was detected: ``"bmfr"``, ``"noisebase"``, ``"oidn"``, or ``"files"`` for whatever else
-            renderers write.
+        layout: the detected layout: ``"bmfr"``, ``"noisebase"``, ``"oidn"``, or ``"files"`` for all other renderers.
         numbers: frame numbers, ascending.
         size: height and width in pixels, the same for every buffer and frame.
         buffers: names of the buffers that every frame of the sequence has.
         reference_numbers: frames that have a reference; possibly only some.
-        color_has_albedo: whether the files hold color with the albedo in it. Frames always do.
-        realisations: how many noisy colors every frame has: of the same pixels, with independent noise. Mostly 1.
-        noisy: names of the buffers that each realisation has of its own: its color, and the features of its samples
-            where they have noise, too.
-        table: what each buffer was taken from.
-        warnings: what is probably wrong, a line each.
-        unused: files and layers that look like buffers and are not used.
-        unknown: layers with names that say nothing.
-        lights: names of the layers of light that every frame has as ``layers``.
+        color_has_albedo: whether the color in the files includes the albedo. The color of frames always does.
+        realisations: number of noisy colors per frame, with different noise seeds; usually 1.
+        noisy: names of the buffers that differ between noise seeds: the color, and features that have noise.
+        table: the source of each buffer.
+        warnings: probable mistakes, one line each.
+        unused: files and layers that look like buffers but are not used.
+        unknown: layers with unknown names.
+        lights: names of the layers of light that every frame has in ``layers``.
     """
 
     root: Path
@@ -76,20 +74,20 @@ class Sequence:
 
     @property
     def folders(self) -> set[Path]:
-        """Where the files lie; what is written has their names, and may not be written there."""
+        """The folders of the input files; results have the same names, so they may not be written there."""
         return self._source.folders
 
     def files(self, number: int) -> list[Path]:
-        """The files that a frame is made of, each once, sorted: all that lie beside one another for it, cameras too.
+        """The files of a frame, sorted and without duplicates, including camera files.
 
         Raises:
-            InputError: there is no such frame.
+            InputError: the frame does not exist.
         """
         self._check(number)
         return sorted(set(self._source.frame_files(number)))
 
     def part(self, numbers: Sequential[int]) -> Sequence:
-        """Some of its frames, ascending, read as those of the whole are: what was decided of its values stays."""
+        """Select some frames, ascending; how the values are read does not change."""
         for number in numbers:
             self._check(number)
         chosen = set(numbers)
@@ -106,22 +104,22 @@ class Sequence:
     ) -> Frame:
         """Read one frame: a batch of 1, float32, on the CPU; values are not validated.
 
-        ``color`` is radiance with the albedo in it, whatever the files hold. ``depth`` is that of the depth file or
-        else the clip w of the position; it is ``inf`` where nothing was hit. ``view_projection`` has the pixel
-        offset of the files folded in: ``u W - 0.5, v H - 0.5`` is the pixel index. Where frames were left out before
-        this one, it has neither ``motion`` nor ``previous_position``: its past is found by positions and cameras, or it
-        has none.
+        ``color`` is radiance including albedo, whatever the files hold. ``depth`` is read from a depth file, or
+        computed as clip w of the position; it is ``inf`` where nothing was hit. ``view_projection`` includes the pixel
+        offset of the files: ``u W - 0.5, v H - 0.5`` is the pixel index. If the frame before this one was not selected,
+        the frame has neither ``motion`` nor ``previous_position``; its history is found through positions and cameras,
+        or not at all.
 
         Args:
             number: one of ``numbers``.
-            reference: whether to read the reference too, where there is one.
-            realisation: which noisy color, from 0 to ``realisations - 1``, with its other ``noisy`` buffers; the
-                others are the same for all.
-            buffers: names of those that are of use: of parts of the light and samples (``PARTS``), which take time to
-                read, the others are left out. All by default.
+            reference: whether to read the reference, if there is one.
+            realisation: index of the noise seed, from 0 to ``realisations - 1``: it selects the ``noisy`` buffers; the
+                others are the same for all seeds.
+            buffers: names of the buffers in use. Parts of the light and samples (``LIGHT_PARTS``), which are slow to
+                read, are skipped if they are not among them. All by default.
 
         Raises:
-            InputError: there is no such frame or realisation, or a file is damaged.
+            InputError: the frame or the noise seed does not exist, or a file is damaged.
         """
         self._check(number)
         if not 0 <= realisation < self.realisations:
@@ -132,21 +130,21 @@ class Sequence:
         frame = self._source.frame(number, reference=reference, realisation=realisation, buffers=buffers)
         if self.numbers.index(number) == 0 or number - 1 in self.numbers:
             return frame
-        # They lead to a frame that was not chosen, and not to the one before in this sequence.
+        # They refer to a frame that was not selected, not to the previous one of this sequence.
         return frame.replace(motion=None, previous_position=None)
 
     @_any_values
     def reference(self, number: int) -> Tensor:
-        """Read the reference of one frame, and nothing else.
+        """Read only the reference of one frame.
 
         Args:
             number: one of ``reference_numbers``.
 
         Returns:
-            ``(1, 3, H, W)`` radiance, float32, on the CPU; as :meth:`frame` gives it.
+            ``(1, 3, H, W)`` radiance, float32, on the CPU; the same as from :meth:`frame`.
 
         Raises:
-            InputError: there is no such frame, it has no reference, or the file is damaged.
+            InputError: the frame does not exist, it has no reference, or the file is damaged.
         """
         self._check(number)
         if number not in self.reference_numbers:
@@ -157,17 +155,17 @@ class Sequence:
         """Attributes of the color file of one frame: texts, numbers and tuples of numbers.
 
         Raises:
-            InputError: there is no such frame, or its file is damaged.
+            InputError: the frame does not exist, or its file is damaged.
         """
         self._check(number)
         return self._source.metadata(number)
 
     @_any_values
     def check_output_layer(self, name: str) -> None:
-        """See that a layer of this name can be added.
+        """Check that a layer of this name can be added.
 
         Raises:
-            InputError: it cannot: the name is no word, the files have a layer of it already, or they have no layers.
+            InputError: the name is invalid, or the files have such a layer already or have no layers.
         """
         if not isinstance(self._source, RenderedFiles):
             raise InputError(
@@ -187,22 +185,22 @@ class Sequence:
         output_layer: str | None = None,
         full_float: bool = False,
     ) -> Path:
-        """Write the clean image of one frame: the file that held its radiance, under its own name, clean.
+        """Write the denoised image of one frame to a file with the name of the color file.
 
-        Whatever else is in the file stays as it was: layers, parts, attributes, windows, compression, types of numbers.
-        In the BMFR layout, where each file is a buffer, it is a file ``denoisedN`` beside the ``colorN`` that it is of.
+        Everything else is copied unchanged: layers, parts, attributes, windows, compression, pixel types. In the BMFR
+        layout, where each file is a buffer, the file is ``denoisedN`` for the color ``colorN``.
 
         Args:
             out: folder to write to. It must exist.
             number: one of ``numbers``.
             image: ``(H, W, 3)`` radiance.
-            alpha: ``(H, W, 1)`` coverage; that of the file stays by default.
+            alpha: ``(H, W, 1)`` coverage; by default that of the file is kept.
             lights: ``(H, W, 3)`` radiance of layers of light, by the names in ``frame.layers``.
-            output_layer: name of a layer to be added; then nothing is replaced.
-            full_float: store what is written as 32-bit floats, whatever it was before.
+            output_layer: name of a layer to add; then nothing is replaced.
+            full_float: store the written channels as 32-bit floats, whatever they were before.
 
         Returns:
-            The file.
+            The path of the file.
 
         Raises:
             InputError: the file cannot be written.
@@ -211,7 +209,7 @@ class Sequence:
         if output_layer is not None:
             self.check_output_layer(output_layer)
         if not isinstance(self._source, RenderedFiles):
-            # There is neither alpha nor a layer.
+            # This layout has neither alpha nor layers.
             return self._source.write(out, number, image, full_float=full_float)
         return self._source.write(
             out, number, image, alpha=alpha, lights=lights, output_layer=output_layer, full_float=full_float
@@ -233,19 +231,19 @@ def open_sequence(
     color_has_albedo: bool | None = None,
     lights: Sequential[str] = (),
 ) -> Sequence:
-    """Open the frames of a shot: headers of all chosen files are checked, and the pixels of the first one looked at.
+    """Open the frames of a shot: the headers of all selected files are checked, and the pixels of the first frame.
 
     Args:
-        path: a folder, or the one that has a folder ``inputs`` inside it; a file; a pattern such as ``shot_####.exr``;
-            or several of these. Zips of Noisebase: one of a sequence, or those of its frames, or the folder of these.
-        frames: which frames to use, such as ``"0-59,70"``; all of them by default.
-        mapping: layers by buffer where names do not tell, such as ``"albedo=RGBA.diff"``; ``"motion="`` for none.
-        color_has_albedo: whether radiance has the albedo in it; told by the files' values by default.
-        lights: names of layers of light that add up to the color, or ``("all",)``: a frame has them as ``layers``.
+        path: a folder, or a folder that contains it as ``inputs``; a file; a pattern such as ``shot_####.exr``; or
+            several of these. For Noisebase: the zip of a sequence, the zips of its frames, or a folder of zips.
+        frames: frames to use, such as ``"0-59,70"``; all by default.
+        mapping: layers by buffer if names do not tell, such as ``"albedo=RGBA.diff"``; ``"motion="`` for none.
+        color_has_albedo: whether the radiance includes the albedo; by default determined from the values.
+        lights: names of layers of light that add up to the color, or ``("all",)``: frames have them in ``layers``.
 
     Raises:
-        InputError: nothing is there, the files do not tell what they are, a frame or buffer is missing, or files do not
-            fit together.
+        InputError: nothing was found, the files cannot be recognised, a frame or buffer is missing, or files do not
+            match one another.
     """
     given = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
     if not given:
@@ -288,17 +286,17 @@ def open_sequence(
 
 
 def frame_numbers(path: Path | Sequential[Path], frames: str | None = None) -> list[int]:
-    """Which frames are there, by the names of their files alone, whatever is in them.
+    """The numbers of the existing frames, from file names alone.
 
     Args:
         path: see :func:`open_sequence`.
-        frames: likewise; numbers of frames that are not there are left out.
+        frames: see :func:`open_sequence`; missing frames are omitted.
 
     Returns:
-        The frame numbers, ascending; none where names do not tell.
+        The frame numbers, ascending; empty if names do not tell.
 
     Raises:
-        InputError: nothing is there, or the choice of frames is no such text.
+        InputError: nothing was found, or ``frames`` is invalid.
     """
     given = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
     folder = _bmfr_folder(given)
@@ -313,7 +311,7 @@ def frame_numbers(path: Path | Sequential[Path], frames: str | None = None) -> l
 
 
 def _bmfr_folder(given: Sequential[Path]) -> Path | None:
-    """The folder of frames in that layout, if that is what was given; or one ``inputs`` in it."""
+    """The given folder, or its subfolder ``inputs``, if it has the BMFR layout."""
     (path, *more) = given
     if more or not os.path.isdir(path):
         return None
@@ -324,7 +322,7 @@ def _bmfr_folder(given: Sequential[Path]) -> Path | None:
 
 
 def with_unique_names(sequences: list[Sequence]) -> list[Sequence]:
-    """The same sequences; the second of a name gets a number, so that tables and folders keep them apart."""
+    """Add numbers to duplicate names of sequences, so that tables and folders keep them apart."""
     unique: list[Sequence] = []
     names: set[str] = set()
     for sequence in sequences:
@@ -337,17 +335,17 @@ def with_unique_names(sequences: list[Sequence]) -> list[Sequence]:
 
 
 def parse_frames(text: str, name: str = "frames") -> list[int]:
-    """Read a choice of frames.
+    """Parse a selection of frames.
 
     Args:
         text: numbers and ranges, such as ``"0-59,70"``.
-        name: what is chosen, for the message.
+        name: what is selected, for the message.
 
     Returns:
         The frame numbers, ascending, each once.
 
     Raises:
-        InputError: the text is something else, or names more than a million frames.
+        InputError: the text has another form, or selects more than a million frames.
 
     Example:
         >>> parse_frames("0-3, 70")
@@ -376,7 +374,7 @@ def _choose(folder: Path, present: list[int], frames: str | None) -> list[int]:
 
 
 def _gaps(present: list[int]) -> list[str]:
-    """What is missing between the frames that are there."""
+    """A warning about missing frame numbers."""
     missing = [(a + 1, b - 1) for a, b in pairwise(present) if b != a + 1]
     if not missing:
         return []

@@ -1,4 +1,4 @@
-"""Videos through FFmpeg: H.264 in MP4, which browsers, players and editors open."""
+"""Writing videos through FFmpeg: H.264 in MP4, which browsers, players and editors support."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from mcdenoise.data.files import atomic_path
 from mcdenoise.data.png import Picture
 from mcdenoise.errors import InputError
 
-# The longest side that decoders in hardware take (level 5.1); what is larger is scaled down.
+# Longest side that hardware decoders support (level 5.1); larger pictures are scaled down.
 _LONGEST = 4096
 _RATES = (1.0, 1000.0)
 _CODEC: Final = "libx264"
-# Slower presets save less than a fifth of the bytes, and take more memory.
+# Slower presets save less than a fifth of the bytes and take more memory.
 _ENCODER = {"preset": "veryfast", "crf": "18"}
 
 
 def check_video(frames_per_second: float) -> None:
-    """See that a video can be written.
+    """Check that a video can be written.
 
     Args:
         frames_per_second: 1 to 1000.
 
     Raises:
-        InputError: it cannot be so many, or the package of ``mcdenoise[preview]`` is not installed, or built without
-            the encoder.
+        InputError: the frame rate is out of range, or the package of ``mcdenoise[preview]`` is not installed or was
+            built without the encoder.
     """
     slowest, fastest = _RATES
     if not slowest <= frames_per_second <= fastest:
@@ -45,14 +45,14 @@ def check_video(frames_per_second: float) -> None:
 
 
 def write_video(path: Path, pictures: Iterable[Picture], frames_per_second: float = 24.0) -> None:
-    """Write pictures as an MP4 file (H.264, 8 bit, chroma of half the resolution), whole or not at all.
+    """Write pictures as an MP4 file (H.264, 8 bit, 4:2:0 chroma), atomically.
 
-    One picture is held at a time, beside those that the encoder looks ahead: memory does not depend on their number.
-    Chroma comes in pairs of pixels: an odd last row or column is repeated. Pictures with a side of more than 4096
-    pixels are scaled down to that.
+    Memory does not depend on the number of pictures: besides the encoder's look-ahead, one picture is held at a time.
+    4:2:0 chroma needs even sizes, so an odd last row or column is repeated. Pictures with a side of more than 4096
+    pixels are scaled down.
 
     Args:
-        path: the file to be written. Its folder must exist.
+        path: the file. Its folder must exist.
         pictures: at least one, ``(H, W, 3)``, on the sRGB curve, all of one size.
         frames_per_second: 1 to 1000.
 
@@ -61,7 +61,7 @@ def write_video(path: Path, pictures: Iterable[Picture], frames_per_second: floa
         ValueError: there is no picture.
     """
     check_video(frames_per_second)
-    # Here because it is optional, and loads FFmpeg.
+    # Imported here because it is optional, and loads FFmpeg.
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
@@ -72,13 +72,13 @@ def write_video(path: Path, pictures: Iterable[Picture], frames_per_second: floa
     width, height = _size_in_video(first)
     with atomic_path(path) as temporary:
         try:
-            # The index goes to the front, so that a browser plays what it has not yet loaded to the end.
+            # Put the index first, so that a browser can play the video while it loads.
             with av.open(temporary, "w", options={"movflags": "faststart"}) as container:
-                # MP4 counts in whole ticks: a ratio of small numbers.
+                # MP4 counts time in integer ticks: use a ratio of small integers.
                 rate = Fraction(frames_per_second).limit_denominator(1001)
                 stream = container.add_stream(_CODEC, rate, options=_ENCODER)
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-                # Players that are not told guess, and by the number of rows.
+                # Without this, players guess the color space from the number of rows.
                 stream.codec_context.color_primaries = ColorPrimaries.BT709
                 stream.codec_context.color_trc = ColorTrc.IEC61966_2_1
                 stream.codec_context.colorspace = Colorspace.ITU709
@@ -97,7 +97,7 @@ def write_video(path: Path, pictures: Iterable[Picture], frames_per_second: floa
                     container.mux(stream.encode(frame))
                 container.mux(stream.encode())
         except av.FFmpegError as error:
-            # What the operating system refuses, such as a full disk, is told by `atomic_path`.
+            # `atomic_path` reports errors of the operating system, such as a full disk.
             if isinstance(error, OSError):
                 raise
             raise InputError(f"{path}: expected frames that H.264 can hold, found: {error.strerror}") from error

@@ -1,4 +1,4 @@
-"""The zoo: denoisers assembled from the operators, by name, and the wrappers that any method may wear."""
+"""The zoo: denoisers assembled from the operators, by name, and wrappers that any method can use."""
 
 from mcdenoise.models._adapter import FromBuffers, as_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared

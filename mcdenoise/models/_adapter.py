@@ -1,4 +1,4 @@
-"""From a module that takes images and returns an image to a method."""
+"""Adapters that turn a module or function of images into a method."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ CONTRACT = (
 
 
 class FromBuffers(nn.Module):
-    """A method without a state, made of a function of images.
+    """A method without a state that wraps a function of images.
 
     Args:
-        function: takes ``(B, C, H, W)`` tensors whose names are those of the buffers that it gets, of the vocabulary or
-            of ``Frame.extra``; one with a default value gets the buffer only where the frame has it. It returns
-            ``(B, 3, H, W)`` radiance, or an :class:`mcdenoise.models.Output`.
+        function: takes ``(B, C, H, W)`` tensors. The names of its parameters are the names of the buffers that it gets:
+            those of :data:`mcdenoise.frame.BUFFERS` or keys of ``Frame.extra``. A parameter with a default value is
+            optional: it gets the buffer only if the frame has it. The function returns ``(B, 3, H, W)`` radiance or an
+            :class:`mcdenoise.models.Output`.
         reach: see :class:`mcdenoise.models.Needs`.
 
     Raises:
-        InputError: the function takes no arguments by name.
+        InputError: the function has no parameters that can be passed by name.
     """
 
     def __init__(self, function: Any, reach: int | None = None) -> None:
@@ -71,10 +72,10 @@ class FromBuffers(nn.Module):
 
 
 def as_model(thing: Any) -> Model:
-    """A model as it is, and a module or function of images as one.
+    """Return a model unchanged, and wrap a module or function of images as one.
 
     Raises:
-        InputError: it is neither.
+        InputError: the object is neither.
     """
     if isinstance(getattr(thing, "needs", None), Needs):
         model: Model = thing

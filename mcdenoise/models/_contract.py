@@ -1,4 +1,4 @@
-"""What a host asks of a method that may be anybody's: a pair of an image of the frame and a state of tensors."""
+"""Checks of what a method receives and returns; the method may be a user's own."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from mcdenoise.models._weights import pretrained_models
 
 
 def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...]) -> tuple[Output, State]:
-    """Call a method, and refuse what is no image of the frame, or no state.
+    """Call a method, and reject a result that is not an image of the frame with a state of tensors.
 
     Args:
         model: any method.
-        frame: valid.
-        state: of the frame before.
-        shape: of that frame's color.
+        frame: with valid values.
+        state: the state after the previous frame.
+        shape: shape of the color of that previous frame.
 
     Raises:
-        InputError: the result breaks the contract of :class:`mcdenoise.models.Model`, is not finite, or the method
-            fails with a state that is of frames of another size.
+        InputError: the result breaks the contract of :class:`mcdenoise.models.Model` or is not finite, or the method
+            fails with a state that belongs to frames of another size.
     """
     try:
         found: Any = model(frame, state)
@@ -43,7 +43,7 @@ def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...
             f"model: the state is of frames of {shape}, found one of {tuple(frame.color.shape)}, with which the model "
             f"fails; reset the denoiser: {' '.join(str(error).split())}"
         ) from error
-    # An Output is a pair, too.
+    # An Output is a tuple of its own, and must not be mistaken for the pair (Output, state).
     if isinstance(found, Output) or not (isinstance(found, tuple) and len(found) == 2):
         raise InputError(f"model: expected a pair (Output, state), found {type(found).__name__}")
     output, after = found
@@ -54,10 +54,10 @@ def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...
 
 
 def absent_buffers(model: Model, frame: Frame) -> list[str]:
-    """Buffers that a method is better with and the frame has not, sorted.
+    """Sorted names of the buffers that would improve a method's result and that the frame lacks.
 
     Raises:
-        MissingBufferError: the frame lacks one that the method needs.
+        MissingBufferError: the frame lacks a required buffer.
     """
     needs = model.needs
     check_needs(needs, frame.buffers)
@@ -66,14 +66,14 @@ def absent_buffers(model: Model, frame: Frame) -> list[str]:
 
 
 def check_needs(needs: Needs, given: Collection[str]) -> None:
-    """See that a frame has what a method cannot do without.
+    """Check that a frame has all required buffers.
 
     Args:
-        needs: of the method.
-        given: names of the buffers of the frame.
+        needs: the needs of the method.
+        given: names of the frame's buffers.
 
     Raises:
-        MissingBufferError: it has not; the message says what is missing, and which methods would do.
+        MissingBufferError: a buffer is missing; the message names it, and the methods that do not need it.
     """
     if needs.buffers <= set(given):
         return
@@ -89,27 +89,28 @@ def check_needs(needs: Needs, given: Collection[str]) -> None:
 
 @functools.cache
 def _ready() -> dict[str, frozenset[str]]:
-    """What each method needs that can be had at once: with weights, or without any to be trained."""
+    """The needs of every method that is ready to use: one with shipped weights, or one that needs no training."""
     found = {}
     shipped = pretrained_models()
-    # Networks are drawn at random, which must not show in what the caller draws.
+    # Constructing a network draws random numbers: keep the caller's generator unchanged.
     with torch.random.fork_rng(devices=[]):
         for name in list_models():
             try:
                 needs = build_model(name).needs if find_model(name).installed else None
-            except Exception:  # whatever another package's model fails with: it is not offered
+            except Exception:  # a third-party model may raise anything; such a model is not offered
                 continue
-            # What reaches no other pixel does not denoise.
+            # A method that reads only the pixel itself does not denoise.
             if needs is not None and needs.reach != 0 and (name in shipped or not needs.trainable):
                 found[name] = needs.buffers
     return found
 
 
 def owned(tree: Any, others: Any) -> Any:
-    """A tree of ordinary tensors, each with memory of its own.
+    """Copy tensors of a tree where needed, so that each is an ordinary tensor with its own memory.
 
-    Copied is what shares memory with others, what could not be written to element by element, and what was made in
-    inference mode, of which torch lets nothing be changed or differentiated outside that mode.
+    A tensor is copied if it shares memory with ``others``, if it is an expanded view that cannot be written to element
+    by element, or if it was created in inference mode, because torch allows neither in-place changes nor derivatives of
+    such a tensor outside that mode.
     """
     taken = {leaf.untyped_storage().data_ptr() for leaf in pytree.tree_leaves(others) if isinstance(leaf, Tensor)}
 
@@ -132,7 +133,7 @@ def _check_image(output: Any, frame: Frame) -> None:
         raise InputError(f"model: expected a floating-point image, found {image.dtype}")
     if image.device != frame.color.device:
         raise InputError(f"model: expected an image on {frame.color.device}, found one on {image.device}")
-    # A sum is the fastest way to see either, and only what is far beyond all radiance overflows it.
+    # One sum detects NaN and infinity fastest; only values far beyond any radiance could overflow it.
     if not at_hand(image.device) or not image.detach().sum().isfinite():
         ask((~image.detach().isfinite()).any(1).sum(), _refuse_pixels)
 
@@ -168,7 +169,7 @@ def _check_state(before: State, state: State, frame: Frame) -> None:
 
 
 def _alike(a: State, b: State) -> bool:
-    """Whether two states have the same structure; what is not there is like anything."""
+    """Whether two states have the same structure; ``None`` matches anything."""
     if a is None or b is None:
         return True
     children, spec = pytree.tree_flatten(a, is_leaf=lambda x: x is not a)

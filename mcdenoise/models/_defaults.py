@@ -1,4 +1,4 @@
-"""What models are made of, whatever torch's defaults are in the process that makes them."""
+"""Torch's own default dtype and device, for constructing models."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import torch
 
 @contextmanager
 def plain_defaults() -> Iterator[None]:
-    """Within this, what names neither a dtype nor a device is float32 on the CPU, as weights are stored."""
+    """Make float32 and the CPU the defaults inside this block, whatever the program's defaults are."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float32)
     try:
-        # Where it is that already, nothing is slowed down.
+        # Skip the context managers, which slow down every call, where the defaults are these already.
         with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
             yield
     finally:

@@ -1,4 +1,4 @@
-"""What a method is: a step that takes a frame and its state, and returns images and the next state."""
+"""The interface of a method: a step that takes a frame and its state, and returns images and the next state."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame
 
-# Any pytree of tensors ``(B, ...)``; ``None`` stands for what is not there, such as the state before the first frame.
+# Any pytree of tensors ``(B, ...)``. ``None`` stands for a missing part, such as the state before the first frame.
 State: TypeAlias = Any
 
 
 class Output(NamedTuple):
-    """What a method makes of a frame.
+    """Result of a method for one frame.
 
     Args:
         image: ``(B, 3, H, W)`` scene-linear radiance in the unit of ``frame.color``.
-        stages: images on the way to it by name, in order and of the same shape and unit, such as ``accumulated`` and
+        stages: intermediate images by name, in order, with the shape and unit of ``image``, such as ``accumulated`` and
             ``initial``.
-        layers: ``(B, 3, H, W)`` parts of the image, one for each of ``frame.layers``, filtered with its kernels; they
-            sum to ``image``. Of a method without kernels none: whoever calls it splits the image, see
+        layers: ``(B, 3, H, W)`` parts of the image, one for each of ``frame.layers``, filtered with the kernels of the
+            color; they sum to ``image``. Empty for a method without kernels: the caller then splits the image, see
             :func:`mcdenoise.models._layers.completed`.
-        alpha: ``(B, 1, H, W)`` the frame's, filtered with the same kernels, if ``frame.hints.alpha``; likewise.
+        alpha: ``(B, 1, H, W)`` alpha of the frame, filtered with the same kernels if ``frame.hints.alpha`` is set;
+            ``None`` for a method without kernels.
     """
 
     image: Tensor
@@ -35,17 +36,17 @@ class Output(NamedTuple):
 
 @dataclass(frozen=True)
 class Needs:
-    """What a method asks of its frames and its host.
+    """What a method requires of its frames and its host.
 
     Args:
-        buffers: names of the buffers that it cannot do without, see :data:`mcdenoise.frame.BUFFERS`.
-        uses: names of those that it is better with.
-        trainable: whether it has to be trained; False for filters without weights, for programs of others, and for
-            networks that come with their weights.
-        reach: how many pixels away its result depends on a buffer; ``None`` where that is the whole image, so that it
-            is neither computed in tiles nor skipped in parts.
-        stride: a rectangle of the image has the same pixels as the whole where it begins at multiples of so many
-            pixels, such as the pixels of a U-Net's coarsest level.
+        buffers: names of the required buffers, see :data:`mcdenoise.frame.BUFFERS`.
+        uses: names of optional buffers that improve the result.
+        trainable: whether the method has weights to train; False for filters without weights, for third-party
+            denoisers, and for networks that come with their weights.
+        reach: largest distance in pixels between a pixel of the result and a buffer pixel that it depends on; ``None``
+            if the result depends on the whole image, so that tiles can neither be computed separately nor skipped.
+        stride: a crop of the image gives the same pixels as the whole image if it begins at a multiple of ``stride``
+            pixels, such as the side of a pixel of a U-Net's coarsest level.
     """
 
     buffers: frozenset[str] = frozenset({"color"})
@@ -55,7 +56,7 @@ class Needs:
     stride: int = 1
 
     def missing(self, frame: Frame) -> list[str]:
-        """Names of the buffers that a frame lacks, sorted."""
+        """Sorted names of the required buffers that a frame lacks."""
         return sorted(self.buffers - frame.buffers)
 
 
@@ -63,13 +64,13 @@ class Needs:
 class Model(Protocol):
     """A method: a pure function of a frame and its state.
 
-    ``state`` is ``None`` before the first frame of a shot, later what the call before has returned; its structure stays
-    the same from then on. A method whose pixels depend on something of the whole image besides (its exposure, its
-    brightest pixel) has a method ``statistics(frame)`` that returns this by name, ``(B, N, 1, 1)`` each, and looks for
-    it in ``frame.statistics``: then it can be computed in tiles.
+    ``state`` is ``None`` before the first frame of a shot, and then the state that the previous call returned; its
+    structure does not change after that. Some methods use values that depend on the whole image, such as an exposure or
+    the brightest pixel. Such a method has a method ``statistics(frame)`` that returns these values by name, ``(B, N, 1,
+    1)`` each, and reads them from ``frame.statistics``; this allows computing it in tiles.
 
-    A method with a state may say how fast it forgets, by an attribute ``persistence``: the largest fraction of what is
-    kept of a shot that one more frame leaves, in [0, 1); ``None`` where nobody knows. See
+    A method with a state may declare how fast it forgets with an attribute ``persistence``: the largest fraction of the
+    kept history that remains after one more frame, in [0, 1), or ``None`` if it is unknown. See
     :func:`mcdenoise.models.frames_remembered`.
     """
 
@@ -82,8 +83,8 @@ class Model(Protocol):
         """Denoise a frame.
 
         Args:
-            frame: valid values (:meth:`mcdenoise.frame.Frame.validate`), with the buffers that are needed.
-            state: of the frame before.
+            frame: with valid values (:meth:`mcdenoise.frame.Frame.validate`) and all required buffers.
+            state: the state that the previous frame returned.
 
         Returns:
             The images, and the state for the next frame.
@@ -92,9 +93,9 @@ class Model(Protocol):
 
 
 def prepared(model: Model, frame: Frame) -> Frame:
-    """The frame with the model's statistics of the whole image added to its own.
+    """The frame with the model's statistics of the whole image added.
 
-    Whoever changes the color prepares the frame anew.
+    A caller that changes the color has to prepare the frame again.
     """
     statistics = getattr(model, "statistics", None)
     return frame if statistics is None else frame.replace(statistics={**frame.statistics, **statistics(frame)})

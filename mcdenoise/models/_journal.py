@@ -1,8 +1,8 @@
-"""What happened while a frame was denoised: run times, and what was skipped and why.
+"""Reports about denoising a frame: run times, and what was skipped and why.
 
-Methods are pure; what they report goes beside their results to whoever listens, and to nobody otherwise. On a device
-whose values are not at hand nothing is waited for meanwhile: what is to be known of them is copied at once when the
-frame is done, and read when somebody asks, or when the next frame comes.
+Methods are pure functions. They report beside their results, to the active :class:`Journal` if there is one. Reporting
+never makes the host wait for a GPU: values are copied asynchronously when the frame is done, and read when the report
+is read or when the next frame begins.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._stopwatch import Moment, Stopwatch
 
-# What is done with numbers once they are read.
+# Handles numbers once they have been read from the device.
 Tell: TypeAlias = Callable[[Sequence[float]], None]
 
 
@@ -29,9 +29,9 @@ class Stage:
 
     Args:
         name: such as ``reproject``.
-        skipped: the fraction of it that was skipped.
-        reason: why, or why not.
-        exact: whether the pixels are the same without it; else they agree to the tolerance.
+        skipped: fraction of the stage that was skipped.
+        reason: why it was skipped, or why it was not.
+        exact: whether skipping leaves the pixels unchanged; otherwise they agree up to the tolerance.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Stage:
 
 @dataclass
 class _Span:
-    """Of a stage: from when to when, and what was timed within it."""
+    """Start and end of one run of a stage, with the runs that were timed inside it."""
 
     stage: str
     watch: Stopwatch
@@ -61,15 +61,14 @@ class _Span:
 
 @dataclass
 class Journal:
-    """What is reported of one frame; of a frame on a GPU it is complete once it was settled.
+    """The report of one frame. For a frame on a GPU it is complete after :meth:`settle`.
 
     Args:
         milliseconds: run time of each stage.
-        stages: what was skipped of them, and why, by name.
-        reset: why the history was not used; empty where it was.
-        tiles: the parts of the image that were computed, and why those.
-        history: the fraction of the pixels that found themselves in the frame before; ``None`` where nothing was looked
-            for.
+        stages: how much of each stage was skipped, and why, by name.
+        reset: why the history was discarded; empty if it was used.
+        tiles: how the image was divided into tiles, and why.
+        history: fraction of the pixels that have a history; ``None`` if no history was looked up.
     """
 
     milliseconds: dict[str, float] = field(default_factory=dict)
@@ -79,19 +78,19 @@ class Journal:
     history: float | None = None
 
     def __post_init__(self) -> None:
-        # No fields: whoever writes a report down has no use for what it is made from.
+        # These are no dataclass fields, because a written report must not contain them.
         self._open: list[_Span] = []
         self._spans: list[_Span] = []
         self._asked: list[tuple[Tensor, Tell]] = []
         self._sent: tuple[Tensor, Stopwatch, Moment] | None = None
 
     def note(self, name: str, reason: str, skipped: float = 0.0, *, exact: bool = True) -> None:
-        """Add a :class:`Stage`; the last word on each counts."""
+        """Add a :class:`Stage`; it replaces an earlier one of the same name."""
         self.stages[name] = Stage(name, float(skipped), reason, exact)
 
     @contextmanager
-    def timed(self, stage: str, device: torch.device, *, unless_told: bool = False) -> Iterator[None]:
-        """See :func:`timed`; ``unless_told``: the stage counts only if nothing is timed within it."""
+    def timed(self, stage: str, device: torch.device, *, unless_detailed: bool = False) -> Iterator[None]:
+        """See :func:`timed`; with ``unless_detailed`` the stage counts only if nothing is timed inside it."""
         watch = Stopwatch(device)
         span = _Span(stage, watch, watch.mark())
         self._open.append(span)
@@ -101,8 +100,8 @@ class Journal:
             self._open.pop()
         span.end = watch.mark()
         if self._open:
-            self._open[-1].within += span.within if unless_told and span.within else [span]
-        if unless_told and span.within:
+            self._open[-1].within += span.within if unless_detailed and span.within else [span]
+        if unless_detailed and span.within:
             return
         self._spans.append(span)
         if not watch.runs_behind:
@@ -113,7 +112,7 @@ class Journal:
         self._asked.append((values.detach().reshape(-1), tell))
 
     def send(self) -> None:
-        """Have all that was asked for copied to the host in one piece, and do not wait for it."""
+        """Start copying all requested values to the host in one piece, without waiting for it."""
         if not self._asked:
             return
         values = torch.cat([values for values, _ in self._asked])
@@ -121,10 +120,10 @@ class Journal:
         self._sent = values.to("cpu", non_blocking=True), watch, watch.mark()
 
     def settle(self) -> None:
-        """Fill in what was not known yet; waits for the device.
+        """Fill in the values that were still on the device; this waits for the device.
 
         Raises:
-            Exception: what one of those raises that wait for numbers, after all were told.
+            Exception: the first exception that a handler raised, after all handlers have run.
         """
         self._add_times()
         sent, asked = self._sent, self._asked
@@ -138,7 +137,7 @@ class Journal:
             own = [next(numbers) for _ in range(len(part))]
             try:
                 tell(own)
-            except Exception as error:  # whatever is wrong with one must not hide the others
+            except Exception as error:  # an exception of one handler must not keep the others from running
                 failures.append(error)
         if failures:
             raise failures[0]
@@ -154,7 +153,7 @@ _listening: list[Journal] = []
 
 @contextmanager
 def listening(journal: Journal) -> Iterator[None]:
-    """Collect in a journal what methods report."""
+    """Collect the reports of methods in a journal inside this block."""
     _listening.append(journal)
     try:
         yield
@@ -164,23 +163,23 @@ def listening(journal: Journal) -> Iterator[None]:
 
 
 def journal() -> Journal | None:
-    """The journal of whoever listens."""
+    """The active journal, or ``None``."""
     return _listening[-1] if _listening and not torch.compiler.is_compiling() else None
 
 
 def note(name: str, reason: str, skipped: float = 0.0, *, exact: bool = True) -> None:
-    """Report a :class:`Stage`; the last word on each counts."""
+    """Report a :class:`Stage`; it replaces an earlier one of the same name."""
     if (found := journal()) is not None:
         found.note(name, reason, skipped, exact=exact)
 
 
 def ask(values: Tensor, tell: Tell) -> None:
-    """Have numbers told that a device computes: at once where they are at hand, else when the journal is settled.
+    """Request values that a device computes: handled at once if the host can read them, else in :meth:`Journal.settle`.
 
     Args:
         values: any number of them, of any shape.
-        tell: takes them as they lie in memory; may raise. Of values that are not at hand, nothing is told where nobody
-            listens.
+        tell: handles the values in memory order; may raise. Without an active journal it is not called for values on
+            a GPU.
     """
     if at_hand(values.device):
         tell(values.detach().reshape(-1).tolist())
@@ -189,7 +188,7 @@ def ask(values: Tensor, tell: Tell) -> None:
 
 
 def tell_history(fraction: Tensor) -> None:
-    """Report which fraction of the pixels found themselves in the frame before, a tensor of one number."""
+    """Report the fraction of the pixels that have a history, a tensor of one number."""
     if (found := journal()) is None:
         return
 
@@ -199,28 +198,28 @@ def tell_history(fraction: Tensor) -> None:
     ask(fraction, tell)
 
 
-def timed(stage: str, device: torch.device, *, unless_told: bool = False) -> AbstractContextManager[None]:
-    """Measure the run time of a stage; what is timed within it counts as its own stage and not as this one.
+def timed(stage: str, device: torch.device, *, unless_detailed: bool = False) -> AbstractContextManager[None]:
+    """Measure the run time of a stage. A stage that is timed inside it counts separately.
 
     Args:
         stage: its name.
-        device: where it runs. A GPU is not waited for: it marks the time itself, which is read when the journal is
-            settled.
-        unless_told: whether the stage counts only if nothing is timed within it.
+        device: where it runs. The host does not wait for a GPU: the GPU records the time itself, which is read when the
+            journal is settled.
+        unless_detailed: whether the stage counts only if nothing is timed inside it.
     """
     found = journal()
-    return nullcontext() if found is None else found.timed(stage, device, unless_told=unless_told)
+    return nullcontext() if found is None else found.timed(stage, device, unless_detailed=unless_detailed)
 
 
 def summarize(frames: list[list[Stage]]) -> list[dict[str, Any]]:
-    """What was skipped in a shot.
+    """Summarize what was skipped in a shot.
 
     Args:
         frames: the stages of each frame.
 
     Returns:
         For each stage, in order: ``stage``; ``kept``, false if all of it was skipped in all frames; ``skipped``, the
-        mean fraction, from 0 to 1; ``reason``, the most frequent one for skipping it, or else for keeping it; and
+        mean fraction, from 0 to 1; ``reason``, the most frequent reason for skipping it, or else for computing it; and
         ``exact``.
     """
     rows = []

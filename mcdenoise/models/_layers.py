@@ -1,8 +1,9 @@
-"""Layers, such as diffuse and glossy light, that still add up to the image after it was denoised; and alpha.
+"""Denoised layers, such as diffuse and glossy light, that add up to the denoised image; and denoised alpha.
 
-A method with kernels filters every layer with those of the color: a linear map of non-negative weights, so that what it
-makes of the layers tells in which proportion they are in each pixel. The image is then split in this proportion. So the
-layers sum to it whatever happened to it besides (logarithms, clamping), and none of them changes its sign.
+A method with kernels filters every layer with the kernels of the color. The filter is linear with non-negative weights,
+so the filtered layers tell in which proportion they contribute to each pixel. The image is then split in these
+proportions. The layers therefore sum to the image even if the method also took logarithms or clamped, and no layer
+changes its sign.
 """
 
 from __future__ import annotations
@@ -19,46 +20,46 @@ from mcdenoise.models._journal import ask, journal, note
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.ops import cross_bilateral_filter, downsample, upsample
 
-# What is in none of the layers that were asked for; a name that nobody gives to a layer.
+# Name of the remainder: the part of the color that is in none of the given layers. No renderer uses this name.
 REST = "(rest)"
-# How fast weights fall off with the squared difference of albedo, normal and depth in [0, 1], and of the logarithm of
-# the exposed image; and the weight of the coarse scale in a pixel like its block. Of what was tried on a Cycles shot
-# with references of every layer these were the best (docs/layers.md).
+# Falloffs of the weights with the squared differences of albedo, normal, depth in [0, 1] and the logarithm of the
+# exposed image; and the weight of the coarse scale in a pixel that resembles its block. These values were the best of
+# those tried on a Cycles shot with a reference for every layer (docs/layers.md).
 _FALLOFFS, _COARSE = (10.0, 10.0, 1000.0, 20.0), 0.75
-# Of a pixel: what half floats leave of a sum that they round. Less is no layer of its own.
+# Relative rounding error of a sum of half-precision layers. A smaller remainder is no layer of its own.
 _ROUNDING, _SMALLEST_HALF = 2.0**-9, 2.0**-24
-# Of all light: layers that are brighter than the color together by more than this are not its parts.
+# Layers that are together brighter than the color by more than this fraction of all light are not its parts.
 _MOST_EXCESS = 0.02
 
 
 def carried(frame: Frame) -> Tensor | None:
-    """Layers and alpha of a frame side by side ``(B, 3 L + 1, H, W)``, as far as they are asked for.
+    """Layers and alpha of a frame, concatenated ``(B, 3 L + 1, H, W)``, as far as they are requested.
 
-    For a method with kernels, which filters them as its color and hands the result to :func:`answered`; they need not
-    be in the unit of what it filters otherwise, since only their proportions count.
+    A method with kernels filters them like its color and passes the result to :func:`answered`. They need not be in the
+    unit of the filtered color, since only their proportions count.
     """
     images = [*frame.layers.values(), *([] if (alpha := alpha_of(frame)) is None else [alpha])]
     return torch.cat(images, 1) if images else None
 
 
 def with_carried(frame: Frame) -> Tensor:
-    """The color with :func:`carried` behind it, ``(B, 3 + 3 L + 1, H, W)``: what goes through the same kernels."""
+    """The color with :func:`carried` concatenated, ``(B, 3 + 3 L + 1, H, W)``: all channels that share the kernels."""
     others = carried(frame)
     return frame.color if others is None else torch.cat([frame.color, others], 1)
 
 
 def alpha_of(frame: Frame) -> Tensor | None:
-    """The alpha of a frame if it is to be denoised."""
+    """The alpha of a frame if it should be denoised, else ``None``."""
     return frame.alpha if frame.hints.alpha else None
 
 
 def answered(frame: Frame, image: Tensor, filtered: Tensor | None = None) -> Output:
-    """A method's output with what its kernels made of :func:`carried`.
+    """Build a method's output from its image and the filtered :func:`carried` channels.
 
     Args:
-        frame: that the method was given.
-        image: ``(B, 3, H, W)`` its result; or that of :func:`with_carried`, which has the next behind it.
-        filtered: ``(B, 3 L + 1, H, W)``; ``None`` where nothing was carried, or there was no kernel for it.
+        frame: the method's input.
+        image: ``(B, 3, H, W)`` its result, or the filtered :func:`with_carried` with all its channels.
+        filtered: ``(B, 3 L + 1, H, W)``; ``None`` if there were none or the method has no kernels.
     """
     if filtered is None and image.shape[1] > 3:
         image, filtered = image[:, :3], image[:, 3:]
@@ -74,10 +75,10 @@ def answered(frame: Frame, image: Tensor, filtered: Tensor | None = None) -> Out
 
 
 def completed(frame: Frame, output: Output) -> Output:
-    """The output of a method with layers that sum to its image, and with an alpha, if there are any in its frame.
+    """Add layers that sum to the image, and an alpha, to an output of a frame that has them.
 
-    A method that answers without layers has its image split by :func:`fractions`, and one without an alpha keeps the
-    frame's.
+    If the method returned no layers, the image is split by :func:`fractions`; if it returned no alpha, the frame's
+    alpha is kept.
     """
     alpha = output.alpha
     if alpha is None and alpha_of(frame) is not None:
@@ -93,14 +94,14 @@ def completed(frame: Frame, output: Output) -> Output:
 
 
 def split(image: Tensor, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """An image in parts of given proportions, which sum to it: each is ``image * part / sum of parts``.
+    """Split an image into parts of given proportions, which sum to it: ``image * part / sum of parts``.
 
-    Where all parts are black they have the proportion that they have in the whole of the image; where all are black
-    everywhere they are equal.
+    In a pixel where all parts are black, the proportions of the whole image are used; if all parts are black
+    everywhere, they are equal.
 
     Args:
         image: ``(B, 3, H, W)``.
-        parts: likewise, by name; what is below zero counts as black.
+        parts: ``(B, 3, H, W)`` each, by name; negative values count as 0.
     """
     positive = {name: part.to(image.dtype).clamp_min(0) for name, part in parts.items()}
     total = _sum(positive)
@@ -117,17 +118,18 @@ def split(image: Tensor, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def fractions(frame: Frame, image: Tensor) -> Mapping[str, Tensor]:
-    """In which proportion the layers of a frame are in an image that a method without kernels made of it.
+    """Estimate the proportions of a frame's layers in an image from a method without kernels.
 
-    A cross-bilateral filter of 5x5 pixels, after another one at half the resolution that stands for most of a pixel
-    that is like its block; guided by the features and by the logarithm of the image itself, which has no noise.
+    A cross-bilateral filter of 5x5 pixels smooths the layers, after a filter at half the resolution that dominates in
+    pixels that resemble their block. Guides are the features and the logarithm of the denoised image, which has no
+    noise.
 
     Args:
-        frame: with layers, noisy as its color.
-        image: ``(B, 3, H, W)`` what the method made of the color.
+        frame: with layers, as noisy as its color.
+        image: ``(B, 3, H, W)`` the method's result for the color.
 
     Returns:
-        ``(B, 3, H, W)`` of each layer, means of its pixels.
+        ``(B, 3, H, W)`` for each layer: weighted means of its pixels.
     """
     frame = frame.replace(statistics={**frame.statistics, **image_statistics(frame)})
     logarithm = torch.log1p(image.clamp_min(0) * frame.statistics["exposure"])
@@ -148,13 +150,13 @@ def _smoothed(image: Tensor, guide: Tensor) -> Tensor:
 
 
 def closed(frame: Frame) -> Frame:
-    """The frame with all of its color in layers: what is in none of them is one more, :data:`REST`.
+    """The frame with layers that sum to its color: the remainder is added as the layer :data:`REST`.
 
-    Half floats round every layer by itself. Where layers are brighter together than the color they are scaled to it,
-    and everywhere if they lack no more than rounding takes.
+    Half precision rounds every layer separately. Where the layers are together brighter than the color, they are scaled
+    to it; so they are everywhere if the remainder is within the rounding error.
 
     Raises:
-        InputError: they are brighter by more than that: parts of something else.
+        InputError: the layers are brighter than the color by more than that, so they are not its parts.
     """
     if not frame.layers:
         return frame
@@ -172,7 +174,7 @@ def closed(frame: Frame) -> Frame:
     ask(excess, refuse)
     rest = frame.color - total
     least = _ROUNDING * frame.color + (len(frame.layers) + 1) * _SMALLEST_HALF
-    # Of all pixels or none: what is dim in some is a layer all the same.
+    # Decide for the whole image: a layer that is dim in some pixels is a layer all the same.
     whole = (rest < 0) | ((rest <= least).all() & (total > 0))
     scale = torch.where(whole, frame.color / torch.where(whole, total, 1), 1)
     layers = {name: layer * scale for name, layer in frame.layers.items()}
@@ -192,6 +194,6 @@ def _sum(parts: Mapping[str, Tensor]) -> Tensor:
 
 
 def _note_once(name: str, reason: str) -> None:
-    """What a method has said of itself counts for more."""
+    """Report a stage unless the method has reported it itself."""
     if (found := journal()) is not None and name not in found.stages:
         note(name, reason)

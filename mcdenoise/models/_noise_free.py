@@ -1,4 +1,4 @@
-"""Pixels that have no noise: background, emitters, and their mirror images."""
+"""Pixels without noise: background, emitters, and their mirror images."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from mcdenoise.models._reads import at_hand
 from mcdenoise.ops import NO_ALBEDO
 from mcdenoise.ops._window import corner, up_to_multiple
 
-# Of the mean of two pixels; one sample of a path tracer differs from the next by ten times as much or more.
+# Relative difference of two pixels. Consecutive samples of a path tracer differ by ten times as much or more.
 _SMOOTH = 0.02
 _CELL = 8
-# Of the 576 pixels of nine cells.
+# Of the 576 pixels of 3x3 cells.
 _LEAST_WITNESSES, _MANY = 100, 1000
 
 
 def noise_free(frame: Frame) -> Tensor | None:
-    """Pixels whose radiance has no noise to remove.
+    """Find pixels whose radiance has no noise to remove.
 
-    Nothing was hit there, or what was hit has no albedo and is bright. And in the cell of 8x8 pixels and those around
-    it, where at least 100 pixels are of this kind, no two of them side by side differ by more than 2 %. Fog before a
-    background, a rough mirror, or glass that reflects one sample and refracts the next do not pass; nor does a
-    background of detail, such as stars, which has no noise but cannot be told from it.
+    In such a pixel nothing was hit, or the surface has no albedo and is bright. In addition, the 3x3 cells of 8x8
+    pixels around it must contain at least 100 such pixels, and no two adjacent ones may differ by more than 2 %. This
+    test rejects fog before a background, rough mirrors, and glass that reflects one sample and refracts the next. It
+    also rejects a detailed background, such as stars, which has no noise but cannot be told from noise.
 
     Args:
-        frame: with a depth, else nothing is known to be background; with an albedo, else nothing to be an emitter. The
-            radiance of the frame alone is looked at; its albedo may have been divided out.
+        frame: its depth identifies the background, and its albedo the emitters. Only the radiance of the current frame
+            is used, not the history; the albedo may have been divided out.
 
     Returns:
-        ``(B, 1, H, W)`` bool, or ``None`` where there is known to be no such pixel.
+        ``(B, 1, H, W)`` bool, or ``None`` if it is known that no pixel qualifies.
     """
     kinds = []
     current = frame.color if frame.current is None else frame.current
@@ -50,17 +50,17 @@ def noise_free(frame: Frame) -> Tensor | None:
         rows = known.any(-1).flatten(0, -2).any(0).nonzero()
         if not len(rows):
             return None
-        # Whole cells: what is above and below them has no such pixel.
+        # Crop to whole cells; the rows above and below contain no such pixel.
         band = slice(int(rows[0]) // _CELL * _CELL, (int(rows[-1]) // _CELL + 1) * _CELL)
     plain, brightness = known[..., band, :], brightness[..., band, :]
-    # NaN is neither more nor less than its neighbours.
+    # Comparisons with NaN are false in both directions.
     plainly = torch.where(plain, brightness, torch.nan)
     lowest = plainly * ((1 + _SMOOTH / 2) / (1 - _SMOOTH / 2))
     rough = torch.zeros_like(plain)
     for dim in (-2, -1):
         (here, there), (here_lowest, there_lowest) = (_neighbours(image, dim) for image in (plainly, lowest))
         rough.narrow(dim, 0, here.shape[dim]).logical_or_((here > there_lowest) | (there > here_lowest))
-    # Both in one sum: a difference counts for more than all witnesses.
+    # One sum for both tests: a single difference outweighs all votes.
     counted = plain.to(brightness.dtype).add_(rough, alpha=_MANY)
     sums = F.avg_pool2d(up_to_multiple(counted, _CELL), _CELL)
     witnesses = (F.avg_pool2d(sums, 3, 1, 1) * (9 * _CELL**2)).round()
@@ -74,11 +74,11 @@ def noise_free(frame: Frame) -> Tensor | None:
 
 
 def _combined(operator: Callable[[Tensor, Tensor], Tensor], image: Tensor) -> Tensor:
-    """A reduction over three channels takes many times as long."""
+    """Combine the three channels pairwise; a reduction over this dimension takes many times as long."""
     return operator(operator(image[:, :1], image[:, 1:2]), image[:, 2:])
 
 
 def _neighbours(image: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """The pixels that have a next one along an axis, and the next ones."""
+    """The pixels that have a next pixel along an axis, and those next pixels."""
     count = image.shape[dim] - 1
     return image.narrow(dim, 0, count), image.narrow(dim, 1, count)

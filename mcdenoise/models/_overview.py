@@ -21,22 +21,22 @@ _SIDE = 64  # a multiple of every model's padding, so that no padded pixel is co
 
 @dataclass(frozen=True)
 class ModelOverview:
-    """What `mcdenoise models` prints of one model.
+    """One row of `mcdenoise models`.
 
     Args:
-        name: in the register.
+        name: the registered name.
         description: one line.
-        kind: what makes its image.
-        paper: its authors and year; empty where there is none.
+        kind: how the model makes its image.
+        paper: authors and year; empty if there is none.
         parameters: number of weights.
-        kmacs_per_pixel: thousands of multiply-adds a pixel in convolutions, which are nearly all of a network's work;
-            ``None`` for what is no network, whose work is elsewhere.
-        weights: "shipped"; "compared", shipped to be compared with others alone; "its own", which it finds by itself;
-            "to train"; or "none" where there are none.
-        needs: names of the buffers that it cannot do without.
-        uses: names of those that it is better with.
-        trainable: whether it learns.
-        reason: why it is not available, such as an optional package that is not installed; empty if it is.
+        kmacs_per_pixel: thousands of multiply-adds per pixel in convolutions, which are nearly all of a network's work;
+            ``None`` for a method that is not a network.
+        weights: "shipped"; "compared", shipped for comparisons only; "its own", found by the model itself; "to train";
+            or "none" for a model without weights.
+        needs: names of the required buffers.
+        uses: names of optional buffers that improve the result.
+        trainable: whether the model can be trained.
+        reason: why the model is not available, such as an optional package that is not installed; empty if it is.
     """
 
     name: str
@@ -53,19 +53,19 @@ class ModelOverview:
 
 
 def overview() -> list[ModelOverview]:
-    """An entry for every registered model, by kind and then by name; one that cannot be made says why."""
+    """One entry per registered model, sorted by kind and name; a model that cannot be made states the reason."""
     weights = dict.fromkeys(compared_models(), "compared") | dict.fromkeys(pretrained_models(), "shipped")
     entries = [_overview(name, weights.get(name, "")) for name in list_models()]
     return sorted(entries, key=lambda entry: get_args(Kind).index(entry.kind))
 
 
 def users_of(buffers: Iterable[str]) -> dict[str, list[str]]:
-    """For each of some buffers the names of the models that need it or are better with it, sorted."""
+    """For each given buffer, the sorted names of the models that need or use it."""
     needs: dict[str, frozenset[str]] = {}
-    # Networks are drawn at random, which must not show in what the caller draws.
+    # Constructing a network draws random numbers: keep the caller's generator unchanged.
     with torch.random.fork_rng(devices=[]):
         for name in list_models():
-            # One that cannot be made uses nothing.
+            # A model that cannot be made uses nothing.
             with suppress(InputError):
                 found = build_model(name).needs
                 needs[name] = found.buffers | found.uses
@@ -93,14 +93,14 @@ def _overview(name: str, weights: str) -> ModelOverview:
     )
 
 
-# Of what makes the model too: another one may be registered under a name.
+# The constructor is part of the cache key, because another model may be registered under the same name.
 @cache
 def _kmacs_per_pixel(name: str, _: object) -> float:
-    # Imports Triton where it is installed, which takes a fifth of a second.
+    # The import loads Triton where it is installed, which takes 0.2 s.
     from torch.utils.flop_counter import FlopCounterMode
 
     model = build_model(name)
-    # The counter knows torch's convolutions, not those that are fused where nobody asks for derivatives.
+    # The counter knows torch's convolutions but not the fused ones, which run only without derivatives.
     with FlopCounterMode(display=False) as counter, torch.enable_grad():
         model(_frame())
     return float(counter.get_total_flops()) / 2 / _SIDE**2 / 1e3

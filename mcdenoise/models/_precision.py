@@ -1,4 +1,4 @@
-"""In which precision the convolutions of a network run: what was asked for, or what is fastest on this machine."""
+"""The precision of a network's convolutions: the requested one, or the fastest on this machine."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ from mcdenoise.user_cache import cache_file, keep
 
 FloatPrecision = Literal["float32", "bfloat16"]
 Precision = Literal["float32", "bfloat16", "int8"]
-# Those that any model runs in.
+# Every model runs in these.
 FLOATS: tuple[FloatPrecision, ...] = ("float32", "bfloat16")
 PRECISIONS: tuple[Precision, ...] = (*FLOATS, "int8")
-# What "auto" means, for whoever wants the same on every machine.
+# A fixed precision for callers that need the same result on every machine, unlike "auto".
 ENVIRONMENT = "MCDENOISE_PRECISION"
-# So many times as fast bfloat16 must be: below that, what it rounds buys nothing.
+# Minimum speed-up of bfloat16; a smaller one is not worth the rounding.
 _WORTH = 1.2
 _CHANNELS, _SIDE, _ROUNDS = 32, 160, 7
 
 
 class Chosen(NamedTuple):
-    """A precision, and why this one."""
+    """A precision and the reason for choosing it."""
 
     precision: Precision
     reason: str
 
 
 def fastest_precision(device: torch.device) -> Chosen:
-    """bfloat16 where the processor computes with it and that pays, else float32.
+    """Choose bfloat16 if the processor supports it and it is sufficiently faster, else float32.
 
-    A convolution is measured in both, once on each machine: the ratio is kept in the user's cache folder, by processor
-    and version of torch. The environment variable MCDENOISE_PRECISION takes the choice away.
+    A convolution is timed in both, once per machine: the ratio is stored in the user's cache folder, by processor and
+    version of torch. The environment variable MCDENOISE_PRECISION overrides the choice.
 
     Raises:
-        InputError: the environment variable is no precision.
+        InputError: the environment variable does not name a precision.
     """
     if own := os.environ.get(ENVIRONMENT):
         for known in FLOATS:
@@ -70,15 +70,15 @@ def fastest_precision(device: torch.device) -> Chosen:
 
 
 def precisions_of(model: Model) -> tuple[Precision, ...]:
-    """Those in which a model can run on this machine's processor."""
+    """The precisions in which a model can run on this machine's CPU."""
     return PRECISIONS if has_int8() and _is_calibrated(model) else FLOATS
 
 
 def quantize(model: Model, device: torch.device) -> None:
-    """Get the U-Nets of a model ready to compute in integers, see :mod:`mcdenoise.nn.int8`.
+    """Prepare the U-Nets of a model for computing in integers, see :mod:`mcdenoise.nn.int8`.
 
     Raises:
-        InputError: they are not calibrated, or the machine is none for it.
+        InputError: the U-Nets are not calibrated, or the processor does not support it.
     """
     if device.type != "cpu" or not has_int8():
         raise InputError(
@@ -101,10 +101,10 @@ def quantize(model: Model, device: torch.device) -> None:
 
 @contextmanager
 def calibrating(model: Model) -> Iterator[None]:
-    """Calibrate the U-Nets of a model on what they see in this block.
+    """Record the value ranges of the model's U-Nets while they run inside this block.
 
     Raises:
-        InputError: it has none.
+        InputError: the model has no U-Net.
     """
     unets = list(parts_of(model, UNet))
     if not unets:
@@ -119,7 +119,7 @@ def calibrating(model: Model) -> Iterator[None]:
 
 @contextmanager
 def computing_in(precision: Precision, device: torch.device) -> Iterator[None]:
-    """Run convolutions in this precision; what is left of them in int8 in bfloat16, where the processor has it."""
+    """Run convolutions in this precision; for int8, run the remaining ones in bfloat16 if the processor supports it."""
     rounded = precision == "bfloat16" or (precision == "int8" and _has_bfloat16(device))
     with torch.autocast(device.type, torch.bfloat16, enabled=rounded), integers(precision == "int8"):
         yield
@@ -136,13 +136,13 @@ def _has_bfloat16(device: torch.device) -> bool:
     try:
         return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
     except AttributeError:
-        # Built without oneDNN.
+        # torch was built without oneDNN.
         return False
 
 
 def _measured(device: torch.device) -> float:
-    """How many times as fast a convolution is in bfloat16."""
-    # Not a layer, whose weights would be drawn from the caller's random numbers.
+    """Speed-up of a convolution in bfloat16."""
+    # A layer object would draw its weights from the caller's random generator.
     weight = torch.full((_CHANNELS, _CHANNELS, 3, 3), 0.01, device=device)
     image = torch.full((1, _CHANNELS, _SIDE, _SIDE), 0.01, device=device)
     image = image.contiguous(memory_format=torch.channels_last)
@@ -155,13 +155,13 @@ def _measured(device: torch.device) -> float:
                     start = watch.mark()
                     F.conv2d(image, weight, padding=1)
                     own.append(watch.between(start, watch.mark()))
-    # The first rounds make kernels.
+    # The first rounds compile kernels.
     exact, rounded = (statistics.median(own[2:]) for own in times.values())
     return exact / rounded
 
 
 def _machine(device: torch.device) -> str:
-    """What the ratio depends on."""
+    """Identifies the machine: everything that the ratio depends on."""
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)
     else:

@@ -1,4 +1,4 @@
-"""What the methods of the paper's comparison have in common: the accumulation before them, and what networks see."""
+"""Common parts of the methods in the paper's comparison: the accumulation before them, and the network input."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.ops import remodulate
 
-# Of the BMFR scene "classroom", squared, in scene units (its world is in metres).
+# Squared distance for the BMFR scene "classroom" in scene units (metres).
 POSITION_LIMIT, NORMAL_LIMIT = 0.01, 1.0
-# Darker radiance counts as this before the power, whose derivative at zero is infinite.
+# Darker radiance is raised to this value before the power function, whose derivative at zero is infinite.
 _DARKEST = 1e-6
 
 
 def as_published(
     method: Model, alpha_min: float, position_limit: float, normal_limit: float, *, also: Sequence[str] = ()
 ) -> Model:
-    """A method on demodulated radiance that is accumulated by the published rule (Koskela et al. 2019), and no more.
+    """Wrap a method with demodulation and the published accumulation rule (Koskela et al. 2019), and nothing else.
 
     Args:
         method: any.
         alpha_min: smallest weight of the current frame in the accumulation.
-        position_limit: squared distance in scene units below which two points are one.
-        normal_limit: likewise for normals.
+        position_limit: squared distance in scene units below which two points count as the same point.
+        normal_limit: the same for normals.
         also: see :class:`mcdenoise.models.Accumulated`.
     """
     return Demodulated(
@@ -49,13 +49,13 @@ def as_published(
 
 
 def check_odd(kernel_size: int) -> None:
-    """``InputError`` for a kernel without a centre."""
+    """Raise ``InputError`` for an even kernel size."""
     if kernel_size < 1 or kernel_size % 2 == 0:
         raise InputError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
 
 
 class TenChannels(nn.Module):
-    """A network whose input is an image and seven channels of features in [0, 1]."""
+    """Base of networks whose input is an image and seven feature channels in [0, 1]."""
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The depth scale of the whole image."""
@@ -71,6 +71,6 @@ class TenChannels(nn.Module):
 
 
 def displayed(frame: Frame) -> Tensor:
-    """Demodulated radiance with its albedo, as a display shows it: ``max(x, 1e-6)^(1 / 2.2)``, ``(B, 3, H, W)``."""
+    """Radiance including albedo, gamma-mapped for a display: ``max(x, 1e-6)^(1 / 2.2)``, ``(B, 3, H, W)``."""
     lit = frame.color if frame.albedo is None else remodulate(frame.color, frame.albedo)
     return lit.clamp_min(_DARKEST).pow(1 / 2.2)

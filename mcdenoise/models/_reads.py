@@ -1,7 +1,7 @@
-"""Whether a step may look at values on its way, to leave out what they make needless.
+"""Whether a step may read tensor values on the host, to skip work that they make unnecessary.
 
-On a processor a look costs nothing beside what it saves. On any other device the host would wait for all that it has
-asked for so far, at every look; so a step makes none there, and computes what a recorded graph computes.
+On a CPU, reading a value costs little compared with what it saves. On any other device, every read makes the host wait
+for all queued work, so a step reads nothing there and computes everything, as a recorded graph does.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from contextlib import contextmanager
 
 import torch
 
-_out_of_reach = False
+_reads_disabled = False
 
 
 def at_hand(device: torch.device) -> bool:
-    """Whether values on a device may be read while a step runs; of a graph that is recorded there are none."""
-    return device.type == "cpu" and not _out_of_reach and not torch.compiler.is_compiling()
+    """Whether the host may read values on a device while a step runs; a graph being recorded has none."""
+    return device.type == "cpu" and not _reads_disabled and not torch.compiler.is_compiling()
 
 
 @contextmanager
-def out_of_reach() -> Iterator[None]:
-    """Within it, in all threads, steps on a processor look at no values, as on a GPU."""
-    global _out_of_reach
-    before, _out_of_reach = _out_of_reach, True
+def without_reads() -> Iterator[None]:
+    """Make steps on a CPU read no values inside this block, as on a GPU, in all threads."""
+    global _reads_disabled
+    before, _reads_disabled = _reads_disabled, True
     try:
         yield
     finally:
-        _out_of_reach = before
+        _reads_disabled = before

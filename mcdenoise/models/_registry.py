@@ -1,4 +1,4 @@
-"""The zoo's register: names to constructors, and where a model that is not in it comes from."""
+"""The register of the zoo: it maps names to constructors, and finds models that are not registered."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from mcdenoise.own import in_one_line, load_own
 
 GROUP = "mcdenoise.models"
 
-# What makes a model's image, in the order in which they are listed: predicted kernels; predicted pixels; bilateral
-# grids; a network with a memory of its own; a filter without weights; another denoiser; or nobody has said.
+# How a model makes its image, in listing order: predicted kernels; predicted pixels; bilateral grids; a recurrent
+# network; a filter without weights; another denoiser; or unspecified.
 Kind = Literal["kernel", "pixel", "grid", "recurrent", "filter", "peer", "other"]
 
 
@@ -31,12 +31,12 @@ class Entry:
     """A registered model.
 
     Args:
-        construct: makes it, with fresh weights.
-        settings: what ``construct`` is given under this name.
+        construct: makes the model, with fresh weights.
+        settings: arguments for ``construct`` under this name.
         description: one line.
-        kind: what makes its image.
-        paper: its authors and year; empty where there is none.
-        requires: the optional package that it cannot be made without; empty if there is none.
+        kind: how the model makes its image.
+        paper: authors and year; empty if there is none.
+        requires: the optional package that the model needs; empty if there is none.
     """
 
     construct: Callable[..., Any]
@@ -48,12 +48,12 @@ class Entry:
 
     @property
     def installed(self) -> bool:
-        """Whether what it requires is installed."""
+        """Whether the required package is installed."""
         return not self.requires or importlib.util.find_spec(self.requires) is not None
 
     @property
     def architecture(self) -> dict[str, Any]:
-        """The settings that weights are of, with their defaults: the constructor's positional arguments."""
+        """The settings that determine the weights, with their defaults: the constructor's positional arguments."""
         parameters = inspect.signature(self.construct).parameters.values()
         own = {each.name: each.default for each in parameters if each.kind is each.POSITIONAL_OR_KEYWORD}
         return own | {name: value for name, value in self.settings.items() if name in own}
@@ -65,21 +65,21 @@ _MODELS: dict[str, Entry] = {}
 def register_model(
     name: str, description: str = "", *, kind: Kind = "other", paper: str = "", requires: str = "", **settings: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator that enters a model's constructor under ``name``.
+    """Decorator that registers a model's constructor under ``name``.
 
-    The constructor's positional arguments are what weights are of (sizes), its keyword-only ones are not (how histories
-    are kept, what is skipped).
+    The constructor's positional arguments determine the weights (sizes); its keyword-only arguments do not (history,
+    skipping).
 
     Args:
-        name: in the register.
-        description: one line; the first one of the constructor's docstring by default.
-        kind: what makes its image.
-        paper: its authors and year, such as "Schied et al. 2017".
-        requires: the optional package that it cannot be made without.
-        settings: for the constructor, under this name.
+        name: the registered name.
+        description: one line; by default the first line of the constructor's docstring.
+        kind: how the model makes its image.
+        paper: authors and year, such as "Schied et al. 2017".
+        requires: the optional package that the model needs.
+        settings: arguments for the constructor under this name.
 
     Raises:
-        ValueError: the name is taken, or there is no such kind.
+        ValueError: the name is taken, or the kind is unknown.
     """
     if kind not in get_args(Kind):
         raise ValueError(f"kind: expected one of {', '.join(get_args(Kind))}, found '{kind}'")
@@ -95,17 +95,17 @@ def register_model(
 
 
 def list_models(pattern: str = "*") -> list[str]:
-    """Names of all registered models that match a shell-style pattern, sorted; those of installed packages as well."""
+    """Sorted names of all registered models that match a shell-style pattern, including those of installed packages."""
     _import_pages()
     return sorted(name for name in {*_MODELS, *_installed()} if fnmatch(name, pattern))
 
 
 def find_model(name: str) -> Entry:
-    """The entry of a registered model, one that an installed package offers, or somebody's own.
+    """The entry of a registered model, of one that an installed package offers, or of a user's own model.
 
     Args:
-        name: of :func:`list_models`; or ``path/to/file.py:factory`` or ``package.module:factory``, whose factory is
-            called for the model.
+        name: one of :func:`list_models`, or ``path/to/file.py:factory`` or ``package.module:factory``; the factory is
+            called to make the model.
 
     Raises:
         InputError: there is no such model, file, module or factory.
@@ -124,7 +124,7 @@ def find_model(name: str) -> Entry:
 
 
 def build_model(name: str, **settings: Any) -> Model:
-    """A model with fresh weights, float32 on the CPU whatever torch's defaults are.
+    """Make a model with fresh weights, in float32 on the CPU whatever torch's defaults are.
 
     Raises:
         InputError: there is no such model, or it has no such setting.
@@ -160,7 +160,7 @@ def _of_factory(name: str, factory: Any) -> Entry:
 
 @functools.cache
 def _import_pages() -> None:
-    """Import every page of this room, so that a model is registered by its page alone."""
+    """Import every module of this package, so that a model is registered by its file alone."""
     room = __name__.rpartition(".")[0]
     for page in pkgutil.iter_modules(importlib.import_module(room).__path__):
         if not page.name.startswith("_"):

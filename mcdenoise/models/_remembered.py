@@ -1,4 +1,4 @@
-"""How many frames of a shot a method remembers."""
+"""How many frames of history influence a method's result."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from mcdenoise.models._interface import Model
 
 
 def frames_remembered(model: Model, tolerance: float) -> int | None:
-    """After how many frames what a method kept of a shot before them counts for no more than a tolerance.
+    """The number of frames after which earlier history has a weight below a tolerance.
 
-    Of a history that each frame leaves the fraction ``p`` of, ``p**n`` is left after ``n`` frames. Where a method holds
-    others that remember, the frames of all are added, as each remembers what the one before it remembered.
+    If each frame keeps the fraction ``p`` of the history, ``p**n`` remains after ``n`` frames. If a method contains
+    other methods with a history, their frames are added, because each history holds results of the one before it.
 
     Args:
         model: any method.
-        tolerance: fraction of what was kept, in (0, 1).
+        tolerance: remaining weight of the history, in (0, 1).
 
     Returns:
-        The number of frames, 0 for a method that keeps nothing; or ``None`` where nobody knows: what a recurrent
-        network has learnt to remember, and a method of somebody else's that does not say it by ``persistence``.
+        The number of frames, 0 for a method without a history; or ``None`` if it is unknown, as for a recurrent
+        network or for a user's method without ``persistence``.
 
     Raises:
         InputError: the tolerance is out of its range.

@@ -1,4 +1,4 @@
-"""Whether a state that a method is handed is its own, said in one line before anything is computed of it."""
+"""Checks that a state belongs to the method that receives it, with a message of one line."""
 
 from __future__ import annotations
 
@@ -19,41 +19,41 @@ ADVICE = "hand a method what it returned for the frame before, or None at the be
 def own_state(
     state: State, kind: type[_Kind], frame: Frame, *, channels: int | None = None, keeper: str = ""
 ) -> _Kind | None:
-    """The state as what a method keeps, or ``None`` where it is that.
+    """Check that a state has the type that a method keeps; ``None`` passes.
 
-    Another size of the image is no error but the beginning of a shot, which is the method's own business.
+    A state of another image size is not an error but the beginning of a shot, which the method handles.
 
     Args:
-        state: that the method was handed.
-        kind: named tuple of what the method keeps, in the file of the method. Its first tensor is of the precision in
+        state: the state that the method received.
+        kind: named tuple that the method keeps, defined in the method's file. Its first tensor has the precision in
             which frames are computed.
-        frame: that it was handed with.
-        channels: of that first tensor, where they are known.
-        keeper: the method, for the message; by default the file of the kind.
+        frame: the frame that the method received.
+        channels: number of channels of that first tensor, if it is fixed.
+        keeper: name of the method for the message; by default the file that defines ``kind``.
 
     Raises:
-        InputError: the state is of another kind, device, batch, precision or number of channels.
+        InputError: type, device, batch, precision or number of channels do not match.
     """
     if state is None:
         return None
     if type(state) is not kind:
         expected = keeper or _file_of(kind)
         raise InputError(f"state: expected what {expected} keeps of a frame, found {_described(state)}; {ADVICE}")
-    # Graphs are made with a state of their own, for any batch.
+    # An exported graph has its own state, for any batch size.
     if not torch.compiler.is_compiling():
         _check_tensors(state, keeper or _file_of(kind), frame, channels)
     return state
 
 
 def own_pair(state: State, keeper: str) -> tuple[State, State]:
-    """The two parts of a state: what a wrapper keeps, and what the method inside keeps.
+    """Unpack a wrapper's state: its own part and the part of the method inside.
 
     Args:
-        state: that the wrapper was handed; ``None`` stands for two parts that are ``None``.
-        keeper: the wrapper, for the message.
+        state: the state that the wrapper received; ``None`` stands for two parts that are ``None``.
+        keeper: name of the wrapper for the message.
 
     Raises:
-        InputError: it is no such pair.
+        InputError: the state is not a pair.
     """
     if state is None:
         return None, None
@@ -66,10 +66,10 @@ def own_pair(state: State, keeper: str) -> tuple[State, State]:
 
 
 def own_parts(state: State, names: tuple[str, ...]) -> dict[str, State]:
-    """The parts of a state by name; ``None`` stands for parts that are ``None``.
+    """Unpack a state by part name; ``None`` stands for parts that are ``None``.
 
     Raises:
-        InputError: there are not these parts.
+        InputError: the parts have other names.
     """
     if state is None:
         return dict.fromkeys(names)
@@ -117,7 +117,7 @@ def _file_of(kind: type) -> str:
 
 
 def _described(state: State) -> str:
-    """Whose state it is, as far as it tells."""
+    """Name the method that a state belongs to, as far as its type tells."""
     if isinstance(state, dict):
         return f"what each of {', '.join(map(str, state)) or 'nothing'} keeps"
     if isinstance(state, tuple | list) and not hasattr(state, "_fields"):

@@ -1,4 +1,4 @@
-"""When a device did what it was told to do."""
+"""Time stamps of work on a device."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import Any, TypeAlias
 
 import torch
 
-# What a stopwatch marks: a number of milliseconds, or an event of a GPU.
+# A time stamp: milliseconds on a CPU, an event on a GPU.
 Moment: TypeAlias = Any
 
 
 class Stopwatch:
-    """Marks moments of a device without waiting for it: by CUDA events on a GPU, else by the clock.
+    """Takes time stamps without waiting for the device: CUDA events on a GPU, otherwise the clock.
 
     Args:
-        device: where the work is done.
+        device: where the work runs.
     """
 
     def __init__(self, device: torch.device | str) -> None:
@@ -23,11 +23,11 @@ class Stopwatch:
 
     @property
     def runs_behind(self) -> bool:
-        """Whether what was marked is known only later, so that asking for it waits."""
+        """Whether time stamps are asynchronous, so that reading one waits for the device."""
         return self._device.type == "cuda"
 
     def mark(self) -> Moment:
-        """Now; on a GPU, when it will have done what it was told to do so far."""
+        """A time stamp: now, or on a GPU the moment at which all work queued so far is done."""
         if not self.runs_behind:
             return time.perf_counter() * 1e3
         event = torch.cuda.Event(enable_timing=True)
@@ -35,12 +35,12 @@ class Stopwatch:
         return event
 
     def wait(self, moment: Moment) -> None:
-        """Until a moment has come."""
+        """Wait until a time stamp has been reached."""
         if self.runs_behind:
             moment.synchronize()
 
     def between(self, start: Moment, end: Moment) -> float:
-        """Milliseconds from one moment to another; waits until the latter has come."""
+        """Milliseconds between two time stamps; waits for the second one."""
         if not self.runs_behind:
             return float(end - start)
         self.wait(end)

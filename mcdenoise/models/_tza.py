@@ -1,4 +1,4 @@
-"""Archives of Open Image Denoise's weights (``.tza``), by themselves and inside its library."""
+"""Reading archives of Open Image Denoise's weights (``.tza``), from files and from inside its library."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from mcdenoise.reading import check_file, read_bytes
 
 Archive: TypeAlias = dict[str, Tensor]
 
-# The identifier, and the major version.
+# Magic number and major version.
 _MAGIC = struct.pack("<HB", 0x41D7, 2)
 _TYPES: dict[object, str] = {b"f": "<f4", b"h": "<f2"}
-# Bytes.
+# Longest name in bytes.
 _LARGEST = 1 << 30
 _MOST_TENSORS, _LONGEST_NAME, _MOST_AXES = 1000, 200, 4
 
 
 def read_tza(path: Path) -> Archive:
-    """The tensors of an archive by name, in its order, as float32.
+    """Read an archive: its tensors by name, in file order, as float32.
 
     Args:
-        path: such as the training scripts of Open Image Denoise export.
+        path: a file as exported by the training scripts of Open Image Denoise.
 
     Raises:
-        InputError: there is no such file, or it is no archive, or a damaged one.
+        InputError: the file does not exist, is not an archive, or is damaged.
     """
     try:
         content = read_bytes(path, _LARGEST)
@@ -50,7 +50,7 @@ def read_tza(path: Path) -> Archive:
 
 
 def archives_in(path: Path) -> Iterator[Archive]:
-    """All archives that a file contains, such as those that are compiled into the library.
+    """Find all archives inside a file, such as those compiled into the library.
 
     Raises:
         InputError: the file cannot be read.
@@ -60,7 +60,7 @@ def archives_in(path: Path) -> Iterator[Archive]:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             at = content.find(_MAGIC)
             while at >= 0:
-                # The same three bytes may be there by chance.
+                # The magic number of three bytes may occur by chance.
                 with suppress(struct.error, ValueError):
                     yield _archive(content, at)
                 at = content.find(_MAGIC, at + 1)
@@ -69,7 +69,7 @@ def archives_in(path: Path) -> Iterator[Archive]:
 
 
 def _archive(content: bytes | mmap.mmap, start: int) -> Archive:
-    """Identifier, version, where the table is; in the table name, axes, their names, type and place of each tensor."""
+    """Parse magic number, version and table offset, then name, shape, layout, type and offset of each tensor."""
     (table,) = struct.unpack_from("<Q", content, start + 4)
     at = start + table
     (count,) = struct.unpack_from("<I", content, at)

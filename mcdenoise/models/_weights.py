@@ -1,4 +1,4 @@
-"""Weights that describe themselves: safetensors with architecture, training and licence in the header."""
+"""Weights files that describe themselves: safetensors with architecture, training and licence in the header."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from mcdenoise.nn import UNet
 from mcdenoise.reading import check_file
 
 _SHIPPED = Path(__file__).parent / "weights"
-# Of methods that are there to be compared: all trained alike, and shortly.
+# Folder of weights for comparisons: all methods were trained with the same short recipe.
 _COMPARED = _SHIPPED / "compared"
 
 
 def create_model(name: str, *, pretrained: bool = False, weights: Path | str | None = None, **settings: Any) -> Model:
-    """A model of the zoo, or somebody's own.
+    """Create a model of the zoo or a user's own model.
 
     Args:
         name: one of :func:`mcdenoise.models.list_models`, ``path/to/file.py:factory`` or ``package.module:factory``.
-        pretrained: load the weights that are shipped with the package. A model without weights, and one of somebody's
-            own, comes as it is made.
-        weights: a safetensors file written by :func:`save_weights`; its settings are used for the model.
-        settings: for the model's constructor, such as ``width=32``.
+        pretrained: load the weights that are shipped with the package. Has no effect on a model without weights or on
+            a user's own model.
+        weights: a safetensors file written by :func:`save_weights`; the model gets the settings in the file.
+        settings: arguments for the model's constructor, such as ``width=32``.
 
     Returns:
         The model in evaluation mode, float32, on the CPU.
@@ -51,41 +51,42 @@ def create_model(name: str, *, pretrained: bool = False, weights: Path | str | N
 
 
 def find_weights(name: str) -> Path | None:
-    """The file of a model's shipped weights; ``None`` where there are none."""
+    """The file of a model's shipped weights, or ``None``."""
     files = [folder / f"{name}.safetensors" for folder in (_SHIPPED, _COMPARED)]
     return next((path for path in files if path.is_file()), None)
 
 
 def pretrained_models() -> list[str]:
-    """Names of the models that have shipped weights to denoise with, and whose packages are installed, sorted."""
+    """Sorted names of the models with shipped weights for denoising whose optional packages are installed."""
     return sorted(path.stem for path in _SHIPPED.glob("*.safetensors") if find_model(path.stem).installed)
 
 
 def compared_models() -> list[str]:
-    """Names of the models that have shipped weights for comparison alone, sorted.
+    """Sorted names of the models with shipped weights for comparisons only.
 
-    They are trained alike by ``recipes/zoo.toml``, for some minutes each, to be compared with one another.
+    ``recipes/zoo.toml`` trains each of them in the same way for some minutes.
     """
     return sorted(path.stem for path in _COMPARED.glob("*.safetensors"))
 
 
 def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
-    """The model that a weights file describes, with these weights.
+    """Load the model that a weights file describes.
 
     Args:
         path: a file written by :func:`save_weights`.
-        name: the model it must be, or somebody's own that it must fit; by default the one that the file names.
+        name: registered model that the file must hold, or a user's own model to load it into; by default the model that
+            the file names.
         settings: override the settings in the file.
 
     Raises:
-        InputError: no such file, not safetensors, another model, tensors that do not fit (the first of them is named),
-            or that are not finite.
+        InputError: the file does not exist, is not safetensors, holds another model, has tensors that do not fit (the
+            message names the first one), or has weights that are not finite.
     """
     description = describe_weights(path)
     found = description["architecture"]
     if name is not None and found != name and ":" not in name:
         raise InputError(f"{path}: expected weights of model '{name}', found those of '{found}'")
-    # The code alone never decides what a file means.
+    # The settings come from the file, so that a change of defaults in the code cannot change what a file means.
     if lacking := sorted(set(find_model(name or found).architecture) - set(description["settings"])):
         raise InputError(
             f"{path}: header 'settings': expected every setting of model '{found}', found no {', '.join(lacking)}; "
@@ -101,7 +102,7 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - a safetensors handle is no dict
     for name, unet in _unets(model).items():
-        # Only of a network that has been calibrated.
+        # Only a calibrated network has ranges.
         if (ranges := tensors.get(f"{name}.ranges")) is not None:
             unet.ranges = torch.zeros(ranges.shape)
     own = _named(model)
@@ -123,10 +124,10 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
 
 
 def describe_weights(path: Path) -> dict[str, Any]:
-    """What a weights file says of itself: architecture, settings, training, data, licence.
+    """The header of a weights file: architecture, settings, training, data, licence.
 
     Raises:
-        InputError: no such file, or not written by :func:`save_weights`.
+        InputError: the file does not exist, or was not written by :func:`save_weights`.
     """
     try:
         check_file(path)
@@ -149,17 +150,17 @@ def describe_weights(path: Path) -> dict[str, Any]:
 
 
 def save_weights(model: Model, architecture: str, settings: dict[str, Any], about: dict[str, str]) -> bytes:
-    """A model's weights as the bytes of a safetensors file, half precision.
+    """Encode a model's weights as the bytes of a safetensors file, in half precision.
 
     Args:
         model: the model.
-        architecture: the name under which it is registered.
-        settings: what its constructor was given besides what is registered with the name. The file holds every setting
-            that weights are of, so that the code alone never decides what a file means.
-        about: how the weights came to be: config, data, steps, commit, licence; texts.
+        architecture: the registered name.
+        settings: arguments given to the constructor in addition to the registered ones. The file holds every setting
+            that determines the weights, so that a change of defaults in the code cannot change what a file means.
+        about: provenance as texts: config, data, steps, commit, licence.
 
     Returns:
-        The file's bytes; the header also has the ``sha256`` of the tensors' bytes.
+        The bytes of the file; the header also holds the ``sha256`` of the tensors' bytes.
 
     Raises:
         InputError: a weight is not finite in half precision.
@@ -174,9 +175,9 @@ def save_weights(model: Model, architecture: str, settings: dict[str, Any], abou
 
 
 def _named(model: Model) -> dict[str, Tensor]:
-    """The weights of a model by name, and the ranges of what is calibrated.
+    """The weights of a model by name, and the ranges of its calibrated U-Nets.
 
-    What it wears does not count, so that a file fits it with and without.
+    Names do not include wrappers, so that a file fits the model with and without them.
     """
     if not isinstance(model, nn.Module):
         return {}
@@ -198,6 +199,6 @@ def _bare(key: str) -> str:
 def _digest(tensors: dict[str, Tensor]) -> str:
     digest = hashlib.sha256()
     for key in sorted(tensors):
-        # numpy knows no bfloat16.
+        # numpy has no bfloat16.
         digest.update(key.encode() + tensors[key].contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()

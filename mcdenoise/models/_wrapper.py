@@ -1,4 +1,4 @@
-"""A model that holds a model."""
+"""Base of wrappers: models that contain a model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _Wanted = TypeVar("_Wanted")
 
 
 class Wrapper(nn.Module):
-    """A model that holds another one and changes what goes in or comes out.
+    """Contains another model, and changes its input or output.
 
     Args:
         inner: any :class:`mcdenoise.models.Model`, or a module or function of images, see
@@ -30,11 +30,11 @@ class Wrapper(nn.Module):
 
     @property
     def needs(self) -> Needs:
-        """Those of the model inside."""
+        """The needs of the inner model."""
         return self.inner.needs
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """Those of the model inside, see :class:`mcdenoise.models.Model`."""
+        """The statistics of the inner model, see :class:`mcdenoise.models.Model`."""
         inner = getattr(self.inner, "statistics", None)
         return {} if inner is None else inner(frame)
 
@@ -44,20 +44,20 @@ class Wrapper(nn.Module):
 
 
 def run(model: Model, handed: list[Frame], state: State) -> tuple[Output, State]:
-    """Call a model with a frame that nobody else holds, so that the model can free it: of a large one, that is much.
+    """Call a model with a frame that has no other reference, so that the model can free its memory early.
 
     Args:
         model: any.
-        handed: the frame; empty afterwards.
+        handed: list that holds the frame; empty afterwards.
         state: see :class:`mcdenoise.models.Model`.
     """
-    # A module's own call keeps its arguments until it returns.
+    # ``nn.Module.__call__`` keeps references to its arguments until it returns.
     step = model.forward if isinstance(model, nn.Module) else model
     found: tuple[Output, State] = step(handed.pop(), state)
     return found
 
 
 def parts_of(model: Model, kind: type[_Wanted]) -> Iterator[_Wanted]:
-    """The wrappers of a kind that a model wears, outermost first."""
+    """The wrappers of a type around and inside a model, outermost first."""
     if isinstance(model, nn.Module):
         yield from (module for module in model.modules() if isinstance(module, kind))

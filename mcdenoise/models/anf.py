@@ -1,31 +1,33 @@
-"""Affinity of neural features: dilated filters whose weights are how alike learnt features are, in space and in time.
+"""Affinity of neural features: dilated filters weighted by the similarity of learnt features, in space and in time.
 
 Isik et al. 2021, "Interactive Monte Carlo Denoising using Affinity of Neural Features", ACM Transactions on Graphics
-40(4). For each frame ``t``, with ``W`` what was there in the frame before, at the places of this one:
+40(4). For each frame ``t``, where ``W`` reprojects the previous frame to the current one:
 
-1. Each sample of a pixel is embedded by itself, in layers of 1x1, and the mean of the embeddings is ``e_t``.
-2. A U-Net sees ``e_t`` and ``W e_bar_{t-1}`` and predicts, for each pixel, ``lambda``; for each filter ``k`` features
-   ``f^k``, a bandwidth ``a^k`` and a weight of the centre ``c^k``; and a bandwidth in time ``b``.
-3. Exponential means: ``L_bar_t = (1 - lambda) L_t + lambda W L_bar_{t-1}``, and likewise ``e_bar_t`` of ``e_t``.
-4. ``L_bar_t`` goes through filters one after the other, with 7x7 taps 1, 2 and 4 pixels apart and weights
-   ``exp(-a_p |f_p - f_q|^2)``, ``c_p`` of the pixel itself (:func:`mcdenoise.ops.affinity_filter`).
-5. The last of them also has taps in the result of the frame before, ``exp(-b_p |f_p - W f_{q, t-1}|^2)`` with the
-   features of its last filter.
+1. Each sample of a pixel is embedded separately by 1x1 layers, and the mean of the embeddings is ``e_t``.
+2. A U-Net takes ``e_t`` and ``W e_bar_{t-1}``. For each pixel it predicts ``lambda``; for each filter ``k`` features
+   ``f^k``, a bandwidth ``a^k`` and a weight of the centre ``c^k``; and a temporal bandwidth ``b``.
+3. Exponential means are updated: ``L_bar_t = (1 - lambda) L_t + lambda W L_bar_{t-1}``, and ``e_bar_t`` in the same
+    way.
+4. ``L_bar_t`` passes through the filters one after the other, with 7x7 taps 1, 2 and 4 pixels apart and the weights
+   ``exp(-a_p |f_p - f_q|^2)``; the centre has the weight ``c_p`` (:func:`mcdenoise.ops.affinity_filter`).
+5. The last filter also has taps in the result of the previous frame, ``exp(-b_p |f_p - W f_{q, t-1}|^2)``, with the
+   features of that frame's last filter.
 
-From a public re-implementation (Luciferbobo/SSR) come three filters, 8 features, ``a`` as a square, ``c`` and
-``lambda`` as sigmoids; ``b`` is a square here as well. What is left open, and what is taken here:
+From a public re-implementation (Luciferbobo/SSR) come three filters, 8 features, ``a`` as a square, and sigmoids for
+``c`` and ``lambda``; ``b`` is a square here as well. The sources leave the following open; this is our choice:
 
-- the embedding: three layers of 1x1 and 32 channels with LeakyReLU, of ``log(1 + radiance)``, albedo, normal and depth;
-- a frame without samples has one a pixel, its color; those of a frame differ in nothing but their radiance;
-- typical radiance is brought to 0.5 for the network (:func:`mcdenoise.nn.auto_exposure`); the filters are linear in it;
-- the U-Net: four levels of 32 channels (:class:`mcdenoise.nn.UNet`);
-- the albedo is divided out before, as of most methods here;
-- where nothing shows the same surface (:func:`mcdenoise.ops.reproject`), ``lambda`` and the weights in time are 0;
-  where only some of the taps do, less;
-- layers and alpha are filtered, and accumulated, with the radiance.
+- The embedding has three 1x1 layers of 32 channels with LeakyReLU. It takes ``log(1 + radiance)``, albedo, normal,
+  depth.
+- A frame without samples has one sample per pixel: its color. The samples of a pixel differ only in their radiance.
+- Typical radiance is scaled to 0.5 for the network (:func:`mcdenoise.nn.auto_exposure`); the filters are linear in it.
+- The U-Net has four levels of 32 channels (:class:`mcdenoise.nn.UNet`).
+- The albedo is divided out before, as in most methods here.
+- Where no tap shows the same surface (:func:`mcdenoise.ops.reproject`), ``lambda`` and the temporal weights are 0;
+  where only some taps do, they are reduced.
+- Layers and alpha are filtered and accumulated together with the radiance.
 
-Its authors' loss is SMAPE with 0.25 times that of frame differences (``temporal_weight = 0.25`` in training), and
-``1e-5 (a^2 + b^2)``, which is not in the trainer.
+The authors' loss is SMAPE plus 0.25 times SMAPE of frame differences (``temporal_weight = 0.25`` in training), plus
+``1e-5 (a^2 + b^2)``, which the trainer does not have.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.recurrent import from_before, to_be_kept
 from mcdenoise.nn.inputs import features_of, image_statistics
-from mcdenoise.nn.samples import samples_of, told_of
+from mcdenoise.nn.samples import describe_samples, samples_of
 from mcdenoise.nn.unet import Head, UNet
 from mcdenoise.ops import affinity_filter
 from mcdenoise.ops._steps.network import normalized_depth
@@ -54,7 +56,7 @@ _SAMPLE = 10  # radiance 3, albedo 3, normal 3, depth 1
 
 
 class Anf(nn.Module):
-    """The method, on radiance without albedo.
+    """The method, for demodulated radiance.
 
     Args:
         width: channels of the embedding, the paper's 32, and of the U-Net.
@@ -73,17 +75,17 @@ class Anf(nn.Module):
         self.unet = UNet(2 * width, [width] * LEVELS, scales=1)
         self.head = Head(self.unet, 0, FILTERS * _OF_FILTER + 2)
         with torch.no_grad():
-            # Bandwidths begin at about 1: a square has no slope at 0.
+            # Bandwidths start at about 1, because a square has no slope at 0.
             self.head.bias[FEATURES::_OF_FILTER] = 1.0  # type: ignore[index]
             self.head.bias[-1] = 1.0  # type: ignore[index]
 
     @property
     def persistence(self) -> None:
-        """Nobody knows what the network has learnt to remember, see :func:`mcdenoise.models.frames_remembered`."""
+        """Unknown, since the network learns what to remember; see :func:`mcdenoise.models.frames_remembered`."""
 
     @property
     def needs(self) -> Needs:
-        """Color; of use are features, samples, and what tells motion."""
+        """Needs color; uses features, samples and motion."""
         return Needs(uses=MOTION | {"albedo", "normal", "depth", "samples", "view_projection"})
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
@@ -131,7 +133,7 @@ class Anf(nn.Module):
         albedo, normal, depth = features_of(frame)
         shared = torch.cat([albedo, normal, normalized_depth(depth, near, typical)], 1).to(frame.color.dtype)
         radiance = samples_of(frame).to(frame.color.dtype)
-        note("samples", told_of(frame))
+        note("samples", describe_samples(frame))
         total: Tensor | None = None
         count = radiance.shape[1]
         for sample in range(count):
@@ -149,7 +151,7 @@ class Anf(nn.Module):
     paper="Isik et al. 2021",
 )
 def anf(width: int = 32) -> Model:
-    """Affinity of neural features, of Isik et al. 2021.
+    """Affinity of neural features (Isik et al. 2021).
 
     Args:
         width: channels of the embedding, the paper's 32, and of the U-Net.

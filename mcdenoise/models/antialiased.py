@@ -1,6 +1,6 @@
-"""Temporal anti-aliasing: the image before is blended in as far as it lies among the colors around a pixel.
+"""Temporal anti-aliasing: the previous image is clamped to the colors around each pixel and blended in.
 
-Karis 2014, "High-Quality Temporal Supersampling"; in the setting of Koskela et al. 2019 (BMFR), kernel ``taa``.
+Karis 2014, "High-Quality Temporal Supersampling"; with the settings of Koskela et al. 2019 (BMFR), kernel ``taa``.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _GAMMA = 2.2
 
 
 class Shown(NamedTuple):
-    """What is kept of a frame.
+    """State after a frame.
 
     Args:
-        image: ``(B, 3, H, W)`` its result, gamma-mapped.
-        view_projection: ``(B, 4, 4)`` by which camera.
+        image: ``(B, 3, H, W)`` the result, gamma-mapped.
+        view_projection: ``(B, 4, 4)`` camera of the frame.
     """
 
     image: Tensor
@@ -36,14 +36,14 @@ class Shown(NamedTuple):
 
 
 class Antialiased(Wrapper):
-    """Blends the image of a method with its own reprojected result of the frame before, clamped to what is around.
+    """Blends the image of a method with its own reprojected previous result, clamped to the neighbourhood.
 
-    Radiance is gamma-mapped, ``x^(1 / 2.2)``, and brought back afterwards; it is not cut off at 1, so that the result
-    is radiance like any other, and scales with the exposure. In YCoCg, the result before is clamped to the mean of the
-    range of the 3x3 pixels and of the range of the cross of five among them; ``result = alpha image + (1 - alpha)
-    before``. Surfaces are not compared, and no cut is looked for: only the clamp limits the weight of the history.
+    Radiance is gamma-mapped, ``x^(1 / 2.2)``, and mapped back afterwards. It is not clamped at 1, so that the result is
+    linear radiance and scales with the exposure. In YCoCg, the previous result is clamped to a range: the mean of the
+    range of the 3x3 neighbourhood and the range of its 5-pixel cross. Then ``result = alpha image + (1 - alpha)
+    previous``. Surfaces are not compared and cuts are not detected: only the clamp limits the weight of the history.
 
-    Layers and alpha are those of the method.
+    Layers and alpha are passed through from the method.
 
     Args:
         inner: any method.
@@ -61,13 +61,13 @@ class Antialiased(Wrapper):
 
     @property
     def needs(self) -> Needs:
-        """As those inside; whatever tells motion is of use."""
+        """The needs of the inner method; motion is used."""
         needs = self.inner.needs
         return Needs(needs.buffers, needs.uses | MOTION | {"view_projection"}, needs.trainable, None)
 
     @property
     def persistence(self) -> float:
-        """What one more frame leaves of the history, see :func:`mcdenoise.models.frames_remembered`."""
+        """Fraction of the history that one more frame leaves, see :func:`mcdenoise.models.frames_remembered`."""
         return 1 - self.alpha
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
@@ -116,8 +116,8 @@ def _to_rgb(image: Tensor) -> Tensor:
 
 
 def _range(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Means of the minimum of 3x3 pixels and of the cross among them, and of their maximum; inside the image."""
-    # Those of both signs at once.
+    """Minimum and maximum of the neighbourhood: means over the 3x3 pixels and their cross; inside the image only."""
+    # Negate to get the minimum and the maximum from one max-pooling.
     both = torch.cat([-image, image], 1)
     box = F.max_pool2d(both, 3, 1, 1)
     cross = torch.maximum(F.max_pool2d(both, (1, 3), 1, (0, 1)), F.max_pool2d(both, (3, 1), 1, (1, 0)))

@@ -1,31 +1,31 @@
-"""BMFR, a filter without weights: every block of the image is the best combination of its features.
+"""BMFR, a filter without weights: it fits every block of the image by a linear combination of its features.
 
 Koskela et al. 2019, "Blockwise Multi-Order Feature Regression for Real-Time Path-Tracing Reconstruction", ACM
-Transactions on Graphics 38(5), and its public code, ``bmfr.cl``. In its order:
+Transactions on Graphics 38(5), and its public code, ``bmfr.cl``. The steps are:
 
-1. The radiance without albedo is accumulated by its rule, with the weight ``max(1 / n, 0.2)`` of the current frame
+1. Demodulated radiance is accumulated by the BMFR rule, with the weight ``max(1 / n, 0.2)`` of the current frame
    (:class:`mcdenoise.models.Accumulated`, ``rule="bmfr"``). The limits of the rule are in scene units, and the authors
-   chose them for each scene: the defaults are those of their "classroom".
-2. Blocks of 32x32 pixels, which begin in another one of 16 places in every frame, are fitted by 1, the normal, the
-   position, and the squares of the position (:func:`mcdenoise.ops.block_regression`). What is negative is cut off.
-3. The result is accumulated once more, over the taps that the first accumulation accepted, with ``max(1 / n, 0.1)``.
-4. It gets its albedo back, is gamma-mapped, and anti-aliased over time with the weight 0.2
+      chose them for each scene: the defaults are their values for "classroom".
+2. Blocks of 32x32 pixels, whose origin cycles through 16 offsets from frame to frame, are fitted by 1, the normal, the
+   position, and the squares of the position (:func:`mcdenoise.ops.block_regression`). Negative results are clamped to
+   0.
+3. The result is accumulated again, over the taps that the first accumulation accepted, with ``max(1 / n, 0.1)``.
+4. The result is remodulated, gamma-mapped, and temporally anti-aliased with the weight 0.2
    (:class:`mcdenoise.models.antialiased.Antialiased`).
 
-What differs from the public code:
+Differences from the public code:
 
-- It adds noise of +-0.01 to the features, another one in every frame, lest they depend on one another. Here a ridge
-  does that, which leaves the result of a frame the same however often it is computed; and it is as small as float32's
-  rounding, so that what is linear in the features stays.
-- It brings positions to 0..1 within a block only where they span more than one scene unit, and loses smaller ones in
-  its noise. Here each feature has the same spread in every block, whatever its unit.
-- Its squares are those of the world's coordinates; here they are those of the distances from the block's mean. Both
-  with the positions themselves and 1 span the same functions.
-- It ends with an image of 8 bits: gamma-mapped values are cut off at 1 before they are anti-aliased. Radiance has no
-  such limit, so that nothing is cut off here, and the result is brought back to linear radiance. In numbers up to 1
-  that is the same.
+- The code adds noise of +-0.01 to the features, different in every frame, to make them linearly independent. Here a
+  ridge does this, so that the result of a frame is reproducible. The ridge is as small as float32's rounding, so that
+  radiance that is linear in the features is preserved.
+- The code normalizes positions to 0..1 within a block only if they span more than one scene unit; smaller spans are
+  lost in its noise. Here each feature is normalized in every block, whatever its unit.
+- The code squares world coordinates; here the distances from the block's mean are squared. Together with the positions
+  and 1, both span the same functions.
+- The code ends with an 8-bit image: gamma-mapped values are clamped at 1 before anti-aliasing. Here nothing is clamped
+  and the result is mapped back to linear radiance. For values up to 1 both agree.
 
-Layers and alpha are fitted and accumulated as the color is, and cut off below 0 as it is.
+Layers and alpha are fitted, accumulated and clamped at 0 together with the color.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from mcdenoise.models.antialiased import Antialiased
 from mcdenoise.ops import Surface, block_regression, reproject
 from mcdenoise.ops.regression import BLOCK, RIDGE
 
-# Where the first block of a frame begins, (x, y) in pixels of blocks of 32; half a block is taken off both.
+# Offsets of the first block of a frame, (x, y) in pixels for blocks of 32; half a block is subtracted from both.
 _OFFSETS = (
     *((-14, -14), (4, -6), (-8, 14), (8, 0), (-10, -8), (2, 12), (12, -12), (-10, 0)),
     *((12, 14), (-8, -16), (6, 6), (-2, -2), (6, -14), (-16, 12), (14, -4), (-6, 4)),
@@ -58,13 +58,13 @@ _OFFSETS = (
 
 
 class History(NamedTuple):
-    """What is kept of a shot.
+    """State of a shot.
 
     Args:
-        images: ``(B, 3 + C, H, W)`` fitted and accumulated, with layers and alpha behind the color.
-        surface: what was seen.
-        view_projection: ``(B, 4, 4)`` by which camera.
-        number: ``(B, 1, 1, 1)`` of the next frame, modulo 16.
+        images: ``(B, 3 + C, H, W)`` fitted and accumulated color, followed by layers and alpha.
+        surface: surface of the previous frame.
+        view_projection: ``(B, 4, 4)`` camera of the previous frame.
+        number: ``(B, 1, 1, 1)`` number of the next frame, modulo 16.
     """
 
     images: Tensor
@@ -74,15 +74,15 @@ class History(NamedTuple):
 
 
 class Bmfr(nn.Module):
-    """Fits accumulated radiance by the features of each block, and accumulates what comes of it.
+    """Fits accumulated radiance by the features of each block, and accumulates the result.
 
-    It stands in :class:`mcdenoise.models.Accumulated`, with the same limits.
+    It has to be wrapped in :class:`mcdenoise.models.Accumulated` with the same limits.
 
     Args:
         block: side of a block in pixels, at least 2.
         second_alpha: smallest weight of the current frame in the second accumulation, in (0, 1].
         position_limit: see :func:`mcdenoise.ops.reproject`, rule "bmfr".
-        normal_limit: likewise.
+        normal_limit: the same for normals.
         ridge: see :func:`mcdenoise.ops.block_regression`.
 
     Raises:
@@ -114,13 +114,13 @@ class Bmfr(nn.Module):
 
     @property
     def needs(self) -> Needs:
-        """Features, and the length of the accumulated history; whatever tells motion is of use."""
+        """Needs features and the history length; uses motion."""
         buffers = frozenset({"color", "normal", "position", "length"})
         return Needs(buffers, MOTION - {"position"} | {"view_projection"}, trainable=False)
 
     @property
     def persistence(self) -> float:
-        """What one more frame leaves of the history, see :func:`mcdenoise.models.frames_remembered`."""
+        """Fraction of the history that one more frame leaves, see :func:`mcdenoise.models.frames_remembered`."""
         return 1 - self.second_alpha
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
@@ -140,11 +140,11 @@ class Bmfr(nn.Module):
         return answered(frame, images)._replace(stages={"fitted": fitted}), after
 
     def _fitted(self, frame: Frame, images: Tensor, number: Tensor) -> Tensor:
-        """Fitted by the blocks of this frame, none below zero."""
+        """Fit the images in the blocks of this frame; clamp at 0."""
         assert frame.normal is not None
         assert frame.position is not None
         features = torch.cat([frame.normal, frame.position], 1)
-        # Images of a batch may be at different places of their shots; and no place is read from where it is computed.
+        # Images of a batch may be at different frame numbers; the offset is looked up on the device.
         rows, columns = self._starts[number.flatten().long()].unbind(1)
         image, guide = (
             _moved(_moved(each, rows, -2, self.block), columns, -1, self.block) for each in (images, features)
@@ -154,7 +154,7 @@ class Bmfr(nn.Module):
         return _moved_back(_moved_back(fitted, rows, -2, height), columns, -1, width).clamp_min(0)
 
     def _accumulated(self, frame: Frame, images: Tensor, history: History) -> Tensor:
-        """With the result before, at the taps and with the length of the first accumulation."""
+        """Accumulate with the previous result, over the taps and with the length of the first accumulation."""
         if not has_motion(frame, history.view_projection):
             return images
         motion = motion_unless_still(frame, history.view_projection)
@@ -167,20 +167,20 @@ class Bmfr(nn.Module):
 
 
 def _moved(image: Tensor, starts: Tensor, axis: int, block: int) -> Tensor:
-    """Whole blocks that begin so many pixels before each image ``(B, C, H, W)``, which goes on mirrored."""
+    """Shift each image ``(B, C, H, W)`` by its offset and pad it by reflection to whole blocks."""
     size = image.shape[axis]
     places = torch.arange(-(-(size + block - 1) // block) * block, device=image.device)
     places = (places - starts[:, None]) % (2 * size)
-    return _taken(image, torch.minimum(places, 2 * size - 1 - places), axis)
+    return _gathered(image, torch.minimum(places, 2 * size - 1 - places), axis)
 
 
 def _moved_back(blocks: Tensor, starts: Tensor, axis: int, size: int) -> Tensor:
     """The inverse of :func:`_moved`."""
-    return _taken(blocks, torch.arange(size, device=blocks.device) + starts[:, None], axis)
+    return _gathered(blocks, torch.arange(size, device=blocks.device) + starts[:, None], axis)
 
 
-def _taken(image: Tensor, places: Tensor, axis: int) -> Tensor:
-    """Of each image of a batch other places along one of its last two axes, ``(B, N)``."""
+def _gathered(image: Tensor, places: Tensor, axis: int) -> Tensor:
+    """Gather indices ``(B, N)`` along one of the last two axes, separately for each image of a batch."""
     index = places[:, None, :, None] if axis == -2 else places[:, None, None, :]
     shape = list(image.shape)
     shape[axis] = places.shape[1]
@@ -188,7 +188,7 @@ def _taken(image: Tensor, places: Tensor, axis: int) -> Tensor:
 
 
 def _start(number: int, block: int) -> tuple[int, int]:
-    """How many rows and columns before the image the blocks of a frame begin."""
+    """Offset of a frame's first block: rows and columns before the image."""
     x, y = _OFFSETS[number % len(_OFFSETS)]
     return ((BLOCK // 2 - y) * block // BLOCK) % block, ((BLOCK // 2 - x) * block // BLOCK) % block
 
@@ -205,18 +205,18 @@ def bmfr(
     block: int = BLOCK,
     ridge: float = RIDGE,
 ) -> Model:
-    """Blockwise multi-order feature regression of Koskela et al. 2019, with its accumulations and its anti-aliasing.
+    """Blockwise multi-order feature regression (Koskela et al. 2019), with its accumulations and anti-aliasing.
 
     Args:
         alpha_min: smallest weight of the current frame in the first accumulation, in (0, 1].
-        second_alpha: the same of the second one.
-        taa: whether the result is anti-aliased over time, as the published one is.
-        taa_alpha: weight of the current frame in that, in (0, 1].
-        position_limit: squared distance in scene units below which two points are one, see
+        second_alpha: the same for the second accumulation.
+        taa: whether the result is temporally anti-aliased, as published.
+        taa_alpha: weight of the current frame in the anti-aliasing, in (0, 1].
+        position_limit: squared distance in scene units below which two points count as the same point, see
             :func:`mcdenoise.ops.reproject`.
-        normal_limit: likewise for normals.
+        normal_limit: the same for normals.
         block: see :func:`mcdenoise.ops.block_regression`.
-        ridge: likewise.
+        ridge: see :func:`mcdenoise.ops.block_regression`.
     """
     limits = {"position_limit": position_limit, "normal_limit": normal_limit}
     fit = Bmfr(block=block, second_alpha=second_alpha, ridge=ridge, **limits)

@@ -1,16 +1,16 @@
-"""The cascaded pixel-kernel network of the paper: a pixel network, and a kernel network that filters what it predicts.
+"""The paper's cascaded pixel-kernel network: a pixel network, and a kernel network that filters its prediction.
 
-The paper is doi:10.1007/s00371-023-02951-6; equation numbers are its own. What it leaves open, and what is taken here:
+The paper is doi:10.1007/s00371-023-02951-6; equation numbers refer to it. It leaves some details open; the choices are:
 
 - the fusion module's layers: one 3x3 convolution of both scales and a sigmoid (:class:`mcdenoise.nn.FusionModule`);
-- how kernels are normalised: ``softmax(logits - f1 |dn|^2 - f2 dd^2 - f3 r^2)``, which is Eq. 5 of unnormalised weights
-  divided by their sum; ``normalize="none"`` is Eq. 5 to the letter;
+- the normalization of kernels: ``softmax(logits - f1 |dn|^2 - f2 dd^2 - f3 r^2)``, which is Eq. 5 for unnormalised
+  weights divided by their sum; ``normalize="none"`` is Eq. 5 exactly;
 - f1, f2, f3 >= 0: a softplus;
-- the unit of radiance: typical radiance is brought to 0.5 (:class:`mcdenoise.models.Exposed`);
+- the unit of radiance: typical radiance is scaled to 0.5 (:class:`mcdenoise.models.Exposed`);
 - depth in [0, 1]: ``d / (d + typical depth)``;
 - accumulation (its Appendix 1): the published rule of Koskela et al. 2019 with alpha 0.2, on demodulated radiance; it
   compares positions in scene units;
-- radiance below zero, which Eq. 2 allows: the result is cut off at 0.
+- negative radiance, which Eq. 2 allows: the result is clamped at 0.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ LEVELS = 4  # of the U-Net
 
 
 class _Network(TenChannels):
-    """The U-Net of Fig. 2, and a head and a fusion module at the scales of its last three decoder layers."""
+    """The U-Net of Fig. 2, with a head and a fusion module at the scales of its last three decoder layers."""
 
     def __init__(self, width: int, channels: int, radius: int) -> None:
         super().__init__()
@@ -55,24 +55,24 @@ class _Network(TenChannels):
 
     @property
     def needs(self) -> Needs:
-        """A pixel for each head and fusion and the radius of each filter, at their scales, behind the U-Net."""
+        """The reach adds a pixel for head and fusion and the filter's radius, at each scale, to that of the U-Net."""
         ways = (self.unet.reach(scale) + ((1 + self._radius) << scale) for scale in range(self.unet.scales))
         reach = max(ways) + sum(1 << scale for scale in range(self.unet.scales - 1))
         return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple)
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`."""
+        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`."""
         return self.unet.bytes_per_pixel(bfloat16=bfloat16)
 
     def fuse(self, images: list[Tensor]) -> Tensor:
-        """The scales of an image, finest first, in one."""
+        """Fuse the scales of an image, finest first."""
         fused = images[-1]
         for image, fusion in zip(images[-2::-1], self.fusions, strict=True):
             fused = fusion(image, fused)  #                                                                     Eq. 2
         return fused
 
     def fuse_with(self, images: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """The scales of an image in one, and those of what was filtered with it: means, with the same weights."""
+        """Fuse the color of each scale, and blend its further channels by weighted means with the same weights."""
         fused, others = images[-1][:, :3], images[-1][:, 3:]
         for image, fusion in zip(images[-2::-1], self.fusions, strict=True):
             fine = image[:, :3]
@@ -82,7 +82,7 @@ class _Network(TenChannels):
 
 
 class PixelNetwork(_Network):
-    """P: predicts the image at three scales, and fuses them.
+    """P: predicts the image at three scales and fuses them.
 
     Args:
         width: feature channels of every convolution, the paper's 40.
@@ -118,7 +118,7 @@ class KernelNetwork(_Network):
         """See :class:`mcdenoise.models.Model`."""
         x, (albedo, normal, depth) = frame.color, self.features(frame)
         levels = self.unet(torch.cat([x, albedo, normal, depth], 1))
-        # Weights below zero say nothing of proportions.
+        # Negative weights have no meaning as proportions.
         others = carried(frame) if self.normalize == "softmax" else None
         x = x if others is None else torch.cat([x, others], 1)
         images = []
@@ -137,7 +137,7 @@ class KernelNetwork(_Network):
 
 
 class _NonNegative(Wrapper):
-    """Cuts off radiance below zero."""
+    """Clamps negative radiance to 0."""
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
@@ -166,15 +166,15 @@ def cascaded(
     """The paper's network, and its ablations.
 
     Args:
-        width: feature channels of every convolution; 40, for ``"K"`` and ``"P"`` alone 64.
+        width: feature channels of every convolution: the paper's 40 for two networks, 64 for ``"K"`` or ``"P"`` alone.
         kernel_size: k of the kernel network.
-        cascade: ``"P+K"``, the paper's; ``"K"``, ``"P"``, ``"K+P"``, ``"K+K"`` as in its Table 3.
+        cascade: ``"P+K"`` as in the paper, or ``"K"``, ``"P"``, ``"K+P"``, ``"K+K"`` as in its Table 3.
         bilateral: whether features adjust the kernels, see its Table 4.
         normalize: see :class:`KernelNetwork`.
         alpha_min: smallest weight of the current frame in the accumulation.
-        position_limit: squared distance in scene units below which two points are one, see
+        position_limit: squared distance in scene units below which two points count as the same point, see
             :func:`mcdenoise.ops.reproject`.
-        normal_limit: likewise for normals.
+        normal_limit: the same for normals.
 
     Raises:
         InputError: there is no such cascade.

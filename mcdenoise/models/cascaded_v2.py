@@ -1,15 +1,15 @@
 """The family ``cascaded_v2``: the cascaded pixel-kernel network with a history, logarithms and three resolutions.
 
-What goes beyond the paper's network (:mod:`mcdenoise.models.cascaded`), each because it was measured to pay:
+It adds the following to the paper's network (:mod:`mcdenoise.models.cascaded`); measurements showed a benefit of each:
 
-- the networks see what the accumulation did: the current frame alone, and one over the history length;
-- the pixel network predicts the logarithm of the radiance on top of its input's, and is given means at coarser scales;
-- scales are fused as logarithms, and no pixel grows beyond the brightest of the input;
+- the networks also see the current frame alone and one over the history length;
+- the pixel network predicts the logarithm of the radiance as a residual, and takes means at coarser scales;
+- scales are fused as logarithms, and no pixel becomes brighter than the brightest input pixel;
 - the pixel network also denoises the image at half and at a quarter of its size (:class:`CoarseToFine`).
 
 ``cascaded_v2`` has the paper's width. ``cascaded_v2_small`` (widths 16 and 32, 0.41 of the multiply-adds) and
-``cascaded_v2_tiny`` (width 16, 3x3 kernels, 0.18 of them) are the same network for processors on which it is too slow,
-and ``cascaded_v2_micro`` (0.08 of them) is one whose U-Nets begin at half the resolution.
+``cascaded_v2_tiny`` (width 16, 3x3 kernels, 0.18 of them) are the same network for slower processors, and the U-Nets of
+``cascaded_v2_micro`` (0.08 of them) begin at half the resolution.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _USES = frozenset({"albedo", "normal", "depth", "current", "length"})
 
 
 class _Network(nn.Module):
-    """What both networks have in common: a U-Net, heads at three scales, and their fusion."""
+    """Common base of both networks: a U-Net, heads at three scales, and their fusion."""
 
     def __init__(self, unet: UNet, channels: int, radius: int) -> None:
         super().__init__()
@@ -57,32 +57,32 @@ class _Network(nn.Module):
 
     @property
     def needs(self) -> Needs:
-        """A pixel for each head and fusion and the radius of each filter, at their scales, behind the U-Net."""
+        """The reach adds a pixel for head and fusion and the filter's radius, at each scale, to that of the U-Net."""
         heads = (max(1 << scale, self.unet.stride) for scale in range(self.unet.scales))
         ways = (self.unet.reach(scale) + head + (self._radius << scale) for scale, head in enumerate(heads))
         reach = max(ways) + sum(1 << scale for scale in range(self.unet.scales - 1))
         return Needs(uses=_USES, reach=reach, stride=self.unet.multiple)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """Exposure, depth scale, and the logarithm of the brightest pixel: that of this network's own input."""
+        """Exposure, depth scale, and the logarithm of the brightest pixel of this network's own input."""
         found = image_statistics(frame)
         return found | {"top": torch.log1p(frame.color.amax((1, 2, 3), keepdim=True) * found["exposure"])}
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: measured, in widths of the U-Net."""
+        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`; measured per channel of width."""
         return self.unet.bytes_per_pixel(bfloat16=bfloat16)
 
 
 class PixelNetwork(_Network):
     """P: predicts the image itself at three scales and fuses them, coarse to fine.
 
-    Beside what it makes of the noisy pixels itself, its U-Net is given the logarithm of their means at each coarser
-    scale: with one path a pixel most of the light of a dark surface is in few bright pixels, whose mean is easily taken
-    of radiance, but not of its logarithm or of what a maximum leaves of it.
+    In addition to the noisy pixels, the U-Net takes the logarithm of their means at each coarser scale. At one sample
+    per pixel, most light of a dark surface is in few bright pixels. Their mean radiance is informative; the mean of
+    their logarithms, or the maximum that pooling keeps, is not.
 
     Args:
         width: feature channels of the U-Net.
-        half: whether it has no level at full resolution, and twice the width at all coarser ones than the finest.
+        half: whether the U-Net begins at half the resolution, with twice the width at all of its levels but the finest.
     """
 
     def __init__(self, width: int, half: bool = False) -> None:
@@ -104,8 +104,8 @@ class PixelNetwork(_Network):
             image = downsample(image)
             means.append(torch.log1p(image))
         levels = self.unet(input_of(frame, logs, logarithms=False), means)
-        # The heads predict the logarithm of the radiance, on top of the input's: a network at rest is the identity,
-        # and errors are relative, as the eye and the loss see them.
+        # The heads predict a residual of the logarithm of the radiance: an untrained network is the identity, and
+        # errors are relative, as in the loss.
         scales = [logs]
         for _ in levels[1:]:
             scales.append(downsample(scales[-1]))
@@ -117,16 +117,16 @@ class PixelNetwork(_Network):
 
 
 class KernelNetwork(_Network):
-    """K: predicts kernels at three scales, filters the image's pyramid with them, and fuses, coarse to fine.
+    """K: predicts kernels at three scales, filters the image's pyramid with them, and fuses from coarse to fine.
 
-    Each scale has ``K*K + 3`` channels: the kernel's logits and the scales f1 (normal), f2
-    (depth) and f3 (distance) of the paper's Eqs. 5-8, kept non-negative by a softplus and counted in units in which 1
-    is a plausible value: normals and depths in [0, 1] differ by much less than pixel coordinates.
+    Each scale has ``K*K + 3`` channels: the kernel's logits and the falloffs f1 (normal), f2 (depth) and f3 (distance)
+    of the paper's Eqs. 5-8. The falloffs are made non-negative by a softplus and scaled by ``SCALE_UNITS``, since
+    normals and depths in [0, 1] differ by much less than pixel coordinates.
 
     Args:
         width: feature channels of the U-Net.
         kernel_size: K, 5 in the paper.
-        half: as of :class:`PixelNetwork`.
+        half: see :class:`PixelNetwork`.
     """
 
     def __init__(self, width: int, kernel_size: int = 5, half: bool = False) -> None:
@@ -143,19 +143,19 @@ class KernelNetwork(_Network):
         guides, others = guides_of(frame), carried(frame)
         image = image if others is None else torch.cat([image, others], 1)
         scales: list[Tensor] = []
-        # One for all scales: a tile of an image must not be filtered otherwise than the whole.
+        # All scales share the statistics of the whole image, so that a tile is filtered as in the whole image.
         with one_backend(image):
             for head, level in zip(self.heads, levels, strict=True):
                 prediction = head(level, image.shape[-2:])
                 logits, rest = prediction[:, : self.taps], prediction[:, self.taps :]
                 *falloffs, distance = softplus(rest, SCALE_UNITS).split(1, 1)
-                # A mean of radiance keeps the energy of a noisy image; a mean of logarithms would darken it.
+                # A mean of radiance preserves energy; a mean of logarithms would darken the image.
                 scales.append(cross_bilateral_filter(image, logits, guides, falloffs, distance, border="renormalize"))
                 if len(scales) < len(levels):
                     image, guides = downsample(image), [downsample(guide) for guide in guides]
         if others is not None:
             others = scales[-1][:, 3:]
-        # Each scale is a weighted mean; their fusion could leave the range of the input.
+        # Each scale is a weighted mean, but their fusion could leave the range of the input.
         fused = torch.log1p(scales[-1][:, :3])
         for scale, fusion in ((1, self.fusions[0]), (0, self.fusions[1])):
             fine = scales[scale][:, :3]
@@ -172,7 +172,7 @@ def _unet(width: int, half: bool, coarse_channels: int = 0) -> UNet:
 
 
 def _at_least_float32(tensor: Tensor) -> Tensor:
-    """Half precision as float32, float64 as it is: the shipped weights also run in float64, to measure what rounds."""
+    """Convert half precision to float32; keep float64, in which tests run the shipped weights to measure rounding."""
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
@@ -187,16 +187,16 @@ def _cascade(
     anti_lag: bool = True,
     tolerance: float = TOLERANCE,
 ) -> Model:
-    """The cascade with all that it wears.
+    """The cascade with all its wrappers.
 
     Args:
         width: feature channels of the pixel network.
-        kernel_width: of the kernel network; ``width`` by default.
+        kernel_width: feature channels of the kernel network; ``width`` by default.
         kernel_size: K.
-        resolutions: how many sizes of the image the pixel network denoises; 1 in the paper.
+        resolutions: number of image sizes that the pixel network denoises; 1 in the paper.
         half: whether the U-Nets begin at half the resolution.
         alpha_min: see :class:`mcdenoise.models.Accumulated`.
-        anti_lag: likewise.
+        anti_lag: see :class:`mcdenoise.models.Accumulated`.
         tolerance: see :class:`mcdenoise.models.Skipping`.
     """
     network = Chain(

@@ -1,4 +1,4 @@
-"""One method after another: each sees the image of the one before, and the same features."""
+"""A chain of methods: each one takes the image of the previous one, and the same features."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from mcdenoise.models.exposed import Exposed
 
 
 class Chain(nn.Module):
-    """One method after another, such as ``Chain(initial=P, final=K)`` of the paper's Eqs. 1 and 3.
+    """Runs methods one after another, such as ``Chain(initial=P, final=K)`` for the paper's Eqs. 1 and 3.
 
-    The output of each but the last is a stage under its name. Statistics of the whole image that one method has found
-    are there for the next, which looks for those only that depend on its own input. So are the layers of the image that
-    it has made, of a method without kernels too (:func:`mcdenoise.models._layers.completed`).
+    The output of each method but the last is a stage under its name. Statistics of the whole image that one method has
+    computed are available to the next one, which computes only those that depend on its own input. The denoised layers
+    are passed on in the same way, also by a method without kernels (:func:`mcdenoise.models._layers.completed`).
 
     Args:
-        methods: by name, in order.
+        methods: the methods by name, in order.
     """
 
     def __init__(self, **methods: Model) -> None:
@@ -38,10 +38,10 @@ class Chain(nn.Module):
 
     @property
     def needs(self) -> Needs:
-        """What any of them needs; the reach is that of all in a row.
+        """The union of all needs; the reach is the sum of all reaches.
 
-        It is that of the whole image where a later one depends on statistics: those are of an image that the ones
-        before it have made, which a tile is not.
+        The reach is the whole image if a method after the first uses statistics: these depend on the image of the
+        methods before it, of which a tile holds only a part.
         """
         first, *later = (getattr(self, name) for name in self._names)
         every = [method.needs for method in (first, *later)]
@@ -55,7 +55,7 @@ class Chain(nn.Module):
         )
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """Those of the first."""
+        """The statistics of the first method."""
         return prepared(getattr(self, self._names[0]), frame).statistics
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
@@ -67,7 +67,7 @@ class Chain(nn.Module):
             method: Model = getattr(self, name)
             known = None if skip is None else skip.of("image" if name == last else name)
             part = None if skip is None else Skip(skip.mask, {} if known is None else {"image": known})
-            # Of a tile, the first one has been given those of the whole image.
+            # In a tile, the first method has been given the statistics of the whole image.
             frame = frame if name == self._names[0] and frame.statistics else prepared(method, frame)
             output, states[name] = method(frame.replace(skip=part), states[name])
             if skip is not None and known is not None:
@@ -84,7 +84,7 @@ class Chain(nn.Module):
 
 
 def _has_statistics(model: Model) -> bool:
-    """Whether a model's pixels depend on something of the whole image besides; most wrappers only pass that on."""
+    """Whether a model uses statistics of the whole image; most wrappers only forward those of the inner model."""
     parts = model.modules() if isinstance(model, nn.Module) else [model]
     passing = (Wrapper, Chain)
     return any(

@@ -1,4 +1,4 @@
-"""A method at several resolutions: each gives the next finer one its low frequencies."""
+"""A method at several resolutions: each resolution passes its low frequencies to the next finer one."""
 
 from __future__ import annotations
 
@@ -14,40 +14,40 @@ from mcdenoise.ops import downsample
 from mcdenoise.ops._steps.network import BLOCK, low_frequencies_of
 from mcdenoise.ops._window import corner, up_to_multiple
 
-# Of the buffers, what a mean of 2x2 pixels is a buffer of.
+# The buffers that stay valid when 2x2 pixels are averaged.
 _IMAGES = tuple(name for name in BUFFERS if name not in ("motion", "reference"))
 
 
 class CoarseToFine(Wrapper):
     """The same method, with the same weights, on an image at half its size, at a quarter, and so on.
 
-    Each size gives the next larger one its low frequencies
-    (:func:`mcdenoise.ops._steps.network.low_frequencies_of`). A U-Net sees no further than some 60 pixels; at one
-    sample a pixel the mean of all of these is still noisy, and where light is sparse most of them are black.
+    Each size passes its low frequencies to the next larger one
+    (:func:`mcdenoise.ops._steps.network.low_frequencies_of`). A U-Net sees only about 60 pixels far; at one sample per
+    pixel their mean is still noisy, and where light is sparse most of them are black.
 
     Args:
-        inner: a method without a state whose statistics have the ``exposure`` and the logarithm ``top`` of the largest
-            exposed radiance, such as :class:`mcdenoise.models.cascaded_v2.PixelNetwork`.
-        resolutions: how many sizes; with 1 the method is as it was.
+        inner: a method without a state whose statistics contain the ``exposure`` and the logarithm ``top`` of the
+            largest exposed radiance, such as :class:`mcdenoise.models.cascaded_v2.PixelNetwork`.
+        resolutions: number of sizes; with 1 the method is unchanged.
     """
 
     def __init__(self, inner: Model, resolutions: int = 3) -> None:
         super().__init__(inner)
         self.resolutions = resolutions
         for tiled in parts_of(self, Tiled):
-            # Means are interpolated between neighbouring blocks.
+            # A pixel more, because means are interpolated between adjacent blocks.
             tiled.margin = BLOCK if resolutions > 1 else 0
 
     @property
     def needs(self) -> Needs:
-        """Those of the method at its coarsest size."""
+        """The needs of the method; the reach is that of the coarsest size."""
         needs, factor = self.inner.needs, 1 << (self.resolutions - 1)
         reach = None if needs.reach is None else (needs.reach + BLOCK) * factor
         return Needs(needs.buffers, needs.uses, needs.trainable, reach, needs.stride * factor)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        # Each size would have layers of its own; what is made of all of them has no kernels.
+        # Each size would have its own layers, and their combination has no kernels.
         frame = frame.replace(layers={}, hints=frame.hints._replace(alpha=False))
         return Output(self._at(frame if frame.statistics else prepared(self.inner, frame), self.resolutions)), None
 
@@ -62,7 +62,7 @@ class CoarseToFine(Wrapper):
 
 
 def _halved(frame: Frame) -> Frame:
-    """The frame at half its size, with the statistics of the whole image as they are."""
+    """The frame at half its size, with the unchanged statistics of the whole image."""
     images = {name: downsample(image) for name, image in frame.items() if name in _IMAGES}
     others = {name: None for name in frame.buffers if name not in images}
     skip = None if frame.skip is None else Skip(_halved_mask(frame.skip.mask), {})
@@ -70,7 +70,7 @@ def _halved(frame: Frame) -> Frame:
 
 
 def _halved_mask(mask: Tensor) -> Tensor:
-    """Where nothing is needed at half the size: in tiles far from all pixels that are needed."""
+    """Halve a mask of pixels that are not needed; a half-size pixel is not needed if none near it is."""
     height, width = mask.shape[-2:]
     needed = up_to_multiple((~mask).float(), TILE)
     tiles = F.max_pool2d(F.max_pool2d(needed, TILE), 3, 1, 1)

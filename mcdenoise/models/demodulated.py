@@ -1,4 +1,4 @@
-"""A method on demodulated radiance: the albedo is divided out before, and multiplied back after."""
+"""A wrapper that divides the albedo out of the radiance before a method, and multiplies it back after it."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from mcdenoise.ops.demodulation import modulation
 
 
 class Demodulated(Wrapper):
-    """Divides the albedo out of the radiance, and multiplies it back into every image of the result.
+    """Divides the radiance by the albedo, and multiplies every image of the result by it.
 
-    That is skipped for a frame without an albedo, and where :func:`mcdenoise.ops.demodulate` would divide by one
-    everywhere.
+    This is skipped for a frame without an albedo, and if the divisor of :func:`mcdenoise.ops.demodulate` is one in
+    every pixel.
 
     Args:
-        inner: any method; it sees the radiance, that of the frame alone, of diffuse reflection and of the samples, and
-            the variance without albedo. Specular radiance by itself has none.
+        inner: any method. Its frame has demodulated radiance: the color, the color of the current frame, diffuse
+            radiance, samples, and the variance. Specular radiance is not demodulated.
     """
 
     @property
     def needs(self) -> Needs:
-        """As those inside; an albedo is of use."""
+        """The needs of the inner method; the albedo is used."""
         needs = self.inner.needs
         return Needs(needs.buffers, needs.uses | {"albedo"}, needs.trainable, needs.reach, needs.stride)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """What the model inside finds of the demodulated frame."""
+        """The statistics of the inner model for the demodulated frame."""
         return super().statistics(frame if _why_not(frame.albedo) else _without_albedo(frame))
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
@@ -52,7 +52,7 @@ class Demodulated(Wrapper):
         del frame
         output, state = run(self.inner, handed, state)
         with timed("remodulate", device):
-            # A network that ends with a convolution hands out its precision.
+            # A network that ends with a convolution returns half precision under autocast.
             stages = {name: _with(albedo, image) for name, image in output.stages.items() if wanted}
             layers = {name: _with(albedo, layer) for name, layer in output.layers.items()}
             return Output(_with(albedo, output.image), stages, layers, output.alpha), state
@@ -68,7 +68,7 @@ def _without_albedo(frame: Frame) -> Frame:
     }
     changes["layers"] = {name: by_rows(demodulate, layer, albedo) for name, layer in frame.layers.items()}
     if frame.variance is not None:
-        # That of a quotient is the variance over the square of the divisor.
+        # Var(x / a) = Var(x) / a^2.
         changes["variance"] = demodulate(demodulate(frame.variance, albedo), albedo)
     if frame.samples is not None:
         changes["samples"] = scale_samples(frame.samples, 1 / modulation(albedo).to(frame.samples.dtype))
@@ -80,7 +80,7 @@ def _with(albedo: Tensor, image: Tensor) -> Tensor:
 
 
 def _why_not(albedo: Tensor | None) -> str:
-    """Why there is nothing to divide out; empty if there is."""
+    """Reason for skipping the demodulation; empty if it is needed."""
     if albedo is None:
         return "no albedo"
     if not at_hand(albedo.device):

@@ -1,4 +1,4 @@
-"""A method on exposed radiance: typical radiance is brought to a standard before, and back after."""
+"""A wrapper that scales typical radiance to a standard value before a method, and back after it."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from mcdenoise.nn.inputs import auto_exposure
 class Exposed(Wrapper):
     """Multiplies the radiance by :func:`mcdenoise.nn.auto_exposure`, and divides every image of the result by it.
 
-    So a method does not depend on a scene's unit: ``model(s x) = s model(x)``.
+    This makes a method independent of the unit of radiance: ``model(s x) = s model(x)``.
 
     Args:
         inner: any method.
     """
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """The exposure, and what the model inside finds of the exposed frame."""
+        """The exposure, and the statistics of the inner model for the exposed frame."""
         exposure = auto_exposure(frame.color)
         exposed = _scaled(frame, exposure).replace(statistics={**frame.statistics, "exposure": exposure})
         return {**super().statistics(exposed), "exposure": exposure}

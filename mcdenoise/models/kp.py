@@ -1,10 +1,10 @@
-"""Kernel prediction at one scale, the paper's rival "KP": MRKP's U-Net and one larger kernel a pixel.
+"""Kernel prediction at one scale, the paper's baseline "KP": MRKP's U-Net and one larger kernel per pixel.
 
 After Bako et al. 2017, "Kernel-predicting convolutional networks for denoising Monte Carlo renderings", whose kernels
-are normalised by a softmax. The paper (doi:10.1007/s00371-023-02951-6) gives it the backbone of MRKP and a larger
-kernel, for about the time that its own network takes, and leaves the size open. It is 13 here: at 320x180 on one
-thread of a busy processor a frame took 1.0 s with 13, 1.5 s with 17 and 1.1 s by `cascaded`, measured once after a
-first frame; 15 was not measured. What the network sees, and what it wears, is as for `mrkp`.
+are normalised by a softmax. The paper (doi:10.1007/s00371-023-02951-6) uses the backbone of MRKP and a larger kernel,
+so that the run time is about that of its own network, but does not state the size. It is 13 here: at 320x180 on one
+thread of a busy processor, a frame took 1.0 s with 13, 1.5 s with 17 and 1.1 s by `cascaded`, measured once after a
+first frame; 15 was not measured. Network input and wrappers are the same as for `mrkp`.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ class KpNetwork(TenChannels):
 
     @property
     def needs(self) -> Needs:
-        """A pixel for the head and the radius of the filter, behind the U-Net."""
+        """The reach adds a pixel for the head and the radius of the filter to that of the U-Net."""
         reach = self.unet.reach() + 1 + self._radius
         return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         logits = self.head(self.unet(self.input_of(frame, frame.color))[0])
-        # Without guides it is the filter with the softmax of the logits, and holds no tensor of weights besides.
+        # Without guides this is a filter with the softmax of the logits, and it needs no extra tensor for the weights.
         filtered = cross_bilateral_filter(with_carried(frame), logits, [], [], normalize="softmax")
         return answered(frame, filtered), None
 

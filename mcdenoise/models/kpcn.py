@@ -1,33 +1,33 @@
-"""KPCN, the kernel-predicting convolutional network: one network for diffuse light, and one for specular light.
+"""KPCN, the kernel-predicting convolutional network: separate networks for diffuse and for specular light.
 
 Bako et al. 2017, "Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings", ACM Transactions on
-Graphics (SIGGRAPH). ``PUBLISHED`` are its sizes: nine 5x5 convolutions of 100 channels and kernels of 21x21, with the
-27 input channels of the re-implementation that Gharbi et al. 2019 published, 2.92 million parameters a branch; training
-them takes a GPU. The default is smaller, for a CPU.
+Graphics (SIGGRAPH). ``PUBLISHED`` holds its sizes: nine 5x5 convolutions of 100 channels and kernels of 21x21, with the
+27 input channels of the re-implementation by Gharbi et al. 2019, 2.92 million parameters per branch; training them
+requires a GPU. The default is smaller and trains on a CPU.
 
-- Diffuse light is filtered without its albedo, specular light as ``log(1 + s)``, and the result is ``albedo diffuse +
-  exp(specular) - 1``, to which ``emission``, which has no noise, is added where the frame has it.
-- **A frame with color only**: renderers that do not tell the two apart give no ``diffuse`` and ``specular``. Then the
-  color, without its albedo, is what the diffuse branch filters, and there is no specular light: that branch is not
-  computed, and does not learn. Weights that were trained on such frames are those of ``split=False``, a network of one
-  branch: beside them, a branch that has learnt nothing would only blur. **The shipped weights are such**: methods are
-  compared on color alone. ``mcdenoise generate --renderer cycles --parts`` makes frames that both branches learn from.
+- Diffuse light is filtered without its albedo, and specular light as ``log(1 + s)``. The result is ``albedo diffuse +
+  exp(specular) - 1``, plus ``emission``, which has no noise, if the frame has it.
+- **A frame with color only**: without the buffers ``diffuse`` and ``specular``, the diffuse branch filters the
+  demodulated color, and there is no specular light: the specular branch is neither computed nor trained. Weights
+  trained on such frames use ``split=False``, a network of one branch, because an untrained second branch would only
+  blur. **The shipped weights are of this kind**, since methods are compared on color alone. Frames that train both
+  branches are made by ``mcdenoise generate --renderer cycles --parts``.
 
-What is taken where the paper or its re-implementation leaves something open, and what is different here:
+Our choices where the paper and its re-implementation leave something open, and differences:
 
 - the 27 channels: the image, albedo, normal and depth (10), the horizontal and vertical differences of the image's
   luminance, albedo, normal and depth (16), and ``log(1 + variance)`` of the image (1). The variance is estimated from
-  the 7x7 pixels of the same surface around, for frames of one sample have none, and one of several is that of the color
-  and not of its parts;
+    the 7x7 neighbouring pixels of the same surface, because frames of one sample have no variance buffer, and the
+    variance of several samples is that of the color and not of its parts;
 - convolutions are padded with zeros, where the authors crop the border;
-- taps of a kernel that lie outside the image have no weight;
-- typical radiance is brought to 0.5 first (:class:`mcdenoise.models.Exposed`): otherwise the logarithm, and so the
-  result, depends on the unit of radiance;
+- taps of a kernel outside the image have the weight 0;
+- typical radiance is scaled to 0.5 first (:class:`mcdenoise.models.Exposed`); otherwise the logarithm, and with it the
+  result, would depend on the unit of radiance;
 - depth in [0, 1]: ``d / (d + typical depth)``;
 - the authors denoise single images of many samples. Here light is accumulated over frames by the rule of
-  :mod:`mcdenoise.models.cascaded`, as for all methods that are compared; ``alpha_min=1`` is a single image;
-- the authors train each branch with an L1 loss of its own, and both together afterwards; here the losses of the trainer
-  are of the sum from the start.
+  :mod:`mcdenoise.models.cascaded`, as for all compared methods; ``alpha_min=1`` denoises single images;
+- the authors train each branch with its own L1 loss, and then both together; here the trainer's losses apply to the sum
+  from the start.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class _Branch(nn.Sequential):
         super().__init__(*modules[:-1])
 
     def filtered(self, image: Tensor, others: Tensor | None, frame: Frame) -> tuple[Tensor, Tensor | None]:
-        """An image ``(B, 3, H, W)`` with the kernels that are predicted for it, and others with the same kernels."""
+        """Filter ``(B, 3, H, W)`` with the kernels predicted for it, and other channels with the same kernels."""
         logits = self(_seen(image, frame))
         together = image if others is None else torch.cat([image, others], 1)
         found = cross_bilateral_filter(together, logits, border="renormalize")
@@ -78,13 +78,13 @@ class _Branch(nn.Sequential):
 
 
 class KpcnNetwork(nn.Module):
-    """Both branches, on light without albedo in the diffuse one.
+    """Both branches; the diffuse one takes demodulated light.
 
     Args:
         width: channels of each convolution but the last, the paper's 100.
-        layers: how many 5x5 convolutions a branch has, at least 2, the paper's 9.
+        layers: number of 5x5 convolutions of a branch, at least 2, the paper's 9.
         kernel_size: side of the kernels, odd, the paper's 21.
-        split: whether there is a branch for specular light; without it, color is all that is looked at.
+        split: whether there is a branch for specular light; without it only the color is used.
 
     Raises:
         InputError: a setting is out of its range.
@@ -99,14 +99,14 @@ class KpcnNetwork(nn.Module):
         check_odd(kernel_size)
         self.diffuse = _Branch(width, layers, kernel_size)
         self.specular = _Branch(width, layers, kernel_size) if split else None
-        # What a result depends on: convolutions, the variance with the slope of the depth at its taps, and the kernel.
+        # The reach: convolutions, the variance estimate with the depth slope at its taps, and the kernel.
         self._reach = layers * (_CONVOLUTION // 2) + _WINDOW // 2 + 1 + kernel_size // 2
         # Measured at the default's sizes: 3.8 kB a pixel.
         self._live = 4 * max(width, CHANNELS) + 6 * kernel_size**2
 
     @property
     def needs(self) -> Needs:
-        """Features, and the parts of the light."""
+        """Uses features, and diffuse and specular light."""
         uses = frozenset({"albedo", "normal", "depth"})
         parts = frozenset({"diffuse", "specular", "emission"} if self.specular is not None else ())
         return Needs(uses=uses | parts, reach=self._reach)
@@ -116,7 +116,7 @@ class KpcnNetwork(nn.Module):
         return image_statistics(frame)
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: features, logits and weights, and buffers."""
+        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`: features, logits, weights, buffers."""
         return bytes_of(self._live, bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
@@ -135,7 +135,7 @@ class KpcnNetwork(nn.Module):
         if frame.emission is not None:
             shiny = shiny + frame.emission
         if frame.albedo is not None:
-            # The albedo is multiplied into all of the result, see Demodulated.
+            # Demodulated multiplies the whole result by the albedo, so the specular part is divided by it here.
             shiny = demodulate(shiny, frame.albedo)
         image = matt + shiny
         if of_matt is not None and of_shiny is not None:
@@ -146,13 +146,13 @@ class KpcnNetwork(nn.Module):
 
 
 def _seen(image: Tensor, frame: Frame) -> Tensor:
-    """What a branch sees, ``(B, 27, H, W)``."""
+    """The input of a branch, ``(B, 27, H, W)``."""
     moments = luminance_moments(image.clamp_max(BRIGHTEST))
     variance = moments_variance(moments, frame.normal, frame.depth, kernel_size=_WINDOW)
     features = torch.cat(unit_features_of(frame), 1)
     varying = torch.cat([moments[:, :1].to(image.dtype), features], 1)
     across, down = (varying.diff(dim=dim) for dim in (-1, -2))
-    # The last pixel of a row or column has nothing to differ from.
+    # The last pixel of a row or column has no next pixel.
     differences = [F.pad(across, (0, 1)), F.pad(down, (0, 0, 0, 1))]
     return torch.cat([image, features, *differences, torch.log1p(variance).to(image.dtype)], 1)
 

@@ -1,29 +1,29 @@
-"""Layer embeddings: samples are put into two layers, which are filtered apart and composited.
+"""Layer embeddings: samples are divided between two layers, which are filtered separately and composited.
 
 Munkberg and Hasselgren 2020, "Neural Denoising with Layer Embeddings", Computer Graphics Forum (EGSR). No public code
-was found to compare with: this is a re-implementation of its idea.
+was found to compare with; this is an independent re-implementation.
 
-- Each sample is put into the layers softly, by weights that a network predicts for it and that sum to one, so that a
-  firefly or what is seen through glass need not be averaged with the rest of its pixel.
-- Each layer is filtered with kernels of its own, so that the cost hardly grows with the number of samples.
-- The filtered layers are composited front to back, ``sum_l a_l prod_{j < l} (1 - a_j) F_l``, with alpha that a network
-  predicts; the last layer's is one.
+- A network predicts soft weights that assign each sample to the layers and sum to one, so that a firefly, or a surface
+  seen through glass, need not be averaged with the rest of its pixel.
+- Each layer is filtered with its own kernels, so the cost hardly grows with the number of samples.
+- The filtered layers are composited front to back, ``sum_l a_l prod_{j < l} (1 - a_j) F_l``, with predicted alpha; the
+  last layer has alpha one.
 
-What is taken here:
+Our choices:
 
-- the embedding of samples is one round of that of SBMC (:class:`mcdenoise.nn.samples.SampleEmbedding`): a chain of
-  three 1x1 convolutions on each sample, and the context of its pixel by a U-Net;
-- a layer's embedding is the mean of the samples' with their weights; a second U-Net sees those of both layers, and a
-  1x1 convolution behind it predicts the logits of each layer's kernel, and its alpha;
+- the samples are embedded by one round of SBMC's embedding (:class:`mcdenoise.nn.samples.SampleEmbedding`): a chain of
+  three 1x1 convolutions on each sample, and a U-Net for the context of its pixel;
+- a layer's embedding is the weighted mean of its samples' embeddings; a second U-Net takes both layers, followed by a
+  1x1 convolution that predicts the logits of each layer's kernel, and its alpha;
 - a layer holds ``C_l = mean_s w_sl x_s`` and its coverage ``A_l = mean_s w_sl``; both are filtered with the same kernel
-  (a softmax of the logits, gathered), and ``F_l`` is their quotient: the mean of the light in the layer. Weights are at
-  least 1e-3, so that no layer is empty;
+    (a softmax of the logits, gathered), and ``F_l`` is their quotient: the mean light of the layer. Weights are at
+    least 1e-3, so that no layer is empty;
 - sizes: width 16 and kernels of 11x11 by default.
 
-As for all methods that are compared, light is accumulated over frames by the rule of :mod:`mcdenoise.models.cascaded`,
-without albedo, and typical radiance is brought to 0.5; the paper denoises single frames. Beside ``frame.samples`` the
-accumulated color is one more sample; **where there are none, the color is the one sample of a pixel**, and its light is
-in both layers in the proportion of its weights.
+As for all compared methods, light is accumulated over frames by the rule of :mod:`mcdenoise.models.cascaded`,
+demodulated, and scaled to a typical radiance of 0.5; the paper denoises single frames. The accumulated color is one
+sample in addition to ``frame.samples``. **Without samples, the color is the only sample of a pixel**, and its light is
+in both layers in proportion to its weights.
 """
 
 from __future__ import annotations
@@ -48,27 +48,26 @@ from mcdenoise.nn.samples import (
     LeakyUNet,
     SampleEmbedding,
     chain,
+    describe_samples,
     of_each,
     samples_input,
     samples_of,
-    told_of,
     with_context,
 )
 from mcdenoise.nn.unet import bytes_of
 from mcdenoise.ops import cross_bilateral_filter
 
 LAYERS = 2
-# Of a sample that is in a layer, whatever was predicted.
+# Smallest weight of a sample in a layer.
 _LEAST = 1e-3
 
 
 class LayeredNetwork(nn.Module):
-    """Predicts in which layer each sample is, and the kernels and alpha of the layers.
+    """Predicts the layer weights of each sample, and the kernels and alpha of the layers.
 
     Args:
-        width: channels of the embedding of a sample and of a layer, and of the U-Nets' finest level.
-        convolutions: of each block of the U-Nets.
-        kernel_size: side of the kernels, odd.
+        width: channels of the embeddings of samples and layers, and of the U-Nets' finest level.
+        convolutions: number of convolutions in each block of the U-Nets.
 
     Raises:
         InputError: a setting is out of its range.
@@ -88,7 +87,7 @@ class LayeredNetwork(nn.Module):
 
     @property
     def needs(self) -> Needs:
-        """Features and samples; the length of a history marks what is accumulated."""
+        """Uses features, samples, and the history length, which marks the accumulated sample."""
         uses = frozenset({"albedo", "normal", "depth", "samples", "length"})
         return Needs(uses=uses, reach=self._reach, stride=LeakyUNet.multiple)
 
@@ -97,14 +96,14 @@ class LayeredNetwork(nn.Module):
         return image_statistics(frame)
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: embeddings, logits, weights and buffers."""
+        """Peak memory per pixel of a tile (:class:`mcdenoise.models.Tiled`): embeddings, logits, weights, buffers."""
         return bytes_of(self._live, bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         light, others = samples_of(frame), carried(frame)
-        note("samples", told_of(frame))
+        note("samples", describe_samples(frame))
         embedded, context = self.embedding(samples_input(frame, light))
         logits = of_each(self.partition, with_context(embedded, context)).to(light.dtype)
         weights = _LEAST + (1 - LAYERS * _LEAST) * torch.softmax(logits, 2)
@@ -144,7 +143,7 @@ def layered(
     position_limit: float = POSITION_LIMIT,
     normal_limit: float = NORMAL_LIMIT,
 ) -> Model:
-    """Layer embeddings of Munkberg and Hasselgren 2020.
+    """Layer embeddings (Munkberg and Hasselgren 2020).
 
     Args:
         width: see :class:`LayeredNetwork`.

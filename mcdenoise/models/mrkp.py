@@ -1,18 +1,18 @@
 """Kernel prediction at several scales: the network of Vogels et al. 2018 as Meng et al. 2020 modified it for 1 spp.
 
 Vogels et al. 2018, "Denoising with kernel prediction and asymmetric loss functions"; the layers are those of Meng's
-public code, MultiResolutionKernelPredictionCNN, whose 341,838 parameters this has. As in that code and unlike Vogels:
+public code, MultiResolutionKernelPredictionCNN, with the same 341,838 parameters. Like that code and unlike Vogels:
 
-- the weights of a kernel are made non-negative by a ReLU and divided by their sum, of each color channel over those
-  taps inside the image that are above zero in it, plus 1e-8; Vogels has a softmax;
-- alpha, how much a coarse scale counts, is one more channel beside the kernel's, behind a ReLU, unbounded; Vogels has a
-  small network and a sigmoid;
-- what is upsampled is aligned with the even pixels, which copy; odd ones are the mean of their two or four neighbours.
+- the weights of a kernel are made non-negative by a ReLU and divided by their sum plus 1e-8; for each color channel
+  only taps inside the image whose value is positive count. Vogels uses a softmax;
+- alpha, the weight of the coarse scale, is one more channel of the kernel's convolution behind a ReLU, without an upper
+  bound; Vogels uses a small network and a sigmoid;
+- upsampling copies to even pixels, and odd pixels are the mean of their two or four neighbours.
 
-What is not as in that code: typical radiance is brought to 0.5 before the network, so that the unit of a scene does not
-matter; depth is ``d / (d + typical depth)`` where the code scales each frame's to its smallest and largest; sides are
-padded inside the U-Net only, by repeating the edge; radiance below zero, which an alpha above one allows, is cut off.
-Meng trains with L1 on gamma-mapped images, the paper with SMAPE, and so does `mcdenoise train`.
+Unlike that code: typical radiance is scaled to 0.5 before the network, so that the unit of radiance does not matter;
+depth is ``d / (d + typical depth)``, where the code scales each frame's depth to its minimum and maximum; only the
+U-Net pads its input, by repeating the edge; negative radiance, which an alpha above one allows, is clamped to 0. Meng
+trains with L1 on gamma-mapped images; the paper and `mcdenoise train` use SMAPE.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from mcdenoise.ops import downsample, kernel_conv
 from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
 
 LEVELS, SCALES = 5, 3
-# Beside the sum of a kernel's weights.
+# Added to the sum of a kernel's weights.
 _EPSILON = 1e-8
 
 
 class Backbone(nn.Module):
     """Meng's U-Net: one 3x3 convolution a level with 2x2 mean pooling, and 3x3 transposed convolutions up again.
 
-    Features of the encoder are concatenated behind those of the decoder; no convolution follows but the heads'. A side
+    Encoder features are concatenated to those of the decoder; only the heads' convolutions follow. The image
     is padded to a multiple of 32 by repeating the edge.
 
     Args:
-        in_channels: of the input.
+        in_channels: number of input channels.
         width: channels of every convolution, 48.
     """
 
@@ -64,10 +64,10 @@ class Backbone(nn.Module):
 
     @staticmethod
     def reach() -> int:
-        """How far from a pixel of the input a feature of any scale depends on it, in pixels.
+        """Largest distance in pixels between a feature of any scale and an input pixel that it depends on.
 
-        A pixel of each level on the way down, one of the next coarser level on the way up, and the rest of the block of
-        the coarsest level.
+        The sum of one pixel of each level on the way down, one of the next coarser level on the way up, and the rest of
+        the block of the coarsest level.
         """
         steps: int = sum(3 << level for level in range(LEVELS))
         return steps + Backbone.multiple - 1
@@ -89,7 +89,7 @@ class Backbone(nn.Module):
 
 
 def with_glorot(layer: nn.Module) -> nn.Module:
-    """A convolution with Glorot's initial weights, and biases of zero."""
+    """Initialize a convolution with Glorot's weights and zero biases."""
     weight, bias = layer.parameters()
     nn.init.xavier_uniform_(weight)
     nn.init.zeros_(bias)
@@ -127,7 +127,7 @@ class MrkpNetwork(TenChannels):
         """See :class:`mcdenoise.models.Model`."""
         dtype = accumulator_dtype(frame.color.dtype)
         levels = self.unet(self.input_of(frame, frame.color))
-        *scales, blended = scales_of(with_carried(frame).to(dtype))  # what is coarsest is not filtered
+        *scales, blended = scales_of(with_carried(frame).to(dtype))  # the coarsest scale is not filtered
         for n, level, head in zip(reversed(scales), reversed(levels), reversed(self.heads), strict=True):
             predicted = F.relu(head(level).to(dtype))
             kernel, alpha = predicted.split([self.taps, 1], 1)
@@ -136,21 +136,21 @@ class MrkpNetwork(TenChannels):
 
 
 def reach_of(radius: int) -> int:
-    """How far from a pixel its result depends on the image where a filter of this radius runs at each scale.
+    """Reach of a network that runs a filter of this radius at each scale.
 
-    Beside the features, a pixel for each head, the radius, and two for each step up, at their scales.
+    The features' reach plus a pixel for each head, the radius, and two pixels for each upsampling, at their scales.
     """
     own = ((1 + radius) << (SCALES - 1)) + sum(4 << scale for scale in range(SCALES))
     return Backbone.reach() + own
 
 
 def scales_of(image: Tensor) -> list[Tensor]:
-    """The image, and its means over squares of 2, 4 and 8 pixels."""
+    """The image, and its means over blocks of 2x2, 4x4 and 8x8 pixels."""
     return list(itertools.accumulate(range(SCALES), lambda x, _: downsample(x), initial=image))
 
 
 def _filter(image: Tensor, kernel: Tensor) -> Tensor:
-    """``sum w c / (sum w + 1e-8)`` over taps inside the image whose channel is above zero; for layers, all inside."""
+    """``sum w c / (sum w + 1e-8)`` over positive taps inside the image; for layers and alpha over all inside."""
     counted = torch.ones_like(image)
     counted[:, :3] = (image[:, :3] > 0).to(image.dtype)
     total, weight = kernel_conv(torch.cat([image * counted, counted], 1), kernel, border="zeros").chunk(2, 1)
@@ -158,7 +158,7 @@ def _filter(image: Tensor, kernel: Tensor) -> Tensor:
 
 
 def blend_scales(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
-    """``fine - alpha U D fine + alpha U coarse`` (the paper's Eq. 2); of layers a mean, which stays between both."""
+    """``fine - alpha U D fine + alpha U coarse`` (the paper's Eq. 2); layers and alpha are blended by a mean."""
     height, width = fine.shape[-2:]
     color = fine[:, :3] + alpha * aligned(coarse[:, :3] - downsample(fine[:, :3]), height, width)
     if fine.shape[1] == 3:
@@ -168,12 +168,12 @@ def blend_scales(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
 
 
 def aligned(image: Tensor, height: int, width: int) -> Tensor:
-    """``U`` of Meng's code: even pixels copy, odd ones are the mean of their neighbours inside the image.
+    """Upsample as in Meng's code: even pixels are copies, odd ones are the mean of their neighbours inside the image.
 
     Args:
         image: ``(B, C, ceil(H / 2), ceil(W / 2))``.
-        height: of the result.
-        width: likewise.
+        height: height of the result.
+        width: width of the result.
     """
     padded = F.pad(image, (0, 1, 0, 1), mode="replicate")
     size = [2 * side + 1 for side in image.shape[-2:]]

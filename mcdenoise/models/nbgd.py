@@ -1,31 +1,33 @@
-"""The neural bilateral grid: a small network draws three guides, and a bilateral grid of each smooths the light.
+"""The neural bilateral grid: a small network predicts three guides, and a bilateral grid for each smooths the light.
 
 Meng, Zheng, Varshney, Singh and Zwicker 2020, "Real-Time Monte Carlo Denoising with the Neural Bilateral Grid",
-Eurographics Symposium on Rendering. Where the paper and its public code differ, this is what the code does:
+Eurographics Symposium on Rendering. Where paper and public code differ, this file follows the code:
 
-- The network of 7 layers has 29,425 parameters: a 5x5 convolution of the 10 input channels to 20; five of 5 channels
-  each, of all channels before them, which are concatenated with theirs (so of 20, 25, 30, 35 and 40); a last one of
-  these 45 to 5. LeakyReLU of slope 0.2 follows the first and every concatenation, a sigmoid the last. That is
-  ``25 * (10 * 20 + 5 * (20 + 25 + 30 + 35 + 40) + 5 * 45)`` weights and 50 biases; 2 layers have 7,525. What is
-  concatenated passes LeakyReLU once more with the new channels; the number of parameters does not tell whether it does.
-- It sees the radiance with its albedo, as a display shows it, ``max(x, 0)^(1 / 2.2)``; albedo; normal; and depth. The
-  grids filter the radiance without its albedo.
-- Its five numbers a pixel are three guides and two weights; the weight of the third grid is what these leave of one. It
-  is negative where they sum to more.
+- The network of 7 layers has 29,425 parameters: a 5x5 convolution of the 10 input channels to 20; five with 5 output
+  channels each, whose inputs are all channels so far, concatenated (20, 25, 30, 35 and 40); and a last one of these 45
+  to
+  5. LeakyReLU of slope 0.2 follows the first convolution and every concatenation, a sigmoid the last. That is
+  ``25 * (10 * 20 + 5 * (20 + 25 + 30 + 35 + 40) + 5 * 45)`` weights and 50 biases; 2 layers have 7,525. Channels that
+  were concatenated before pass LeakyReLU again together with the new ones; the number of parameters does not show
+  whether they should.
+- Its input is the radiance with albedo, gamma-mapped for a display, ``max(x, 0)^(1 / 2.2)``; albedo; normal; and depth.
+  The grids filter the demodulated radiance.
+- Its five outputs per pixel are three guides and two weights; the weight of the third grid is one minus both, which is
+  negative where they sum to more than one.
 
-Left open, or otherwise here:
+Differences, and choices where paper and code leave something open:
 
-- sizes: the code takes multiples of 16 only; here the last cells hang over the image,
+- image sizes: the code requires multiples of 16; here the last cells extend beyond the image,
   see :func:`mcdenoise.ops.grid_splat`;
-- cells that hold black pixels only count as empty in the code, and here as black;
-- the unit of radiance: typical radiance is brought to 0.5 (:class:`mcdenoise.models.Exposed`);
-- depth in [0, 1] is ``d / (d + typical depth)``; the code stretches each frame's depth to that range;
-- radiance below zero, which negative weights allow: the result is cut off at 0;
+- cells that contain only black pixels count as empty in the code, and as black here;
+- the unit of radiance: typical radiance is scaled to 0.5 (:class:`mcdenoise.models.Exposed`);
+- depth in [0, 1] is ``d / (d + typical depth)``; the code scales each frame's depth to that range;
+- negative radiance, which negative weights allow, is clamped to 0;
 - accumulation: the published rule of Koskela et al. 2019 with alpha 0.2, on demodulated radiance, as in Meng's data;
-- derivatives: that of a display's radiance has no limit at black, and is taken for 0 below 1e-6. As in the code, those
-  in a guide of more than 100 are taken for 0 in training: where the tail of a tent alone reaches a cell they tell
-  nothing;
-- its authors' loss is L1 of what a display shows: ``loss="l1_display"`` of the trainer, ``temporal_weight=0``.
+- derivatives: the derivative of the gamma curve is unbounded at black, and is 0 below 1e-6 here. As in the code,
+  derivatives in a guide above 100 are set to 0 in training: they occur where only the tail of a tent reaches a cell,
+  and carry no information;
+- the authors' loss is L1 of gamma-mapped images: ``loss="l1_display"`` of the trainer, ``temporal_weight=0``.
 """
 
 from __future__ import annotations
@@ -47,23 +49,23 @@ from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import grid_slice, grid_splat
 
-# s_s in pixels and 256 / s_r bins of the grids, whose guides these are in order.
+# Cell size s_s in pixels and 256 / s_r bins of the three grids, in the order of the guides.
 GRIDS = ((4, 64), (8, 32), (16, 16))
 _INPUTS, _FIRST, _GROWTH, _OUTPUTS, _SLOPE = 10, 20, 5, 5, 0.2
-# Of a derivative in a guide, in training.
+# Largest derivative in a guide, in training.
 _LARGEST = 100.0
-# Peak of the network and of the finest grid, in float32; 920 were measured, with the frame.
+# Peak bytes per pixel of network and finest grid in float32; 920 were measured, including the frame.
 _BYTES_PER_PIXEL = 1100
 
 
 class NeuralBilateralGrid(TenChannels):
-    """The network, its three grids, and their sum.
+    """The network, its three grids, and the sum of their results.
 
     Args:
-        layers: convolutions, 2 at least; the paper's are 2 and 7.
+        layers: number of convolutions, at least 2; the paper has 2 and 7.
 
     Raises:
-        InputError: these are less than 2.
+        InputError: there are fewer than 2 layers.
     """
 
     def __init__(self, layers: int = 7) -> None:
@@ -78,17 +80,17 @@ class NeuralBilateralGrid(TenChannels):
 
     @property
     def needs(self) -> Needs:
-        """Two pixels for each convolution; and from a pixel to its cells' centres, and from these to their pixels."""
+        """The reach is two pixels per convolution, plus the distance via a cell's centre to its farthest pixel."""
         coarsest = max(cell for cell, _ in GRIDS)
         reach = 2 * (2 + len(self.dense)) + 2 * coarsest
         return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=coarsest)
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`; grids are in float32 anyway."""
+        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`; grids are always in float32."""
         return _BYTES_PER_PIXEL
 
     def predicted(self, frame: Frame) -> Tensor:
-        """Three guides and two weights ``(B, 5, H, W)`` in [0, 1]."""
+        """Three guides and two weights, ``(B, 5, H, W)`` in [0, 1]."""
         x = F.leaky_relu(self.first(self.input_of(frame, displayed(frame))), _SLOPE)
         for layer in self.dense:
             x = F.leaky_relu(torch.cat([x, layer(x)], 1), _SLOPE)
@@ -107,7 +109,7 @@ class NeuralBilateralGrid(TenChannels):
             image = _sum(weights, [each[:, :3] for each in smooth]).clamp_min(0)
             if light.shape[1] == 3:
                 return Output(image), None
-            # Layers and alpha need a mean, of no negative weights.
+            # Layers and alpha require a mean with non-negative weights.
             weights = [weight.clamp_min(0) for weight in weights]
             total = _sum(weights, [each[:, 3:] for each in smooth]) / (weights[0] + weights[1] + weights[2])
         return answered(frame, image, total), None
@@ -123,7 +125,7 @@ def _smoothed(light: Tensor, guide: Tensor, grid: tuple[int, int]) -> Tensor:
 
 
 def _limited(guide: Tensor) -> Tensor:
-    """The same guide, whose derivatives of more than the largest that counts are 0."""
+    """The guide unchanged, with derivatives above the limit set to 0."""
     guide = guide.view_as(guide)
     if guide.requires_grad:
         guide.register_hook(lambda gradient: torch.where(gradient.abs() > _LARGEST, 0, gradient))
@@ -150,8 +152,8 @@ def nbgd(
     Args:
         layers: see :class:`NeuralBilateralGrid`.
         alpha_min: smallest weight of the current frame in the accumulation.
-        position_limit: squared distance in scene units below which two points are one, see
+        position_limit: squared distance in scene units below which two points count as the same point, see
             :func:`mcdenoise.ops.reproject`.
-        normal_limit: likewise for normals.
+        normal_limit: the same for normals.
     """
     return as_published(Exposed(Tiled(NeuralBilateralGrid(layers))), alpha_min, position_limit, normal_limit)

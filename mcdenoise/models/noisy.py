@@ -1,4 +1,4 @@
-"""Doing nothing, and accumulation alone: what every method has to be better than."""
+"""The identity, and accumulation alone: the baselines of every comparison."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from mcdenoise.ops.lag import THRESHOLD
 
 @register_model("noisy", kind="filter")
 class Noisy(nn.Module):
-    """The frame's own color."""
+    """Returns the frame's color unchanged."""
 
     def __init__(self) -> None:
         super().__init__()
 
     @property
     def needs(self) -> Needs:
-        """The color; each pixel is its own."""
+        """Needs the color; each pixel depends only on itself."""
         return Needs(trainable=False, reach=0)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
@@ -34,10 +34,10 @@ class Noisy(nn.Module):
 
 @register_model("accumulated", kind="filter")
 def accumulated(*, alpha_min: float = 0.1, anti_lag: bool = True) -> Model:
-    """The history of the shot without any filter: what the family ``cascaded_v2`` starts from.
+    """Temporal accumulation without a spatial filter, the first step of the family ``cascaded_v2``.
 
     Args:
         alpha_min: smallest weight of the current frame, see :class:`mcdenoise.models.Accumulated`.
-        anti_lag: whether the history is given up where the light has changed, see :func:`mcdenoise.ops.history_lag`.
+        anti_lag: whether the history is shortened where the light has changed, see :func:`mcdenoise.ops.history_lag`.
     """
     return Demodulated(Accumulated(Noisy(), alpha_min=alpha_min, lag_threshold=THRESHOLD if anti_lag else math.inf))

@@ -1,39 +1,41 @@
-"""Neural partitioning pyramids: a network divides each pixel's light among five scales and splats it there.
+"""Neural partitioning pyramids: a network partitions each pixel's light among five scales and splats it there.
 
 Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", SIGGRAPH, and its public code
-(balintio/nppd), which this page follows: steps, layers and weights are the code's. A step is
+(balintio/nppd), whose steps, layers and weights this file follows. The steps are:
 
-1. warp what is kept of the frame before to this one: the mean of the radiance ``c'``, the result ``o'``, features
+1. warp the state of the previous frame to the current one: the mean radiance ``c'``, the result ``o'``, the features
    ``f'``;
-2. encode every sample, and average: ``f = mean_s E(depth, normal, albedo, log(1 + radiance / mean radiance))``;
+2. encode every sample and average: ``f = mean_s E(depth, normal, albedo, log(1 + radiance / mean radiance))``;
 3. predict all weights from ``log(1 + (c', c) / mean of both)``, ``f'`` and ``f``: 6 + 32 + 32 = 70 channels;
-4. ``c <- lambda c' + (1 - lambda) c`` and ``f <- lambda f' + (1 - lambda) f`` with one sigmoid ``lambda`` a pixel;
-5. divide ``c`` among K = 5 levels by a softmax, average each part down to its level, splat it there by a 5x5 softmax,
-   and sum from coarse to fine, each coarse image upsampled by 4x4 weights, 4 times a softmax;
-6. splat ``o'`` by a 5x5 softmax, and mix both by a sigmoid: ``o = mu o' + (1 - mu) d``.
+4. ``c <- lambda c' + (1 - lambda) c`` and ``f <- lambda f' + (1 - lambda) f`` with one sigmoid ``lambda`` per pixel;
+5. partition ``c`` among K = 5 levels by a softmax, average each part down to its level, splat it there by a 5x5
+    softmax,
+   and sum from coarse to fine, upsampling by 4x4 weights that are 4 times a softmax;
+6. splat ``o'`` by a 5x5 softmax, and blend by a sigmoid: ``o = mu o' + (1 - mu) d``.
 
-The radiance is whole, with its albedo. Each pixel hands on all of its light, but what a pixel receives are weights of
-any sum: a splat is no mean. Nothing but training keeps a constant image constant.
+The radiance includes its albedo. Each pixel splats all of its light, but the weights that a pixel receives need not sum
+to
+one: a splat is not a mean. Only training makes a constant image stay constant.
 
-What the code leaves to its data set or its user, and what is taken here:
+Choices where the code depends on its data set or its user:
 
-- sizes that are no multiples of 32: the network sees the image with its edge repeated, the pyramid no more than the
-  image, and its weights are cropped;
-- samples: those of ``frame.samples``, radiance alone, each with the features of its pixel; without them the color
-  counts as one sample. The published networks are trained on 2, 4, 8 or 32;
-- depth in [0, 1] (:func:`mcdenoise.nn.normalize_depth`) in place of that of the data set's reader; normals as the frame
-  has them;
-- history that lies outside of the image is zero, as all is before the first frame; at its rim
-  (:func:`mcdenoise.ops.reproject`) it is a mean of what there is, where the code blends it with black. Nothing tests
-  whether a surface is the same one: the warped features tell, and lambda and mu decide;
-- the code adds 1e-8 to a mean radiance; here it is the mean alone, so that the unit of radiance does not matter;
-- taps of a splat are numbered by where light goes; in the code by where it comes from, which only renames channels.
+- image sizes that are not multiples of 32: the network takes the image with repeated edges, the pyramid only the image,
+  and the predicted weights are cropped;
+- samples: those of ``frame.samples``, radiance only, each with the features of its pixel; without them the color is the
+  only sample. The published networks are trained on 2, 4, 8 or 32 samples;
+- depth in [0, 1] (:func:`mcdenoise.nn.normalize_depth`) instead of the scaling by the data set's reader; normals as in
+  the frame;
+- history outside the image is zero, as before the first frame. At the image border (:func:`mcdenoise.ops.reproject`) it
+  is the mean of the valid taps, where the code blends with black. Surfaces are not compared: lambda and mu are
+  predicted from the warped features instead;
+- the code adds 1e-8 to a mean radiance; here nothing is added, so that the unit of radiance does not matter;
+- taps of a splat are numbered by destination; in the code by source, which only permutes channels.
 
-As in the code, light that a kernel sends over the border of the image is lost, and the network learns to send none.
+As in the code, light that is splatted outside the image is lost, and the network learns to avoid that.
 
-Its authors train it with ``2 SMAPE`` in space, ``0.2 SMAPE`` of differences to the frame before, which is warped, and
-``0.025`` times a perceptual loss in each, on two frames at a time whose state has no gradient, by Adam at 1e-4 with a
-decay of 0.94 an epoch. The trainer here has SMAPE in space, and in time without warping, through whole clips.
+The authors train with ``2 SMAPE`` in space, ``0.2 SMAPE`` of differences to the warped previous frame, and ``0.025``
+times a perceptual loss in each, on two frames at a time without gradients through the state, by Adam at 1e-4 with a
+decay of 0.94 per epoch. The trainer here uses SMAPE in space, and in time without warping, over whole clips.
 """
 
 from __future__ import annotations
@@ -55,30 +57,30 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import has_motion, motion_unless_still
 from mcdenoise.nn.inputs import features_of, normalize_depth
-from mcdenoise.nn.samples import samples_of, told_of
+from mcdenoise.nn.samples import describe_samples, samples_of
 from mcdenoise.ops import kernel_splat, learned_upsample, pyramid_partition, reproject
 from mcdenoise.ops._window import corner, up_to_multiple
 
 Backbone = Literal["convunet", "convunext"]
 
 LEVELS = 5  # K
-FEATURES = 32  # of a sample
+FEATURES = 32  # per sample
 _SPLAT, _UPSAMPLE = 5**2, 4**2
 _SLOPE = 0.3  # of the leaky ReLUs
-# What is predicted at the finest scale, in order, and at each coarser one: 57 and 41 channels.
+# Names and channels of the predictions at the finest scale, in order, and at each coarser one: 57 and 41 channels.
 _FINE = {"splat": _SPLAT, "previous": _SPLAT, "mu": 1, "lambda": 1, "partition": LEVELS}
 _COARSE = {"splat": _SPLAT, "upsample": _UPSAMPLE}
 
 
 class History(NamedTuple):
-    """What is kept of a frame. All of it zeros is that of no frame.
+    """State after a frame. Zeros are the state before the first frame.
 
     Args:
-        radiance: ``(B, 3 + C, H, W)`` exponential mean; where there are layers or an alpha, with them behind it, and
-            with ones, of which the sum of all weights comes.
-        image: ``(B, 3 + C, H, W)`` result, likewise.
+        radiance: ``(B, 3 + C, H, W)`` exponential mean; C is 0, or the channels of layers and alpha and one channel of
+            ones, whose result is the sum of all weights.
+        image: ``(B, 3 + C, H, W)`` result, with the same channels.
         features: ``(B, 32, H, W)`` exponential mean.
-        view_projection: ``(B, 4, 4)`` by which camera.
+        view_projection: ``(B, 4, 4)`` camera of the frame.
     """
 
     radiance: Tensor
@@ -88,16 +90,16 @@ class History(NamedTuple):
 
 
 class ConvUNet(nn.Module):
-    """The small network of the code: a U-Net of 3x3 convolutions, max-pooling, and upsampling by repetition.
+    """The small network of the code: a U-Net of 3x3 convolutions, max-pooling, and nearest-neighbour upsampling.
 
     Args:
-        in_channels: of the input.
-        out_channels: predicted at each scale, the finest first, by 1x1 convolutions.
+        in_channels: number of input channels.
+        out_channels: number of channels predicted at each scale, the finest first, by 1x1 convolutions.
         width: feature channels of the finest level, the published 96; the six levels have 3, 3, 4, 6, 8, 12 and 16
-            thirds of it, one more on the way to each level than on the way from it.
+            thirds of it. The encoder has one convolution more per level than the decoder.
     """
 
-    multiple = 32  # of pixels, those of the coarsest level
+    multiple = 32  # side of a pixel of the coarsest level
 
     def __init__(self, in_channels: int, out_channels: Sequence[int], width: int) -> None:
         super().__init__()
@@ -110,7 +112,7 @@ class ConvUNet(nn.Module):
             _convolutions(channels, *each)
             for channels, each in zip(entering, [*above, (bottom, bottom, before)], strict=True)
         )
-        # Each way up ends with as many features as the next finer level has.
+        # Each decoder level ends with as many features as the next finer level has.
         self.up = nn.ModuleList(_convolutions(2 * own, own, ending) for ending, own in above)
         self.heads = nn.ModuleList(
             nn.Conv2d(ending, channels, 1) for (ending, _), channels in zip(above, out_channels, strict=True)
@@ -137,16 +139,16 @@ class ConvUNet(nn.Module):
 
 
 class ConvUNeXt(nn.Module):
-    """The large network of the code: blocks of ConvNeXt (Liu et al. 2022), and pixels of 2x2 as channels up and down.
+    """The large network of the code: ConvNeXt blocks (Liu et al. 2022); 2x2 pixels become channels and back.
 
     Args:
-        in_channels: of the input.
-        out_channels: predicted at each scale, the finest first, by 1x1 convolutions.
+        in_channels: number of input channels.
+        out_channels: number of channels predicted at each scale, the finest first, by 1x1 convolutions.
         width: feature channels of the finest level, the published 128, a multiple of 4; the five levels have 1, 1, 2, 2
             and 4 times it.
     """
 
-    multiple = 16  # of pixels, those of the coarsest level
+    multiple = 16  # side of a pixel of the coarsest level
 
     def __init__(self, in_channels: int, out_channels: Sequence[int], width: int) -> None:
         super().__init__()
@@ -158,7 +160,7 @@ class ConvUNeXt(nn.Module):
         self.heads = nn.ModuleList(nn.Conv2d(*each, 1) for each in zip(widths, out_channels, strict=True))
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """As :meth:`ConvUNet.forward`, of multiples of 16."""
+        """See :meth:`ConvUNet.forward`; sizes are multiples of 16."""
         levels: list[Tensor] = []
         for level, block in enumerate(self.down):
             x = block(x if level == 0 else F.pixel_unshuffle(x, 2))
@@ -171,7 +173,7 @@ class ConvUNeXt(nn.Module):
 
 
 class _Block(nn.Module):
-    """A residual block of ConvNeXt: 7x7 on each channel, layer norm, and two layers a pixel with four times as many."""
+    """A ConvNeXt residual block: depthwise 7x7 convolution, layer norm, and a pixelwise MLP of four times the width."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -187,11 +189,11 @@ class _Block(nn.Module):
 
 
 class Nppd(nn.Module):
-    """The method, see the page.
+    """The method, see the module's docstring.
 
     Args:
-        width: of the network.
-        backbone: which network.
+        width: feature channels of the network.
+        backbone: type of the network.
     """
 
     def __init__(self, width: int, backbone: Backbone) -> None:
@@ -209,11 +211,11 @@ class Nppd(nn.Module):
 
     @property
     def persistence(self) -> None:
-        """Nobody knows what the network has learnt to remember, see :func:`mcdenoise.models.frames_remembered`."""
+        """Unknown, since the network learns what to remember; see :func:`mcdenoise.models.frames_remembered`."""
 
     @property
     def needs(self) -> Needs:
-        """Means of the whole image, and a history: no tiles."""
+        """It uses means of the whole image and a history, so it has no tiles."""
         return Needs(uses=MOTION | {"albedo", "normal", "depth", "samples", "view_projection"})
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
@@ -244,7 +246,7 @@ class Nppd(nn.Module):
         return output, History(radiance, image, features, frame.view_projection) if keeps else None
 
     def _warped(self, frame: Frame, before: History | None, radiance: Tensor) -> list[Tensor]:
-        """Mean radiance, result and features of the frame before at the places of this one, 0 where there is none."""
+        """Previous mean radiance, result and features, reprojected to this frame; 0 where there is no history."""
         channels = [radiance.shape[1], radiance.shape[1], FEATURES]
         reset, motion = "first frame", None
         if before is not None:
@@ -261,9 +263,9 @@ class Nppd(nn.Module):
         return list(warped.split(channels, 1))
 
     def _encoded(self, frame: Frame, dtype: torch.dtype) -> Tensor:
-        """Features of the samples, averaged."""
+        """The mean of the samples' features."""
         samples = samples_of(frame).to(dtype)
-        note("samples", told_of(frame))
+        note("samples", describe_samples(frame))
         albedo, normal, depth = features_of(frame)
         pixel = torch.cat([normalize_depth(depth), normal, albedo], 1).to(dtype)
         count = samples.shape[1]
@@ -272,7 +274,7 @@ class Nppd(nn.Module):
         return torch.unflatten(encoded, 0, (-1, count)).mean(1)
 
     def _weights(self, seen: Tensor) -> tuple[dict[str, Tensor], list[dict[str, Tensor]]]:
-        """What the network predicts at the finest scale, and at each coarser one."""
+        """Predicted weights at the finest scale, and at each coarser one."""
         height, width = seen.shape[-2:]
         predicted = self.network(up_to_multiple(seen, self.network.multiple, mode="replicate"))
         found = []
@@ -291,13 +293,13 @@ def _logarithm(radiance: Tensor) -> Tensor:
 
 
 def _mean(filtered: Tensor) -> Tensor:
-    """Of sums of weighted images, with those of the weights behind them, the means: an alpha of one stays one."""
+    """Divide filtered images by their last channel, the sum of the weights, so that an alpha of one stays one."""
     total = filtered[:, -1:]
     return filtered[:, :-1] / torch.where(total > 0, total, 1)
 
 
 def _denoised(radiance: Tensor, fine: dict[str, Tensor], coarse: list[dict[str, Tensor]]) -> Tensor:
-    """The pyramid: down in parts, splatted there, and summed from coarse to fine."""
+    """The pyramid: partition and average down, splat, and sum from coarse to fine."""
     parts = pyramid_partition(radiance, fine["partition"])
     splatted = [_splatted(part, weights["splat"]) for part, weights in zip(parts, (fine, *coarse), strict=True)]
     denoised = splatted.pop()
@@ -324,15 +326,15 @@ def _blocks(entering: int, width: int, depth: int) -> nn.Sequential:
 
 @register_model("nppd", kind="recurrent", paper="Balint et al. 2023")
 def nppd(width: int = 18, backbone: Backbone = "convunet") -> Nppd:
-    """Partitioning pyramids of Balint et al. 2023, recurrent; the published networks are larger (width 96, 128).
+    """Neural partitioning pyramids (Balint et al. 2023), recurrent; the published networks are larger (width 96, 128).
 
     Args:
-        width: feature channels of the finest level. 96 of ``"convunet"`` is the published small network, of 2 and 4
-            samples a pixel; 128 of ``"convunext"`` the large one, of 8 and 32.
+        width: feature channels of the finest level. The published small network, for 2 and 4 samples per pixel, is
+            ``"convunet"`` with 96; the large one, for 8 and 32, is ``"convunext"`` with 128.
         backbone: ``"convunet"`` or ``"convunext"``.
 
     Raises:
-        InputError: there is no such backbone, or none of that width.
+        InputError: the backbone is unknown or does not support this width.
     """
     if backbone not in ("convunet", "convunext"):
         raise InputError(f"backbone: expected convunet or convunext, found '{backbone}'")

@@ -1,4 +1,4 @@
-"""Intel Open Image Denoise through its own package, in each of its settings: the denoiser to compare with.
+"""Intel Open Image Denoise through the package ``pyoidn``, with all of its settings, for comparisons.
 
 https://www.openimagedenoise.org, Apache License 2.0; optional, ``pip install 'mcdenoise[oidn]'``.
 """
@@ -30,15 +30,16 @@ Source = Literal["raw", "accumulated", "demodulated", "accumulated after"]
 
 
 class Oidn:
-    """Open Image Denoise on the CPU, of the frame's color as it is; its device, filters and buffers are kept.
+    """Open Image Denoise on the CPU, applied to the frame's color; device, filters and buffers are kept between frames.
 
-    Filters are made when they are first needed, and made anew when the size changes. It has no derivatives.
+    Filters are created when they are first needed, and again when the image size changes. There are no derivatives.
 
     Args:
-        quality: which network. With noisy features high is the same network as balanced; else it is a larger one.
-        auxiliary: what is said of albedo and normal: that they may be noisy; that they are clean; or nothing, since
-            they are denoised first, one by one at high quality as the library recommends, and then are clean.
-        threads: how many it may use; by default it decides itself, and takes every core.
+        quality: selects the network. With noisy features, high uses the same network as balanced; otherwise a larger
+            one.
+        auxiliary: what OIDN assumes of albedo and normal: "noisy"; "clean"; or "prefiltered", which denoises each of
+            them first at high quality, as the library recommends, and then treats them as clean.
+        threads: maximum number of threads; by default the library uses every core.
 
     Raises:
         InputError: the package ``pyoidn`` is not installed, or a setting is unknown.
@@ -60,29 +61,29 @@ class Oidn:
         self._check_device()
         self._filters: dict[tuple[tuple[str, ...], Quality, bool], Any] = {}
         self._buffers: dict[str, Tensor] = {}
-        # Filters go before their device, and both before the library does.
+        # Filters must be released before their device, and both before the library.
         weakref.finalize(self, _release, self._filters, self._device)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Oidn:
-        """One of the same settings: a device of the library cannot be copied."""
+        """A new object with the same settings, because a device of the library cannot be copied."""
         return Oidn(self.quality, self.auxiliary, threads=self.threads)
 
     @property
     def needs(self) -> Needs:
-        """Color; albedo and normal are of use. It looks at the whole image, whose exposure it finds."""
+        """Needs color; uses albedo and normal. The result depends on the whole image through its exposure."""
         return Needs(uses=frozenset({"albedo", "normal"}), trainable=False)
 
     def __call__(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`.
 
         Raises:
-            InputError: a derivative in the color is asked for, which would silently be zero.
-            RuntimeError: the library refuses; the message is its own.
+            InputError: a derivative in the color is requested; it would silently be zero.
+            RuntimeError: the library reports an error; the message is the library's.
         """
         if torch.is_grad_enabled() and frame.color.requires_grad:
             raise InputError("oidn: expected a color without gradients, found one with; the library has no derivatives")
         with timed("network", frame.color.device), torch.no_grad():
-            # Without an albedo the library takes no normal.
+            # The library accepts a normal only together with an albedo.
             given = {"albedo": frame.albedo, "normal": frame.normal if frame.albedo is not None else None}
             guides = {name: image for name, image in given.items() if image is not None}
             if self.auxiliary == "prefiltered":
@@ -91,7 +92,7 @@ class Oidn:
         return Output(image.to(frame.color.dtype)), None
 
     def _run(self, images: dict[str, Tensor], quality: Quality, *, clean: bool) -> Tensor:
-        """A filter of the images ``(B, 3, H, W)``, one after the other."""
+        """Run the filter for the given images ``(B, 3, H, W)``, one image of the batch at a time."""
         first = next(iter(images.values()))
         batch, _, height, width = first.shape
         self._resize(height, width)
@@ -146,15 +147,15 @@ def oidn(
 
     Args:
         quality: see :class:`Oidn`.
-        auxiliary: likewise.
-        source: the image that it starts from: one sample a pixel (``"raw"``), the accumulated radiance, or the
-            accumulated radiance without albedo (``"demodulated"``), which the result is multiplied with.
-            ``"accumulated after"`` starts from one sample a pixel, and accumulates the results by the rule that makes
-            the accumulated image, without a test for lag: denoised frames flicker, and have no noise to excuse it.
+        auxiliary: see :class:`Oidn`.
+        source: the image to denoise: the frame's color (``"raw"``), the accumulated radiance (``"accumulated"``), or
+            the accumulated and demodulated radiance (``"demodulated"``), whose result is remodulated.
+            ``"accumulated after"`` denoises the frame's color and accumulates the results, by the same rule but without
+            the test for lag, because denoised frames flicker by more than their estimated noise explains.
         threads: see :class:`Oidn`.
 
     Raises:
-        InputError: as of :class:`Oidn`.
+        InputError: see :class:`Oidn`.
     """
     _check("source", source, Source)
     denoiser = Oidn(quality, auxiliary, threads=threads)
@@ -182,10 +183,10 @@ def _import_oidn() -> Any:
 
 
 def library_of_oidn() -> Path:
-    """The file of the installed library that its weights are compiled into.
+    """The file of the installed library that contains its weights.
 
     Raises:
-        InputError: the package ``pyoidn`` is not installed, or has no such file.
+        InputError: the package ``pyoidn`` is not installed, or the file is missing.
     """
     folder = Path(_import_oidn().__file__).parent
     found = sorted(path for path in folder.rglob("*OpenImageDenoise_core*") if path.is_file())

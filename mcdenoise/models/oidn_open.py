@@ -1,7 +1,7 @@
-"""The method ``oidn_open``: Open Image Denoise's network in torch, with derivatives, on any device, to be trained on.
+"""The method ``oidn_open``: Open Image Denoise's network in torch. It has derivatives, any device, and can be trained.
 
-The weights are those that the user has: of the library of the optional package pyoidn, or of an archive (``.tza``) as
-the library's own training scripts export it. The result is the library's, up to rounding.
+The weights come from the user's installation: from the library of the optional package pyoidn, or from an archive
+(``.tza``) as exported by the library's training scripts. The result equals the library's up to rounding.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, compress, expand, oidn_exposure
 
 _CHANNELS = 9  # color, albedo, normal
-_PROBE = 48  # side of the image that tells which weights the library takes
-_CLOSE = 1e-2  # largest difference there; measured: 2e-5, and of other weights 1.4
+_PROBE = 48  # side of the test image that identifies the library's weights
+_CLOSE = 1e-2  # largest difference for the right weights; measured: 2e-5, and 1.4 for others
 
 
 class OidnOpen(nn.Module):
@@ -42,7 +42,7 @@ class OidnOpen(nn.Module):
 
     @property
     def needs(self) -> Needs:
-        """Color, albedo and normal. It comes with its weights, which can be trained further."""
+        """Needs color, albedo and normal. It comes with weights, which can be trained further."""
         buffers = frozenset({"color", "albedo", "normal"})
         return Needs(buffers, trainable=False, reach=self.unet.reach, stride=self.unet.multiple)
 
@@ -51,7 +51,7 @@ class OidnOpen(nn.Module):
         return {"oidn_exposure": oidn_exposure(frame.color)}
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`."""
+        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`."""
         return self.unet.bytes_per_pixel(bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
@@ -67,12 +67,12 @@ class OidnOpen(nn.Module):
 
 
 def seen_by_oidn(color: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
-    """What the network is given.
+    """The network's input.
 
     Args:
         color: ``(B, 3, H, W)`` exposed radiance.
-        albedo: likewise, in [0, 1].
-        normal: likewise, in [-1, 1], of the world or of the camera.
+        albedo: ``(B, 3, H, W)`` in [0, 1].
+        normal: ``(B, 3, H, W)`` in [-1, 1], in world or camera space.
 
     Returns:
         ``(B, 9, H, W)``, in [0, 1].
@@ -81,10 +81,10 @@ def seen_by_oidn(color: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
 
 
 def load_archive(unet: OidnUNet, archive: Archive, where: str) -> None:
-    """Give a network the weights of an archive, layer by layer.
+    """Load the weights of an archive into a network, layer by layer.
 
     Raises:
-        InputError: they are those of another network.
+        InputError: the archive is for another network.
     """
     names = [name.removesuffix(".weight") for name in archive if name.endswith(".weight")]
     layers = unet.convolutions
@@ -100,19 +100,19 @@ def load_archive(unet: OidnUNet, archive: Archive, where: str) -> None:
 
 
 def _size(quality: Quality, *, clean: bool) -> Size:
-    """The network that the library takes."""
+    """The network that the library uses for these settings."""
     return "small" if quality == "fast" else "large" if quality == "high" and clean else "base"
 
 
 @functools.cache
 def archive_of_library(quality: Quality = "high", auxiliary: Auxiliary = "noisy") -> Archive:
-    """The weights that the installed library takes for color, albedo and normal of high dynamic range.
+    """The weights that the installed library uses for HDR color with albedo and normal.
 
-    They are compiled into it, without names: those are taken with which an image comes out as the library's own.
+    The library contains them without names; they are identified by comparing a denoised image with the library's own.
 
     Args:
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
-        auxiliary: likewise; "prefiltered" takes those of "clean".
+        auxiliary: likewise; "prefiltered" uses the weights of "clean".
 
     Raises:
         InputError: the package ``pyoidn`` is not installed, or its library has no such weights.
@@ -140,8 +140,8 @@ def oidn_open(*, quality: Quality = "high", auxiliary: Auxiliary = "noisy", arch
 
     Args:
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
-        auxiliary: likewise, but that nothing is filtered before: "prefiltered" is refused.
-        archive: a file of weights (``.tza``) to take instead of the library's, for the network of this quality.
+        auxiliary: likewise, except that "prefiltered" is rejected.
+        archive: a file of weights (``.tza``) to use instead of the library's, for the network of this quality.
 
     Raises:
         InputError: the package is not installed, or the file is no such archive.

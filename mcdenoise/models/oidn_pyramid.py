@@ -1,9 +1,9 @@
-"""The method ``oidn_pyramid``: Open Image Denoise's images corrected by a network, and made steady.
+"""The method ``oidn_pyramid``: a network combines Open Image Denoise's images with the noisy pixels, then stabilizes.
 
-Its two images of a frame, for noisy and for clean features, are wrong in other places, and both in other ones than a
-mean of noisy pixels is: the network of ``pyramid`` sees all three, and weighs them pixel by pixel. That is an ensemble
-as of Zheng et al. 2021, "Ensemble Denoising for Monte Carlo Renderings", with a learnt denoiser as one of those in it,
-which is trained to be right where the library is not.
+OIDN's images for noisy and for clean features have different errors, and both differ from the errors of a mean of noisy
+pixels. The network of ``pyramid`` takes all three and predicts their weights for each pixel. This is an ensemble as in
+Zheng et al. 2021, "Ensemble Denoising for Monte Carlo Renderings"; its own learnt member is trained to be right where
+the library is not.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ def oidn_pyramid(
     threads: int | None = None,
     history: float = 10.0,
 ) -> Model:
-    """Open Image Denoise (optional package pyoidn) corrected by a network that sees the noisy pixels, and made steady.
+    """Combine Open Image Denoise (optional package pyoidn) with a network on the noisy pixels, and stabilize over time.
 
     Args:
         width: feature channels of the finest level of the network, a multiple of 4.
-        kernel_size: side of its kernels.
+        kernel_size: side of the network's kernels.
         quality: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         threads: likewise.
         history: see :class:`mcdenoise.models.steadied.Steadied`.
 
     Raises:
-        InputError: as of both.
+        InputError: see both classes.
     """
     network = PyramidNetwork(widths_of(width), kernel_size, others=(OIDN, OIDN_CLEAN))
     corrected, steadied = Demodulated(Tiled(network)), Recurrent(Tiled(Steadied(history)))

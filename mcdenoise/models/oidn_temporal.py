@@ -1,10 +1,10 @@
-"""The method ``oidn_temporal``: Open Image Denoise made steady, and its two ways with features in one.
+"""The method ``oidn_temporal``: Open Image Denoise's images for noisy and clean features combined, and stabilized.
 
-The library denoises every frame by itself, in the state of the art for a still, and flickers in a film. And it has to
-be told whether albedo and normal have noise, which is hardly ever true of a whole image: they are exact on a wall, and
-noisy behind glass, in a blurred mirror and out of focus. Here it comes first, once for noisy and once for clean
-features, and their mean is about as good as the better of them, which one had to know. Then the result of the frame
-before is blended in. Nothing is learnt.
+The library denoises every frame separately: single images are state of the art, but sequences flicker. It also has to
+be told whether albedo and normal have noise, which rarely holds for a whole image: they are exact on a wall, and noisy
+behind glass, in a blurred mirror and out of focus. This method runs the library for noisy and for clean features. The
+mean of both is about as good as the better one, without having to know which one that is. Then the previous result is
+blended in. No weights are learnt.
 """
 
 from __future__ import annotations
@@ -23,19 +23,20 @@ from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.models.with_oidn import EXACT, OIDN, OIDN_CLEAN, WithOidn
 
-# Parts of the image for clean features for each of that for noisy ones, where they are not exact, and where they are.
+# Weight of the image for clean features relative to that for noisy ones, if features are noisy and if they are exact.
 _CLEAN_PARTS = (1.0, 3.0)
 
 
 class Mixed(nn.Module):
-    """The mean of Open Image Denoise's two images: ``(oidn + a oidn_clean) / (1 + a)``, a = 1, or 3 of exact features.
+    """A weighted mean of Open Image Denoise's images: ``(oidn + a oidn_clean) / (1 + a)``.
 
-    See :class:`mcdenoise.models.with_oidn.WithOidn`, which hands it both.
+    The weight a is 3 if the features are exact, else 1.
+    :class:`mcdenoise.models.with_oidn.WithOidn` provides both images.
     """
 
     @property
     def needs(self) -> Needs:
-        """Color; of use is what it mixes."""
+        """Needs color; uses the images that it combines."""
         return Needs(uses=frozenset({OIDN, OIDN_CLEAN, EXACT}), trainable=False, reach=0)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
@@ -49,7 +50,7 @@ class Mixed(nn.Module):
 
 @register_model("oidn_temporal", kind="peer", requires="pyoidn")
 def oidn_temporal(*, quality: Quality = "high", threads: int | None = None, history: float = 10.0) -> Model:
-    """Open Image Denoise (optional package pyoidn) for noisy and for clean features, made steady by the frame before.
+    """Open Image Denoise (optional package pyoidn) for noisy and for clean features, stabilized by the previous result.
 
     Args:
         quality: see :class:`mcdenoise.models.with_oidn.WithOidn`.
@@ -57,7 +58,7 @@ def oidn_temporal(*, quality: Quality = "high", threads: int | None = None, hist
         history: see :class:`mcdenoise.models.steadied.Steadied`.
 
     Raises:
-        InputError: as of both.
+        InputError: see both classes.
     """
     steadied = Recurrent(Tiled(Steadied(history)))
     return WithOidn(Chain(mixed=Mixed(), steadied=steadied), quality=quality, threads=threads)

@@ -1,18 +1,18 @@
-"""The family ``pyramid``: one U-Net that weighs, splits and filters the noisy pixels themselves, scale by scale.
+"""The family ``pyramid``: one U-Net weighs, splits and filters the noisy pixels themselves, scale by scale.
 
 Every pixel of the result is a weighted mean of noisy pixels, times a bounded factor. One network predicts all weights,
-and so decides what rules decide elsewhere:
+and so makes the decisions for which other methods have fixed rules:
 
-- how far the history is to be trusted against the frame alone, pixel by pixel: highlights and reflections do not move
-  with the surface whose history they are in;
-- how much of the light is matt: what is filtered is ``color / e`` with the effective albedo ``e = m + t (1 - m)``
-  between the albedo ``m`` (t = 0) and one (t = 1). Where ``color = m D + S``, of matt light and of what a coat
-  reflects, ``t / (1 - t) = S / D`` makes it as smooth as D and S are, and no grain is multiplied into highlights;
-- how much a pixel is worth: a firefly little, a pixel without noise much;
-- on which scale a pixel's light is to be spread: each scale keeps a part of it and hands on the rest, as in Balint et
+- how far to trust the history against the current frame, for each pixel: highlights and reflections do not move with
+  the surface whose history they are in;
+- how diffuse the light is: the filtered signal is ``color / e`` with the effective albedo ``e = m + t (1 - m)``,
+  between the albedo ``m`` (t = 0) and one (t = 1). For ``color = m D + S``, with diffuse light D and coat reflection S,
+  ``t / (1 - t) = S / D`` makes the signal as smooth as D and S, so that no texture is multiplied into highlights;
+- the weight of a pixel: low for a firefly, high for a pixel without noise;
+- the scale at which a pixel's light is filtered: each scale keeps a part of it and passes on the rest, as in Balint et
   al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Renderings", Sec. 4;
-- how features that have noise themselves (anti-aliased, out of focus, blurred by motion) are filtered before they are
-  multiplied back or guide anything, and how far the history of the albedo is to be trusted.
+- how noisy features (anti-aliased, out of focus, motion-blurred) are filtered before they are multiplied back or used
+  as guides, and how far to trust the history of the albedo.
 """
 
 from __future__ import annotations
@@ -40,31 +40,31 @@ from mcdenoise.ops._steps.network import softplus
 from mcdenoise.ops.demodulation import modulation
 from mcdenoise.ops.lag import THRESHOLD
 
-SCALE_UNITS = (10.0, 1000.0, 1.0)  # of the falloffs with normal, depth and distance
+SCALE_UNITS = (10.0, 1000.0, 1.0)  # units of the falloffs with normal, depth and distance
 _USES, _HISTORY = frozenset({"albedo", "normal", "depth"}), frozenset({"current", "length", ALBEDO_HISTORY})
-_COARSE_CHANNELS = 7  # logarithms of the means, with the history and of the frame, and how much its pixels differ
-_FEATURE_TAPS = 9  # of the kernel for features
-# "albedo" weighs that of the 3x3 pixels around, that of the history, and that which the pyramid makes of it.
+_COARSE_CHANNELS = 7  # logarithms of the means, with and without history, and the deviation of the pixels
+_FEATURE_TAPS = 9  # taps of the feature filter
+# "albedo" has weights of the filtered 3x3 neighbourhood, of the history, and of the albedo that the pyramid filters.
 _PARTS = {"importance": 1, "history": 1, "albedo": 3, "matt": 1, "gain": 3, "features": _FEATURE_TAPS}
-# What they are before anything was learnt: the history is trusted, light is matt, features are exact.
+# Initial predictions: the history is trusted, light is diffuse, features are exact.
 _AT_REST = {"history": 2.0, "matt": -1.0}
-_QUARTERS = (4, 6, 8, 12, 16)  # of the width, at each level
-_LEAST = 1e-3  # of the light of a pixel that a scale keeps or hands on, and that a pixel is worth
-_MOST_GAIN = 1.0  # of the logarithm of the factor
+_QUARTERS = (4, 6, 8, 12, 16)  # width of each level in quarters of the finest one
+_LEAST = 1e-3  # smallest fraction that a scale keeps or passes on, and smallest weight of a pixel
+_MOST_GAIN = 1.0  # largest logarithm of the factor
 
 
 class PyramidNetwork(nn.Module):
     """Predicts all weights of the pyramid, and filters the image with them.
 
-    It sees demodulated radiance, and turns it into what it filters by itself.
+    It takes demodulated radiance and converts it to the signal that it filters.
 
     Args:
         widths: feature channels of each level of the U-Net, finest first.
         kernel_size: side of the kernels at every scale.
         half: whether the U-Net begins at half the resolution.
-        others: names in ``frame.extra`` of images ``(B, 3, H, W)`` that other methods have made of the frame: it sees
-            them, and the result is a mean of its own image and of them with weights that it predicts. One that a frame
-            lacks is the noisy one.
+        others: keys of ``frame.extra`` for images ``(B, 3, H, W)`` that other methods made of the frame. The network
+            takes them, and the result is a mean of its own image and theirs with predicted weights. An image that a
+            frame lacks is replaced by the noisy color.
     """
 
     def __init__(
@@ -75,7 +75,8 @@ class PyramidNetwork(nn.Module):
         self.others = tuple(others)
         self.unet = UNet(9 + FEATURES + 3 * len(self.others), widths, scales, _COARSE_CHANNELS, half)
         self.taps = kernel_size**2
-        # Kernel, its three falloffs, what a scale keeps, and what it takes of the coarser one.
+        # Channels per scale: kernel, its three falloffs, the kept fraction, and the fraction taken from the coarser
+        # scale.
         self.channels = [self.taps + 5] * (scales - 1) + [self.taps + 3]
         self.parts = {"others": 1 + len(self.others), **_PARTS} if self.others else _PARTS
         extra = [sum(self.parts.values())] + [0] * (scales - 1)
@@ -91,18 +92,18 @@ class PyramidNetwork(nn.Module):
         at_rest["albedo"][0] = 1.0  # of the pixels around
         rest = torch.cat(list(at_rest.values()))
         with torch.no_grad():
-            # A head of half the resolution predicts each channel for two by two pixels.
+            # A head at half the resolution predicts each channel for 2x2 pixels.
             self.heads[0].bias[self.channels[0] * self.heads[0].side ** 2 :] = rest.repeat_interleave(  # type: ignore
                 self.heads[0].side ** 2  # type: ignore
             )
 
     @property
     def needs(self) -> Needs:
-        """What the U-Net sees, and the radius of each filter at its scale behind it."""
+        """The reach of the U-Net plus, at each scale, the radius of the filter."""
         radius = math.isqrt(self.taps) // 2
         behind = sum((radius + 1) << scale for scale in range(self.unet.scales))
         ways = (self.unet.reach(scale) + max(1 << scale, self.unet.stride) for scale in range(self.unet.scales))
-        # Other methods have made theirs of this frame, not of its history.
+        # The other methods' images do not depend on the history.
         uses = _USES | (frozenset(self.others) or _HISTORY)
         return Needs(uses=uses, reach=max(ways) + behind, stride=self.unet.multiple)
 
@@ -111,7 +112,7 @@ class PyramidNetwork(nn.Module):
         return image_statistics(frame)
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`."""
+        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`."""
         return self.unet.bytes_per_pixel(bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
@@ -121,7 +122,7 @@ class PyramidNetwork(nn.Module):
         image = frame.color * exposure
         albedo = modulation(features_of(frame)[0]) if frame.albedo is not None else torch.ones_like(image)
         before = modulation(frame.extra[ALBEDO_HISTORY]) if ALBEDO_HISTORY in frame.extra else albedo
-        # In the unit of the image, and with their albedo.
+        # In the unit of the image, including albedo.
         others = [frame.extra[name] * exposure if name in frame.extra else image * albedo for name in self.others]
         logarithms = [torch.log1p(each) for each in (image * albedo, *others)]
         seen = torch.cat([input_of(frame, image), logarithms[0], before, *logarithms[1:]], 1)
@@ -135,7 +136,7 @@ class PyramidNetwork(nn.Module):
         parts = dict(zip(self.parts, predicted[0][:, self.channels[0] :].split(counts, 1), strict=True))
         predicted[0] = predicted[0][:, : self.channels[0]]
 
-        # Features of the pixel, which may be of one sample, and what the samples around it say.
+        # The features of the pixel, which may be of one sample, and their mean over the neighbourhood.
         features = torch.cat([albedo, *guides_of(frame)], 1)
         smooth, guides = kernel_conv(features, torch.softmax(parts["features"], 1)).split([3, 4], 1)
         matt = 1 - torch.sigmoid(parts["matt"])
@@ -148,7 +149,7 @@ class PyramidNetwork(nn.Module):
                 1,
             )
         light = [color * ratio, albedo, *([] if layers is None else [layers])]
-        # Of the weights alone, in the last channel, the mean is what it is divided by.
+        # The last channel holds the filtered weights, by which the others are divided.
         worth = _inside(parts["importance"])
         weighted = torch.cat([*light, torch.ones_like(worth)], 1) * worth
         filtered = self._filtered(weighted, predicted, guides)
@@ -163,10 +164,10 @@ class PyramidNetwork(nn.Module):
         return answered(frame, result / exposure, None if layers is None else mean[:, 6:]), None
 
     def _coarse(self, frame: Frame, exposure: Tensor) -> list[Tensor]:
-        """At each coarser scale the logarithms of mean radiances, and how much single pixels of the frame differ.
+        """Logarithms of mean radiances at each coarser scale, and the deviation of single pixels of the frame.
 
-        Over a block the means of the frame and of its history have little noise, so that a highlight that has moved, or
-        light that has changed, shows as their difference.
+        The mean of the frame and that of the history over a block have little noise, so their difference shows a moved
+        highlight or a change of light.
         """
         color = frame.color * exposure
         alone = color if frame.current is None else frame.current * exposure
@@ -181,7 +182,7 @@ class PyramidNetwork(nn.Module):
         return found[self.unet.stride - 1 :]
 
     def _filtered(self, light: Tensor, predicted: list[Tensor], guides: Tensor) -> Tensor:
-        """Down: each scale keeps a part. Up: it is filtered together with what comes from the coarser scales."""
+        """Down: each scale keeps a part. Up: this part is filtered together with the result of the coarser scales."""
         kept: list[Tensor] = []
         for prediction in predicted[:-1]:
             keep = _inside(prediction[:, -2:-1])
@@ -190,7 +191,7 @@ class PyramidNetwork(nn.Module):
         guiding = [guides]
         for _ in kept:
             guiding.append(downsample(guiding[-1]))
-        # One for all scales: a tile of an image must not be filtered otherwise than the whole.
+        # All scales share the statistics of the whole image, so that a tile is filtered as in the whole image.
         with one_backend(light):
             for scale in reversed(range(len(predicted))):
                 prediction, guide = predicted[scale], guiding[scale]
@@ -210,21 +211,21 @@ class PyramidNetwork(nn.Module):
 
 
 def _ratio(albedo: Tensor, smooth: Tensor, matt: Tensor) -> Tensor:
-    """Albedo over the effective albedo of what is smooth: from demodulated radiance to what is filtered."""
+    """Albedo over effective albedo: converts demodulated radiance to the filtered signal."""
     return albedo / torch.lerp(torch.ones_like(smooth), smooth, matt)
 
 
 def _inside(logit: Tensor) -> Tensor:
-    """In [_LEAST, 1 - _LEAST]: nothing is ever lost altogether, and no mean is 0 / 0."""
+    """Map a logit to [_LEAST, 1 - _LEAST], so that no light is lost completely and no mean is 0 / 0."""
     return _LEAST + (1 - 2 * _LEAST) * torch.sigmoid(logit)
 
 
 def widths_of(width: int, levels: int = len(_QUARTERS)) -> list[int]:
-    """Feature channels of each level, finest first: of 32 they are 32, 48, 64, 96 and 128.
+    """Feature channels of each level, finest first; for a width of 32 they are 32, 48, 64, 96 and 128.
 
     Args:
-        width: those of the finest level, a multiple of 4.
-        levels: how many there are.
+        width: channels of the finest level, a multiple of 4.
+        levels: number of levels.
     """
     return [width * quarters // 4 for quarters in _QUARTERS[:levels]]
 
@@ -242,14 +243,14 @@ def _pyramid(
     anti_lag: bool = True,
     tolerance: float = TOLERANCE,
 ) -> Model:
-    """The pyramid with all that it wears.
+    """The pyramid with all its wrappers.
 
     Args:
         width: feature channels of the finest level, a multiple of 4.
         kernel_size: side of the kernels.
-        half: whether the U-Net begins at half the resolution; it has one level less then.
+        half: whether the U-Net begins at half the resolution; it then has one level fewer.
         alpha_min: see :class:`mcdenoise.models.Accumulated`.
-        anti_lag: likewise.
+        anti_lag: see :class:`mcdenoise.models.Accumulated`.
         tolerance: see :class:`mcdenoise.models.Skipping`.
     """
     widths = widths_of(width, len(_QUARTERS) - half)

@@ -1,31 +1,32 @@
-"""The recurrent autoencoder: a U-Net that remembers, at every resolution of its way down, what it saw before.
+"""The recurrent autoencoder: a U-Net with a hidden state at every resolution of its encoder.
 
 Chaitanya et al. 2017, "Interactive Reconstruction of Monte Carlo Image Sequences using a Recurrent Denoising
-Autoencoder", ACM Transactions on Graphics 36(4). The denoiser of OptiX 5.1, "ONND" in the comparison of
-doi:10.1007/s00371-023-02951-6, came of this work and is a black box: this is a re-implementation of the paper, and no
-figure of it is one of OptiX.
+Autoencoder", ACM Transactions on Graphics 36(4). The closed-source denoiser of OptiX 5.1, "ONND" in the comparison of
+doi:10.1007/s00371-023-02951-6, is based on this work. This file re-implements the paper, and its results are not those
+of OptiX.
 
-Nothing is accumulated and nothing is warped: the memory is a hidden state at each of six resolutions,
+There is no accumulation and no reprojection: the memory is a hidden state at each of six resolutions,
 
     a = L(conv(x)),  h_t = L(conv(L(conv([a, h_{t-1}])))),  L = LeakyReLU with slope 0.1,
 
-3x3 convolutions all of them. Encoder stages have 32, 43, 57, 76 and 101 channels, a factor of 4/3 each, and 2x2
-max-pooling after them; the bottleneck has 101. A decoder stage is nearest-neighbour upsampling, the stage of the
-encoder at that resolution beside it, and two convolutions with L.
+with 3x3 convolutions throughout. Encoder stages have 32, 43, 57, 76 and 101 channels, a factor of 4/3 each, followed by
+2x2 max-pooling; the bottleneck has 101. A decoder stage upsamples by nearest neighbours, concatenates the encoder stage
+of that resolution, and has two convolutions with L.
 
-The seven input channels are radiance without albedo 3, normal in view space x and y 2, depth 1, roughness 1. What is
-left open, and what is taken here:
+The seven input channels are demodulated radiance 3, x and y of the view-space normal 2, depth 1, roughness 1. The paper
+leaves the following open; these are our choices:
 
-- radiance goes in and comes out as ``log(1 + x)``, typical radiance brought to 0.5 (:class:`mcdenoise.models.Exposed`);
-- the last convolution has no L; below zero is black, and no pixel becomes brighter than the brightest of the input;
-- its second to last has as many channels as the first stage of the encoder;
-- without a camera, x and y of the normal as the renderer wrote it; depth in [0, 1] is ``d / (d + typical depth)``;
-  what a frame lacks is constant: depth and roughness are 1, the normal is 0;
-- any size: stages of odd height or width keep the last row and column by themselves;
-- when a shot ends: at another size, and at a cut, where less than 5 % of an image shows what the frame before showed.
-  What has no motion has no cuts, and whoever calls the method begins anew.
+- radiance is input and output as ``log(1 + x)``, with typical radiance scaled to 0.5
+  (:class:`mcdenoise.models.Exposed`);
+- the last convolution has no L; negative results are clamped to 0, and no pixel is brighter than the brightest input;
+- the second to last convolution has as many channels as the first stage of the encoder;
+- without a camera, x and y of the normal are used as written by the renderer; depth in [0, 1] is
+  ``d / (d + typical depth)``; a missing buffer is constant: 1 for depth and roughness, 0 for the normal;
+- any image size: at odd heights or widths the last row or column is pooled alone;
+- a shot ends when the size changes, and at a cut: when less than 5 % of an image shows what the previous frame showed.
+  Without motion no cut is detected, and the caller has to reset the state.
 
-Its authors' loss is ``[train] loss = "rae"`` (:func:`mcdenoise.train.losses.rae_loss`), on clips of 7 frames.
+The authors' loss is ``[train] loss = "rae"`` (:func:`mcdenoise.train.losses.rae_loss`), on clips of 7 frames.
 """
 
 from __future__ import annotations
@@ -54,11 +55,11 @@ _TYPICAL = 0.5  # exposed radiance
 
 
 class Memory(NamedTuple):
-    """What is kept of a shot. All of it zeros is that of no frame.
+    """State of a shot. Zeros are the state before the first frame.
 
     Args:
-        hidden: ``(B, C, H / s, W / s)`` of each stage, finest first, sizes rounded up; the bottleneck's last.
-        before: what was seen, to tell a cut; its image is empty.
+        hidden: ``(B, C, H / s, W / s)`` of each stage, finest first, bottleneck last; sizes are rounded up.
+        before: the previous surface, for detecting a cut; its image has no channels.
     """
 
     hidden: tuple[Tensor, ...]
@@ -66,7 +67,7 @@ class Memory(NamedTuple):
 
 
 class _Recurrent(nn.Module):
-    """A stage with a hidden state, which is its result."""
+    """A stage whose result is also its hidden state."""
 
     def __init__(self, entering: int, width: int) -> None:
         super().__init__()
@@ -79,7 +80,7 @@ class _Recurrent(nn.Module):
 
 
 class Rae(nn.Module):
-    """The network, on exposed radiance without albedo.
+    """The network, for exposed and demodulated radiance.
 
     Args:
         width: channels of the first stage, the paper's 32.
@@ -104,11 +105,11 @@ class Rae(nn.Module):
 
     @property
     def persistence(self) -> None:
-        """Nobody knows what the network has learnt to remember, see :func:`mcdenoise.models.frames_remembered`."""
+        """Unknown, since the network learns what to remember; see :func:`mcdenoise.models.frames_remembered`."""
 
     @property
     def needs(self) -> Needs:
-        """Color; of use are its features, and what tells motion and with it a cut."""
+        """Needs color; uses features, and motion for detecting cuts."""
         features = frozenset({"normal", "depth", "roughness", "view_projection"})
         return Needs(uses=features | MOTION)
 
@@ -146,10 +147,10 @@ def input_of(frame: Frame) -> Tensor:
 
 
 def view_normal(frame: Frame) -> Tensor:
-    """The normal along the image's x and y, ``(B, 2, H, W)`` in [-1, 1]; without a camera, its own x and y.
+    """The normal along the image's x and y axes, ``(B, 2, H, W)`` in [-1, 1]; without a camera its own x and y.
 
-    Clip x and y are the camera's axes times a scale, and a part along the view axis where the image is a crop of a
-    larger one; clip w is along the view axis, or constant if the camera has no perspective.
+    Clip x and y are the camera's axes times a scale, plus a component along the view axis if the image is a crop of a
+    larger one; clip w is along the view axis, or constant for an orthographic camera.
     """
     _, normal, _ = features_of(frame)
     if frame.view_projection is None:
@@ -165,7 +166,7 @@ def view_normal(frame: Frame) -> Tensor:
 
 
 def _recalled(frame: Frame, memory: Memory | None) -> list[Tensor | None]:
-    """The hidden states that this frame may see."""
+    """The hidden states of the previous frame; ``None`` at the beginning of a shot."""
     nothing: list[Tensor | None] = [None] * (STAGES + 1)
     fits = memory is not None and memory.before.image.shape == frame.color[:, :1].shape
     if memory is None or not fits:
@@ -206,6 +207,6 @@ def rae(width: int = 32) -> Model:
     """The recurrent denoising autoencoder of Chaitanya et al. 2017, re-implemented.
 
     Args:
-        width: channels of the first stage, the paper's 32; each further one has 4/3 of them.
+        width: channels of the first stage, the paper's 32; each further stage has 4/3 of the previous one's.
     """
     return Demodulated(Exposed(Rae(width)))

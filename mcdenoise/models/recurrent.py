@@ -1,4 +1,4 @@
-"""A method that is given its own image of the frame before, as it is seen from here."""
+"""A wrapper that gives a method its own previous image, reprojected to the current frame."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import comparable, has_motion, motion_unless_still, surface_before
 from mcdenoise.ops import Surface, demodulate, remodulate, reproject
 
-# The image of the frame before at the places of this one, and how much of each of its pixels shows the same surface.
+# Keys in ``frame.extra``: the reprojected previous image, and its weight, the fraction that shows the same surface.
 PREVIOUS, PREVIOUS_WEIGHT = "previous", "previous_weight"
-PREVIOUS_LIGHT = "previous_light"  # the same with the albedo of this frame
+PREVIOUS_LIGHT = "previous_light"  # the previous image with the albedo of this frame
 
 
 class Before(NamedTuple):
-    """What is kept of a frame. All of it zeros is that of no frame: nothing there shows what is here.
+    """State after a frame. Zeros are the state before the first frame: their weight is 0.
 
     Args:
-        image: ``(B, C, H, W)`` what is reprojected; of :class:`Recurrent`, 6 channels: what the method made of the
-            frame, and the same without albedo.
-        weight: ``(B, 1, 1, 1)`` 1, or 0 where there was no frame.
-        surface: what was seen.
-        view_projection: ``(B, 4, 4)`` by which camera.
+        image: ``(B, C, H, W)`` the channels to reproject; for :class:`Recurrent` 6: the method's image, and the same
+            demodulated.
+        weight: ``(B, 1, 1, 1)`` 1, or 0 if there was no frame.
+        surface: surface of the frame.
+        view_projection: ``(B, 4, 4)`` camera of the frame.
     """
 
     image: Tensor
@@ -38,18 +38,17 @@ class Before(NamedTuple):
 
 
 class Recurrent(Wrapper):
-    """Hands a method its image of the frame before, reprojected.
+    """Provides a method with its own previous image, reprojected.
 
-    The method finds it in ``frame.extra``, ``(B, 3, H, W)`` each, 0 where nothing shows the same surface:
+    The method finds it in ``frame.extra``, ``(B, 3, H, W)`` each, 0 where no tap shows the same surface:
 
-    - ``previous``: that image itself. Every reprojection blurs it a little more.
-    - ``previous_light``: its radiance without albedo, with the albedo of this frame. What is textured stays sharp; but
-      the albedo of few samples a pixel has noise of its own.
+    - ``previous``: the image. Every reprojection blurs it a little more.
+    - ``previous_light``: the demodulated image multiplied by the albedo of this frame. Textures stay sharp; but an
+      albedo of few samples per pixel adds its own noise.
 
-    ``previous_weight`` ``(B, 1, H, W)`` in [0, 1] is how much of it shows the same surface, see
-    :func:`mcdenoise.ops.reproject`: of the first frame, and where nothing tells how things move, 0. What blends its
-    image with those is steady and has the noise of many frames; it is trained over clips to tell where they no longer
-    hold.
+    ``previous_weight`` ``(B, 1, H, W)`` in [0, 1] is the fraction that shows the same surface, see
+    :func:`mcdenoise.ops.reproject`; it is 0 in the first frame and without motion. A method that blends its image with
+    these does not flicker and has the noise of many frames; it is trained on clips to detect where they no longer hold.
 
     Args:
         inner: a method without a state.
@@ -57,7 +56,7 @@ class Recurrent(Wrapper):
 
     @property
     def needs(self) -> Needs:
-        """As those inside but for what is handed to it; whatever tells motion is of use."""
+        """The needs of the inner method without the buffers provided here; motion is used."""
         needs = self.inner.needs
         given = frozenset({PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
         uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth"}
@@ -65,7 +64,7 @@ class Recurrent(Wrapper):
 
     @property
     def persistence(self) -> float | None:
-        """Nobody knows what a network has learnt to keep of its images; what blends with them says so itself."""
+        """``None``, unknown, unless the inner method declares it."""
         inside = self.inner.modules() if isinstance(self.inner, nn.Module) else ()
         return 0.0 if any(hasattr(each, "persistence") for each in inside) else None
 
@@ -84,7 +83,7 @@ class Recurrent(Wrapper):
 
 
 def to_be_kept(frame: Frame, image: Tensor) -> Before | None:
-    """What is kept of a frame and of an image of it ``(B, C, H, W)`` for the next one; nothing of the last frame."""
+    """The state for the next frame from an image ``(B, C, H, W)`` of this frame; ``None`` after the last frame."""
     keeps = frame.hints.keep_all or not frame.hints.last
     note("remember", "for the next frame" if keeps else "last frame", float(not keeps))
     if not keeps:
@@ -94,20 +93,20 @@ def to_be_kept(frame: Frame, image: Tensor) -> Before | None:
 
 
 def from_before(frame: Frame, state: State, channels: int, keeper: str = "recurrent") -> tuple[Tensor, Tensor]:
-    """What was kept of the frame before, at the places of this one.
+    """Reproject the previous image to this frame.
 
     Args:
-        frame: with a depth, if it has what tells one (:meth:`mcdenoise.frame.Frame.with_depth`).
-        state: by :func:`to_be_kept`, or ``None``.
-        channels: of the image that is kept.
-        keeper: the method, for messages.
+        frame: with a depth, if it can be computed (:meth:`mcdenoise.frame.Frame.with_depth`).
+        state: result of :func:`to_be_kept`, or ``None``.
+        channels: number of channels of the image.
+        keeper: name of the method for messages.
 
     Returns:
-        ``(B, channels, H, W)`` image, and ``(B, 1, H, W)`` in [0, 1] how much of it shows the same surface; zeros of a
-        first frame, of another size than the one before, and where nothing tells motion.
+        ``(B, channels, H, W)`` image, and ``(B, 1, H, W)`` in [0, 1] the fraction that shows the same surface; both are
+        zero in a first frame, after a change of the image size, and without motion.
 
     Raises:
-        InputError: the state is that of another method.
+        InputError: the state belongs to another method.
     """
     before = own_state(state, Before, frame, channels=channels, keeper=keeper)
     nothing = frame.color.new_zeros(frame.color.shape[0], channels, *frame.size), torch.zeros_like(frame.color[:, :1])

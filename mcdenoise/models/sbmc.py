@@ -1,24 +1,24 @@
-"""SBMC: every sample is splat over its neighbours with a kernel of its own.
+"""SBMC: every sample is splatted over its neighbours with its own kernel.
 
 Gharbi et al. 2019, "Sample-based Monte Carlo Denoising using a Kernel-Splatting Network", ACM Transactions on Graphics
-(SIGGRAPH). ``PUBLISHED`` are the sizes of their code: embeddings of 128 channels by chains of three 1x1 convolutions,
-three rounds of them and of a U-Net of three levels with three convolutions each, on the mean over the samples, and
-kernels of 21x21; it takes a GPU to train. The default is smaller, for a CPU.
+(SIGGRAPH). ``PUBLISHED`` holds the sizes of their code: embeddings of 128 channels by chains of three 1x1 convolutions,
+three rounds of embedding and U-Net (three levels with three convolutions each, on the mean over the samples), and
+kernels of 21x21; training it requires a GPU. The default is smaller and trains on a CPU.
 
-Kernels are splat: a sample says to which pixels its light goes, so that a firefly is got rid of where it is, and each
-pixel is the mean of what arrives, by weights that are exponentials (:func:`mcdenoise.ops.softmax_splat`, one sample
-after the other).
+Splatting lets a sample decide which pixels receive its light, so that a firefly is suppressed where it occurs. Each
+pixel is the mean of the light that it receives, with exponential weights (:func:`mcdenoise.ops.softmax_splat`, one
+sample after the other).
 
-Where a frame has ``samples`` ``(B, S, C, H, W)``, their first three channels are radiance. **Where it has none, its
-color is the one sample of a pixel.** What is different here:
+The first three channels of ``samples`` ``(B, S, C, H, W)`` are radiance. **In a frame without samples, the color is the
+only sample of a pixel.** Differences from the paper:
 
-- features are those of the pixel, and not of each sample; random numbers and probabilities of the path are not seen;
-- light is accumulated over frames by the rule of :mod:`mcdenoise.models.cascaded`, without albedo, as for all methods
-  that are compared. Beside samples, which are of the frame alone, the accumulated color is one more sample, marked by
-  one over its length. The authors denoise single images with their albedo; :class:`SbmcNetwork` alone does;
-- typical radiance is brought to 0.5 first (:class:`mcdenoise.models.Exposed`): otherwise the logarithm that the network
-  sees, and so the result, depends on the unit of radiance;
-- convolutions are padded with zeros and nothing is cropped; the authors crop a kernel's radius off the result;
+- features are those of the pixel, not of each sample; random numbers and path probabilities are not used;
+- light is accumulated over frames by the rule of :mod:`mcdenoise.models.cascaded`, demodulated, as for all compared
+  methods. Samples belong to the current frame, so the accumulated color is one more sample, marked by one over the
+  history length. The authors denoise single images with albedo, as :class:`SbmcNetwork` without its wrappers does;
+- typical radiance is scaled to 0.5 first (:class:`mcdenoise.models.Exposed`); otherwise the logarithm in the input, and
+  with it the result, would depend on the unit of radiance;
+- convolutions are padded with zeros and nothing is cropped; the authors crop the result by a kernel's radius;
 - the losses are those of the trainer.
 """
 
@@ -45,9 +45,9 @@ from mcdenoise.nn.samples import (
     LeakyUNet,
     SampleEmbedding,
     chain,
+    describe_samples,
     samples_input,
     samples_of,
-    told_of,
     with_context,
 )
 from mcdenoise.nn.unet import bytes_of
@@ -57,12 +57,12 @@ PUBLISHED: Mapping[str, Any] = {"width": 128, "rounds": 3, "convolutions": 3, "k
 
 
 class SbmcNetwork(nn.Module):
-    """Predicts a kernel for every sample, and splats the samples with them.
+    """Predicts a kernel for every sample, and splats the samples with these kernels.
 
     Args:
         width: channels of the embedding of a sample, and of the U-Nets' finest level.
-        rounds: of embedding and U-Net.
-        convolutions: of each block of the U-Nets.
+        rounds: number of rounds of embedding and U-Net.
+        convolutions: number of convolutions in each block of the U-Nets.
         kernel_size: side of the kernels, odd.
 
     Raises:
@@ -80,7 +80,7 @@ class SbmcNetwork(nn.Module):
 
     @property
     def needs(self) -> Needs:
-        """Features and samples; the length of a history marks what is accumulated."""
+        """Uses features, samples, and the history length, which marks the accumulated sample."""
         uses = frozenset({"albedo", "normal", "depth", "samples", "length"})
         return Needs(uses=uses, reach=self._reach, stride=LeakyUNet.multiple)
 
@@ -96,7 +96,7 @@ class SbmcNetwork(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         light, others = samples_of(frame), carried(frame)
-        note("samples", told_of(frame))
+        note("samples", describe_samples(frame))
         known = with_context(*self.embedding(samples_input(frame, light)))
         mean, total = light[:, 0], None
         for sample, seen in zip(light.unbind(1), known.unbind(1), strict=True):
@@ -105,7 +105,7 @@ class SbmcNetwork(nn.Module):
             if total is None:
                 mean, total = splat, weight
             else:
-                # Of all samples so far, by the weights that arrived: a sum that no exponential overflows.
+                # A running mean over the samples so far, weighted so that no exponential overflows.
                 mean = torch.lerp(mean, splat, torch.sigmoid(weight - total).to(mean.dtype))
                 total = torch.logaddexp(total, weight)
         return answered(frame, mean), None

@@ -1,4 +1,4 @@
-"""A method that is not asked for what is known already: pixels without noise, and tiles in which nothing changes."""
+"""A wrapper that skips a method where its result is known: pixels without noise, and tiles that do not change."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.tiled import TILE
 from mcdenoise.ops._window import corner
 
-# So small that no metric moves in its third digit.
+# So small that no error metric changes in its third digit.
 TOLERANCE = 1e-3
-# One pixel in 16 says whether it is worth while to look at all of them.
+# Distance of the pixels that are tested first: all pixels are tested only if this subset suggests it.
 _STRIDE = 4
-# Tiles on each side that count for a network. Its lowest resolution sees twice as far, but what changes there moves a
-# result by no more than what it does to the exposure of the whole image.
+# Margin in tiles around a changed one. A network's coarsest level sees twice as far, but a change there affects the
+# result no more than through the exposure of the whole image.
 _SEEN = 4
-# A tile that is passed through comes back only when it is noisier than it had to be by this factor.
+# Hysteresis: a tile that is passed through is computed again only when its noise exceeds the threshold by this factor.
 _NOISE_HYSTERESIS = 2.0
-# Relative difference between a frame and the accumulated image below which it says nothing of the noise.
+# If frame and accumulated image differ by less than this, relatively, the difference does not measure the noise.
 _LEAST_RESIDUAL = 1e-4
-# Frames from which the noise can be told.
+# Smallest history length for estimating the noise.
 _LEAST_LENGTH = 8
-# A tile may change by this fraction of the tolerance from frame to frame before it is reused, and in all by the
-# tolerance.
+# A tile is reused if it changes by less than this fraction of the tolerance per frame, and by less than the tolerance
+# in total.
 _HYSTERESIS = 0.25
-# How much a network's result changes, relatively, with the weight that a frame has in the accumulated image.
+# Relative change of a network's result with the weight of the current frame in the accumulated image.
 _EFFECT_OF_WEIGHT = 0.05
 
 
 class Remembered(NamedTuple):
-    """What is kept of a frame while nothing moves.
+    """State while nothing moves.
 
     Args:
-        images: results by stage, ``"image"`` the last, ``(B, 3, H, W)``.
-        color: ``(B, 3, H, W)`` radiance of which each tile was computed.
-        weight: ``(B, 1, H, W)`` of the current frame in it: one over the history length.
-        passed: ``(B, 1, h, w)`` bool, tiles whose accumulated image was passed through; of all images alike.
-        reused: ``(B, 1, h, w)`` bool, tiles whose last result was reused; likewise.
-        marks: means of the features over each tile, which tell one content from another; ``None`` until they are
-            needed.
+        images: results by stage, ``"image"`` last, ``(B, 3, H, W)``.
+        color: ``(B, 3, H, W)`` radiance from which each tile was computed.
+        weight: ``(B, 1, H, W)`` weight of the current frame in it: one over the history length.
+        passed: ``(B, 1, h, w)`` bool, tiles whose accumulated image was passed through; equal for all images of a
+            batch.
+        reused: ``(B, 1, h, w)`` bool, tiles whose last result was reused; equal for all images of a batch.
+        marks: means of the features over each tile, which identify its content; ``None`` until they are needed.
     """
 
     images: Mapping[str, Tensor]
@@ -63,21 +63,22 @@ class Remembered(NamedTuple):
 
 
 class Skipping(Wrapper):
-    """Skips what a scene does not need of a method.
+    """Skips the parts of a method's work that a scene does not need.
 
     Exactly: pixels without noise (:func:`mcdenoise.models._noise_free.noise_free`) are copied from the frame. Up to a
     tolerance, while nothing moves in the image (``frame.hints.still``): tiles of 32x32 pixels whose accumulated noise
-    has fallen below it are passed through; tiles that have changed by less since they were last computed, and four
-    tiles around them too, are not computed again. Neither switches to and fro: a tile that is passed through comes back
-    only at twice the noise, and one is reused only when it changes by less than a quarter of the tolerance from frame
-    to frame. Neither is done where layers or an alpha are asked for: their proportions change where the color does not.
+    is below the tolerance are passed through; and tiles are reused if they and all tiles up to four tiles away have
+    changed by less than the tolerance since they were last computed. Both have hysteresis: a tile that is passed
+    through is computed again only at twice the noise, and a tile is reused only if it changes by less than a quarter of
+    the tolerance per frame. Neither is done if layers or an alpha are requested, because their proportions change where
+    the color does not.
 
     Args:
-        inner: a method; where it is :class:`mcdenoise.models.Tiled`, or a chain of such, it computes no more than the
-            tiles that are left.
+        inner: a method. :class:`mcdenoise.models.Tiled`, or a chain of tiled methods, computes only the remaining
+            tiles.
         tolerance: largest noise (root mean square, relative to the tile's mean) of a tile that is passed through, and
-            largest change of one that is not computed again; 0 computes every tile that has noise.
-        alpha_min: of the accumulation whose noise is estimated, see :class:`mcdenoise.models.Accumulated`.
+            largest relative change of a tile that is reused; 0 computes every tile that has noise.
+        alpha_min: setting of the accumulation, for estimating its noise, see :class:`mcdenoise.models.Accumulated`.
 
     Raises:
         InputError: the tolerance is negative or not finite.
@@ -95,7 +96,7 @@ class Skipping(Wrapper):
         before = own_state(remembered, Remembered, frame)
         current = frame.color if frame.current is None else frame.current
         still = frame.hints.still and self.tolerance > 0 and not frame.hints.keep_all
-        # The color of a tile may have converged while light goes from one of its layers to another.
+        # The color of a tile may have converged while light still moves between its layers.
         carries = bool(frame.layers) or alpha_of(frame) is not None
         with timed("plan", current.device):
             free = noise_free(frame)
@@ -120,7 +121,7 @@ class Skipping(Wrapper):
         return output, None if kept is None and inner is None else (kept, inner)
 
     def _decided(self, frame: Frame, current: Tensor, before: Remembered | None) -> Remembered:
-        """What is to be kept of a frame, without its images: which tiles need no network in it."""
+        """The state after this frame, without its images: it holds the tiles that are not computed."""
         length = torch.ones_like(frame.color[:, :1]) if frame.length is None else frame.length
         passed = self._converged(frame.color, current, length, None if before is None else before.passed)
         weight = 1 / length
@@ -145,25 +146,25 @@ class Skipping(Wrapper):
         squares = (current - color).square().mean(1, keepdim=True)
         variance, residual = (_means(image, TILE // _STRIDE) for image in (squares * factor, squares))
         mean = _means(color.mean(1, keepdim=True), TILE // _STRIDE)
-        # Where nothing differs, either there is no noise, or a renderer at rest repeats it: nothing can be told. What
-        # is black so far may still be hit by light.
+        # If the difference is zero, the pixel has no noise, or the renderer repeats its image: the noise is unknown. A
+        # black pixel may still receive light later.
         noise = torch.where(residual.sqrt() > _LEAST_RESIDUAL * mean, variance.sqrt() / mean, torch.inf)
         stays = self.tolerance * _NOISE_HYSTERESIS
         limit = self.tolerance if before is None else torch.where(before, stays, self.tolerance)
         return (noise <= limit).all(0, keepdim=True).expand_as(noise)
 
     def _squared_weights(self, length: Tensor) -> Tensor:
-        """Sum of the squared weights of the frames in an accumulated image: an average at first, a window later."""
+        """Sum of the squared weights of the accumulated frames: first an average, later an exponential window."""
         alpha, longest = self._alpha_min, 1 / self._alpha_min
         window = alpha / (2 - alpha)
         later = window + (alpha - window) * (1 - alpha) ** (2 * (length - longest).clamp_min(0))
         return torch.where(length <= longest, 1 / length.clamp_min(1), later)
 
     def _unchanged(self, frame: Frame, weight: Tensor, before: Remembered) -> tuple[Tensor, Tensor | None]:
-        """Tiles that, as far as a network sees, have changed by less than the tolerance since they were computed.
+        """Tiles whose input has changed by less than the tolerance since they were computed.
 
         Returns:
-            The tiles, and the marks of this frame if they were needed.
+            The tiles, and the marks of this frame if they were computed.
         """
         limit = torch.where(before.reused, self.tolerance, self.tolerance * _HYSTERESIS)
         now, then = (tuple(map(_thinned, pair)) for pair in ((frame.color, weight), (before.color, before.weight)))
@@ -186,7 +187,7 @@ def _skip(
     color: Tensor,
     images: Mapping[str, Tensor],
 ) -> Skip | None:
-    """Pixels whose result is known, and that result: the last one, the accumulated radiance, or that of the frame."""
+    """Pixels with a known result, and that result: the previous one, the accumulated radiance, or the frame's color."""
     if passed is None or reused is None or not (passed.any() or reused.any()):
         return None if free is None else Skip(free, {"image": current})
     known = {name: torch.where(passed, color, image) for name, image in (images or {"image": color}).items()}
@@ -209,7 +210,7 @@ def _note(name: str, pixels: Tensor | None, reason: str, none: str = "there are 
 
 
 def _change(color: Tensor, weight: Tensor, old_color: Tensor, old_weight: Tensor, tile: int) -> Tensor:
-    """Of each tile, relative to its mean."""
+    """Change of each tile, relative to its mean."""
     squares = _means((color - old_color).square().mean(1, keepdim=True), tile)
     change = torch.where(squares > 0, squares.sqrt() / _means(color.mean(1, keepdim=True), tile), 0)
     return (change + _EFFECT_OF_WEIGHT * _means((weight - old_weight).abs(), tile)).amax(0, keepdim=True)

@@ -1,8 +1,8 @@
-"""The last step of a method that denoises every frame by itself: its result of the frame before is blended in.
+"""Stabilization: the last step of a method that denoises frames separately blends in the previous result.
 
-As temporal anti-aliasing does (Karis 2014, "High-Quality Temporal Supersampling"), where the light is still the same:
-where highlights, reflections or shadows have moved on, it differs from this frame by more than noise explains. Nothing
-is learnt: what a network learnt of some hundred clips to do here was to trust the frame before too much.
+This is temporal anti-aliasing (Karis 2014, "High-Quality Temporal Supersampling") restricted to unchanged light: where
+highlights, reflections or shadows have moved, the previous result differs by more than the noise explains. No weights
+are learnt; a network trained for this task on some hundred clips trusted the previous frame too much.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
 from mcdenoise.models.with_oidn import EXACT, NOISY
 from mcdenoise.nn.oidn import oidn_exposure
 
-# Sides of the squares over which the result before is compared with this frame, and how much a difference of as much as
-# single samples deviate takes from the logarithm of its weight.
+# Sides of the windows over which the previous result is compared with this frame, and how much a difference equal to
+# the deviation of single samples reduces the logarithm of its weight.
 _WINDOWS, _DOUBTS = (3, 15), (4.0, 12.0)
-# The same sums in fewer steps: over 3 pixels, and of 5 such sums that are 3 pixels apart.
+# Factors of a 15x15 sum: over 3 pixels, and then over 5 such sums that are 3 pixels apart.
 _SUMS = {3: ((3, 1),), 15: ((3, 1), (5, 3))}
-_LEAST_NOISE = 0.02  # that single samples deviate by, in parts of their mean
-_LEAST_MEAN = 0.01  # of what differences are parts, where the typical radiance of the image is 0.18
+_LEAST_NOISE = 0.02  # smallest deviation of single samples, relative to their mean
+_LEAST_MEAN = 0.01  # smallest mean for relative differences; the typical radiance of the image is 0.18
 
 
 class Steadied(nn.Module):
-    """Blends a denoised image, and the result of the frame before where its light is still the same.
+    """Blends a denoised image with the previous result where the light has not changed.
 
-    ``result = (color + n previous) / (1 + n)`` with ``n = history same exp(-sum_s c_s d_s / noise)``: ``same`` is how
-    much of the frame before shows the same surface; d are the differences of the means over 3x3 and 15x15 pixels, and
-    noise the mean deviation of single samples over 15x15, all in parts of the mean. The frame before is taken without
-    its albedo and with this frame's where that is exact.
+    ``result = (color + n previous) / (1 + n)`` with ``n = history same exp(-sum_s c_s d_s / noise)``. ``same`` is the
+    fraction of the previous frame that shows the same surface; ``d_s`` are the differences of the means over 3x3 and
+    15x15 pixels, and ``noise`` is the mean deviation of single samples over 15x15, all relative to the mean. If the
+    albedo is exact, the previous result is demodulated and multiplied by this frame's albedo.
 
-    It stands in :class:`mcdenoise.models.Recurrent`, and finds ``noisy`` and ``exact`` of
-    :class:`mcdenoise.models.with_oidn.WithOidn` in ``frame.extra``.
+    It has to be wrapped in :class:`mcdenoise.models.Recurrent`, and takes ``noisy`` and ``exact`` of
+    :class:`mcdenoise.models.with_oidn.WithOidn` from ``frame.extra``.
 
     Args:
-        history: parts of the result before for each of this frame, where nothing speaks against it; above 0.
+        history: weight of the previous result relative to this frame's where the light has not changed; above 0.
 
     Raises:
         InputError: ``history`` is not above 0.
@@ -57,13 +57,13 @@ class Steadied(nn.Module):
 
     @property
     def needs(self) -> Needs:
-        """Color; of use is what it blends."""
+        """Needs color; uses the images that it blends."""
         uses = frozenset({NOISY, EXACT, PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
         return Needs(uses=uses, trainable=False, reach=max(_WINDOWS) // 2)
 
     @property
     def persistence(self) -> float:
-        """What one more frame leaves of the results before, see :func:`mcdenoise.models.frames_remembered`."""
+        """Fraction of the history that one more frame leaves, see :func:`mcdenoise.models.frames_remembered`."""
         return self.history / (1 + self.history)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
@@ -77,10 +77,10 @@ class Steadied(nn.Module):
         noisy = frame.extra.get(NOISY, image)
         exact = frame.extra.get(EXACT, torch.zeros_like(image[:, :1]))
         same = frame.extra.get(PREVIOUS_WEIGHT, torch.zeros_like(exact))
-        # What is textured stays sharp with an exact albedo, and gets the noise of another.
+        # An exact albedo keeps textures sharp; a noisy one would add its noise.
         before = torch.where(exact > 0, frame.extra.get(PREVIOUS_LIGHT, image), frame.extra.get(PREVIOUS, image))
 
-        # In units of the image: to multiply it with its exposure would round it once more.
+        # In the image's unit, because scaling it by the exposure would add a rounding error.
         least = _LEAST_MEAN / exposure
         noise = _relative(noisy, image, torch.ones_like(same), max(_WINDOWS), least, inside=True) + _LEAST_NOISE
         n = self.history * same
@@ -92,7 +92,7 @@ class Steadied(nn.Module):
 def _relative(
     image: Tensor, other: Tensor, counted: Tensor, window: int, least: Tensor, *, inside: bool = False
 ) -> Tensor:
-    """How far two images are apart over a window: their means, or (``inside``) their pixels; in parts of the mean."""
+    """Relative difference of two images over a window: of their means, or with ``inside`` the mean over the pixels."""
     both = torch.cat([(image - other).abs(), other] if inside else [image, other], 1) * counted
     a, b, count = _means(torch.cat([both, counted], 1), window).split([3, 3, 1], 1)
     apart = (a if inside else (a - b).abs()).mean(1, keepdim=True)
@@ -102,7 +102,7 @@ def _relative(
 
 
 def _means(image: Tensor, window: int) -> Tensor:
-    """Means over the square around each pixel, with zeros beyond the border."""
+    """Means over the window around each pixel, with zeros outside the image."""
     image = F.pad(image, [window // 2] * 4)
     for axis in (-1, -2):
         for taps, apart in _SUMS[window]:

@@ -1,4 +1,4 @@
-"""A method that is given Open Image Denoise's images of each frame, in both of its ways with features."""
+"""A wrapper that provides a method with Open Image Denoise's images of each frame, for noisy and for clean features."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.oidn import Oidn, Quality
 
-# Open Image Denoise's images where features are taken for noisy and for clean ones, and the frame's own radiance.
+# Keys in ``frame.extra``: OIDN's images for noisy and for clean features, and the frame's own radiance.
 OIDN, OIDN_CLEAN, NOISY = "oidn", "oidn_clean", "noisy"
-EXACT = "exact"  # everywhere 1 where all features are exact, else 0
-# Squared length of a normal that is no mean of others, and the fraction of pixels that may have shorter ones.
+EXACT = "exact"  # 1 in every pixel if all features are exact, else 0
+# Smallest squared length of a normal that is not a mean of several, and largest fraction of pixels with shorter ones.
 _UNIT, _MOST_MEANS = 0.98, 0.002
-# Relative difference of inverse depths at two pixels' distance that is no rounding of half floats.
+# Smallest relative difference of inverse depths two pixels apart that is no rounding error of half floats, and largest
+# relative change of the slope in smooth depth.
 _LEAST_SLOPE, _EVEN = 4e-3, 0.1
-# Largest difference of two normals that is unlike, and the fraction of pixels: measured, of scenes without such
-# materials up to 0.0039, of rough glass and metal in Cycles 0.0069.
+# Smallest difference of dissimilar normals, and largest fraction of dissimilar pixels. Fractions of up to 0.0039 were
+# measured in scenes without rough glass and metal, and 0.0069 in Cycles with them.
 _UNLIKE, _MOST_SPECKS = 0.1, 0.0045
 
 
 class WithOidn(Wrapper):
-    """Hands a method Open Image Denoise's images of each frame.
+    """Provides a method with Open Image Denoise's images of each frame.
 
-    The method finds them in ``frame.extra``, ``(B, 3, H, W)`` each: ``oidn`` where features are taken for noisy,
-    ``oidn_clean`` where they are taken for clean; ``noisy``, the radiance of the frame, which a later method of a chain
-    no longer has; and ``exact`` ``(B, 1, H, W)``, see :func:`has_exact_features`. Both images are stages of their own.
-    OIDN always sees the whole image.
+    The method finds them in ``frame.extra``, ``(B, 3, H, W)`` each: ``oidn`` for features treated as noisy,
+    ``oidn_clean`` for features treated as clean; ``noisy``, the frame's radiance, for later methods of a chain; and
+    ``exact`` ``(B, 1, H, W)``, see :func:`has_exact_features`. Both images are also stages of the output. OIDN always
+    takes the whole image.
 
     Args:
         inner: any method.
@@ -48,20 +49,20 @@ class WithOidn(Wrapper):
 
     @property
     def needs(self) -> Needs:
-        """As those inside but for what is handed to it; albedo and normal are of use."""
+        """The needs of the inner method without the buffers provided here; albedo and normal are used."""
         needs = self.inner.needs
         given = frozenset({OIDN, OIDN_CLEAN, NOISY, EXACT})
         return Needs(needs.buffers - given, (needs.uses - given) | self._oidn.needs.uses, needs.trainable, None)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """None: those of the method inside may be of what is handed to it."""
+        """None, because the statistics of the inner method may depend on OIDN's images."""
         return {}
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`.
 
         Raises:
-            InputError: a derivative in the color is asked for.
+            InputError: a derivative in the color is requested.
         """
         handed = self.before(frame)
         output, state = self.inner(handed, state)
@@ -69,9 +70,9 @@ class WithOidn(Wrapper):
         return output._replace(stages={**stages, **output.stages}), state
 
     def before(self, frame: Frame) -> Frame:
-        """The frame as the method inside sees it."""
+        """The frame with OIDN's images added."""
         noisy = self._oidn(frame)[0].image
-        # Without features there is one way only.
+        # Without features both images are the same.
         clean = noisy if frame.albedo is None else self._clean(frame)[0].image
         exact = torch.full_like(frame.color[:, :1], float(has_exact_features(frame)))
         given = {OIDN: noisy, OIDN_CLEAN: clean, NOISY: frame.color, EXACT: exact}
@@ -79,22 +80,22 @@ class WithOidn(Wrapper):
 
 
 def has_exact_features(frame: Frame) -> bool:
-    """Whether features are those of one ray through the center of each pixel, and so have no noise.
+    """Whether features come from one ray through the center of each pixel, and so have no noise.
 
-    The normals of hardly any pixel are shorter than one, as means of several are. And depth goes on evenly from pixel
-    to pixel: along a plane its inverse is linear in the image, along what is curved nearly so, but not where rays go
-    through a point of each pixel, or of a lens, that was drawn. Where one of four triples of neighbours in a row or a
-    column or more have ``|a - 2 b + c| < |a - c| / 10``, rays went through the centers. Nor are there many normals
-    unlike all four around them where these are alike: rough metal and glass scatter the rays, and some renderers hand
-    over the features of what such a ray hits.
+    Averages of several normals are shorter than one, so hardly any pixel may have a short normal. Depth must be smooth:
+    along a plane its inverse is linear in the image, and on a curved surface nearly so, but not if rays pass through
+    random points of a pixel or a lens. Rays passed through the centers if at least a quarter of the triples of
+    neighbours in a row or a column have ``|a - 2 b + c| < |a - c| / 10``. Finally, few normals may differ from all four
+    neighbours where these agree: rough metal and glass scatter rays, and some renderers write the features of the
+    surface that such a ray hits.
 
     Args:
-        frame: any; without a normal or a depth nothing tells that, and the answer is no.
+        frame: any; without a normal and a depth the answer is no.
     """
     if frame.normal is None or frame.depth is None:
         return False
     squares = frame.normal.square().sum(1)
-    # Nothing was hit: no normal.
+    # A zero normal: nothing was hit.
     if float(((squares < _UNIT) & (squares > 0)).float().mean()) > _MOST_MEANS:
         return False
     even = told = 0
@@ -108,7 +109,7 @@ def has_exact_features(frame: Frame) -> bool:
 
 
 def _specks(normal: Tensor) -> float:
-    """Fraction of the pixels that are unlike all of their four neighbours, of which those opposite are alike."""
+    """Fraction of the pixels whose normal differs from all four neighbours where opposite neighbours agree."""
     inside = normal.detach()[..., 1:-1, 1:-1]
     left, right = normal.detach()[..., 1:-1, :-2], normal.detach()[..., 1:-1, 2:]
     above, below = normal.detach()[..., :-2, 1:-1], normal.detach()[..., 2:, 1:-1]

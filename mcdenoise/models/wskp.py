@@ -1,24 +1,25 @@
-"""Kernel prediction with shared weights: a few maps of importance from which all kernels of all pixels are decoded.
+"""Kernel prediction with shared weights: all kernels of all pixels are decoded from a few importance maps.
 
 Fan et al. 2021, "Real-time Monte Carlo denoising with weight sharing kernel prediction network". This is the network of
 the public code for the BMFR data: six 5x5 convolutions of 14 channels without biases, LeakyReLU 0.1 between them, and
-12 channels at the end: six maps of importance for kernels of sides 3, 5, 7, 9, 11, 13 at one scale, and six of blending
-weights, of which a softmax is taken.
+12 output channels: six importance maps for kernels of sides 3, 5, 7, 9, 11, 13 at one scale, and six blending weights,
+which are normalized by a softmax.
 
-Fan's paper instead describes a U-Net that predicts at several scales. That is `wskp_unet`, as far as it is known: by
-the comparison of doi:10.1007/s00371-023-02951-6 it has the backbone of `mrkp`, and each scale three maps for kernels
-of sides 3, 5 and 7. All else is a guess here: three scales, at each of which the kernels are blended as above, by a
-softmax of three more maps; scales blended as in `mrkp`, by one more channel behind a ReLU, the coarsest unfiltered; and
-a backbone of plain convolutions, as wide as that of `mrkp`. Nothing public has its sizes or its weights.
+Fan's paper describes a U-Net that predicts at several scales instead. This is `wskp_unet`, as far as it is known: by
+the comparison of doi:10.1007/s00371-023-02951-6 it has the backbone of `mrkp`, and at each scale three maps for kernels
+of sides 3, 5 and 7. The rest is our guess: three scales, at each of which the kernels are blended as above, by a
+softmax of three more maps; scales blended as in `mrkp`, by one more channel behind a ReLU, with the coarsest
+unfiltered; and a backbone of ordinary convolutions, as wide as that of `mrkp`. Neither its sizes nor its weights are
+public.
 
-Each convolution is trained as the sum of one of 5x5, one of 3x3, one of 1x1 and, but for the first and last, the
-identity (RepVGG, Ding et al. 2021). These are merged into one 5x5 kernel before it is applied, in training too: the sum
-is the same, and so are its derivatives. The merged network has 27,300 parameters.
+Each convolution is trained as the sum of a 5x5, a 3x3 and a 1x1 convolution and, except for the first and last, the
+identity (RepVGG, Ding et al. 2021). These are merged into one 5x5 kernel before it is applied, also in training: result
+and derivatives are the same. The merged network has 27,300 parameters.
 
-The public code exponentiates the maps as they are; :func:`mcdenoise.ops.importance_filter` is the same without
-overflow. The network sees the radiance with albedo, to the power of 1 / 2.2, and filters that without. As for `mrkp`,
-typical radiance is brought to 0.5 first, and depth is ``d / (d + typical depth)``, where the code scales each frame's
-to its smallest and largest. Its authors train with SMAPE of an epsilon of 0.01 in linear radiance with albedo.
+The public code exponentiates the maps directly; :func:`mcdenoise.ops.importance_filter` computes the same without
+overflow. The network takes the radiance with albedo to the power of 1 / 2.2, and filters demodulated radiance. As for
+`mrkp`, typical radiance is scaled to 0.5 first, and depth is ``d / (d + typical depth)``, where the code scales each
+frame's depth to its minimum and maximum. The authors train with SMAPE in linear radiance with albedo, epsilon 0.01.
 """
 
 from __future__ import annotations
@@ -50,9 +51,9 @@ class Reparameterized(nn.Module):
     """A 5x5 convolution without bias that is the sum of branches.
 
     Args:
-        in_channels: of the input.
-        out_channels: of the result.
-        identity: whether the input itself is one of the branches.
+        in_channels: number of input channels.
+        out_channels: number of output channels.
+        identity: whether the identity is one of the branches.
     """
 
     def __init__(self, in_channels: int, out_channels: int, identity: bool) -> None:
@@ -63,7 +64,7 @@ class Reparameterized(nn.Module):
         self.identity = identity
 
     def merged(self) -> Tensor:
-        """The one kernel ``(out_channels, in_channels, 5, 5)`` that does what all branches do."""
+        """The kernel ``(out_channels, in_channels, 5, 5)`` that equals the sum of all branches."""
         five, three, one = (branch.weight for branch in self.branches)
         kernel = five + F.pad(three, (1,) * 4) + F.pad(one, (2,) * 4)
         if self.identity:
@@ -72,16 +73,16 @@ class Reparameterized(nn.Module):
         return kernel
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(B, out_channels, H, W)``."""
+        """Apply the merged kernel; the result is ``(B, out_channels, H, W)``."""
         return F.conv2d(x, self.merged(), padding=2)
 
 
 class WskpNetwork(TenChannels):
-    """Predicts maps of importance and how to blend what they give.
+    """Predicts importance maps and blending weights, and filters with them.
 
     Args:
         width: channels between the convolutions, 14.
-        layers: convolutions, 6; the public code has 3 as well.
+        layers: number of convolutions, 6; the public code also has 3.
     """
 
     def __init__(self, width: int = 14, layers: int = 6) -> None:
@@ -96,7 +97,7 @@ class WskpNetwork(TenChannels):
 
     @property
     def needs(self) -> Needs:
-        """Two pixels for each convolution, and the radius of the largest kernel."""
+        """The reach is two pixels per convolution plus the radius of the largest kernel."""
         uses = frozenset({"albedo", "normal", "depth"})
         return Needs(uses=uses, reach=2 * len(self.layers) + max(SIDES) // 2)
 
@@ -114,7 +115,7 @@ class WskpNetwork(TenChannels):
 
 
 class WskpUNet(TenChannels):
-    """Predicts maps of importance and how to blend at three scales, filters each, and blends from coarse to fine.
+    """Predicts importance maps and blending weights at three scales, filters each, and blends from coarse to fine.
 
     Args:
         width: channels of every convolution, 48.
@@ -145,13 +146,13 @@ class WskpUNet(TenChannels):
 
 
 def filtered(image: Tensor, importance: Tensor, blend: Tensor, sides: Sequence[int]) -> Tensor:
-    """The blend of what filters by maps of importance give, ``sum_i blend_i box_i(exp(m_i) c) / box_i(exp(m_i))``.
+    """Blend the filters given by importance maps, ``sum_i blend_i box_i(exp(m_i) c) / box_i(exp(m_i))``.
 
     Args:
         image: ``(B, C, H, W)``.
-        importance: ``(B, N, H, W)`` logarithms, a map for each filter.
-        blend: ``(B, N, H, W)`` of sum 1.
-        sides: of the windows, N of them.
+        importance: ``(B, N, H, W)`` logarithms, one map per filter.
+        blend: ``(B, N, H, W)`` with sum 1.
+        sides: N window sides.
     """
     out = torch.zeros_like(image)
     for side, m, weight in zip(sides, importance.split(1, 1), blend.to(image.dtype).split(1, 1), strict=True):
@@ -174,7 +175,7 @@ def wskp(
 
     Args:
         width: channels between the convolutions.
-        layers: convolutions, 6, or the 3 of the smaller network of the public code.
+        layers: number of convolutions: 6, or 3 as in the smaller network of the public code.
         alpha_min: smallest weight of the current frame in the accumulation.
         position_limit: see :func:`mcdenoise.ops.reproject`.
         normal_limit: likewise for normals.

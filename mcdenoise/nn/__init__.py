@@ -1,4 +1,4 @@
-"""Layers with weights that models share, and what networks see of a frame."""
+"""Layers with weights that several models use, and the conversion of a frame to network inputs."""
 
 from mcdenoise.nn.fusion import FusionModule, LogFusion
 from mcdenoise.nn.inputs import auto_exposure, normalize_depth

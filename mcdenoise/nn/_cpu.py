@@ -1,7 +1,7 @@
-"""What works round torch on a CPU: the layers of a U-Net, with the same results in less time.
+"""Layers of a U-Net that avoid slow paths of torch on a CPU, with the same results.
 
-Each behaves as the torch layer that it is named after, with its derivatives; what is faster is chosen where nobody asks
-for a derivative and nothing is compiled.
+Each behaves like the torch layer that it is named after, derivatives included. Faster code runs only if no derivative
+is requested and nothing is being compiled.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from mcdenoise.ops._autograd import Function
 
 
 def layout_of(x: Tensor) -> torch.memory_format:
-    """Channels of several layouts are concatenated number by number."""
+    """The memory format of a tensor, for tensors to be concatenated with it: torch copies mixed formats one by one."""
     channels_last = x.is_contiguous(memory_format=torch.channels_last)
     return torch.channels_last if channels_last else torch.contiguous_format
 
 
 class ConvBlock(nn.Sequential):
-    """Convolutions and ReLUs in turn, which are one step where no derivative is asked for."""
+    """Alternating convolutions and ReLUs; each pair runs as one step if no derivative is requested."""
 
     def forward(self, x: Tensor) -> Tensor:
-        fused = is_plain_inference(x)
+        fused = is_cpu_inference(x)
         for layer in self:
             if not fused:
                 x = layer(x)
@@ -36,7 +36,7 @@ class ConvBlock(nn.Sequential):
 
 
 def _convolved_with_relu(x: Tensor, layer: nn.Conv2d) -> Tensor:
-    """A convolution and ReLU, in one where oneDNN can: torch has this for what it compiles only."""
+    """A convolution with ReLU, fused by oneDNN if possible; torch offers this only to its compiler."""
     dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
     if not _has_fused_convolution(dtype):
         return F.relu_(layer(x))
@@ -54,24 +54,24 @@ def _has_fused_convolution(dtype: torch.dtype) -> bool:
         supported = {torch.float32: True, torch.bfloat16: onednn._is_mkldnn_bf16_supported()}
         return supported.get(dtype, False) and hasattr(onednn, "_convolution_pointwise")
     except AttributeError:
-        # Built without oneDNN.
+        # torch was built without oneDNN.
         return False
 
 
 class Upsampling(nn.ConvTranspose2d):
-    """A transposed convolution whose bias learns in a twentieth of the time."""
+    """``ConvTranspose2d`` with a 20x faster bias gradient."""
 
     def forward(self, x: Tensor, output_size: list[int] | None = None) -> Tensor:
-        # A bias that does not learn needs nothing, and torch's own has derivatives forward.
+        # A frozen bias has no gradient, and only torch's own layer supports forward-mode derivatives.
         if self.bias is None or not (self.bias.requires_grad and torch.is_grad_enabled()):
             return super().forward(x, output_size)
         return _Biased.apply(F.conv_transpose2d(x, self.weight, self.bias.detach(), self.stride), self.bias)
 
 
 class _Biased(Function):
-    """A result that a bias is in already, with its derivative in the bias: a plain sum.
+    """The identity on a result that already includes a bias; its gradient with respect to the bias is a simple sum.
 
-    On a CPU torch takes four times as long for that as for all other derivatives of a transposed convolution together.
+    On a CPU, torch's own bias gradient takes four times as long as all other derivatives of a transposed convolution.
     """
 
     @staticmethod
@@ -88,7 +88,7 @@ class _Biased(Function):
 
 
 class ReLU(nn.Module):
-    """ReLU in place: neither the convolution before it nor its own derivative needs what it overwrites."""
+    """In-place ReLU: neither the derivative of the convolution before it nor its own needs the overwritten values."""
 
     def forward(self, x: Tensor) -> Tensor:
         if x.dtype == torch.bfloat16 and x.device.type == "cpu" and not torch.compiler.is_compiling():
@@ -97,9 +97,10 @@ class ReLU(nn.Module):
 
 
 class _ReLUOfBits(Function):
-    """ReLU of bfloat16 in place.
+    """In-place ReLU of bfloat16.
 
-    The sign of a bfloat16 is that of its bits as an integer, which a CPU clamps and compares many times as fast.
+    A bfloat16 has the same sign as its bits read as an integer, and a CPU clamps and compares integers many times
+    faster.
     """
 
     @staticmethod
@@ -122,14 +123,14 @@ class _ReLUOfBits(Function):
 
 
 def max_pool(x: Tensor) -> Tensor:
-    """``F.max_pool2d(x, 2)`` of what is not negative, in less time where nobody asks which of the pixels it was."""
-    if not is_plain_inference(x):
+    """``F.max_pool2d(x, 2)`` for non-negative values; faster if no derivative is requested."""
+    if not is_cpu_inference(x):
         return F.max_pool2d(x, 2)
-    # Behind a ReLU, bfloat16 numbers are in the order of their bits as integers, which a CPU compares twice as fast.
+    # Non-negative bfloat16 numbers are ordered like their bits read as integers, which a CPU compares twice as fast.
     values = x.view(torch.int16) if x.dtype == torch.bfloat16 else x
     rows = torch.maximum(values[..., ::2, :], values[..., 1::2, :])
     return torch.maximum(rows[..., ::2], rows[..., 1::2]).view(x.dtype)
 
 
-def is_plain_inference(x: Tensor) -> bool:
+def is_cpu_inference(x: Tensor) -> bool:
     return x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()

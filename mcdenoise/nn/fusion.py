@@ -1,4 +1,4 @@
-"""Fusion modules: how much of a fine image's low frequencies a coarse image takes the place of, learnt."""
+"""Fusion modules: learnt weights for replacing the low frequencies of a fine image by a coarse image."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mcdenoise.ops._steps.network import gated_fusion
 
 
 class _Fusion(nn.Module):
-    """What predicts the blending weight of two scales: one 3x3 convolution of both, and a sigmoid."""
+    """Predicts the blending weight of two scales: one 3x3 convolution of both, and a sigmoid."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -21,19 +21,19 @@ class _Fusion(nn.Module):
 
         Args:
             fine: ``(B, 3, H, W)`` in the unit of the module.
-            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` likewise.
+            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` in the same unit.
         """
         both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)
         return torch.sigmoid(self.conv(both))
 
     @staticmethod
     def mean(fine: Tensor, coarse: Tensor, weight: Tensor) -> Tensor:
-        """Weighted means of the pixels of both scales, for what has to stay between them: layers and alpha.
+        """Blend both scales by a weighted mean, for layers and alpha, which must stay between the two inputs.
 
         Args:
             fine: ``(B, C, H, W)``, any unit.
-            coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` of the same unit.
-            weight: ``(B, 1, H, W)`` of the coarse one.
+            coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` in the same unit.
+            weight: ``(B, 1, H, W)`` weight of the coarse image.
         """
         return torch.lerp(fine, upsample(coarse, (fine.shape[-2], fine.shape[-1])), weight.to(fine.dtype))
 
@@ -42,7 +42,7 @@ class FusionModule(_Fusion):
     """FM of the paper's Fig. 2: predicts the blending weight of Eq. 2 from both images, and blends.
 
     ``alpha = sigmoid(conv3x3([i_f, U i_c]))``, ``o = i_f - alpha U D i_f + alpha U i_c``. The paper names the module
-    and its input and leaves its layers open: it is one convolution here.
+    and its inputs but not its layers: here it is one convolution.
     """
 
     def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
@@ -56,9 +56,9 @@ class FusionModule(_Fusion):
 
 
 class LogFusion(_Fusion):
-    """:class:`FusionModule` of logarithms of radiance.
+    """A :class:`FusionModule` for logarithms of radiance.
 
-    In linear radiance the low frequencies of a lamp, exchanged between scales, would drag the pixels beside it far
+    In linear radiance, exchanging the low frequencies of a lamp between scales would make the pixels beside it far
     below zero.
     """
 
@@ -74,10 +74,10 @@ class LogFusion(_Fusion):
 
         Args:
             fine: ``(B, 3, H, W)`` logarithms of radiance.
-            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` likewise.
-            residual: ``(B, 3, H, W)`` to be added to the fine image; none by default.
-            top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result. With it, the result is radiance.
-            logarithms: whether to take those of the fine image, which then is radiance.
+            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` logarithms of radiance.
+            residual: ``(B, 3, H, W)`` to add to the fine image; none by default.
+            top: ``(B, 1, 1, 1)`` largest logarithm of the result. If it is given, the result is converted to radiance.
+            logarithms: whether the fine image is radiance, whose logarithm is to be taken.
 
         Returns:
             ``(B, 3, H, W)`` logarithms of radiance, or radiance.

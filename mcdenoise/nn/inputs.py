@@ -1,4 +1,4 @@
-"""What networks see of a frame: every buffer in a range from 0 to about 1, whatever the units of the scene."""
+"""Network inputs: every buffer is scaled to a range from 0 to about 1, independent of the scene's units."""
 
 from __future__ import annotations
 
@@ -9,47 +9,47 @@ from torch import Tensor
 from mcdenoise.frame import Frame
 from mcdenoise.ops._steps.network import buffers_input, depth_scale, network_guides, normalized_depth
 
-FEATURES = 11  # albedo 3, normal 3, depth 1; and of the history: the frame alone 3, one over the length 1
+FEATURES = 11  # albedo 3, normal 3, depth 1, color of the current frame 3, one over the history length 1
 
 
 def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
     """The factor that brings an image's typical radiance to ``key``, so that no network depends on a scene's unit.
 
-    ``key / exp(mean(log(blocks)))`` over the means of 16x16-pixel blocks: a block mean is hardly moved by the noise,
-    the logarithm by a lamp in view.
+    ``key / exp(mean(log(blocks)))`` over the means of 16x16-pixel blocks: noise hardly changes a block's mean, and a
+    visible lamp hardly changes the mean logarithm.
 
     Args:
-        color: ``(B, C, H, W)`` radiance up to 1e35; what is below 1e-30 counts as that.
-        key: radiance that the typical block is brought to.
+        color: ``(B, C, H, W)`` radiance up to 1e35; smaller values than 1e-30 count as 1e-30.
+        key: radiance to which the typical block is scaled.
 
     Returns:
         ``(B, 1, 1, 1)`` positive factor; 1 for a black image. The factor has no gradient.
     """
-    # Half precision as float32, float64 as it is.
+    # Convert half precision to float32; keep float64.
     luminance = color.detach().to(torch.promote_types(color.dtype, torch.float32)).mean(1, keepdim=True)
     blocks = F.avg_pool2d(luminance, 16, ceil_mode=True, count_include_pad=False)
     mean = blocks.mean((1, 2, 3), keepdim=True)
     lit = mean > 0
-    # Of the mean, so that the logarithms are small numbers at any exposure. Black blocks count as a thousandth of it.
+    # Relative to the mean, so that the logarithms are small at any exposure. Black blocks count as a thousandth of it.
     fractions = (blocks / torch.where(lit, mean, 1)).clamp_min(1e-3)
     typical = (mean * torch.exp(torch.log(fractions).mean((1, 2, 3), keepdim=True))).clamp_min(1e-30)
     return torch.where(lit, key / typical, 1).to(color.dtype)
 
 
 def normalize_depth(depth: Tensor) -> Tensor:
-    """Depth in [0, 1), whatever the scene's unit: ``d / (d + typical d)``, and 1 where nothing was hit.
+    """Map depth to [0, 1), whatever the scene's unit: ``d / (d + typical d)``, and 1 where nothing was hit.
 
     Args:
         depth: ``(B, 1, H, W)`` distance, scene units, ``inf`` where nothing was hit.
 
     Returns:
-        ``(B, 1, H, W)`` in [0, 1]. The typical depth is the image's geometric mean over what was hit.
+        ``(B, 1, H, W)`` in [0, 1]. The typical depth is the geometric mean over all pixels with a hit.
     """
     return normalized_depth(depth, *depth_scale(depth))
 
 
 def features_of(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-    """Albedo, normal and depth of a frame; one that it lacks is constant, which guides nothing."""
+    """Albedo, normal and depth of a frame; a missing one is a constant image, which guides nothing."""
     color = frame.color
     albedo = torch.ones_like(color) if frame.albedo is None else frame.albedo
     normal = torch.zeros_like(color) if frame.normal is None else frame.normal
@@ -57,10 +57,10 @@ def features_of(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def scale_of_depth(frame: Frame) -> dict[str, Tensor]:
-    """``depth_scale`` of a whole image ``(B, 2, 1, 1)``: what :func:`mcdenoise.ops._steps.network.depth_scale` finds.
+    """``depth_scale`` of a whole image ``(B, 2, 1, 1)``, see :func:`mcdenoise.ops._steps.network.depth_scale`.
 
     Returns:
-        Nothing where the frame has it already, or has no depth.
+        An empty dictionary if the frame has the value already, or has no depth.
     """
     if frame.depth is None or "depth_scale" in frame.statistics:
         return {}
@@ -68,11 +68,11 @@ def scale_of_depth(frame: Frame) -> dict[str, Tensor]:
 
 
 def image_statistics(frame: Frame) -> dict[str, Tensor]:
-    """Exposure and depth scale of a whole image, if the frame does not have them already.
+    """Exposure and depth scale of a whole image, unless the frame has them already.
 
     Returns:
-        ``exposure`` ``(B, 1, 1, 1)``, see :func:`auto_exposure`; ``depth_scale``, see :func:`scale_of_depth`, that of a
-        depth of 1 where there is none. A second network takes what the first one found.
+        ``exposure`` ``(B, 1, 1, 1)``, see :func:`auto_exposure`; ``depth_scale``, see :func:`scale_of_depth`, for a
+        depth of 1 if there is none. A second network uses the values of the first one.
     """
     found = {name: frame.statistics[name] for name in ("exposure", "depth_scale") if name in frame.statistics}
     if "exposure" not in found:
@@ -88,12 +88,12 @@ def input_of(frame: Frame, image: Tensor, *, logarithms: bool = True) -> Tensor:
 
     Args:
         frame: with the statistics of :func:`image_statistics`.
-        image: ``(B, 3, H, W)`` exposed radiance, or its logarithm already.
-        logarithms: whether to take it.
+        image: ``(B, 3, H, W)`` exposed radiance, or its logarithm.
+        logarithms: whether ``image`` is radiance, whose logarithm is to be taken.
 
     Returns:
-        ``(B, 14, H, W)``: ``log1p(image)``, albedo, normal and depth in [0, 1], ``log1p`` of the exposed radiance of
-        the frame alone, and one over the history length.
+        ``(B, 14, H, W)``: ``log1p(image)``; albedo, normal and depth in [0, 1]; ``log1p`` of the exposed radiance of
+        the current frame; and one over the history length.
     """
     current = frame.color if frame.current is None else frame.current
     exposure, (near, typical) = frame.statistics["exposure"], frame.statistics["depth_scale"].split(1, 1)
@@ -102,12 +102,12 @@ def input_of(frame: Frame, image: Tensor, *, logarithms: bool = True) -> Tensor:
 
 
 def guides_of(frame: Frame) -> list[Tensor]:
-    """Normal and depth in [0, 1], which guide bilateral weights."""
+    """Normal and depth in [0, 1], the guides of bilateral weights."""
     _, normal, depth = features_of(frame)
     near, typical = frame.statistics["depth_scale"].split(1, 1)
     return list(network_guides(normal, depth, (near, typical)).split([3, 1], 1))
 
 
 def unit_features_of(frame: Frame) -> list[Tensor]:
-    """Albedo, normal and depth in [0, 1], of a frame with the statistics of :func:`image_statistics`."""
+    """Albedo, normal and depth in [0, 1] for a frame with the statistics of :func:`image_statistics`."""
     return [features_of(frame)[0], *guides_of(frame)]

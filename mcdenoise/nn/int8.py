@@ -1,10 +1,10 @@
-"""The features of a U-Net by convolutions of 8-bit integers, once it has been calibrated.
+"""A calibrated U-Net's features, computed by convolutions of 8-bit integers.
 
-A tensor t is stored as integers ``q = round(t / s) + z`` from 0 to 255. Its scale s follows from the range that it had
-on the frames of a calibration, beyond which it is clamped; its zero point z is 0 behind a ReLU (Jacob et al. 2018,
-"Quantization and Training of Neural Networks for Efficient Integer-Arithmetic-Only Inference", Eq. 1). Weights have a
-scale for each output channel, and the zero point 0. Channels that are concatenated keep scales of their own: the
-weights of the convolution behind them make up for the difference.
+A tensor t is stored as integers ``q = round(t / s) + z`` from 0 to 255. Its scale s follows from its range on the
+calibration frames; values outside are clamped. Its zero point z is 0 behind a ReLU (Jacob et al. 2018, "Quantization
+and Training of Neural Networks for Efficient Integer-Arithmetic-Only Inference", Eq. 1). Weights have one scale per
+output channel, and the zero point 0. Concatenated channels keep their own scales: the weights of the next convolution
+compensate for the difference.
 
 Products are summed exactly, in 32 bits. The convolutions are oneDNN's, as torch's compiler calls them.
 """
@@ -23,23 +23,23 @@ from torch import Tensor, nn
 
 from mcdenoise.nn._cpu import max_pool
 
-# Zero point of what is concatenated with values of both signs, of which three eighths of the integers are negative.
+# Zero point of tensors that are concatenated with signed values: three eighths of the integers are negative.
 _SIGNED = 96
-# The fraction of the values of a channel, above and below, for which no range is made wider.
+# Fraction of a channel's smallest and of its largest values that may be clamped.
 _BEYOND = 1e-4
 Layers: TypeAlias = nn.ModuleList | Sequence[nn.Module]
 _wanted: ContextVar[bool] = ContextVar("int8", default=False)
 
 
 def has_int8() -> bool:
-    """Whether the processor sums products of 8-bit integers without overflow, and torch uses that."""
+    """Whether the processor sums products of 8-bit integers without overflow, and torch uses its instructions."""
     vnni = getattr(torch.cpu, "_is_vnni_supported", None)
     return bool(vnni is not None and vnni() and hasattr(torch.ops.onednn, "qconv2d_pointwise"))
 
 
 @contextmanager
 def integers(enabled: bool = True) -> Iterator[None]:
-    """Let the U-Nets that are calibrated compute in integers, where no derivative is asked for; as autocast does."""
+    """Let calibrated U-Nets compute in integers inside this block if no derivative is requested, like autocast."""
     token = _wanted.set(enabled)
     try:
         yield
@@ -48,19 +48,19 @@ def integers(enabled: bool = True) -> Iterator[None]:
 
 
 def wants_integers() -> bool:
-    """Whether this is within :func:`integers`."""
+    """Whether :func:`integers` is active."""
     return _wanted.get()
 
 
 class Stored(NamedTuple):
-    """How a tensor is stored."""
+    """The quantization of a tensor: scales per channel and a zero point."""
 
     scales: Tensor  # of each channel
     zero: int
 
     @classmethod
     def over(cls, ranges: Tensor, channels: int, *, signed: bool) -> Stored:
-        """Over the ranges ``(C, 2)`` of its channels, or ``(1, 2)`` of all of them; 0 is in each of them."""
+        """Quantization for the ranges ``(C, 2)`` of its channels, or ``(1, 2)`` of all; each range contains 0."""
         zero = _SIGNED if signed else 0
         scales = ranges[:, 1] / (255 - zero)
         if zero:
@@ -68,30 +68,30 @@ class Stored(NamedTuple):
         return cls(scales.clamp_min(1e-8).expand(channels), zero)
 
     def beside(self, other: Stored) -> Stored:
-        """Of this one with another one's channels behind its own."""
+        """Quantization of this tensor's channels followed by another tensor's."""
         return Stored(torch.cat([self.scales, other.scales]), self.zero)
 
     def store(self, t: Tensor) -> Tensor:
-        """``(B, C, H, W)`` values to integers, channels last."""
+        """Quantize ``(B, C, H, W)`` values to integers, channels last."""
         t = t.float().contiguous(memory_format=torch.channels_last) / self.scales.view(-1, 1, 1)
-        # Cutting off half a step on is rounding.
+        # Truncation after adding one half is rounding.
         return t.add_(self.zero + 0.5).clamp_(0, 255).to(torch.uint8)
 
     def restore(self, q: Tensor) -> Tensor:
-        """Integers to values, float32."""
+        """Convert integers to float32 values."""
         return (q.float() - self.zero) * self.scales.view(-1, 1, 1)
 
 
 class Convolution:
-    """A convolution of integers, with ReLU.
+    """A quantized convolution, optionally with ReLU.
 
     Args:
         weight: ``(C', C, K, K)``.
         bias: ``(C',)``.
-        given: how its input is stored.
-        result: how its result is stored, with one scale for all channels; ``None`` for values.
+        given: quantization of the input.
+        result: quantization of the result, with one scale for all channels; ``None`` for floating-point values.
         stride: in pixels.
-        relu: whether there is one.
+        relu: whether a ReLU follows.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Convolution:
         self._relu = "relu" if relu else "none"
 
     def __call__(self, q: Tensor, dtype: torch.dtype = torch.uint8) -> Tensor:
-        """Integers ``(B, C, H, W)`` to integers, or to values of the dtype."""
+        """Convolve integers ``(B, C, H, W)`` to integers, or to values of the dtype."""
         result: Tensor = torch.ops.onednn.qconv2d_pointwise(
             *(q, *self._given, *self._weights, *self._shape, *self._result, dtype, self._relu, [], "")
         )
@@ -120,13 +120,13 @@ class Int8UNet:
     """The levels of a :class:`mcdenoise.nn.UNet` in integers.
 
     Args:
-        encoder: the two convolutions of each level, the finest first.
-        up: the transposed convolutions of 2x2 pixels, the coarsest first.
-        decoder: the two convolutions behind each of these.
-        ranges: of its tensors, see :func:`measure`.
+        encoder: the two convolutions of each level, finest first.
+        up: the 2x2 transposed convolutions, coarsest first.
+        decoder: the two convolutions after each of these, coarsest first.
+        ranges: ranges of the tensors, see :func:`measure`.
 
     Raises:
-        ValueError: these are not as many ranges as there are tensors.
+        ValueError: the number of ranges does not match the number of tensors.
     """
 
     def __init__(self, encoder: Layers, up: Layers, decoder: Layers, ranges: Tensor) -> None:
@@ -144,7 +144,7 @@ class Int8UNet:
             if beside:
                 self._coarse.append(Stored.over(rest[:beside], beside, signed=True))
                 given, rest = given.beside(self._coarse[-1]), rest[beside:]
-            # What the decoder concatenates has the zero point of what it is concatenated with.
+            # The upsampled features need the zero point of the features that they are concatenated with.
             pair, given = _block(block, given, rest[:2], signed=level < len(blocks) - 1)
             self._encoder.append(pair)
             skips.append(given)
@@ -155,7 +155,7 @@ class Int8UNet:
             assert isinstance(wide, nn.ConvTranspose2d)
             assert wide.bias is not None
             between = Stored.over(rest[:1], wide.out_channels, signed=True)
-            # Four pixels of one: a convolution with four times the channels.
+            # A 2x2 transposed convolution is a 1x1 convolution with four times the channels.
             weight = wide.weight.permute(2, 3, 1, 0).reshape(-1, wide.in_channels, 1, 1)
             first = Convolution(weight, wide.bias.repeat(4), self._features[-1], between, relu=False)
             pair, given = _block(_convolutions(own), between.beside(skips.pop()), rest[1:3], values=not skips)
@@ -164,13 +164,13 @@ class Int8UNet:
             rest = rest[3:]
 
     def __call__(self, x: Tensor, coarse: Sequence[Tensor], count: int, dtype: torch.dtype) -> list[Tensor]:
-        """Features of the finest levels, the finest first.
+        """Features of the finest levels, finest first.
 
         Args:
-            x: ``(B, C, H, W)``, of whole pixels of the coarsest level.
-            coarse: what each level but the finest is given besides, or nothing.
-            count: of how many levels.
-            dtype: of the features.
+            x: ``(B, C, H, W)``, a multiple of the coarsest level's pixels in size.
+            coarse: the additional input of each level but the finest, or nothing.
+            count: number of levels to return.
+            dtype: dtype of the features.
         """
         q, skips = self._input.store(x), []
         for level, (first, second) in enumerate(self._encoder):
@@ -183,7 +183,7 @@ class Int8UNet:
         features = [skips.pop()]
         for up, first, second in self._decoder:
             q = torch.cat([_spread(up(q)), skips.pop()], 1)
-            # The finest ones are read by nobody who takes integers.
+            # The finest features are returned as values, because no integer convolution follows.
             q = second(first(q), torch.uint8 if skips else dtype)
             features.append(q)
         coarser = zip(features[-2::-1], self._features[-2::-1], strict=True)
@@ -199,10 +199,10 @@ def measure(
 ) -> Tensor:
     """Ranges ``(N, 2)`` of 0 and the values of each tensor for one input, in float32.
 
-    Arguments are as of :class:`Int8UNet`.
+    The arguments are those of :class:`Int8UNet`.
 
-    In the order in which they come: of each channel of the input; for each level of the encoder of each channel that it
-    is given besides, and of the results of its two convolutions; for each of the decoder of the results of all three.
+    The order is that of the computation: each channel of the input; for each encoder level each channel of its
+    additional input, and the results of its two convolutions; for each decoder level the results of all three.
     """
     found, skips = [_ranges(x)], list[Tensor]()
     for level, block in enumerate(encoder):
@@ -227,7 +227,7 @@ def measure(
 
 
 def union(ranges: Tensor) -> Tensor:
-    """``(N, 2)`` ranges to the ``(1, 2)`` that holds all of them."""
+    """Merge ``(N, 2)`` ranges into the ``(1, 2)`` range that contains all of them."""
     return torch.stack([ranges[:, 0].amin(), ranges[:, 1].amax()])[None]
 
 
@@ -245,7 +245,7 @@ def _convolutions(block: nn.Module) -> list[nn.Conv2d]:
 def _block(
     layers: Sequence[nn.Conv2d], given: Stored, ranges: Tensor, *, signed: bool = False, values: bool = False
 ) -> tuple[tuple[Convolution, Convolution], Stored]:
-    """Two convolutions, and how the result of the second is stored, unless it is values."""
+    """Two quantized convolutions, and the quantization of the result; ``values`` leaves the result unquantized."""
     first, second = layers
     assert first.bias is not None
     assert second.bias is not None
@@ -259,7 +259,7 @@ def _block(
 
 
 def _spread(q: Tensor) -> Tensor:
-    """``(B, 4 C, H, W)``, all channels of the upper left pixel first, to ``(B, C, 2 H, 2 W)``; channels last."""
+    """Reorder ``(B, 4 C, H, W)``, grouped by pixel of a 2x2 block, to ``(B, C, 2 H, 2 W)``; channels last."""
     batch, _, height, width = q.shape
     pixels = q.permute(0, 2, 3, 1).reshape(batch, height, width, 2, 2, -1).transpose(2, 3)
     return pixels.reshape(batch, 2 * height, 2 * width, -1).permute(0, 3, 1, 2)

@@ -1,7 +1,7 @@
-"""The network of Open Image Denoise, and the scale of radiance that it works on.
+"""Open Image Denoise's network, and its transfer function for radiance.
 
-Its layers, transfer function and exposure are those of the library (https://www.openimagedenoise.org, version 2.5,
-Apache License 2.0), so that weights of the one are weights of the other.
+Layers, transfer function and exposure are those of the library (https://www.openimagedenoise.org, version 2.5, Apache
+License 2.0), so that weights are interchangeable.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from mcdenoise.ops._window import corner
 
 Size: TypeAlias = Literal["small", "base", "large"]
 
-MAX_RADIANCE = 65504.0  # of half precision: what is brighter counts as that
+MAX_RADIANCE = 65504.0  # largest half-precision number; brighter radiance is clamped to it
 _COLORS = 3
 _LEVELS = 5
 _MULTIPLE = 1 << (_LEVELS - 1)
-# Peak numbers for each pixel, measured: at most twice the features that are brought to full resolution, and 100 of
-# images, which stay float32, around them.
+# Peak numbers per pixel, measured: at most twice the features that are upsampled to full resolution, and 100 for the
+# surrounding images, which stay float32.
 _LIVE_IMAGES = 100
 
-# Of PU, as the library has it: a line in the dark, then a power, then a logarithm.
+# The library's PU transfer function: linear in the dark, then a power, then a logarithm.
 _A, _B, _C, _D = 1.41283765e03, 1.64593172e00, 4.31384981e-01, -2.94139609e-03
 _E, _F, _G = 1.92653254e-01, 6.26026094e-03, 9.98620152e-01
 _Y0, _Y1, _X0, _X1 = 1.57945760e-06, 3.22087631e-02, 2.23151711e-03, 3.70974749e-01
@@ -38,7 +38,7 @@ _LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
 class _Widths(NamedTuple):
-    """Channels of the convolutions of each level, finest encoder first, coarsest decoder first."""
+    """Channels of the convolutions of each level: encoder finest first, decoder coarsest first."""
 
     encoder: tuple[tuple[int, ...], ...]
     decoder: tuple[tuple[int, ...], ...]
@@ -54,14 +54,14 @@ _SIZES: dict[Size, _Widths] = {
 
 
 class OidnUNet(nn.Module):
-    """Open Image Denoise's U-Net: 3x3 convolutions with ReLU, 2x2 max-pooling, and nearest neighbours on the way up.
+    """Open Image Denoise's U-Net: 3x3 convolutions with ReLU, 2x2 max-pooling, and nearest-neighbour upsampling.
 
-    What the decoder is given of the encoder is pooled already, and at full resolution it is the input itself. Images
-    are padded with zeros to whole pixels of the coarsest level, a sixteenth of the resolution.
+    The decoder concatenates the pooled features of the encoder, and the input at full resolution. Images are padded
+    with zeros to whole pixels of the coarsest level, a sixteenth of the resolution.
 
     Args:
-        in_channels: of the input: 3 color, 3 albedo and 3 normal in the library.
-        size: which of the library's: "small" has 62 thousand multiply-adds a pixel, "base" 125, "large" 312.
+        in_channels: number of input channels: 3 color, 3 albedo and 3 normal in the library.
+        size: size in the library: "small" has 62 thousand multiply-adds per pixel, "base" 125, "large" 312.
 
     Raises:
         ValueError: there is no such size.
@@ -83,27 +83,27 @@ class OidnUNet(nn.Module):
 
     @property
     def convolutions(self) -> list[nn.Conv2d]:
-        """All of them, in the order of the library's archives."""
+        """All convolutions, in the order of the library's archives."""
         return [layer for layer in self.modules() if isinstance(layer, nn.Conv2d)]
 
     @property
     def multiple(self) -> int:
-        """Side of the coarsest pixels."""
+        """Side of a pixel of the coarsest level."""
         return _MULTIPLE
 
     @property
     def reach(self) -> int:
-        """How far from a pixel the result may depend on it: a pixel of a level with each of its convolutions."""
+        """Largest distance between a pixel of the result and an input pixel that it depends on."""
         levels = [*range(_LEVELS), *range(_LEVELS - 2, -1, -1)]
         counts = [len(widths) for part in _SIZES[self.size] for widths in part]
         convolutions: int = sum(count << level for count, level in zip(counts, levels, strict=True))
         return convolutions + 1 + _MULTIPLE - 1
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that an image takes while it is computed, for each of its pixels, with what goes in and out.
+        """Peak memory per pixel of the image, including input and result.
 
         Args:
-            bfloat16: whether convolutions are in bfloat16, else in float32.
+            bfloat16: whether convolutions run in bfloat16, else in float32.
         """
         entering = _SIZES[self.size].decoder[-2][-1]
         return 2 * entering * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
@@ -125,7 +125,7 @@ class OidnUNet(nn.Module):
             if level < _LEVELS - 1:
                 x = max_pool(x)
                 skips.append(x)
-        # The coarsest level is where pooling ended.
+        # The coarsest level is the result of the last pooling.
         skips.pop()
         for block in self.decoder:
             skip = skips.pop()
@@ -143,10 +143,10 @@ def _block(in_channels: int, widths: tuple[int, ...]) -> ConvBlock:
 
 
 def compress(radiance: Tensor) -> Tensor:
-    """Radiance on a scale on which equal steps look equal, from 0 to 1.
+    """Map radiance to a perceptually uniform scale from 0 to 1.
 
     Args:
-        radiance: any shape; exposed, see :func:`oidn_exposure`. What is outside [0, 65504] counts as its limit.
+        radiance: any shape; exposed, see :func:`oidn_exposure`. Values are clamped to [0, 65504].
 
     Returns:
         The same shape, in [0, 1]. Its derivative is finite, also at 0.
@@ -161,25 +161,25 @@ def compress(radiance: Tensor) -> Tensor:
 
 
 def expand(compressed: Tensor) -> Tensor:
-    """The inverse of :func:`compress`; what is negative counts as 0.
+    """The inverse of :func:`compress`; negative values count as 0.
 
     Args:
         compressed: any shape.
 
     Returns:
-        The same shape; not negative, and not limited above.
+        The same shape; not negative, and without an upper limit.
     """
     x = compressed.clamp_min(0) * _WHITE
     power = ((x - _D) / _B).clamp_min(1e-12).pow(1 / _C)
-    # What takes another way does not overflow on this one.
+    # Clamp the input of each branch, so that branches that are not selected do not overflow.
     bright = torch.exp((x.clamp_min(_X1) - _G) / _E) - _F
     return torch.where(x <= _X0, x / _A, torch.where(x <= _X1, power, bright))
 
 
 def oidn_exposure(color: Tensor) -> Tensor:
-    """The factor that Open Image Denoise brings an image's radiance to its range with.
+    """The factor by which Open Image Denoise scales an image's radiance.
 
-    ``0.18 / exp2(mean(log2(luminance)))`` over the means of bins of some 16x16 pixels, without black ones.
+    ``0.18 / exp2(mean(log2(luminance)))`` over the means of bins of about 16x16 pixels, without black ones.
 
     Args:
         color: ``(B, 3, H, W)`` radiance.
@@ -198,7 +198,7 @@ def oidn_exposure(color: Tensor) -> Tensor:
 
 
 def _binned(image: Tensor, axis: int) -> Tensor:
-    """The means over equal parts of an axis. Sums: autocast would round a product of matrices to half precision."""
+    """Means over equal parts of an axis, as sums: autocast would round a matrix product to half precision."""
     side = image.shape[axis]
     count = -(-side // _BIN)
     edges = torch.arange(count + 1, device=image.device) * side // count

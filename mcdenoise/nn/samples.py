@@ -1,7 +1,7 @@
-"""Single samples as networks see them: each is embedded by itself, and learns of its neighbourhood from a U-Net.
+"""Embeddings of single samples: each sample is embedded separately, with its neighbourhood's context from a U-Net.
 
-This is what the methods of Gharbi et al. 2019 ("Sample-based Monte Carlo denoising using a kernel-splatting network")
-and of Munkberg and Hasselgren 2020 ("Neural Denoising with Layer Embeddings") have in common.
+This is common to the methods of Gharbi et al. 2019 ("Sample-based Monte Carlo denoising using a kernel-splatting
+network") and of Munkberg and Hasselgren 2020 ("Neural Denoising with Layer Embeddings").
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from mcdenoise.frame import LARGEST_RADIANCE, Frame
 from mcdenoise.nn.inputs import unit_features_of
 from mcdenoise.ops._window import corner, up_to_multiple
 
-# Logarithm of the radiance 3, albedo 3, normal 3, depth 1, and one over the number of frames that it is a mean of.
+# Logarithm of the radiance 3, albedo 3, normal 3, depth 1, and one over the number of averaged frames 1.
 CHANNELS = 11
-LEVELS = 3  # of a U-Net
-PLANNED = 9  # samples of a pixel that memory is planned for: eight, and the history
-SLOPE = 0.01  # of the leaky ReLU below zero
+LEVELS = 3  # levels of a U-Net
+PLANNED = 9  # number of samples per pixel for estimating memory: eight, and the history
+SLOPE = 0.01  # negative slope of the leaky ReLU
 
 
 def samples_of(frame: Frame) -> Tensor:
     """Radiance of the samples of each pixel.
 
-    Without ``frame.samples`` the color is one sample. Beside samples, which are of the frame alone, an accumulated
-    color (one with ``frame.length``) is one more, which stands for the history.
+    Without ``frame.samples`` the color is the only sample. Samples belong to the current frame, so an accumulated color
+    (in a frame with ``length``) is one more sample, for the history.
 
     Returns:
-        ``(B, S, 3, H, W)`` in the unit of ``frame.color``, from 0 to 1e16; not-a-number counts as 0.
+        ``(B, S, 3, H, W)`` in the unit of ``frame.color``, from 0 to 1e16; NaN counts as 0.
 
     Raises:
-        InputError: samples have less than three channels.
+        InputError: samples have fewer than three channels.
     """
     color = frame.color[:, None]
     if frame.samples is None:
@@ -45,28 +45,28 @@ def samples_of(frame: Frame) -> Tensor:
             f"buffer 'samples': expected (B, S, C, H, W) with at least 3 channels, found {tuple(frame.samples.shape)}; "
             "the first three are radiance"
         )
-    # Of samples nobody has looked at every value.
+    # ``Frame.validate`` does not check every value of the samples.
     light = frame.samples[:, :, :3].nan_to_num(0).clamp(0, LARGEST_RADIANCE)
     return light if frame.length is None else torch.cat([light, color.to(light.dtype)], 1)
 
 
-def told_of(frame: Frame) -> str:
-    """What :func:`samples_of` found, for the report."""
+def describe_samples(frame: Frame) -> str:
+    """Describe the result of :func:`samples_of` for the report."""
     if frame.samples is None:
         return "none: the color is one sample of each pixel"
     return f"{frame.samples.shape[1]} of each pixel{'' if frame.length is None else ', and the history'}"
 
 
 def samples_input(frame: Frame, samples: Tensor) -> Tensor:
-    """What a network sees of each sample.
+    """The network input for each sample.
 
     Args:
         frame: with the statistics of :func:`mcdenoise.nn.inputs.image_statistics`.
-        samples: ``(B, S, 3, H, W)`` of :func:`samples_of`.
+        samples: ``(B, S, 3, H, W)``, see :func:`samples_of`.
 
     Returns:
-        ``(B, S, 11, H, W)``: ``log1p`` of its radiance; albedo, normal and depth of the pixel, in [0, 1]; and 1, of the
-        accumulated color one over its length.
+        ``(B, S, 11, H, W)``: ``log1p`` of its radiance; albedo, normal and depth of the pixel, in [0, 1]; and 1, or one
+        over the history length for the accumulated color.
     """
     batch, count, _, height, width = samples.shape
     features = torch.cat(unit_features_of(frame), 1).to(samples.dtype)
@@ -77,16 +77,16 @@ def samples_input(frame: Frame, samples: Tensor) -> Tensor:
 
 
 class SampleEmbedding(nn.Module):
-    """Rounds of a chain of 1x1 convolutions on each sample, and a U-Net on the mean of what comes of the samples.
+    """Rounds of a chain of 1x1 convolutions on each sample, and a U-Net on the mean of the samples' embeddings.
 
-    From the second round on, a chain sees what the U-Net of the round before has found at the pixel, its context. The
-    order of the samples does not matter, nor how many there are.
+    From the second round on, a chain also takes the pixel's context, the result of the previous round's U-Net. The
+    result does not depend on the order of the samples, and their number is arbitrary.
 
     Args:
-        in_channels: of a sample.
+        in_channels: number of channels of a sample.
         width: channels of an embedding and of a context.
-        rounds: how many.
-        convolutions: of each block of the U-Nets.
+        rounds: number of rounds.
+        convolutions: number of convolutions in each block of the U-Nets.
     """
 
     def __init__(self, in_channels: int, width: int, rounds: int, convolutions: int) -> None:
@@ -116,12 +116,12 @@ class SampleEmbedding(nn.Module):
 
 
 def with_context(samples: Tensor, context: Tensor) -> Tensor:
-    """``(B, S, C + D, H, W)``: the samples of each pixel with its context ``(B, D, H, W)``."""
+    """Concatenate each sample of a pixel with the pixel's context ``(B, D, H, W)``: ``(B, S, C + D, H, W)``."""
     return torch.cat([samples, context[:, None].expand(-1, samples.shape[1], -1, -1, -1)], 2)
 
 
 def of_each(layer: nn.Module, samples: Tensor) -> Tensor:
-    """A layer of images on every sample ``(B, S, C, H, W)``."""
+    """Apply a layer for images to every sample ``(B, S, C, H, W)``."""
     batch, count = samples.shape[:2]
     result: Tensor = layer(samples.flatten(0, 1))
     return result.reshape(batch, count, *result.shape[1:])
@@ -131,8 +131,8 @@ def chain(widths: Sequence[int], *, linear: bool = False) -> nn.Sequential:
     """1x1 convolutions with leaky ReLU.
 
     Args:
-        widths: channels that go in, and those of each convolution.
-        linear: whether there is no leaky ReLU behind the last one.
+        widths: number of input channels, and of the output channels of each convolution.
+        linear: whether the last convolution has no leaky ReLU.
     """
     return _convolutions(widths, 1, linear=linear)
 
@@ -140,13 +140,13 @@ def chain(widths: Sequence[int], *, linear: bool = False) -> nn.Sequential:
 class LeakyUNet(nn.Module):
     """A U-Net of three levels, each twice as wide as the finer one.
 
-    3x3 convolutions with leaky ReLU, 2x2 max-pooling on the way down, bilinear interpolation on the way up, where the
-    features of the same scale are concatenated. Any image size: zeros fill it up to whole pixels of the coarsest level.
+    3x3 convolutions with leaky ReLU, 2x2 max-pooling on the way down, bilinear interpolation on the way up, followed by
+    concatenation with the features of the same scale. Any image size: it is padded with zeros to a multiple of 4.
 
     Args:
-        in_channels: channels of the input.
-        width: of the finest level, and of the result.
-        convolutions: of each level, on the way down and on the way up.
+        in_channels: number of input channels.
+        width: channels of the finest level, and of the result.
+        convolutions: number of convolutions per level, on the way down and on the way up.
     """
 
     multiple: int = 2 ** (LEVELS - 1)
@@ -165,14 +165,14 @@ class LeakyUNet(nn.Module):
 
     @staticmethod
     def reach(convolutions: int) -> int:
-        """How many pixels away a result depends on the input: with what is interpolated, and the coarsest pixels."""
+        """Largest distance between a pixel of the result and an input pixel that it depends on."""
         down, up = range(LEVELS), range(LEVELS - 1)
         interpolated: int = sum(2 << level for level in up)
         convolved: int = sum(convolutions << level for level in (*down, *up))
         return convolved + interpolated + LeakyUNet.multiple - 1
 
     def forward(self, x: Tensor) -> Tensor:
-        """``(B, in_channels, H, W)`` to ``(B, width, H, W)``."""
+        """Map ``(B, in_channels, H, W)`` to ``(B, width, H, W)``."""
         height, width = x.shape[-2:]
         x = up_to_multiple(x, self.multiple)
         skips: list[Tensor] = []

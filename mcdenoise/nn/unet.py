@@ -9,33 +9,32 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.nn._cpu import ConvBlock, ReLU, Upsampling, is_plain_inference, layout_of, max_pool
+from mcdenoise.nn._cpu import ConvBlock, ReLU, Upsampling, is_cpu_inference, layout_of, max_pool
 from mcdenoise.nn.int8 import Int8UNet, measure, wants_integers
 from mcdenoise.ops._window import corner
 
-# Peak numbers for each pixel, measured: 4.5 widths inside the U-Net, and 54 of images and features around it, which
+# Peak numbers per pixel, measured: 4.5 widths inside the U-Net, and 54 for the surrounding images and features, which
 # stay float32.
 _LIVE_WIDTHS, _LIVE_IMAGES = 4.5, 54
 
 
 class UNet(nn.Module):
-    """A U-Net that hands out features of an image at several resolutions: full, half, quarter and so on.
+    """A U-Net that returns features of an image at several resolutions: full, half, quarter and so on.
 
-    Each level is two 3x3 convolutions with ReLU; 2x2 max-pooling goes down, a 2x2 transposed convolution goes up, and
+    Each level has two 3x3 convolutions with ReLU; 2x2 max-pooling goes down, a 2x2 transposed convolution goes up, and
     the encoder's features of the same scale are concatenated before the decoder's convolutions (Ronneberger et al.
     2015; the paper's Sec. 3.2 and Fig. 2). Any image size: the image is padded to whole pixels of the coarsest level
     (``2 ** (levels - 1)``, with ``half`` twice as many) by repeating its edge, and the features are cropped.
 
-    With ``half``, it has no level at full resolution, where most of the time goes: the first convolution is a 4x4 one
-    with a stride of 2, and a :class:`Head` predicts two by two pixels from each feature (``F.pixel_shuffle``, Shi et
-    al. 2016).
+    With ``half``, there is no level at full resolution, which would take most of the time: the first convolution is 4x4
+    with stride 2, and a :class:`Head` predicts 2x2 pixels from each feature (``F.pixel_shuffle``, Shi et al. 2016).
 
     Args:
-        in_channels: channels of the input.
+        in_channels: number of input channels.
         widths: feature channels of the convolutions of each level, finest first (the paper's 40, 40, 40, 40).
-        scales: how many resolutions it hands out, the finest first; 3 in the paper.
-        coarse_channels: channels that the encoder is given at each scale but the finest, beside its own features.
-        half: whether the finest level is that of half the resolution.
+        scales: number of resolutions to return, finest first; 3 in the paper.
+        coarse_channels: channels of the additional encoder input at each scale but the finest.
+        half: whether the finest level has half the resolution.
 
     Raises:
         ValueError: there are fewer levels than scales.
@@ -57,47 +56,47 @@ class UNet(nn.Module):
         upwards = list(itertools.pairwise(self.widths[::-1]))
         self.up = nn.ModuleList(Upsampling(coarser, finer, 2, stride=2) for coarser, finer in upwards)
         self.decoder = nn.ModuleList(_block(2 * finer, finer) for _, finer in upwards)
-        # Ranges of its tensors, where it is calibrated, and what computes with them.
+        # Ranges of the tensors of a calibrated U-Net, and its integer version.
         self.ranges: Tensor | None = None
         self._integers: Int8UNet | None = None
 
     def level(self, scale: int) -> int:
-        """Of which level the features of a scale are."""
+        """The level that holds the features of a scale."""
         return max(0, scale - self.stride + 1)
 
     def reach(self, scale: int) -> int:
-        """How far from a pixel of the input a feature of scale ``2 ** scale`` may depend on it, in pixels of the input.
+        """Largest distance in pixels between a feature of scale ``2 ** scale`` and an input pixel that it depends on.
 
-        Two 3x3 convolutions at each level on the way down and up again, and the rest of a block of the coarsest pixels.
+        The sum of two 3x3 convolutions per level, down and up, and the rest of a block of the coarsest pixels.
         """
         down, up = range(self.levels), range(self.level(scale), self.levels - 1)
         convolutions: int = sum(2 * self.stride << level for level in (*down, *up))
         return convolutions + self.multiple - 1
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that an image takes while it is computed, for each of its pixels, with what goes in and out.
+        """Peak memory per pixel of the image, including input and result.
 
         Args:
-            bfloat16: whether convolutions are in bfloat16, else in float32.
+            bfloat16: whether convolutions run in bfloat16, else in float32.
         """
         return bytes_of(_LIVE_WIDTHS * self.widths[0], bfloat16=bfloat16)
 
     def forward(self, x: Tensor, coarse: Sequence[Tensor] = ()) -> list[Tensor]:
-        """Features at each of the scales.
+        """Compute features at each of the scales.
 
         Args:
             x: ``(B, in_channels, H, W)``.
-            coarse: what the encoder is given besides, ``(B, coarse_channels, ceil(H / s), ceil(W / s))`` for ``s`` = 2,
-                4, ..., with ``half`` from 4 on: one for each level but the finest, or none.
+            coarse: additional encoder inputs, ``(B, coarse_channels, ceil(H / s), ceil(W / s))`` for ``s`` = 2, 4, ...,
+                with ``half`` from 4 on: one for each level but the finest, or none.
 
         Returns:
             Tensors ``(B, width, ceil(H / s), ceil(W / s))`` for ``s`` = 1, 2, 4, ..., with ``half`` 2, 2, 4, ..., each
             with the width of its level.
         """
         height, width = x.shape[-2:]
-        # Whole multiples, whose halves are simple expressions in a graph for images of any size, as a remainder is not.
+        # Sizes are rounded up to multiples, so that halves are simple expressions in a graph for any image size.
         x = self._whole(x)
-        if self._integers is not None and wants_integers() and is_plain_inference(x):
+        if self._integers is not None and wants_integers() and is_cpu_inference(x):
             dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
             features = self._integers(x, self._beside(x, coarse), self.level(self.scales - 1) + 1, dtype)
         else:
@@ -110,7 +109,7 @@ class UNet(nn.Module):
         return found
 
     def _features(self, x: Tensor, coarse: Sequence[Tensor]) -> list[Tensor]:
-        """Those of each level, the finest first."""
+        """Features of each level, finest first."""
         skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):
             if level:
@@ -128,7 +127,7 @@ class UNet(nn.Module):
 
     @torch.no_grad()
     def calibrate(self, x: Tensor, coarse: Sequence[Tensor] = ()) -> None:
-        """Let the ranges of its tensors hold those of one more input; arguments as of :meth:`forward`."""
+        """Extend the ranges of the tensors by those for one more input; arguments as for :meth:`forward`."""
         x = self._whole(x.float())
         found = measure(self.encoder, self.up, self.decoder, x, [given.float() for given in self._beside(x, coarse)])
         if self.ranges is not None:
@@ -137,32 +136,32 @@ class UNet(nn.Module):
         self.ranges = found
 
     def quantize(self) -> None:
-        """Get ready to compute in integers, see :func:`mcdenoise.nn.int8.integers`, with today's weights.
+        """Prepare for computing in integers with the current weights, see :func:`mcdenoise.nn.int8.integers`.
 
         Raises:
-            ValueError: it is not calibrated, or by the ranges of another network.
+            ValueError: the U-Net is not calibrated, or has the ranges of another network.
         """
         if self.ranges is None:
             raise ValueError("ranges: expected a calibrated U-Net, found one that is not")
         self._integers = Int8UNet(self.encoder, self.up, self.decoder, self.ranges)
 
     def _whole(self, x: Tensor) -> Tensor:
-        """Whole pixels of the coarsest level."""
+        """Pad to whole pixels of the coarsest level."""
         return _padded(x, [(side + self.multiple - 1) // self.multiple * self.multiple for side in x.shape[-2:]])
 
     def _beside(self, x: Tensor, coarse: Sequence[Tensor]) -> list[Tensor]:
-        """The same of what each level is given besides; not in a graph, which knows sizes by its tensors alone."""
+        """Pad the additional inputs in the same way; not in a graph, which derives sizes from tensors only."""
         sizes = ([side // (self.stride << level) for side in x.shape[-2:]] for level in range(1, self.levels))
         return [_padded(given, size) for given, size in zip(coarse, sizes, strict=False)]
 
 
 class Head(nn.Conv2d):
-    """A 3x3 convolution from a scale's features to what is predicted there.
+    """A 3x3 convolution that predicts channels from the features of a scale.
 
     Args:
-        unet: whose features.
-        scale: which of them.
-        channels: predicted for each pixel.
+        unet: the U-Net that computes the features.
+        scale: index of the scale.
+        channels: number of channels to predict for each pixel.
     """
 
     def __init__(self, unet: UNet, scale: int, channels: int) -> None:
@@ -175,7 +174,7 @@ class Head(nn.Conv2d):
 
         Args:
             features: ``(B, width, h, w)``.
-            size: height and width of what is predicted.
+            size: height and width of the prediction.
 
         Returns:
             ``(B, channels, *size)``.
@@ -185,19 +184,19 @@ class Head(nn.Conv2d):
 
 
 def bytes_of(live: float, *, bfloat16: bool) -> float:
-    """Memory that each pixel of an image takes, with images and features around a network, which are in float32.
+    """Memory per pixel of an image for a network and the surrounding images and features, which are in float32.
 
     Args:
-        live: numbers that the network holds for each pixel, at its peak.
+        live: numbers per pixel that the network holds at its peak.
         bfloat16: whether these are in bfloat16, else in float32.
     """
     return live * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
 
 
 def _padded(x: Tensor, size: Sequence[int]) -> Tensor:
-    """``x``, its last row and column repeated up to ``size``."""
+    """Repeat the last row and column of ``x`` up to ``size``."""
     missing = (0, size[1] - x.shape[-1], 0, size[0] - x.shape[-2])
-    # Whether anything is missing must not be decided in a graph for images of any size.
+    # A graph for any image size cannot branch on whether padding is needed.
     return F.pad(x, missing, mode="replicate") if torch.compiler.is_compiling() or any(missing) else x
 
 

@@ -1,1 +1,1 @@
-"""What can be rendered: the scene of the demonstration, random ones, and any of Mitsuba 3."""
+"""Scenes to render: demonstration scenes, random scenes, and rendering of any Mitsuba 3 scene."""

@@ -1,9 +1,9 @@
-"""A small living room of our own for demonstrations: a window, a lamp, and a camera that walks past a column.
+"""The demonstration scene: a small living room with a window, a lamp, and a camera that walks past a column.
 
-It has what a denoiser must cope with: textures, a glossy and a mirror-like surface, glass, soft shadows, a corner that
-only indirect light reaches, parallax and disocclusion. All light can be sampled directly, so that one path per pixel
-already shows something. The description is plain Python and numpy, in the form that
-:func:`mcdenoise.scenes.render.render_sequence` takes; Mitsuba is not needed to build it.
+It contains typical difficulties of denoising: textures, glossy and mirror-like surfaces, glass, soft shadows, a corner
+with indirect light only, parallax and disocclusion. All lights can be sampled directly, so that a single path per pixel
+already gives an image. The description is plain Python and numpy, as
+:func:`mcdenoise.scenes.render.render_sequence` expects it; Mitsuba is not needed to build it.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ def demo_scene() -> dict[str, Any]:
 
 
 def demo_cameras(frames: int = 16) -> list[Camera]:
-    """Cameras of a sideways walk: 4 centimetres a frame, with the sway of a person.
+    """Cameras of a sideways walk: 4 centimetres per frame, with a person's sway.
 
     Args:
-        frames: number of cameras; more of them continue the same walk back and forth.
+        frames: number of cameras; a longer path continues the same walk back and forth.
 
     Example:
         >>> len(demo_cameras(3))
@@ -99,7 +99,7 @@ def _lights() -> dict[str, Any]:
 
 
 def _shelf() -> dict[str, Any]:
-    """Two boards of books and a painting on the back wall: fine detail for the filter to keep."""
+    """Two shelves of books and a painting on the back wall: fine detail that the filter should preserve."""
     rng = np.random.default_rng(7)
     wood = diffuse((0.33, 0.2, 0.11))
     parts: dict[str, Any] = {}

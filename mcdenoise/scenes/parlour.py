@@ -1,9 +1,9 @@
-"""A parlour of our own to test on, where light is anything but matt: never trained on.
+"""A parlour as a test scene, with many non-diffuse effects; it is never used for training.
 
-A lacquered table of dark wood with highlights; a mirror that shows a window and a lamp; bottles and glasses before a
-patterned wall; books with thin black gaps between them; a page of text-like marks; rods as thin as hair; shadows where
-things touch; and a pillar that moves and uncovers what was behind it. Plain Python and numpy, in the form that
-:func:`mcdenoise.scenes.render.render_sequence` takes.
+It contains a lacquered table of dark wood with highlights; a mirror that reflects a window and a lamp; bottles and
+glasses before a patterned wall; books with thin black gaps between them; a page of text-like marks; rods as thin as
+hair; contact shadows; and a pillar that moves and uncovers the background. The description is plain Python and numpy,
+as :func:`mcdenoise.scenes.render.render_sequence` expects it.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def parlour_scene() -> dict[str, Any]:
 
 
 def parlour_cameras(frames: int = 8) -> list[Camera]:
-    """Cameras of a walk to the right, 3 centimetres a frame.
+    """Cameras of a walk to the right, 3 centimetres per frame.
 
     Example:
         >>> len(parlour_cameras(3))
@@ -68,7 +68,7 @@ def parlour_cameras(frames: int = 8) -> list[Camera]:
 
 
 def parlour_moves(frames: int = 8) -> dict[str, Array]:
-    """The pillar slides to the right, 7 centimetres a frame: as :class:`mcdenoise.data.camera_path.Shot` has it.
+    """The pillar's motion to the right, 7 centimetres per frame, as in :class:`mcdenoise.data.camera_path.Shot`.
 
     Example:
         >>> parlour_moves(3)["pillar"].shape
@@ -94,7 +94,7 @@ def _room() -> dict[str, Any]:
 
 
 def _lights() -> dict[str, Any]:
-    """A window behind the camera, which the mirror and the table show; a lamp there, and one in the picture."""
+    """A window and a lamp behind the camera, which are reflected in mirror and table, and a visible lamp."""
     return {
         "window": {
             **rectangle((-2.1, 1.65, 3.96), (0.7, 0.75), rotate_y(180), diffuse((0, 0, 0))),
@@ -122,7 +122,7 @@ def _table() -> dict[str, Any]:
         "bowl": sphere((-0.42, _TABLE + 0.15, -1.0), 0.15, metal("Cu", 0.12)),
         "ball": sphere((-0.08, _TABLE + 0.07, -0.72), 0.07, {"type": "conductor", "material": "Ag"}),
         "cup": sphere((0.86, _TABLE + 0.09, -0.85), 0.09, plastic((0.65, 0.62, 0.56), 0.05)),
-        # Matt things whose shadows touch them.
+        # Diffuse objects with contact shadows.
         "die": box((0.3, _TABLE + 0.04, -0.62), (0.08, 0.08, 0.08), diffuse((0.75, 0.7, 0.6)), turn=30),
         "slab": box((-0.72, _TABLE + 0.012, -0.75), (0.24, 0.024, 0.16), diffuse((0.15, 0.3, 0.24)), turn=-20),
         "letter": {
@@ -134,7 +134,7 @@ def _table() -> dict[str, Any]:
 
 
 def _bottles() -> dict[str, Any]:
-    """Closed solids of glass, as Mitsuba's dielectric wants them, and thin tumblers."""
+    """Closed solids of glass, as Mitsuba's dielectric requires, and thin tumblers."""
     parts: dict[str, Any] = {}
     tints: list[Color] = [(0.35, 0.75, 0.4), (0.85, 0.5, 0.15), (0.9, 0.95, 0.95)]
     for index, (x, z, height) in enumerate(((0.5, -1.85, 0.3), (0.68, -1.7, 0.24), (0.9, -1.9, 0.34))):
@@ -166,7 +166,7 @@ def _solid(name: str, foot: Color, height: float, radius: float, bsdf: dict[str,
 
 
 def _shelf() -> dict[str, Any]:
-    """Two boards of books, a few millimetres apart, before a black back."""
+    """Two shelves of books, a few millimetres apart, before a black back wall."""
     rng = np.random.default_rng(12)
     wood = diffuse((0.22, 0.13, 0.07))
     parts: dict[str, Any] = {"shelf_back": box((1.65, 1.55, -2.98), (1.3, 1.1, 0.03), diffuse((0.01, 0.01, 0.01)))}
@@ -184,7 +184,7 @@ def _shelf() -> dict[str, Any]:
 
 
 def _rods() -> dict[str, Any]:
-    """Rods of 1 to 4 millimetres that hang from the ceiling, bright and dark, and a leaning one."""
+    """Rods of 1 to 4 millimetres that hang from the ceiling, bright and dark, and one that leans."""
     rods: dict[str, Any] = {
         f"rod_{index}": cylinder(
             (-0.62 + 0.055 * index, 1.25, -1.7 - 0.04 * (index % 3)),
@@ -233,7 +233,7 @@ def _damask() -> Array:
 
 
 def _writing() -> Array:
-    """Black marks on white in lines of words, as small as print."""
+    """Black marks on white in lines of words, of the size of print."""
     rng = np.random.default_rng(8)
     page = np.full((320, 240), 0.82)
     for top in range(16, 300, 10):

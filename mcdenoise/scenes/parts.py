@@ -1,4 +1,4 @@
-"""What scenes of our own are put together from: shapes and materials as Mitsuba's dictionaries; metres, y is up."""
+"""Building blocks of the scenes: shapes and materials as Mitsuba dictionaries; units are metres, y is up."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ Color = tuple[float, float, float]
 
 
 def tint(brightness: Array, color: Color) -> Array:
-    """A texture of one color whose brightness varies, ``(H, W, 3)`` in 0 to 0.9."""
+    """A texture of one color with varying brightness, ``(H, W, 3)`` in 0 to 0.9."""
     return np.asarray(np.clip(brightness[..., None] * np.array(color), 0, 0.9))
 
 
 def textured(texture: Array) -> dict[str, Any]:
-    """A matt surface with a texture."""
+    """A diffuse surface with a texture."""
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": bitmap(texture)}}
 
 
 def varnish(texture: Array, alpha: float = 0.15) -> dict[str, Any]:
-    """A matt surface under a coat that blurs a little what it mirrors."""
+    """A diffuse surface under a slightly rough coat."""
     return {
         "type": "twosided",
         "bsdf": {"type": "roughplastic", "diffuse_reflectance": bitmap(texture), "alpha": alpha},
@@ -32,17 +32,17 @@ def varnish(texture: Array, alpha: float = 0.15) -> dict[str, Any]:
 
 def bitmap(texture: Array) -> dict[str, Any]:
     """A texture of reflectances."""
-    # raw: the numbers are reflectances already, and no sRGB values to be decoded.
+    # raw: the values are reflectances, not sRGB values to be decoded.
     return {"type": "bitmap", "bitmap": texture, "raw": True}
 
 
 def diffuse(color: Color) -> dict[str, Any]:
-    """A matt surface."""
+    """A diffuse surface."""
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(color)}}}
 
 
 def plastic(color: Color, alpha: float) -> dict[str, Any]:
-    """A matt surface under a rough coat."""
+    """A diffuse surface under a rough coat."""
     reflectance = {"type": "rgb", "value": list(color)}
     return {"type": "twosided", "bsdf": {"type": "roughplastic", "diffuse_reflectance": reflectance, "alpha": alpha}}
 
@@ -53,12 +53,12 @@ def metal(material: str, alpha: float) -> dict[str, Any]:
 
 
 def rectangle(center: Color, half_size: tuple[float, float], rotation: Array, bsdf: dict[str, Any]) -> dict[str, Any]:
-    """A rectangle that faces +z before it is turned."""
+    """A rectangle that faces +z before the rotation."""
     return {"type": "rectangle", "to_world": place(center, (*half_size, 1), rotation), "bsdf": bsdf}
 
 
 def box(center: Color, size: Color, bsdf: dict[str, Any], turn: float = 0) -> dict[str, Any]:
-    """A box, turned about its vertical axis by so many degrees."""
+    """A box, rotated about its vertical axis by ``turn`` degrees."""
     half = (size[0] / 2, size[1] / 2, size[2] / 2)
     return {"type": "cube", "to_world": place(center, half, rotate_y(turn)), "bsdf": bsdf}
 
@@ -69,7 +69,7 @@ def sphere(center: Color, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]
 
 
 def cylinder(foot: Color, height: float, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
-    """The side of an upright cylinder, which has no ends."""
+    """The side of an upright cylinder, without caps."""
     top = [foot[0], foot[1] + height, foot[2]]
     return {"type": "cylinder", "p0": list(foot), "p1": top, "radius": radius, "bsdf": bsdf}
 
@@ -82,12 +82,12 @@ def place(position: Color, scale: Color, rotation: Array | None = None) -> Array
 
 
 def rotate_x(degrees: float) -> Array:
-    """About the x axis."""
+    """Rotation about the x axis."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]])
 
 
 def rotate_y(degrees: float) -> Array:
-    """About the y axis, which is up."""
+    """Rotation about the y axis, which points up."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]])

@@ -1,10 +1,10 @@
-"""Decoded sequences on disk: what training reads again and again, decoded and accumulated once, opened in an instant.
+"""The training cache: decoded and accumulated sequences on disk, for fast reading in every epoch.
 
-What is kept is what a model sees behind its wrappers without weights, see :class:`mcdenoise.train.front.Front`.
+The cached frames are the output of a model's outer wrappers without weights, see :class:`mcdenoise.train.front.Front`.
 
-A cached sequence is a folder of plain ``.npy`` files, one array each, mapped into memory and read where a clip needs
-them. It lies in ``NAME-ID/KEY``: the id says which sequence and settings, the key what it was made from. Whoever finds
-another key makes the arrays anew.
+A cached sequence is a folder ``NAME-ID/KEY`` of ``.npy`` files, one array each, which are memory-mapped. The id
+identifies the sequence and the settings, the key everything that the arrays were computed from. If the key differs, the
+arrays are computed again.
 """
 
 from __future__ import annotations
@@ -33,28 +33,27 @@ from mcdenoise.models.accumulated import motion_to_previous
 from mcdenoise.train.front import ACCUMULATED, Front
 
 _CAMERA = frozenset({"position", "view_projection"})
-# The files that a reader of sequences looks at, and where they are in a sequence's folder.
+# Patterns of the files of a sequence, relative to its folder.
 _SUFFIXES = {".exr", ".h", ".json"}
 _PLACES = ("*", "realisation*/*", "inputs/*", "inputs/realisation*/*")
 _FORMAT = 5
 
 Array: TypeAlias = NDArray[Any]
-# First frame (an index) and realisation of the noise: each has a color of its own.
+# Index of the first frame, and noise seed: each pair has its own colors.
 _Start: TypeAlias = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class Shot:
-    """Successive frames as a network sees them, with one or more realisations of their noise.
+    """Consecutive frames as the network's input, for one or more noise seeds.
 
     Args:
-        colors: for each realisation ``(T, C, H, W)``: what it has of its own, as ``parts`` says.
-        features: ``(T, C, H, W)`` of everything else, by the names of buffers; ``view_projection`` is ``(T, 4, 4)``.
-        demodulated: whether the radiance in ``colors`` has no albedo in it.
-        noisy: for each realisation the features that are of its own samples, in the same form; empty where there are
-            none.
-        parts: names of the buffers in ``colors`` with their channels, as many of the first as there are channels; by
-            default accumulated radiance, that of each frame alone, and the history length.
+        colors: for each noise seed ``(T, C, H, W)``: its channels, as ``parts`` describes them.
+        features: ``(T, C, H, W)`` all other buffers by name; ``view_projection`` is ``(T, 4, 4)``.
+        demodulated: whether the radiance in ``colors`` is demodulated.
+        noisy: for each noise seed the features that depend on it, in the same form; empty if there are none.
+        parts: names and channels of the buffers in ``colors``; these may hold only the first of them. By default
+            accumulated radiance, radiance of the current frame, and history length.
     """
 
     colors: tuple[Array, ...]
@@ -73,7 +72,7 @@ class Shot:
         return int(height), int(width)
 
     def cut(self, frames: slice) -> Shot:
-        """Some of the frames, with the history that they have."""
+        """Select consecutive frames; their history is kept."""
         features = {name: feature[frames] for name, feature in self.features.items()}
         noisy = tuple({name: feature[frames] for name, feature in own.items()} for own in self.noisy)
         return Shot(tuple(color[frames] for color in self.colors), features, self.demodulated, noisy, self.parts)
@@ -91,12 +90,12 @@ class Shot:
         """Copy a part of the shot from disk: ``(T, C, H, W)`` float32 by name.
 
         Args:
-            frames: which frames.
-            rows: which rows.
-            columns: which columns.
-            realisation: of the noise, and of the features that have noise.
-            channels: of some buffers, which channels, in which order.
-            turn: gives another view of ``(T, C, H, W)``, flipped or turned.
+            frames: range of frames.
+            rows: range of rows.
+            columns: range of columns.
+            realisation: index of the noise seed.
+            channels: for some buffers, the selection and order of channels.
+            turn: returns another view of ``(T, C, H, W)``, flipped or rotated.
         """
         color = self.colors[realisation]
         sources: dict[str, Array] = {}
@@ -111,7 +110,7 @@ class Shot:
             if source.ndim == 3:
                 parts[name] = torch.from_numpy(source[frames].astype(np.float32))
                 continue
-            # Views only: everything is moved at once, when it is copied.
+            # Views only: the pixels are moved once, when they are copied.
             image = turn(source[frames, :, rows, columns])
             order = channels.get(name, range(image.shape[1]))
             part = np.empty((image.shape[0], len(order), *image.shape[2:]), np.float32)
@@ -125,7 +124,7 @@ class CachedSequence:
 
     Args:
         shots: one for each first frame.
-        sha256: of every noisy color and reference that was decoded, as bytes of float32.
+        sha256: checksum of all decoded noisy colors and references, as bytes of float32.
     """
 
     shots: list[Shot]
@@ -134,7 +133,7 @@ class CachedSequence:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is to be computed from a sequence."""
+    """The arrays to compute from a sequence."""
 
     sequence: Sequence
     front: Front
@@ -145,15 +144,15 @@ class _Plan:
 
     @property
     def own(self) -> tuple[str, ...]:
-        """Features that each realisation has of its own."""
+        """Features that depend on the noise seed."""
         noisy = self.sequence.noisy
-        # Depth and motion may be those of the positions.
+        # Depth and motion may be computed from the positions.
         derived = {"motion"} if "position" in noisy and "motion" not in self.sequence.buffers else set()
         return tuple(name for name in self.features if name in noisy | derived)
 
     @property
     def shared(self) -> tuple[str, ...]:
-        """Features that all realisations have in common."""
+        """Features that are the same for all noise seeds."""
         return tuple(name for name in self.features if name not in self.own)
 
     @property
@@ -169,7 +168,7 @@ class _Plan:
 
 
 def features_of(sequence: Sequence) -> frozenset[str]:
-    """Names of the buffers without noise that can be had of a sequence: motion also of positions and cameras."""
+    """Names of the buffers without noise that a sequence provides, including motion from positions and cameras."""
     derived = {"motion"} if sequence.buffers >= _CAMERA else set()
     return (sequence.buffers | derived) - {"color", "reference"}
 
@@ -184,35 +183,35 @@ def open_cached(
     realisations: int | None = None,
     keep_fireflies: int = 0,
 ) -> CachedSequence:
-    """A sequence as a network sees it, from a cache that is filled where it has to be.
+    """Open a sequence as the network's input from a cache, and fill the cache if necessary.
 
-    The features are kept once (those with noise once for each realisation), the radiance once for each first frame and
-    realisation of the noise: a shot that starts
-    later has shorter histories, so that a network also learns how a shot begins. Features are kept in half precision
-    where nothing is lost by it, radiance in single. Pixels of the radiance and of the reference that are none (NaN,
-    infinite, negative, or absurdly large) get the mean of their neighbours. Motion is the sequence's own, or else
-    computed of positions and cameras; infinite, that is unknown, in the first frame then.
+    Features are stored once (those with noise once for each noise seed). Radiance is stored once for each first frame
+    and noise seed: a shot that begins later has shorter histories, so that a network also learns the beginning of a
+    shot. Features are stored in half precision if that is exact, radiance in single precision. Invalid pixels of
+    radiance and reference (NaN, infinite, negative, or too large) are replaced by the mean of their neighbours. Motion
+    is the sequence's own, or computed from positions and cameras; then it is infinite (unknown) in the first frame.
 
-    What was made of other files (by name, size or time of change), of other settings or by another version of the
-    code is made again. A run that finds somebody else filling the same place waits.
+    Arrays that were computed from other files (by name, size or modification time), with other settings or by another
+    version of the code are computed again. If another run is filling the same place, this one waits.
 
     Args:
         sequence: frames with references.
-        folder: of the cache; made if it does not exist.
-        front: what is done to the frames.
-        features: names of the buffers that are kept besides, of :func:`features_of`.
+        folder: folder of the cache; created if it does not exist.
+        front: the wrappers that process the frames.
+        features: names of further buffers to store, see :func:`features_of`.
         firsts: indices of the first frames, ascending.
-        realisations: use so many; all by default.
-        keep_fireflies: every n-th realisation keeps its fireflies as if they were caustics; 0 for none.
+        realisations: number of noise seeds to use; all by default.
+        keep_fireflies: every n-th noise seed keeps its fireflies as if they were caustics; 0 for none.
 
     Raises:
-        InputError: a buffer or a reference is missing or damaged, or the cache cannot be written; nothing half made is
-            left.
+        InputError: a buffer or a reference is missing or damaged, or the cache cannot be written; then no incomplete
+            files are left.
     """
     found = sequence.realisations if realisations is None else min(realisations, sequence.realisations)
     kept = tuple(sorted({*features, "reference"}))
     plan = _Plan(sequence, front, kept, tuple(firsts), found, keep_fireflies)
-    # Not how many realisations were found: what was made of fewer is stale, and goes.
+    # The id does not include the number of noise seeds found, so that arrays of fewer seeds are found stale and
+    # removed.
     settings = [sequence.numbers, front.settings, kept, firsts, realisations, keep_fireflies]
     identity = json.dumps([str(sequence.root.resolve()), *settings])
     place = folder / f"{sequence.name[:100]}-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
@@ -222,7 +221,7 @@ def open_cached(
         return cached
     try:
         with locked(place):
-            # While this waited for the lock, somebody else may have done the work.
+            # Another process may have done the work while this one waited for the lock.
             if (cached := _load(finished, plan)) is None:
                 _fill(finished, plan)
     except OSError as error:
@@ -238,13 +237,13 @@ def open_cached(
 
 
 def _key(root: Path, settings: list[Any]) -> str:
-    """Checksum of everything the arrays depend on."""
+    """Checksum of everything that the arrays depend on."""
     digest = hashlib.sha256(json.dumps(settings).encode() + _code())
     for path in sorted(path for place in _PLACES for path in root.glob(place)):
-        # What begins with a dot is being written by a renderer, and gone in a moment.
+        # Hidden files are temporary files of a renderer.
         if path.suffix not in _SUFFIXES or path.name.startswith("."):
             continue
-        # A link to nothing, or to itself, is no file of the sequence.
+        # Broken and circular links are not files of the sequence.
         with suppress(OSError):
             status = path.stat()
             digest.update(os.fsencode(path.relative_to(root)))
@@ -254,9 +253,9 @@ def _key(root: Path, settings: list[Any]) -> str:
 
 @functools.cache
 def _code() -> bytes:
-    """Checksum of the whole package: a mended reader or operator must not find what its predecessor made.
+    """Checksum of the whole package, so that a corrected reader or operator does not use arrays of its predecessor.
 
-    Not of those files only that decode and accumulate: nobody would keep a list of them true.
+    It covers all files rather than those for decoding and accumulating, because such a list would become outdated.
     """
     package, digest = Path(__file__).parents[1], hashlib.sha256()
     for source in sorted(package.rglob("*.py")):
@@ -267,7 +266,7 @@ def _code() -> bytes:
 
 @contextmanager
 def locked(place: Path) -> Iterator[None]:
-    """Have a folder for oneself; the lock ends with the process, however that ends."""
+    """Lock a folder for this process; the lock is released when the process ends in any way."""
     place.mkdir(parents=True, exist_ok=True)
     with (place / "lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
@@ -275,7 +274,7 @@ def locked(place: Path) -> Iterator[None]:
 
 
 def _fill(finished: Path, plan: _Plan) -> None:
-    """Write a folder of arrays beside its final name and rename it; remove what is stale or was left half made."""
+    """Write the arrays to a temporary folder, rename it, and remove stale and incomplete folders."""
     for entry in finished.parent.iterdir():
         if entry.is_dir():
             shutil.rmtree(entry)
@@ -289,7 +288,7 @@ def _fill(finished: Path, plan: _Plan) -> None:
 
 
 def _build(folder: Path, plan: _Plan) -> None:
-    """Decode the frames one after the other; only features in the making are held in memory."""
+    """Decode the frames one after the other; only features without noise are collected in memory."""
     sequence = plan.sequence
     steps = {start: plan.begin(start[1]) for start in plan.starts}
     features: dict[str, list[Array]] = {_feature_name(name): [] for name in plan.shared}
@@ -318,19 +317,19 @@ def _build(folder: Path, plan: _Plan) -> None:
                         features[_feature_name(name, realisation)].append(_smallest(found[name].numpy()))
             camera = frame.view_projection
     for file in list(features):
-        # One frame that half precision cannot hold makes all of them single.
+        # If half precision is not exact for one frame, all frames are stored in single precision.
         np.save(folder / file, np.concatenate(features.pop(file)), allow_pickle=False)
     checksums = {path.name: _checksum(path) for path in sorted(folder.iterdir())}
     (folder / "about.json").write_text(json.dumps({"sha256": digest.hexdigest(), "files": checksums}) + "\n")
 
 
 def _read(sequence: Sequence, number: int, realisation: int, buffers: Collection[str], digest: Any) -> Frame:
-    """Decode a frame, add what is noisy and what is learnt from to the checksum, and validate."""
+    """Decode a frame, add noisy color and reference to the checksum, and validate it."""
     frame = sequence.frame(number, reference=realisation == 0, realisation=realisation, buffers=buffers)
     radiance = {"color": frame.color} | ({} if frame.reference is None else {"reference": frame.reference})
     for image in radiance.values():
         digest.update(image.numpy().tobytes())
-    # What validation does to colour alone; a reference is rendered by the same program.
+    # ``validate`` replaces invalid pixels only in the color; a reference comes from the same renderer.
     mended = {name: replace_invalid(image)[0] for name, image in radiance.items()}
     try:
         return frame.replace(**mended).validate()[0].with_depth()
@@ -339,16 +338,16 @@ def _read(sequence: Sequence, number: int, realisation: int, buffers: Collection
 
 
 def _with_motion(frame: Frame, camera: Tensor | None) -> Frame:
-    """The frame with its motion, if need be that of its positions seen from the camera before."""
+    """The frame with motion, computed from positions and the previous camera if necessary."""
     motion = motion_to_previous(frame, camera)
     return frame.replace(motion=torch.full_like(frame.color[:, :2], torch.inf) if motion is None else motion)
 
 
 @contextmanager
 def _array_file(path: Path, shape: tuple[int, ...]) -> Iterator[BinaryIO]:
-    """A ``.npy`` file of little-endian float32 whose values are yet to be written, in order.
+    """Write the header of a ``.npy`` file of little-endian float32; the values are to be appended in order.
 
-    Written as a stream and not through a map: on a full disk the one fails, the other kills the process.
+    A stream is used instead of a memory map because writing to a map kills the process when the disk is full.
     """
     with path.open("wb") as file:
         header = {"descr": "<f4", "fortran_order": False, "shape": shape}
@@ -357,7 +356,7 @@ def _array_file(path: Path, shape: tuple[int, ...]) -> Iterator[BinaryIO]:
 
 
 def _smallest(values: Array) -> Array:
-    """The values in half precision if it holds them exactly, else as they are."""
+    """Convert to half precision if that is exact."""
     with np.errstate(over="ignore"):
         half = values.astype(np.float16)
     return half if np.array_equal(half.astype(values.dtype), values) else values
@@ -378,7 +377,7 @@ def _checksum(path: Path) -> str:
 
 
 def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
-    """Map the arrays; ``None`` where there are none, or not those of this sequence, or a bit of them has changed."""
+    """Map the arrays; return ``None`` if they are missing, belong to another sequence, or are damaged."""
     sequence = plan.sequence
     try:
         about = json.loads((folder / "about.json").read_text())
@@ -413,7 +412,7 @@ def _size(name: str, sequence: Sequence) -> tuple[int, int]:
 
 
 def _map(path: Path) -> Array:
-    # A plain view of the map: memmap's own slices cost more than what they read.
+    # A plain view, because slicing a memmap takes longer than reading.
     array: Array = np.load(path, mmap_mode="r", allow_pickle=False).view(np.ndarray)
     return array
 

@@ -1,4 +1,4 @@
-"""Training clips: successive frames, accumulated, cropped and augmented."""
+"""Training clips: consecutive frames, accumulated, cropped and augmented."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mcdenoise.train.cache import Array, Shot
 _KNOWN = frozenset(field.name for field in fields(Frame))
 
 
-# What holds radiance, colours, and vectors of the world: all else has no channels that could be shuffled.
+# Buffers of radiance, of reflectance, and of world-space vectors, whose channels can be permuted.
 LIGHT = frozenset({*RADIANCE, "reference", NOISY, OIDN, OIDN_CLEAN})
 _COLORED = LIGHT | {"albedo", ALBEDO_HISTORY, "specular_albedo", "variance"}
 _WORLD = frozenset({"normal", "position", "previous_position"})
@@ -31,17 +31,17 @@ _WORLD = frozenset({"normal", "position", "previous_position"})
 
 @dataclass(frozen=True)
 class Clip:
-    """Successive frames of one shot, in the vocabulary of :class:`mcdenoise.frame.Frame`.
+    """Consecutive frames of one shot, with the buffers of :class:`mcdenoise.frame.Frame`.
 
     Args:
-        buffers: by name, ``(B, T, C, H, W)`` each, and ``view_projection`` ``(B, T, 4, 4)``.
+        buffers: ``(B, T, C, H, W)`` by name, and ``view_projection`` ``(B, T, 4, 4)``.
     """
 
     buffers: dict[str, Tensor]
 
     @staticmethod
     def of(shot: dict[str, Tensor]) -> Clip:
-        """A clip of what :meth:`mcdenoise.train.cache.Shot.read` has read: a batch of one."""
+        """A clip with a batch of one from the result of :meth:`mcdenoise.train.cache.Shot.read`."""
         return Clip({name: buffer[None] for name, buffer in shot.items()})
 
     def __getitem__(self, name: str) -> Tensor:
@@ -60,7 +60,7 @@ class Clip:
         return len(self["color"])
 
     def frame(self, t: int | None = None) -> Frame:
-        """One frame of each clip, or all frames of all of them as a batch of ``B T``."""
+        """Frame ``t`` of each clip, or all frames of all clips as a batch of ``B T``."""
         when = slice(None) if t is None else slice(t, t + 1)
         # Convolutions are faster on channels last.
         flat: dict[str, Any] = {
@@ -74,33 +74,35 @@ class Clip:
 
 
 class ClipSampler:
-    """Draws random clips from shots: position, frames, noise, flips, 90-degree turns, and what else is exact physics.
+    """Draws random clips from shots, with augmentations that are physically exact.
 
-    Each clip has a seed of its own, and depends on nothing else: a batch can be drawn in any order, at any time, by any
-    number of processes.
+    Random are the position, the frames, the noise seed, flips, 90-degree rotations, and the options below. Each clip
+    depends only on its own seed: a batch can be drawn in any order, at any time, by any number of processes.
 
-    Flips and turns are kornia's, the same for all buffers and frames of a clip; motion vectors are flipped and turned
-    with the image, and the camera's matrix projects to the crop, flipped and turned. World-space normals and positions
-    stay as they are: a mirrored or turned image is one of a mirrored or turned world whose axes are named otherwise,
-    and so the axes themselves are shuffled and reversed too. Colour channels are shuffled alike in radiance and albedo.
+    Flips and rotations are kornia's, the same for all buffers and frames of a clip. Motion vectors are transformed with
+    the image, and the camera's matrix projects to the transformed crop. World-space normals and positions are not
+    transformed: a flipped or rotated image shows a flipped or rotated world with other names of axes. For the same
+        reason, axes are also
+    permuted and reversed at random. Color channels are permuted in the same way in radiance and albedo.
 
-    Light is linear: all lamps of a scene, brighter by a factor or of another colour, make noisy color and reference
-    brighter by this factor, channel by channel. The networks bring the exposure to a standard before they look; what
-    the exposure changes is the loss, whose epsilon is in units of radiance. Another albedo would change the light that
-    surfaces send to each other, so albedos are left alone.
+    Light is linear: scaling all lamps of a scene, also per channel, scales noisy color and reference by the same
+    factor. Networks normalize the exposure, so this changes only the loss, whose epsilon is in units of radiance.
+    Changing an albedo would change the light between surfaces, so albedos are not augmented.
 
     Args:
-        shots: those shorter than ``frames`` are skipped.
-        frames: T of a clip.
+        shots: shots shorter than ``frames`` are skipped.
+        frames: T, the number of frames of a clip.
         crop: side of the square crop in pixels.
-        lamps: chance that a clip gets rectangles of constant radiance, without noise, up to 30 times as bright as its
-            mean: emitters seen directly, of which few training scenes have any.
-        key: the typical radiance that each clip is brought to first, see :func:`mcdenoise.nn.inputs.auto_exposure`; 0
-            leaves it as it is.
-        exposure: all light of a clip is scaled by up to so many stops, up or down.
-        tint: each colour channel of the light is scaled by up to so many stops, up or down.
-        gloss: chance that what has no albedo in a clip (mirrors, glass, black gloss, and lamps) is darker, by up to six
-            stops: emitters are common there, and a network that knows nothing else takes a black screen for one.
+        lamps: probability that a clip gets rectangles of constant radiance without noise, up to 30 times as bright as
+            its
+            mean: directly visible emitters, which few training scenes have.
+        key: typical radiance to which each clip is first scaled, see :func:`mcdenoise.nn.inputs.auto_exposure`; 0 does
+            not scale.
+        exposure: the light of a clip is scaled by up to this many stops, up or down.
+        tint: each color channel of the light is scaled by up to this many stops, up or down.
+        gloss: probability that surfaces without albedo (mirrors, glass, black gloss, and lamps) are darkened by up to
+            six
+            stops: most of these are emitters, and without this a network would learn to treat a black screen as one.
 
     Raises:
         InputError: no shot is long enough, or one is smaller than the crop.
@@ -126,14 +128,14 @@ class ClipSampler:
         self.flips_and_turns = nn.Sequential(
             RandomHorizontalFlip(p=0.5),
             RandomVerticalFlip(p=0.5),
-            # "nearest" moves whole numbers; "bilinear" would mix them.
+            # "nearest" keeps integer values; "bilinear" would mix them.
             RandomRotation90((0, 3), p=1.0, resample="nearest"),
         )
 
     def draw(self, seeds: Sequence[int]) -> Clip:
-        """A clip for each seed, from a shot drawn with a chance in proportion to its number of frames."""
+        """Draw a clip for each seed; the probability of a shot is proportional to its number of frames."""
         drawn = []
-        # kornia draws from torch's global generator, which is others' too.
+        # kornia uses torch's global generator, which must not change for other users.
         with torch.random.fork_rng(devices=[]):
             for seed in seeds:
                 torch.default_generator.manual_seed(seed)
@@ -171,7 +173,7 @@ class ClipSampler:
             factor = factor * auto_exposure(clip["reference"][:1], self.key)[0]
         _light(clip, factor)
         if self.gloss and float(torch.rand(())) < self.gloss:
-            # Less is reflected or sent out towards the camera; what that would take from other surfaces is left out.
+            # Darken the light towards the camera; the effect on other surfaces is neglected.
             glossy = clip["albedo"].amax(1, keepdim=True) < NO_ALBEDO
             _light(clip, torch.where(glossy, torch.exp2(-6 * torch.rand(())), 1))
         if self.lamps and float(torch.rand(())) < self.lamps:
@@ -181,7 +183,7 @@ class ClipSampler:
         return clip
 
     def _draw_turn(self) -> _Turn:
-        """Let kornia flip and turn four numbers; what it did to them can be done to any array without copying it."""
+        """Let kornia transform a 2x2 image, and read off the same transformation as a view for arrays of any size."""
         corners = torch.arange(4.0).reshape(1, 1, 2, 2)
         moved = self.flips_and_turns(corners)[0, 0].numpy()
         for turns in range(4):
@@ -192,7 +194,7 @@ class ClipSampler:
         raise RuntimeError(f"kornia: expected flips and 90-degree turns, found {moved.tolist()}")
 
     def _hang_lamp(self, clip: dict[str, Tensor], mean: Tensor, *, demodulated: bool) -> None:
-        """Paint a rectangle that shines in all frames, with or without an albedo of its own."""
+        """Paint a rectangle of constant radiance in all frames, with or without albedo."""
         height, width = 2 + _randint(self.crop // 3), 2 + _randint(self.crop // 3)
         top, left = _randint(self.crop - height), _randint(self.crop - width)
         tint = 0.7 + 0.6 * torch.rand(1, 3, 1, 1)
@@ -202,7 +204,7 @@ class ClipSampler:
         light = demodulate(radiance, albedo) if demodulated else radiance
         painted = {name: light for name in ("color", "current")}
         painted |= {"albedo": albedo, ALBEDO_HISTORY: albedo, "normal": normal, "reference": radiance}
-        # Depth, motion and history stay: lamps hang on whatever is there. Nor do they reflect, or have noise.
+        # Depth, motion and history are not changed: the lamp lies on the surface. It has no albedo and no noise.
         painted |= dict.fromkeys(("emission", NOISY, OIDN, OIDN_CLEAN), radiance)
         painted |= dict.fromkeys(("diffuse", "specular", "variance"), torch.zeros(1, 3, 1, 1))
         for name in painted.keys() & clip.keys():
@@ -210,15 +212,15 @@ class ClipSampler:
 
 
 def check_sizes(shots: Sequence[tuple[int, tuple[int, int]]], frames: int, crop: int) -> None:
-    """See that clips can be cut from shots.
+    """Check that clips can be cut from shots.
 
     Args:
         shots: number of frames, and height and width in pixels of each.
-        frames: T of a clip.
+        frames: T, the number of frames of a clip.
         crop: side of the square crop in pixels.
 
     Raises:
-        InputError: no shot is long enough, or one that is is smaller than the crop.
+        InputError: no shot is long enough, or one of these is smaller than the crop.
     """
     sizes = [size for length, size in shots if length >= frames]
     if not sizes:
@@ -230,27 +232,27 @@ def check_sizes(shots: Sequence[tuple[int, tuple[int, int]]], frames: int, crop:
 
 @dataclass(frozen=True)
 class _Turn:
-    """Turns of 90 degrees, from the rows to the columns, and a flip of the columns after."""
+    """Rotations by 90 degrees from rows to columns, followed by a flip of the columns."""
 
     turns: int
     flip: bool
 
     def image(self, image: Array) -> Array:
-        """A view of ``(..., H, W)``."""
+        """A transformed view of ``(..., H, W)``."""
         turned = np.rot90(image, self.turns, (-2, -1))
         return turned[..., ::-1] if self.flip else turned
 
     def vectors(self, image: Tensor) -> Tensor:
-        """What the turn makes of the vectors (x right, y down) in ``(T, 2, ...)``; their places stay."""
+        """Transform vectors (x right, y down) in ``(T, 2, ...)`` without moving the pixels."""
         x, y = image.unbind(1)
         for _ in range(self.turns):
-            # What was to the right is above.
+            # A vector to the right points up after the rotation.
             x, y = y, -x
         return torch.stack([-x if self.flip else x, y], 1)
 
 
 def _cropped(view: Tensor, size: tuple[int, int], corner: tuple[int, int], crop: int) -> Tensor:
-    """The matrices ``(T, 4, 4)`` of a camera that sees a square of the image: clip x and y from -1 to 1 across it."""
+    """Camera matrices ``(T, 4, 4)`` for a square crop of the image: clip x and y go from -1 to 1 across it."""
     view = view.clone()
     for column, (pixels, start) in enumerate(zip(size[::-1], corner[::-1], strict=True)):
         offset = (pixels - 2 * start) / crop - 1

@@ -1,4 +1,4 @@
-"""What decides what a training run computes."""
+"""The configuration of a training run."""
 
 from __future__ import annotations
 
@@ -19,46 +19,48 @@ _WARM_UP = 200
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything that decides what a training run computes.
+    """All settings that determine the result of a training run.
 
     The defaults are the paper's setting (Sec. 4.2): clips of 8 frames, 128x128 patches, batches of 8 clips, Adam with
     a learning rate of 1e-4, a temporal loss weight of 0.1.
 
     Args:
-        model: a name of the zoo, or path/to/file.py:factory or package.module:factory of your own.
-        settings: of the model's constructor, such as width=16,cascade=K+P.
-        width: feature channels, as in the settings; 0 takes the model's own, or that of the weights it starts from.
-        losses: weights of the result and of stages on the way to it in the loss, such as image=1,initial=0.5; 1 for the
-            result and for the stage initial, where the model has one, by default.
-        loss: of a clip, see :data:`mcdenoise.train.losses.LOSSES`: smape, the paper's; l1_display, that of Meng et al.
-            2020; or rae, that of Chaitanya et al. 2017, whose later frames count more.
+        model: a name in the zoo, or your own path/to/file.py:factory or package.module:factory.
+        settings: arguments of the model's constructor, such as width=16,cascade=K+P.
+        width: feature channels, the same as in the settings; 0 takes the model's default, or that of the initial
+            weights.
+        losses: weights of the result and of intermediate stages in the loss, such as image=1,initial=0.5; by default 1
+            for the result and for the stage initial, if the model has one.
+        loss: loss of a clip, see :data:`mcdenoise.train.losses.LOSSES`: smape, the paper's; l1_display, that of Meng et
+            al. 2020; or rae, that of Chaitanya et al. 2017, whose later frames count more.
         steps: optimiser steps.
         batch: clips in a step, of all processes together.
         frames: frames in a clip.
         crop: side of the square patches, pixels.
-        learning_rate: of Adam, at its highest.
+        learning_rate: highest learning rate of Adam.
         schedule: constant, or cosine down to 0 after a warm-up of 200 steps.
-        temporal_weight: of the temporal loss.
-        display_weight: of the error on a display, see :func:`mcdenoise.train.losses.display_error`.
-        key: each clip is brought to this typical radiance, a middle gray such as 0.2, before its light is scaled; 0
-            leaves it as it was rendered.
+        temporal_weight: weight of the temporal loss.
+        display_weight: weight of the error on a display, see :func:`mcdenoise.train.losses.display_error`.
+        key: each clip is scaled to this typical radiance, a middle gray such as 0.2, before its light is augmented; 0
+            keeps the rendered radiance.
         gradient_norm: largest norm of a step's gradient; 0 does not limit it.
-        ema: decay of an exponential moving average of the weights, such as 0.999, below it in the first steps; the
-            average is what is validated and what the run ends with. 0 takes the weights themselves.
-        draw_resolutions: a model of several resolutions has, in each step, from one to all of them. With all in every
-            step, the low frequencies of a larger one are never learnt from, since those of the smaller one take their
-            place, and drift.
-        start_every: a shot of a model that accumulates also starts at every n-th frame, to train on short histories.
-        keep_fireflies: every n-th realisation of the noise keeps its fireflies as if they were caustics, see
+        ema: decay of an exponential moving average of the weights, such as 0.999; smaller in the first steps. The
+            average is validated, and is the result of the run. 0 uses the weights themselves.
+        draw_resolutions: in each step, draw how many of its resolutions a multi-resolution model uses. If all were used
+            in every step, the low frequencies of a larger one would never be trained and drift, since those of the
+            smaller one replace them.
+        start_every: a shot of a model that accumulates also begins at every n-th frame, to train on short histories.
+        keep_fireflies: every n-th noise seed keeps its fireflies as if they were caustics, see
             :class:`mcdenoise.models.Accumulated`; 0 for none.
-        validation_frames: the last frames of each sequence, kept for validation (the paper's 4); none of a sequence
-            that would be left with less than one clip.
-        lamps: chance that a clip gets lamps: rectangles of constant radiance, without noise, brighter than the rest.
-        exposure: the light of a clip is scaled by up to so many stops.
-        tint: each colour channel of the light is scaled by up to so many stops.
-        gloss: chance that what has no albedo in a clip (mirrors, glass, lamps) is darker, by up to six stops.
+        validation_frames: number of frames at the end of each sequence that are kept for validation (the paper's 4); 0
+            for a sequence with less than one clip left.
+        lamps: probability that a clip gets lamps: rectangles of constant radiance, without noise, brighter than the
+            rest.
+        exposure: the light of a clip is scaled by up to this many stops.
+        tint: each color channel of the light is scaled by up to this many stops.
+        gloss: probability that surfaces without albedo (mirrors, glass, lamps) are darkened by up to six stops.
         precision: bfloat16 runs convolutions in bfloat16.
-        seed: of weights and clips.
+        seed: seed of weights and clips.
     """
 
     model: str = DEFAULT
@@ -90,19 +92,19 @@ class TrainConfig:
 
     @property
     def model_settings(self) -> dict[str, Any]:
-        """What the model's constructor is given.
+        """The arguments of the model's constructor.
 
         Raises:
-            InputError: the settings are something else.
+            InputError: the settings have another form.
         """
         return parse_settings("settings", self.settings) | ({"width": self.width} if self.width else {})
 
     @property
     def loss_weights(self) -> dict[str, float]:
-        """The weights of the loss by stage, as far as they are asked for.
+        """The requested weights of the loss by stage.
 
         Raises:
-            InputError: one is no number.
+            InputError: a weight is not a number.
         """
         found = parse_settings("losses", self.losses)
         for stage, weight in found.items():
@@ -111,7 +113,7 @@ class TrainConfig:
         return found
 
     def rate(self, step: int) -> float:
-        """The learning rate of a step, in parts of the highest."""
+        """The learning rate of a step relative to the highest one."""
         if self.schedule == "constant":
             return 1.0
         warm_up = min(1.0, (step + 1) / _WARM_UP)
@@ -119,17 +121,17 @@ class TrainConfig:
 
 
 def check_config(config: TrainConfig, checkpoint_every: int) -> None:
-    """See that every setting is one that can be trained with.
+    """Check that every setting is valid.
 
     Raises:
-        InputError: one is not; names it.
+        InputError: a setting is invalid; the message names it.
     """
     lowest = {
         "width": 0,
         "steps": 1,
         "batch": 1,
         "frames": 2 if config.temporal_weight else 1,
-        # A lamp is two pixels wide and has room to hang in more than one place.
+        # A lamp is two pixels wide, and needs more than one possible position.
         "crop": 3 if config.lamps else 1,
         "temporal_weight": 0,
         "display_weight": 0,
@@ -164,14 +166,14 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
 
 
 def parse_settings(name: str, text: str) -> dict[str, Any]:
-    """Read settings such as ``width=16,cascade=K+P,bilateral=false``: numbers, true, false, none, or else texts.
+    """Parse settings such as ``width=16,cascade=K+P,bilateral=false``: numbers, true, false, none, or strings.
 
     Args:
-        name: what they are, for the message.
-        text: separated by commas; empty for none.
+        name: name of the option, for the message.
+        text: settings separated by commas; may be empty.
 
     Raises:
-        InputError: a part is no setting, or one is there twice.
+        InputError: a part is not a setting, or a setting is given twice.
 
     Example:
         >>> parse_settings("settings", "width=16, cascade=K+P, alpha_min=0.2, bilateral=false")

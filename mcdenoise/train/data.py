@@ -1,4 +1,4 @@
-"""What a run trains on, and what it is watched on."""
+"""Training and validation data."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
 from mcdenoise.train.front import Front
 
-# A network that is better with these learns to do without them where they are missing, which nobody wants by mistake.
+# Networks that use these buffers would learn to work without them if they were missing, which is rarely intended.
 _FEATURES = ("albedo", "normal", "depth")
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Sequences, ready to be trained on.
+    """Sequences that are ready for training.
 
     Args:
         sampler: draws the training clips.
-        watched: name and frames of what is validated on.
-        description: of every sequence, enough to tell whether another one has the same pixels.
+        watched: name and frames of each sequence to validate on.
+        description: description of every sequence that identifies its pixels.
     """
 
     sampler: ClipSampler
@@ -37,14 +37,14 @@ class TrainingData:
 
 @dataclass(frozen=True)
 class DataFolders:
-    """Sequences that have what training needs, as far as can be told without reading pixels.
+    """Sequences that have the buffers for training, as far as headers tell.
 
     Args:
-        config: of the run.
-        front: what is done to the frames before they are trained on.
-        features: names of the buffers without noise that are trained on.
-        training: to train on, but for the frames that are held out.
-        validation: used for nothing but validation.
+        config: configuration of the run.
+        front: the wrappers that process the frames before training.
+        features: names of the buffers without noise to train on.
+        training: sequences to train on, except for their validation frames.
+        validation: sequences that are used for validation only.
     """
 
     config: TrainConfig
@@ -60,24 +60,24 @@ class DataFolders:
         """Open the folders.
 
         Args:
-            config: of the run.
-            front: of the model.
-            needs: of the rest of the model.
+            config: configuration of the run.
+            front: front of the model.
+            needs: needs of the rest of the model.
             training: folders to train on.
-            validation: folders for nothing but validation.
+            validation: folders to validate on only.
 
         Raises:
-            InputError: there is none to train on, a sequence has no references or not the features that the model
-                needs, frames are missing between others, none is long enough, or one is smaller than the crop.
+            InputError: there is no training folder, a sequence lacks references or features that the model needs,
+                frames are missing within a sequence, no sequence is long enough, or one is smaller than the crop.
         """
         if not training:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
         opened = [open_sequence(path) for path in (*training, *validation)]
-        # What has no albedo is glossy.
+        # Surfaces without albedo are glossy.
         common = frozenset.intersection(*(features_of(sequence) for sequence in opened))
         front = front.of((needs.buffers | needs.uses) & common)
         used = (needs.buffers | needs.uses | ({"albedo"} if config.gloss else set())) - front.parts.keys()
-        # The cache knows no single samples: methods that take them learn on their mean.
+        # The cache does not store single samples: methods that take samples are trained on their mean.
         used -= {"samples"}
         wanted = needs.buffers - front.parts.keys() | (used & set(_FEATURES))
         for sequence in opened:
@@ -89,7 +89,7 @@ class DataFolders:
         return folders
 
     def load(self, cache: Path) -> TrainingData:
-        """Decode and accumulate what is not in the cache yet.
+        """Decode and accumulate the sequences that are not in the cache yet.
 
         Raises:
             InputError: a file is damaged, or the cache cannot be written.
@@ -101,9 +101,9 @@ class DataFolders:
         for sequence in self.training:
             held = self._held_out(sequence)
             length = len(sequence) - len(held)
-            # A clip may begin anywhere in a shot, so that further ones are of use for their shorter histories alone.
+            # A clip may begin anywhere in a shot; further first frames only provide shorter histories.
             firsts = range(0, len(sequence), config.start_every if self.front.accumulates else len(sequence))
-            # A shot without room for a clip would be kept for nothing; the first one also has the checksum.
+            # Skip a shot without room for a clip, except the first one, which carries the checksum.
             useful = [first for first in firsts if first == 0 or length - first >= config.frames]
             cached = open_cached(
                 sequence,
@@ -136,7 +136,7 @@ class DataFolders:
         return TrainingData(sampler, watched, description)
 
     def _held_out(self, sequence: Sequence) -> list[int]:
-        """Numbers of the frames that are kept for validation: the last ones, none where too few would be left."""
+        """Numbers of the last frames, kept for validation; none if too few frames would remain."""
         enough = len(sequence) >= self.config.frames + self.config.validation_frames
         return sequence.numbers[len(sequence) - self.config.validation_frames :] if enough else []
 
@@ -147,7 +147,7 @@ def _describe(sequence: Sequence, sha256: str, **more: Any) -> dict[str, Any]:
 
 
 def _check_trainable(sequence: Sequence, wanted: frozenset[str]) -> None:
-    """See that a sequence has what training needs, from what is known without reading pixels."""
+    """Check that headers of a sequence show everything that training needs."""
     missing = sorted(wanted - features_of(sequence))
     if missing:
         names = ", ".join([*(name for name in _FEATURES if name in wanted), *sorted(wanted - set(_FEATURES))])

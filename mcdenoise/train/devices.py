@@ -1,4 +1,4 @@
-"""The devices a run uses: one, or those that ``torchrun`` gives it."""
+"""The devices of a run: one, or those of ``torchrun``."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ if TYPE_CHECKING:
 
 
 def is_first_process() -> bool:
-    """Whether this process is the only one of its run, or the one among several that writes."""
+    """Whether this process writes the files of the run: it is the only one, or the first one."""
     return not _launched() or os.environ["RANK"] == "0"
 
 
 def open_fabric(accelerator: str, precision: FloatPrecision, batch: int) -> Fabric:
-    """Connect this process with the others of its run: one device each, on one machine or several.
+    """Connect this process with the other processes of its run: one device each, on one or several machines.
 
     Args:
         accelerator: ``"cpu"`` or ``"cuda"``.
-        precision: of the convolutions.
-        batch: clips in a step, to be shared out evenly.
+        precision: precision of convolutions.
+        batch: clips in a step, which are divided evenly between the processes.
 
     Raises:
-        InputError: the training packages are missing, there is no such accelerator, or the batch cannot be shared out.
+        InputError: the training packages are missing, the accelerator is not available, or the batch cannot be divided.
     """
     try:
         from lightning_fabric import Fabric
@@ -38,7 +38,7 @@ def open_fabric(accelerator: str, precision: FloatPrecision, batch: int) -> Fabr
         ) from error
 
     class Autocast(MixedPrecision):
-        """Convolutions in bfloat16 of radiance that keeps all its digits: Fabric would round every input, too."""
+        """Runs convolutions in bfloat16 on float32 radiance; Fabric's own class would also round every input."""
 
         def convert_input(self, data: Any) -> Any:
             return data
@@ -64,5 +64,5 @@ def open_fabric(accelerator: str, precision: FloatPrecision, batch: int) -> Fabr
 
 
 def _launched() -> bool:
-    # torchrun says how many processes there are, and only torchrun says which run it is.
+    # torchrun sets the number of processes, and only torchrun sets the id of the run.
     return "TORCHELASTIC_RUN_ID" in os.environ

@@ -1,4 +1,4 @@
-"""What comes first in a model and has no weights: it is computed once, into the cache, and not in every step."""
+"""The front of a model: its outer wrappers without weights, which are computed once and cached."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcdenoise.models.accumulated import ALBEDO_HISTORY, CAUSTICS
 from mcdenoise.models.with_oidn import EXACT, NOISY, OIDN, OIDN_CLEAN, WithOidn
 from mcdenoise.ops import remodulate
 
-# What comes of accumulation, and of Open Image Denoise, with the number of channels.
+# Buffers that accumulation and Open Image Denoise provide, with their channels.
 ACCUMULATED: Mapping[str, int] = {"color": 3, "current": 3, "length": 1}
 _PARTS = frozenset(RADIANCE) - ACCUMULATED.keys()
 GIVEN: Mapping[str, int] = {OIDN: 3, OIDN_CLEAN: 3, NOISY: 3, EXACT: 1}
@@ -22,11 +22,11 @@ GIVEN: Mapping[str, int] = {OIDN: 3, OIDN_CLEAN: 3, NOISY: 3, EXACT: 1}
 
 @dataclass(frozen=True)
 class Front:
-    """Wrappers without weights, up to the last one that hands on images; none where a model does not begin with them.
+    """The wrappers without weights at the outside of a model, up to the last one that provides images; may be empty.
 
     Args:
         wrappers: outermost first, each with the settings of its constructor.
-        given: parts of the light that every frame has: they are handed on as the wrappers make them.
+        given: parts of the light that every frame has; they are cached as processed by the wrappers.
     """
 
     wrappers: tuple[tuple[type[Wrapper], dict[str, Any]], ...] = ()
@@ -34,17 +34,17 @@ class Front:
 
     @property
     def accumulates(self) -> bool:
-        """Whether frames come out with a history: with ``current`` and ``length``."""
+        """Whether the processed frames have a history: ``current`` and ``length``."""
         return self._has(Accumulated)
 
     @property
     def demodulates(self) -> bool:
-        """Whether frames come out without albedo in their radiance."""
+        """Whether the radiance of the processed frames is demodulated."""
         return self._has(Demodulated)
 
     @property
     def parts(self) -> dict[str, int]:
-        """Names of the buffers that each noise of its own changes, with their channels: radiance, and histories."""
+        """Names and channels of the buffers that depend on the noise seed: radiance, and histories."""
         also = {name for _, settings in self.wrappers for name in settings.get("also", ())}
         history = {ALBEDO_HISTORY: 3} if "albedo" in also else {}
         history |= dict.fromkeys(self.given, 3)
@@ -52,12 +52,12 @@ class Front:
         return {**accumulated, **history, **(GIVEN if self._has(WithOidn) else {})}
 
     def of(self, buffers: Collection[str]) -> Front:
-        """The same for frames that all have these buffers, as far as they are of use."""
+        """The same front for frames that all have these buffers."""
         return replace(self, given=tuple(sorted(_PARTS & set(buffers))))
 
     @property
     def settings(self) -> list[Any]:
-        """Everything that the frames depend on, as JSON knows it."""
+        """Everything that the processed frames depend on, in JSON types."""
         wrappers = [[kind.__name__, settings] for kind, settings in self.wrappers]
         return [*wrappers, ["given", {"given": list(self.given)}]] if self.given else wrappers
 
@@ -65,10 +65,10 @@ class Front:
         return any(kind is wanted for kind, _ in self.wrappers)
 
     def begin(self, *, keep_fireflies: bool = False) -> Callable[[Frame], Frame]:
-        """What makes of each frame of one shot what the rest of the model sees.
+        """Return a function that processes the frames of one shot, in order, as input of the rest of the model.
 
         Args:
-            keep_fireflies: whatever the shot looks like, take its fireflies for caustics.
+            keep_fireflies: treat fireflies as caustics in every shot.
         """
         seen = _Seen()
         model: Model = seen
@@ -86,7 +86,7 @@ class Front:
 
 
 class _Seen(nn.Module):
-    """Remembers the frame that it is given."""
+    """Stores the frame that it receives."""
 
     needs = Needs(trainable=False)
     frame: Frame
@@ -97,11 +97,11 @@ class _Seen(nn.Module):
 
 
 class Remodulated(Wrapper):
-    """A method on frames whose radiance has no albedo in it, which it multiplies into all images of the result."""
+    """Multiplies all images of a method by the albedo, for frames whose radiance is demodulated."""
 
     @property
     def needs(self) -> Needs:
-        """As those inside, and the albedo."""
+        """The needs of the inner method, and the albedo."""
         needs = self.inner.needs
         return Needs(needs.buffers | {"albedo"}, needs.uses, needs.trainable, needs.reach, needs.stride)
 
@@ -115,18 +115,18 @@ class Remodulated(Wrapper):
 
 
 def _with(albedo: Tensor, image: Tensor) -> Tensor:
-    # A network that ends with a convolution hands out its precision.
+    # A network that ends with a convolution returns half precision under autocast.
     return remodulate(image.to(albedo.dtype), albedo)
 
 
 def split(model: Model) -> tuple[Front, Model]:
-    """A model in two: what is computed into the cache, and the rest, which is trained on what is there.
+    """Split a model into its front, which is cached, and the rest, which is trained on the cached frames.
 
-    What only skips work is no part of either: nothing is skipped in training.
+    Wrappers that only skip work are dropped, because training does not skip anything.
     """
     wrappers: list[tuple[type[Wrapper], dict[str, Any]]] = []
     found, rest = 0, model
-    # Not those that are derived from them, which may do anything.
+    # Exact types only, because derived classes may do anything.
     while isinstance(model, Wrapper) and type(model) in (Demodulated, Accumulated, WithOidn):
         wrappers.append((type(model), _settings(model)))
         model = model.inner
@@ -139,5 +139,5 @@ def split(model: Model) -> tuple[Front, Model]:
 
 
 def _settings(wrapper: Wrapper) -> dict[str, Any]:
-    """What the constructor of a wrapper was given: it keeps everything under its own name."""
+    """The constructor arguments of a wrapper, which it stores under the same names."""
     return {name: value for name, value in vars(wrapper).items() if not name.startswith("_") and name != "training"}

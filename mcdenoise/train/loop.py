@@ -1,4 +1,4 @@
-"""The training loop: a run that can be stopped at any moment and goes on as if it had not been."""
+"""The training loop: a run can be stopped at any time and resumes as if it had not been interrupted."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ _LOG_EVERY = 50
 
 @dataclass(frozen=True)
 class Progress:
-    """What a training run reports.
+    """Progress report of a training run.
 
     Args:
-        step: optimiser steps done.
+        step: number of finished optimiser steps.
         loss: mean training loss since the last report.
-        gradient_norm: mean norm of the gradient since the last report, before it was limited.
-        learning_rate: of the last step.
+        gradient_norm: mean norm of the gradient since the last report, before clipping.
+        learning_rate: learning rate of the last step.
         seconds: time since the run was started or resumed.
-        validation: errors on the validation frames, by name, where they were measured.
+        validation: errors on the validation frames by name, if they were measured.
     """
 
     step: int
@@ -74,36 +74,36 @@ def train(
     recipe: str = "",
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> Path:
-    """Train a model, from the start or from where an earlier run of the same config in ``out`` stopped.
+    """Train a model from the beginning, or resume an interrupted run of the same config in ``out``.
 
-    A step unrolls the model over clips, with the gradient through its state. What comes first in it and has no weights,
-    such as its accumulation, is computed once into the cache, see :mod:`mcdenoise.train.front`.
+    A step unrolls the model over clips, with gradients through its state. The front of the model, such as its
+    accumulation, is computed once into the cache, see :mod:`mcdenoise.train.front`.
 
-    Every clip of every step has its own seed, so that a run that was interrupted and resumed computes the same as one
-    that was not, and several processes (``torchrun``) the same as one, up to the rounding of sums. Processes on several
-    machines need ``sequences``, ``out`` and ``cache`` on a disk that they share.
+    Every clip of every step has its own seed. So an interrupted and resumed run gives the same result as an
+    uninterrupted one, and several processes (``torchrun``) the same as one, up to the rounding of sums. Processes on
+    several machines need ``sequences``, ``out`` and ``cache`` on a shared disk.
 
     Args:
-        config: what to train.
+        config: configuration of the run.
         sequences: folders of sequences with references and features.
         out: folder of the run: ``config.json``, ``data.json``, ``log.jsonl``, TensorBoard events, ``checkpoint.pt``,
-            and at the end ``MODEL.safetensors`` (of ``mine.py:factory``, ``factory.safetensors``).
-        validation: folders of sequences that are used for nothing but validation.
-        cache: folder of the decoded sequences, which several runs may share; ``out/cache`` by default. Nothing in it is
-            needed once a run has ended.
+            and at the end ``MODEL.safetensors`` (for ``mine.py:factory``, ``factory.safetensors``).
+        validation: folders of sequences that are used for validation only.
+        cache: folder of the decoded sequences, which several runs may use; ``out/cache`` by default. It may be deleted
+            after the run.
         initial_weights: weights to start from instead of random ones, such as those of an earlier run.
         accelerator: ``"cpu"`` or ``"cuda"``.
-        checkpoint_every: steps between checkpoints and validations.
+        checkpoint_every: number of steps between checkpoints and validations.
         credits: authors and licences of the training scenes, stored with the weights.
-        recipe: checksum of the recipe that the run follows, stored likewise.
+        recipe: checksum of the recipe of the run, stored with the weights.
         report: called with the progress every 50 steps, in the first process only.
 
     Returns:
         Path of the weights.
 
     Raises:
-        InputError: no data, data without references, a run of another config in ``out``, a file that cannot be written,
-            or an optional dependency is missing.
+        InputError: there are no data or no references, ``out`` holds a run of another config, a file cannot be written,
+            or an optional package is missing.
     """
     check_config(config, checkpoint_every)
     fabric = open_fabric(accelerator, config.precision, config.batch)
@@ -127,7 +127,7 @@ def train(
     output, state = _tried(config.model, rest, first_clip, fabric)
     losses = stage_weights(config.loss_weights, output)
     network.train()
-    # Only now, so that input that cannot be trained on leaves no trace of a run.
+    # Only now, so that invalid input does not leave files of a run.
     if fabric.is_global_zero:
         run.claim(config=settled, data=identity)
     fabric.barrier()
@@ -137,7 +137,7 @@ def train(
     weights = out / f"{config.model.rpartition(':')[2]}.safetensors"
     if first == config.steps and weights.exists():
         return weights
-    # The source tree may change while the run goes on, and between its parts.
+    # The source tree may change between interruptions of the run.
     provenance.append({"first_step": first, "commit": source_commit()})
     with _writing(out), run.held() if fabric.is_global_zero else nullcontext():
         _run(trainer, data, run, first, provenance, checkpoint_every, report)
@@ -150,14 +150,14 @@ def train(
 
 
 def _trainable(config: TrainConfig, model: Model) -> Any:
-    """The model in training mode, as a model and a module."""
+    """The model in training mode, typed as both model and module."""
     if not isinstance(model, nn.Module) or not any(weight.requires_grad for weight in model.parameters()):
         raise InputError(f"model '{config.model}': expected one that learns, found one without weights")
     return model.train()
 
 
 def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> tuple[Output, State]:
-    """What a model gives for the first frames of a clip: what fails is to be known before the run begins."""
+    """Run the model on the first frames of a clip, so that errors show before the run begins."""
     state: State = None
     try:
         with torch.no_grad(), fabric.autocast():
@@ -178,11 +178,11 @@ def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> tuple[Output,
 
 
 class Trainer:
-    """A model and what it learns with.
+    """A model with its optimizer and scheduler.
 
     Args:
-        config: of the run.
-        network: in training mode; its front is what the clips have been through.
+        config: configuration of the run.
+        network: network in training mode, without the front, which the clips have passed.
         fabric: devices.
         losses: weights of the loss by stage.
         has_state: whether the model has a state.
@@ -200,29 +200,29 @@ class Trainer:
 
     @property
     def parts(self) -> list[Any]:
-        """What a checkpoint holds."""
+        """The objects whose states a checkpoint holds."""
         parts = [self.network, self.optimizer, self.scheduler]
         return [*parts, self.average] if self.average is not None else parts
 
     @property
     def result(self) -> Any:
-        """The model that is validated and kept."""
+        """The model to validate and to save."""
         return self.network if self.average is None else self.average.module
 
     def seeds(self, step: int) -> list[int]:
-        """The seed of each clip of this process in a step: together those that one process would draw."""
+        """Seeds of this process's clips in a step; those of all processes together are the same as for one process."""
         share = self.config.batch // self.fabric.world_size
         clips = range(self.fabric.global_rank * share, (self.fabric.global_rank + 1) * share)
         entropies = ([self.config.seed, step, clip] for clip in clips)
         return [int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0]) for entropy in entropies]
 
     def step(self, step: int, clip: Clip) -> tuple[float, float]:
-        """Learn from this process's clips; loss and norm of the gradient of the whole batch.
+        """Train on this process's clips; return loss and gradient norm of the whole batch.
 
         Raises:
-            InputError: one of them is not finite; nothing has been learnt from it then.
+            InputError: one of them is not finite; the weights have not been changed.
         """
-        # The clips have seeds of their own; this one is the same in all processes.
+        # The seeds of clips differ between processes; this one is the same in all of them.
         torch.manual_seed(self.config.seed * 1_000_003 + step)
         clip = clip.to(self.fabric.device)
         with _drawn_resolutions(self.network) if self.config.draw_resolutions else nullcontext():
@@ -266,7 +266,7 @@ class Trainer:
 
 @contextmanager
 def _drawn_resolutions(network: Any) -> Iterator[None]:
-    """As many resolutions as are drawn, and then all of them again; a model of one resolution stays as it is."""
+    """Use a random number of resolutions inside this block; a model of one resolution is not changed."""
     parts = [part for part in parts_of(network, CoarseToFine) if part.resolutions > 1]
     every = [part.resolutions for part in parts]
     for part in parts:
@@ -279,7 +279,7 @@ def _drawn_resolutions(network: Any) -> Iterator[None]:
 
 
 def _moving_average(network: nn.Module, decay: float) -> AveragedModel:
-    """Averaged weights; at first over the last few steps only, lest they stay close to random ones for long."""
+    """A moving average of the weights; shorter in the first steps, so that initial weights are forgotten soon."""
 
     def blend(averages: Any, current: Any, count: Any) -> None:
         warm_up = (1 + int(count)) / (10 + int(count))
@@ -297,7 +297,7 @@ def _run(
     checkpoint_every: int,
     report: Callable[[Progress], None],
 ) -> None:
-    """All steps from the first on; only the first process writes."""
+    """Run all steps from ``first`` on; only the first process writes files."""
     config, fabric = trainer.config, trainer.fabric
     with _board(run.out, first, fabric.is_global_zero) as board:
         if fabric.is_global_zero:
@@ -321,7 +321,7 @@ def _run(
             run.log(dataclasses.asdict(progress))
             for name in ("loss", "gradient_norm", "learning_rate"):
                 board.add_scalar(f"train/{name}", getattr(progress, name), done)
-            # Last, so that no step that will not be done again is missing in the log.
+            # Written last, so that the log never lacks a step that will not be repeated.
             if save:
                 run.save(done, provenance, *trainer.parts)
             report(progress)
@@ -329,11 +329,11 @@ def _run(
 
 @contextmanager
 def _board(out: Path, first: int, writes: bool) -> Iterator[Any]:
-    """The TensorBoard writer of the first process; the others have none."""
+    """The TensorBoard writer in the first process, ``None`` in the others."""
     if not writes:
         yield None
         return
-    from torch.utils.tensorboard import SummaryWriter  # here because importing it takes a second
+    from torch.utils.tensorboard import SummaryWriter  # imported here because it takes a second
 
     with _quiet_threads(), SummaryWriter(str(out), purge_step=first) as board:
         yield board
@@ -341,7 +341,7 @@ def _board(out: Path, first: int, writes: bool) -> Iterator[Any]:
 
 @contextmanager
 def _quiet_threads() -> Iterator[None]:
-    """What the operating system refuses to TensorBoard's thread is not printed there: the next write raises it."""
+    """Suppress printed errors of TensorBoard's thread; the next write raises them."""
     before = threading.excepthook
 
     def hook(failed: threading.ExceptHookArgs) -> None:
@@ -357,7 +357,7 @@ def _quiet_threads() -> Iterator[None]:
 
 @contextmanager
 def _writing(out: Path) -> Iterator[None]:
-    """One line for what the operating system refuses."""
+    """Convert errors of the operating system to an ``InputError``."""
     try:
         yield
     except OSError as error:

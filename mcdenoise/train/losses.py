@@ -27,25 +27,25 @@ def stage_loss(
     temporal_weight: float = 0.1,
     display_weight: float = 0.0,
 ) -> Tensor:
-    """The total loss: errors in space and time of the image, its error on a display, and those of stages before it.
+    """The total loss: for the image and for intermediate stages, errors in space and time, and errors on a display.
 
     ``L = sum_s w_s (L_c(R_s, Y) + w_d L_d(R_s, Y))`` with the loss ``L_c`` of a clip; with ``L_c`` of
     :func:`smape_loss`, weights of 1 for the result and the stage ``initial``, and without ``w_d``, that is the paper's.
 
     Args:
-        output: of a clip: images ``(B, T, 3, H, W)``, scene-linear radiance with its albedo.
-        reference: Y of the same shape.
-        weights: of the result, ``"image"``, and of stages by name; those without one do not count.
+        output: output for a clip: images ``(B, T, 3, H, W)``, scene-linear radiance including albedo.
+        reference: Y, the same shape.
+        weights: weight of the result, ``"image"``, and of stages by name; other stages have weight 0.
         loss: a name in :data:`LOSSES`: ``"smape"``, :func:`smape_loss`; ``"l1_display"``, :func:`l1_display_loss`; or
             ``"rae"``, :func:`rae_loss`.
-        temporal_weight: ``w_t`` of these, the paper's ``w_c = w_d``, 0.1; 0 leaves the temporal loss out.
-        display_weight: ``w_d`` of :func:`display_error`; 0, as in the paper, leaves it out.
+        temporal_weight: ``w_t`` of these, the paper's ``w_c = w_d``, 0.1; 0 disables the temporal loss.
+        display_weight: ``w_d`` of :func:`display_error`; 0, as in the paper, disables it.
 
     Returns:
         A scalar, the mean over the batch.
 
     Raises:
-        ValueError: the shapes differ, or the temporal loss is asked for clips of one frame.
+        ValueError: the shapes differ, or a temporal loss is requested for clips of one frame.
 
     Differentiable in all images.
 
@@ -71,35 +71,35 @@ def smape_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1
 
     Args:
         image: R, ``(B, T, 3, H, W)`` scene-linear radiance.
-        reference: Y of the same shape.
-        temporal_weight: ``w_t``; 0 leaves the temporal loss out.
+        reference: Y, the same shape.
+        temporal_weight: ``w_t``; 0 disables the temporal loss.
 
     Returns:
         A scalar, the mean over the batch.
 
     Raises:
-        ValueError: the shapes differ, or the temporal loss is asked for clips of one frame.
+        ValueError: the shapes differ, or a temporal loss is requested for clips of one frame.
     """
     spatial = smape_linear(image, reference).mean()
     return spatial + temporal_weight * temporal_smape_linear(image, reference).mean() if temporal_weight else spatial
 
 
 def l1_display_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) -> Tensor:
-    """Mean absolute difference on the curve of a display, which a bright pixel moves less than a dark one.
+    """Mean absolute difference of gamma-mapped radiance, which gives bright pixels less weight than dark ones.
 
-    ``L = mean |g(R) - g(Y)| + w_t L_t(dR, dY)`` with ``g(x) = (max(x, 0) + c)^(1 / 2.2)`` and ``c = 0.001``. What Meng
-    et al. 2020 train with has no ``c`` and no ``L_t``. Unlike :func:`display_error` it does not end where displays do.
+    ``L = mean |g(R) - g(Y)| + w_t L_t(dR, dY)`` with ``g(x) = (max(x, 0) + c)^(1 / 2.2)`` and ``c = 0.001``. Meng et
+    al. 2020 train without ``c`` and without ``L_t``. Unlike :func:`display_error` it has no upper limit.
 
     Args:
         image: R, ``(B, T, 3, H, W)`` scene-linear radiance.
-        reference: Y of the same shape.
-        temporal_weight: ``w_t`` of the temporal SMAPE; 0 leaves it out.
+        reference: Y, the same shape.
+        temporal_weight: ``w_t`` of the temporal SMAPE; 0 disables it.
 
     Returns:
-        A scalar, the mean over the batch, differentiable where both are not equal, also in black.
+        A scalar, the mean over the batch, differentiable where both images differ, also in black.
 
     Raises:
-        ValueError: the shapes differ, or the temporal loss is asked for clips of one frame.
+        ValueError: the shapes differ, or a temporal loss is requested for clips of one frame.
     """
     if image.shape != reference.shape:
         raise ValueError(f"image: expected shape {tuple(reference.shape)} as reference, found {tuple(image.shape)}")
@@ -109,22 +109,22 @@ def l1_display_loss(image: Tensor, reference: Tensor, *, temporal_weight: float 
 
 
 def rae_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) -> Tensor:
-    """L1 in space, of gradients and in time, which counts the more the later in a clip a frame is.
+    """L1 of values, of gradients and of temporal differences, with larger weights for later frames of a clip.
 
     ``L = sum_t g_t (0.8 L_s + 0.1 L_g + w_t L_t) / sum_t g_t``, with ``P = log(1 + R)`` and ``T = log(1 + Y)``:
 
     - ``L_s = mean |P - T|``,
     - ``L_g = mean |dP - dT|`` over the differences between neighbours along x, and along y, the mean of both,
-    - ``L_t = mean |(P_t - P_{t-1}) - (T_t - T_{t-1})|``, 0 of the first frame,
-    - ``g_t = exp(-(n - t)^2 / 8)`` of frame t of n: of 7 frames 0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1, so that a
-      hidden state has time to fill.
+    - ``L_t = mean |(P_t - P_{t-1}) - (T_t - T_{t-1})|``, 0 for the first frame,
+    - ``g_t = exp(-(n - t)^2 / 8)`` for frame t of n: for 7 frames 0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1, which
+      gives a hidden state time to adapt.
 
-    Its terms and their weights are those of the paper. The logarithms, the differences of neighbours as the gradient,
-    and the division by the sum of the weights, which makes clips of any length alike, are what is taken here.
+    The terms and their weights are those of the paper. Our choices are the logarithms, differences of neighbours as
+    gradients, and the division by the sum of the weights, which makes the loss independent of the clip's length.
 
     Args:
         image: R, ``(B, T, 3, H, W)`` scene-linear radiance, not negative.
-        reference: Y of the same shape.
+        reference: Y, the same shape.
         temporal_weight: ``w_t``.
 
     Returns:
@@ -133,7 +133,7 @@ def rae_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) 
     Raises:
         ValueError: the shapes differ.
 
-    Differentiable in both images where nothing is equal.
+    Differentiable in both images where no two compared values are equal.
 
     Source: Chaitanya et al. 2017, the equations of the spatial, gradient and temporal loss. The weights of the frames
     are a Gaussian with a deviation of 2 frames, which gives the seven numbers of the paper.
@@ -149,11 +149,11 @@ def rae_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) 
     frames = error.shape[1]
     counts = torch.exp(-torch.arange(frames - 1, -1, -1, device=error.device).to(error.dtype).square() / 8)
     each = 0.8 * _by_frame(error)
-    # A row or a column of one pixel has no neighbours.
+    # An image of one row or column has no gradient along that axis.
     for dim in (-1, -2):
         if error.shape[dim] > 1:
             each = each + 0.05 * _by_frame(error.diff(dim=dim))
-    # The difference of differences is that of the errors.
+    # Differences are linear: compute them from the errors.
     change = torch.cat([torch.zeros_like(error[:, :1]), error.diff(dim=1)], 1)
     each = each + temporal_weight * _by_frame(change)
     return (each * counts).sum(1).mean() / counts.sum()
@@ -164,22 +164,22 @@ def _by_frame(error: Tensor) -> Tensor:
     return error.abs().mean((-3, -2, -1))
 
 
-# Of a clip, by name.
+# Losses of a clip by name.
 LOSSES: dict[str, Callable[..., Tensor]] = {"smape": smape_loss, "l1_display": l1_display_loss, "rae": rae_loss}
 
 
 def display_error(image: Tensor, reference: Tensor) -> Tensor:
-    """Root mean square error of each frame as a display shows it, which is what PSNR is the logarithm of.
+    """Root mean square error of each gamma-mapped and clamped frame, from which PSNR is computed.
 
-    ``sqrt(mean((g(x) - g(y))^2))`` with ``g(x) = (clamp(x, 0, 1) + c)^(1 / 2.2)``. SMAPE alone is content with a
-    median: a highlight of which most samples know nothing is left out.
+    ``sqrt(mean((g(x) - g(y))^2))`` with ``g(x) = (clamp(x, 0, 1) + c)^(1 / 2.2)``. SMAPE alone is minimal for the
+    median, which misses a highlight that only few samples hit.
 
     Args:
-        image: ``(..., 3, H, W)`` scene-linear radiance, 1 is the brightest that a display shows.
-        reference: of the same shape.
+        image: ``(..., 3, H, W)`` scene-linear radiance; 1 is the brightest value of a display.
+        reference: the same shape.
 
     Returns:
-        ``(...)``, one number a frame, differentiable also where both are equal, or black: ``c = 0.001``.
+        ``(...)``, one number per frame, differentiable also where both are equal or black, because of ``c = 0.001``.
     """
     shown, wanted = (each.clamp(0, 1).add(_DARK).pow(1 / 2.2) for each in (image, reference))
     return ((shown - wanted).square().mean((-3, -2, -1)) + _DARK**2).sqrt()
@@ -189,12 +189,12 @@ def stage_weights(asked: Mapping[str, float], output: Output) -> dict[str, float
     """The weight of each stage in the loss.
 
     Args:
-        asked: weights by stage; without any, those of the paper: 1 for the result and for the stage ``initial``, where
-            the model has one.
-        output: of the model.
+        asked: weights by stage; if empty, those of the paper: 1 for the result and for the stage ``initial``, if the
+            model has one.
+        output: output of the model.
 
     Raises:
-        InputError: the model has no such stage, or a weight is negative or all are zero.
+        InputError: the model has no such stage, a weight is negative, or all are zero.
     """
     known = (RESULT, *output.stages)
     weights = dict(asked) or {stage: 1.0 for stage in (RESULT, "initial") if stage in known}

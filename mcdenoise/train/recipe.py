@@ -1,13 +1,13 @@
-"""A recipe: a TOML file that says all that decides what weights become, from the seeds of the data on.
+"""A recipe: a TOML file with all settings that determine trained weights, including the seeds of the data.
 
 ::
 
     [train]             # fields of TrainConfig; credits = "authors and licences"
-    [[data]]            # options of `mcdenoise generate`; clean_references = true if they are to be cleaned
-    [[validation]]      # likewise
-    [expected]          # smape and tolerance: the error on the validation frames, and how far above it a run may end
+    [[data]]            # options of `mcdenoise generate`; clean_references = true removes noise from references
+    [[validation]]      # the same options
+    [expected]          # smape and tolerance: the error on the validation frames, and by how much a run may exceed it
 
-A recipe of several runs on the same data has a table for each of them besides::
+A recipe of several runs on the same data also has a table for each run::
 
     [[run]]             # name; fields of TrainConfig that differ from [train]; expected = {smape=..., tolerance=...};
                         # seeds = [1, 2] makes two runs of it, NAME-1 and NAME-2
@@ -36,19 +36,19 @@ from mcdenoise.train.references import clean_references
 _TABLES = ("train", "data", "validation", "expected", "run")
 _BOUND = {"smape": float, "tolerance": float}
 _CLEAN = "clean_references"
-# Of a run: it is a folder's, too.
+# A run's name is also the name of its folder.
 _NAME = re.compile(r"[A-Za-z0-9+_-]{1,64}")
 _NO_PIXELS = ("workers", "threads", "blender_python")
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """Sequences that one run of ``mcdenoise generate`` makes.
+    """The sequences from one run of ``mcdenoise generate``.
 
     Args:
-        where: the file and the table of the recipe, for messages.
-        options: of the command, with underscores.
-        clean: whether what noise is left in the references is removed, see :func:`clean_references`.
+        where: file and table of the recipe, for messages.
+        options: options of the command, with underscores.
+        clean: whether remaining noise is removed from the references, see :func:`clean_references`.
     """
 
     where: str
@@ -56,27 +56,27 @@ class Rendering:
     clean: bool
 
     def folder(self, data: Path) -> Path:
-        """Where they are rendered: the same options have the same place, in whichever recipe."""
+        """The folder to render to; the same options have the same folder in every recipe."""
         return data / self.sha256[:16]
 
     @property
     def sha256(self) -> str:
-        """Of all that decides what is rendered."""
-        # The pixels are the same whoever renders them.
+        """Checksum of everything that determines the rendered images."""
+        # The number of processes does not change the pixels.
         return _digest({key: value for key, value in self.options.items() if key not in _NO_PIXELS})
 
     def make(self, data: Path, generate: Callable[[], object]) -> list[Path]:
-        """Render what is not there yet, and clean the references if that is asked for.
+        """Render missing sequences, and clean the references if requested.
 
         Args:
-            data: folder of the sequences of all recipes.
-            generate: renders to :meth:`folder`; keeps what is finished there.
+            data: folder for the sequences of all recipes.
+            generate: renders to :meth:`folder`, and keeps finished files there.
 
         Returns:
             Folders of the sequences.
 
         Raises:
-            InputError: it cannot be rendered, cleaned or written.
+            InputError: the sequences cannot be rendered, cleaned or written.
         """
         place = self.folder(data)
         finished = place / "finished.json"
@@ -100,10 +100,10 @@ class Run:
     """One training run of a recipe.
 
     Args:
-        name: of its folder; empty for the only run of a recipe, whose folder is that of the recipe.
-        config: what is trained.
-        expected: SMAPE at the end, and how far above it a run may end; ``None`` if the recipe does not say.
-        sha256: of all that decides what is computed.
+        name: name of its folder; empty for the only run of a recipe, which uses the recipe's folder.
+        config: configuration of the run.
+        expected: final SMAPE, and by how much a run may exceed it; ``None`` if the recipe does not state it.
+        sha256: checksum of everything that determines the result.
     """
 
     name: str
@@ -114,12 +114,12 @@ class Run:
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a recipe says.
+    """The contents of a recipe.
 
     Args:
-        runs: what is trained, at least one run.
-        data: what each is trained on.
-        validation: what is used for nothing but validation.
+        runs: the runs, at least one.
+        data: sequences to train on.
+        validation: sequences that are used for validation only.
         credits: authors and licences of the training scenes.
     """
 
@@ -130,14 +130,14 @@ class Recipe:
 
     @staticmethod
     def read(path: Path, options: Collection[str]) -> Recipe:
-        """Read a recipe, and see that what it names exists.
+        """Read a recipe, and check that its names exist.
 
         Args:
-            path: of the file.
-            options: names that a table of data may have.
+            path: the file.
+            options: valid keys of a data table.
 
         Raises:
-            InputError: it cannot be read, a key is unknown, or a value is none that can be trained with.
+            InputError: the file cannot be read, a key is unknown, or a value is invalid.
         """
         content = _parse(path)
         kinds = {field.name: type(field.default) for field in fields(TrainConfig)}
@@ -153,7 +153,7 @@ class Recipe:
             sha256 = _digest([settings or None, *rendered])
             config = TrainConfig(**{key: value for key, value in settings.items() if key != "credits"})
             with naming(where):
-                # What would fail after hours of rendering.
+                # Check settings before hours of rendering.
                 check_config(config, 1)
                 create_model(config.model, **config.model_settings)
             runs.append(Run(name, config, expected, sha256))
@@ -163,10 +163,10 @@ class Recipe:
         return Recipe(runs, made["data"], made["validation"], common.get("credits", ""))
 
     def chosen(self, names: Collection[str]) -> list[Run]:
-        """The runs of some names, in the order of the recipe; all where none is named.
+        """Select runs by name, in the order of the recipe; all if no name is given.
 
         Raises:
-            InputError: the recipe has no run of a name.
+            InputError: the recipe has no run of this name.
         """
         known = [run.name for run in self.runs]
         for name in names:
@@ -177,7 +177,7 @@ class Recipe:
 
 
 def _run_tables(path: Path, content: dict[str, Any], kinds: Mapping[str, type]) -> list[tuple[str, dict[str, Any]]]:
-    """Where each run of a recipe is described, and how it differs from the others."""
+    """The location of each run in the recipe, and its settings that differ from the common ones."""
     tables = content.get("run", [])
     if not isinstance(tables, list):
         raise InputError(f"{path}: expected tables [[run]], found [run]")
@@ -211,7 +211,7 @@ def _expected(where: str, table: Any) -> tuple[float, float] | None:
 
 @contextmanager
 def naming(where: str) -> Iterator[None]:
-    """Say where in a recipe it is that something is wrong."""
+    """Add the location in the recipe to errors."""
     try:
         yield
     except InputError as error:
@@ -242,7 +242,7 @@ def _renderings(path: Path, name: str, tables: Any, options: Collection[str]) ->
 
 
 def _checked(where: str, table: Any, kinds: Mapping[str, type]) -> dict[str, Any]:
-    """A table, whose keys are known and whose values are of their kind."""
+    """Check the keys and the types of the values of a table."""
     _check_keys(where, table, kinds)
     for key, value in table.items():
         if type(value) is not kinds[key] and (type(value), kinds[key]) != (int, float):

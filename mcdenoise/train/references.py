@@ -1,4 +1,4 @@
-"""References with less noise than they were rendered with, to train on."""
+"""Removal of remaining noise from the references of training data."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from mcdenoise.reading import read_text
 
 
 def clean_references(source: Path, out: Path) -> Path:
-    """Copy a sequence in the BMFR layout with the remaining noise of its references removed by Open Image Denoise.
+    """Copy a sequence in the BMFR layout, with its references denoised by Open Image Denoise.
 
-    A network that is trained with an error of relative differences learns the median of noisy references, which is
-    darker than their mean, and few samples a pixel leave much noise where light is hard to find. Open Image Denoise at
-    high quality, told that albedo and normal are clean, removes nearly all of it: at 50 samples a pixel that is a far
-    easier problem than at one. Those of an anti-aliased reference were rendered with it. For training only: what is
-    measured is measured against references as they were rendered.
+    A network trained with a relative error learns the median of noisy references, which is darker than their mean, and
+    much noise remains in a few samples per pixel where light is hard to find. Open Image Denoise at high quality with
+    clean albedo and normal removes nearly all of it: at 50 samples per pixel this is far easier than at one. An
+    anti-aliased reference was rendered with its own features. Use the result for training only; errors are measured
+    against references as rendered.
 
     Args:
-        source: folder of the sequence. The noise of its features, if they have any, comes back in the references.
-        out: folder for the copy. One that is finished is kept.
+        source: folder of the sequence. If its features have noise, this noise will be in the references.
+        out: folder for the copy. A finished copy is kept.
 
     Returns:
         Folder of the copy, ``out/NAME``.
@@ -37,7 +37,7 @@ def clean_references(source: Path, out: Path) -> Path:
     sequence = open_sequence(source)
     inputs = source / "inputs" if (source / "inputs").is_dir() else source
     copied = out / sequence.name / "inputs"
-    # Written last: it says that the copy is finished.
+    # Written last, as a sign that the copy is complete.
     description = copied / "camera.json"
     if description.exists():
         return copied.parent
@@ -49,12 +49,12 @@ def clean_references(source: Path, out: Path) -> Path:
             continue
         features = read_clean_features(inputs, number) or (frame.albedo, frame.normal)
         image = oidn(Frame(color=frame.reference, albedo=features[0], normal=features[1]))[0].image
-        # The filter may undershoot; radiance may not.
+        # The filter may return negative radiance.
         pixels = image[0].clamp(0, 65504).permute(1, 2, 0).numpy()
         write_exr(copied / f"reference{number}.exr", pixels, ["R", "G", "B"], half=True)
     rendered = inputs / description.name
     about = json.loads(read_text(rendered)) if rendered.exists() else {}
-    # What was said of the references no longer holds, and without it no renderer takes them for means of so many paths.
+    # Remove statements about the references that no longer hold, so that no renderer refines them as means of paths.
     about = {key: value for key, value in about.items() if key not in ("reference_spp", "reference_noise")}
     write_text(description, json.dumps({**about, "reference_filter": "Open Image Denoise, high, clean aux"}) + "\n")
     return copied.parent

@@ -1,4 +1,4 @@
-"""The folder of a training run: what is trained on what, how far it is, and the weights at the end."""
+"""The folder of a training run: configuration, data description, progress, and final weights."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from mcdenoise.errors import InputError
 from mcdenoise.reading import read_bytes, read_text
 
 _SEAL = 32  # bytes of a SHA-256
-# Bytes of a log of millions of lines, or of a checkpoint.
+# Size limits of a log of millions of lines, and of a checkpoint.
 _LARGEST = 1 << 34
 
-# Steps from ``first_step`` on were computed by the source tree of ``commit``.
+# The source tree of ``commit`` computed the steps from ``first_step`` on.
 Provenance = list[dict[str, Any]]
 
 
@@ -37,18 +37,18 @@ class RunFolder:
     out: Path
 
     def check(self, **identity: Any) -> None:
-        """See that no other run has the folder; write nothing.
+        """Check that the folder does not belong to another run; write nothing.
 
         Args:
-            identity: for each file its content.
+            identity: contents of each identifying file.
 
         Raises:
-            InputError: an earlier run wrote something else to one of the files, or the folder's name is not UTF-8.
+            InputError: an earlier run wrote other contents, or the folder's name is not valid UTF-8.
         """
         try:
             str(self.out).encode()
         except UnicodeEncodeError as error:
-            # TensorBoard cannot write its events there.
+            # TensorBoard could not write its events there.
             raise InputError(
                 f"{self.out}: expected a folder whose name is UTF-8; choose another one for the run"
             ) from error
@@ -60,10 +60,10 @@ class RunFolder:
                 )
 
     def claim(self, **identity: Any) -> None:
-        """Write what identifies the run to ``NAME.json``, or check that an earlier run did just that.
+        """Write the identity of the run to ``NAME.json``, or check that an earlier run wrote the same.
 
         Args:
-            identity: for each file its content.
+            identity: contents of each identifying file.
 
         Raises:
             InputError: the folder cannot be written to, or belongs to another run.
@@ -79,29 +79,30 @@ class RunFolder:
                 write_text(path, _json(content))
 
     def held(self) -> AbstractContextManager[None]:
-        """Have the folder for oneself; that ends with the process, however that ends.
+        """Lock the folder for this process; the lock is released when the process ends in any way.
 
         Raises:
-            InputError: another process has it, which the message names.
+            InputError: another process holds the lock; the message names it.
         """
         return held(self.out, "training")
 
     def save(self, step: int, provenance: Provenance, *parts: Any) -> None:
-        """Replace the checkpoint: the number of steps done, and the states of model, optimizer and scheduler.
+        """Replace the checkpoint: the number of finished steps, and the states of model, optimizer and scheduler.
 
         Raises:
-            InputError: it cannot be written; the one before is kept.
+            InputError: the file cannot be written; the previous checkpoint is kept.
         """
         states = [part.state_dict() for part in parts]
         content = io.BytesIO()
         torch.save({"step": step, "provenance": provenance, "parts": states}, content)
-        # Not by torch itself, which does not say that a disk is full in a way that could be told from other failures.
+        # torch.save does not distinguish a full disk from other errors, so serialize to memory and write the bytes
+        # here.
         with atomic_path(self._checkpoint) as temporary, temporary.open("wb") as file:
             file.write(content.getbuffer())
             file.write(_sealed(content.getbuffer()))
 
     def load(self, *parts: Any) -> tuple[int, Provenance]:
-        """Restore what :meth:`save` saved; zero steps without a checkpoint.
+        """Restore the state from the checkpoint; return zero steps if there is none.
 
         Raises:
             InputError: the checkpoint cannot be loaded.
@@ -124,16 +125,16 @@ class RunFolder:
             ) from error
 
     def log(self, entry: dict[str, Any]) -> None:
-        """Append a line to ``log.jsonl``, which :meth:`rewind` has seen to be a file, if there was one.
+        """Append a line to ``log.jsonl``, which :meth:`rewind` has checked to be a file, if it existed.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
 
     def errors(self) -> dict[str, float]:
-        """The errors of the last validation; none without one.
+        """The errors of the last validation; empty if there was none.
 
         Raises:
             InputError: the log cannot be read.
@@ -147,9 +148,9 @@ class RunFolder:
             raise InputError(f"{path}: expected the log of this run, found none that can be read") from error
 
     def rewind(self, step: int) -> None:
-        """Drop from ``log.jsonl`` what will be computed again, steps after ``step``, and lines that are damaged.
+        """Remove damaged lines, and lines of steps after ``step``, which will be repeated, from ``log.jsonl``.
 
-        One may be cut off in writing; others hold zeros, or anything, after a power cut.
+        The last line may be truncated, and others may hold zeros or anything else after a power failure.
 
         Raises:
             InputError: the log cannot be read or written.
@@ -169,12 +170,12 @@ class RunFolder:
 
 
 def _sealed(content: memoryview) -> bytes:
-    """The checksum of a checkpoint, which stands behind it: one flipped bit would train other weights."""
+    """Checksum at the end of a checkpoint, because a single flipped bit would silently change the training."""
     return hashlib.sha256(content).digest()
 
 
 def _last_step(line: bytes) -> float:
-    """The step that a line of the log is about, the first that a start is about; infinity where it is damaged."""
+    """The step of a log line, or the first step of a start entry; infinity if the line is damaged."""
     try:
         entry = json.loads(line.decode())
         return float(entry.get("step", entry.get("first_step", math.inf)))
@@ -189,13 +190,13 @@ def _json(content: Any) -> str:
 def about_weights(
     config: dict[str, Any], identity: dict[str, Any], steps: int, provenance: Provenance
 ) -> dict[str, str]:
-    """What weights say of the run that they come from, for :func:`mcdenoise.models.save_weights`.
+    """Provenance of weights from a training run, for :func:`mcdenoise.models.save_weights`.
 
     Args:
-        config: what ``config.json`` holds.
-        identity: what ``data.json`` holds.
-        steps: optimiser steps done.
-        provenance: of the steps.
+        config: contents of ``config.json``.
+        identity: contents of ``data.json``.
+        steps: number of finished optimiser steps.
+        provenance: the commits that computed the steps.
     """
     return {
         "config": json.dumps(config),

@@ -1,4 +1,4 @@
-"""A method over the frames of a clip, with the gradient through its state."""
+"""Running a method over the frames of a clip, with gradients through its state."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from mcdenoise.train.losses import RESULT
 
 
 def unroll(model: Model, clip: Clip, *, has_state: bool = True) -> Output:
-    """Denoise the frames of a clip one after the other, from no state on.
+    """Denoise the frames of a clip one after the other, beginning without a state.
 
     Args:
         model: any method.
-        clip: of T frames.
-        has_state: whether the method has a state; for one without, every frame is a first one, and all are computed at
-            once, which is faster.
+        clip: a clip of T frames.
+        has_state: whether the method has a state; without one, all frames are computed at once as first frames, which
+            is faster.
 
     Returns:
         The image and its stages, ``(B, T, 3, H, W)`` each.
 
     Raises:
-        TypeError: the method has a state and was said to have none.
+        TypeError: the method has a state although ``has_state`` is false.
 
     Differentiable in the weights of the method and in the clip, through the state.
 
@@ -47,11 +47,11 @@ def unroll(model: Model, clip: Clip, *, has_state: bool = True) -> Output:
 
 
 class Unrolled(nn.Module):
-    """:func:`unroll` as a module of the buffers of a clip: what a device, or several, compute in a step.
+    """:func:`unroll` as a module that takes the buffers of a clip, for running on one or several devices.
 
     Args:
         model: any method that is a module.
-        has_state: whether it has a state.
+        has_state: whether the method has a state.
     """
 
     def __init__(self, model: Model, *, has_state: bool = True) -> None:
@@ -59,5 +59,5 @@ class Unrolled(nn.Module):
         self.model, self.has_state = model, has_state
 
     def forward(self, buffers: Mapping[str, Tensor]) -> Output:
-        """Images ``(B, T, 3, H, W)`` of ``(B, T, C, H, W)`` buffers."""
+        """Compute images ``(B, T, 3, H, W)`` from ``(B, T, C, H, W)`` buffers."""
         return unroll(self.model, Clip(dict(buffers)), has_state=self.has_state)

@@ -1,4 +1,4 @@
-"""How good a network is while it learns."""
+"""Validation of a network during training."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ def validate(
     board: Any,
     step: int,
 ) -> dict[str, float]:
-    """Errors of a model on whole frames, one frame after the other, and pictures of them for TensorBoard.
+    """Compute the errors of a model on whole frames, and write images to TensorBoard.
 
     Args:
-        model: not wrapped for several processes; only one of them validates.
-        stages: those that the loss looks at.
-        watched: name and frames of each sequence; realisation 0 of the noise. A model with a state has none before the
-            first of them.
+        model: the unwrapped model; only one process validates.
+        stages: the stages in the loss.
+        watched: name and frames of each sequence; the first noise seed is used. A model with a state begins without
+            one.
         fabric: device and precision.
         board: the TensorBoard writer.
         step: optimiser steps done.
 
     Returns:
-        SMAPE and display PSNR of the result (``smape``, ``psnr``) and of stages (``initial_smape``, ...), means over
+        SMAPE and display PSNR of the result (``smape``, ``psnr``) and of stages (``initial_smape``, ...): means over
         each sequence's frames and then over the sequences; empty without sequences.
     """
     totals: dict[str, float] = {}

@@ -23,7 +23,7 @@ from mcdenoise import Denoiser, Frame, InputError, create_model, ops
 from mcdenoise.models import Accumulated, Demodulated, Journal, Output, list_models, listening, timed
 from mcdenoise.models import _journal as journal_module
 from mcdenoise.models._journal import ask
-from mcdenoise.models._reads import at_hand, out_of_reach
+from mcdenoise.models._reads import at_hand, without_reads
 from mcdenoise.models._stopwatch import Stopwatch
 
 # Open Image Denoise is a library for processors here: images go there and back, which waits.
@@ -65,7 +65,7 @@ def shot(model: Any, count: int = 3) -> list[Frame]:
 def as_on_a_gpu(denoiser: Denoiser, frames: list[Frame]) -> tuple[list[Tensor], Counter[str]]:
     """Images of a shot, and what was read meanwhile; without forms for processors."""
     images = []
-    with ops.use("torch"), out_of_reach(), Reads() as reads:
+    with ops.use("torch"), without_reads(), Reads() as reads:
         for frame in frames:
             images.append(denoiser(frame))
     return images, reads.found
@@ -82,7 +82,7 @@ def test_a_step_reads_nothing(name: str) -> None:
 def test_a_step_with_layers_alpha_and_stages_reads_nothing() -> None:
     model = small("cascaded_v2_tiny")
     denoiser, frames = Denoiser(model, alpha=True), shot(model)
-    with ops.use("torch"), out_of_reach(), Reads() as reads:
+    with ops.use("torch"), without_reads(), Reads() as reads:
         for frame in frames:
             layers = {"diffuse": 0.25 * frame.color, "glossy": 0.5 * frame.color}
             output = denoiser.output(frame.replace(layers=layers, alpha=torch.ones(1, 1, *SIZE)))
@@ -187,7 +187,7 @@ def test_bad_values_are_told_a_frame_late_and_the_history_begins_anew(name: str)
     denoiser = Denoiser(Demodulated(Accumulated(Same())))
     good = shot(denoiser.model, 3)
     bad = good[1].replace(**{name: torch.full_like(good[1].buffer(name), value)})
-    with ops.use("torch"), out_of_reach():
+    with ops.use("torch"), without_reads():
         denoiser(good[0])
         denoiser(bad)
         told = refused(lambda: denoiser(good[2]))
@@ -204,7 +204,7 @@ def test_bad_values_are_told_a_frame_late_and_the_history_begins_anew(name: str)
 def test_layers_that_are_no_parts_are_told_late() -> None:
     denoiser = Denoiser(Same())
     (frame,) = shot(denoiser.model, 1)
-    with out_of_reach():
+    with without_reads():
         denoiser.output(frame.replace(layers={"twice": 2 * frame.color}))
     assert refused(lambda: denoiser.report).startswith("layers: expected parts of the color, found twice brighter")
 
@@ -215,7 +215,7 @@ def test_an_image_that_is_not_finite_is_told_late() -> None:
             return Output(frame.color.index_fill(3, torch.tensor([2]), torch.nan)), None
 
     denoiser = Denoiser(Broken())
-    with out_of_reach():
+    with without_reads():
         denoiser(shot(denoiser.model, 1)[0])
     assert f"found {SIZE[0]} NaN or infinite pixels" in refused(lambda: denoiser.report)
 
@@ -275,9 +275,9 @@ def test_stages_are_timed_without_waiting(monkeypatch: pytest.MonkeyPatch) -> No
         for _ in range(2):
             with timed("inner", device):
                 time.sleep(0.03)
-        with timed("silent", device, unless_told=True), timed("told", device):
+        with timed("silent", device, unless_detailed=True), timed("told", device):
             time.sleep(0.01)
-        with timed("telling", device, unless_told=True):
+        with timed("telling", device, unless_detailed=True):
             time.sleep(0.01)
     whole = (time.perf_counter() - start) * 1e3
     assert (Event.waits, found.milliseconds) == (0, {})
@@ -298,7 +298,7 @@ def test_a_streamed_frame_waits_for_no_mark(monkeypatch: pytest.MonkeyPatch) -> 
     model = small("cascaded_v2_micro")
     denoiser = Denoiser(model)
     frames = shot(model, 2)
-    with ops.use("torch"), out_of_reach():
+    with ops.use("torch"), without_reads():
         denoiser(frames[0])
         denoiser.report  # noqa: B018
         Event.waits = 0
@@ -316,7 +316,7 @@ def test_all_are_told_before_one_that_fails_is_heard() -> None:
         raise InputError("no")
 
     found = Journal()
-    with out_of_reach(), listening(found):
+    with without_reads(), listening(found):
         assert not at_hand(torch.device("cpu"))
         ask(torch.tensor([1.0, 2.0]), refuse)
         ask(torch.tensor(True), lambda numbers: told.append(list(numbers)))

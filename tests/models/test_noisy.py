@@ -26,7 +26,7 @@ def frame(height: int = 18, width: int = 22) -> Frame:
 
 def test_pages_register_themselves() -> None:
     assert {"noisy", "accumulated", "cascaded_v2"} <= set(list_models())
-    assert find_model("noisy").description == "The frame's own color."
+    assert find_model("noisy").description == "Returns the frame's color unchanged."
 
 
 def test_noisy_is_the_color_itself() -> None:

@@ -1,7 +1,7 @@
-"""Attributes of an EXR that OpenEXR's Python module cannot hold, carried past it byte by byte.
+"""Copying EXR attributes that OpenEXR's Python module cannot represent.
 
-A text in Latin-1 or Shift-JIS stops it, and some types of values too. Each gives way to a text of the same length in a
-copy of the file, and takes its place again in what is written.
+The module fails on text in Latin-1 or Shift-JIS, and on some attribute types. A copy of the file holds a placeholder
+text of the same length for each such attribute, and the original bytes are put back into the written file.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from typing import NamedTuple
 
 _MULTI_PART = 0x1000
 _TEXTS = {b"string", b"stringvector"}
-# That it does not know, or drops.
+# Attribute types that the module does not know, or drops.
 _UNKNOWN = {b"bytes", b"deepImageState", b"idmanifest"}
 
 
 class Record(NamedTuple):
-    """An attribute in the header of a file: its name, its type, the count of bytes, the value.
+    """An attribute in the header of a file: name, type, byte count, value.
 
     Args:
         part: index of the part.
-        name: of the attribute.
-        kind: its type.
-        start: of the record in the file.
-        value: where the value starts.
-        end: of the record.
+        name: name of the attribute.
+        kind: type of the attribute.
+        start: file offset of the record.
+        value: file offset of the value.
+        end: file offset of the record's end.
     """
 
     part: int
@@ -40,7 +40,7 @@ class Record(NamedTuple):
 
 
 def records(content: bytes | mmap.mmap) -> Iterator[Record]:
-    """The attributes of all parts of a file (OpenEXR File Layout, "Header"); ``ValueError`` where it is damaged."""
+    """The attributes of all parts of a file (OpenEXR File Layout, "Header"); ``ValueError`` if it is damaged."""
     several = int.from_bytes(content[4:8], "little") & _MULTI_PART
     place, part = 8, 0
     while content[place]:
@@ -60,14 +60,14 @@ def records(content: bytes | mmap.mmap) -> Iterator[Record]:
 
 @contextmanager
 def readable(source: Path, copy: Path) -> Iterator[tuple[Path, dict[tuple[int, bytes], bytes]]]:
-    """Give a file that OpenEXR's Python module can read, and the records that are not in it.
+    """Yield a file that OpenEXR's Python module can read, and the replaced records.
 
     Args:
         source: an EXR.
-        copy: where a copy may be made; it is removed again.
+        copy: path for a temporary copy.
 
     Yields:
-        ``source`` itself with nothing, or ``copy`` with the records of ``source`` by part and name.
+        ``source`` itself and nothing, or ``copy`` and the original records by part and name.
     """
     strange: dict[tuple[int, bytes], bytes] = {}
     with source.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -92,7 +92,7 @@ def readable(source: Path, copy: Path) -> Iterator[tuple[Path, dict[tuple[int, b
 
 
 def put_back(target: Path, strange: dict[tuple[int, bytes], bytes]) -> None:
-    """Write records in the place of those that stand for them."""
+    """Replace placeholder records by the original ones."""
     with target.open("r+b") as file, mmap.mmap(file.fileno(), 0) as content:
         for part, name, _, start, _, end in list(records(content)):
             record = strange.get((part, name))

@@ -1,4 +1,4 @@
-"""The layout of the BMFR data set: one EXR a buffer and frame, cameras in a C header (Koskela et al. 2019)."""
+"""The layout of the BMFR data set: one EXR per buffer and frame, cameras in a C header (Koskela et al. 2019)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from mcdenoise.data.exr import (
 from mcdenoise.data.files import write_text
 from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.data.readers.cameras import convert, read_as
-from mcdenoise.data.readers.diffuse_specular import PARTS, adds_up, off
+from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS, adds_up, off
 from mcdenoise.data.readers.layers import layers_of
 from mcdenoise.data.readers.names import find_files
 from mcdenoise.data.readers.rewrite import write_like
@@ -50,7 +50,7 @@ from mcdenoise.data.readers.values import (
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame, scale_samples
 
-# Buffer to file name, in the order of writing: color comes last, so that a frame that has its color is complete.
+# File names of the buffers in writing order: color is last, so that a frame that has its color is complete.
 _STEMS = {
     "albedo": "albedo",
     "normal": "shading_normal",
@@ -65,7 +65,7 @@ _STEMS = {
     "color": "color",
 }
 _KNOWN = re.compile(rf"({'|'.join(_STEMS.values())})[0-9]+\.exr")
-# What nobody else calls a buffer.
+# Names that are not used for buffers outside this layout.
 _OWN_STEMS = {"shading_normal", "world_position"}
 _CHANNELS = {1: ["Y"], 2: ["X", "Y"], 3: ["R", "G", "B"]}
 _DESCRIPTION, _LARGEST_DESCRIPTION = "camera.json", 2**26
@@ -76,21 +76,21 @@ _FULL_FLOAT = {"position", "previous_position"}
 class BmfrFolder:
     """A folder in this layout: ``{color,albedo,shading_normal,world_position,...}N.exr`` and ``camera_matrices.h``.
 
-    Further noisy colors of the same frames, with noise of their own, are ``realisation{1,2,...}/colorN.exr``. Other
-    buffers that lie beside them are of the same samples, and have noise of their own too; references are the same.
+    Further noisy colors of the same frames, with other noise seeds, are ``realisation{1,2,...}/colorN.exr``. If other
+    buffers lie beside them, these have noise of the same seed; references do not depend on the seed.
 
     Args:
         path: the folder that holds the files.
         files: for each buffer, the file of each frame number.
         numbers: frames in use, ascending.
         size: height and width in pixels, the same for every buffer and frame.
-        cameras: what ``camera_matrices.h`` says, or ``None`` without it.
+        cameras: contents of ``camera_matrices.h``, or ``None`` without it.
         color_has_albedo: whether the color files hold radiance (``camera.json`` says so) or radiance divided by
             albedo (the published data, which has no ``camera.json``). Without albedo files it is always radiance.
-        more: for each realisation of the noise from 1 on, the files that it has of its own, as ``files``.
-        table: what each buffer was taken from.
-        warnings: what is probably wrong.
-        unused: files that look like buffers of the layout and are not.
+        more: for each noise seed from 1 on, its own files, like ``files``.
+        table: the source of each buffer.
+        warnings: probable mistakes.
+        unused: files that look like buffers of the layout but are not used.
     """
 
     path: Path
@@ -109,24 +109,24 @@ class BmfrFolder:
 
     @property
     def folders(self) -> set[Path]:
-        """Where the files lie."""
+        """The folders of the files."""
         return {self.path}
 
     @property
     def realisations(self) -> int:
-        """How many noisy colors every frame in use has."""
+        """The number of noisy colors that every frame in use has."""
         return 1 + len(self.more)
 
     @property
     def noisy(self) -> frozenset[str]:
-        """Names of the buffers that are of each realisation's own samples, as :meth:`frame` gives them."""
+        """Names of the buffers that differ between noise seeds, as :meth:`frame` returns them."""
         own = {name for files in self.more for name in files} | {"color"}
         derived = {"depth"} if "position" in own and self.cameras is not None and not self.files.get("depth") else set()
         return frozenset(own | derived)
 
     @property
     def buffers(self) -> frozenset[str]:
-        """Names of the buffers that every frame has, as :meth:`frame` gives them."""
+        """Names of the buffers that every frame has, as :meth:`frame` returns them."""
         present = {name for name, files in self.files.items() if all(number in files for number in self.numbers)}
         present -= {"motion"} if self.motion is None else set()
         if self.cameras is not None:
@@ -139,7 +139,7 @@ class BmfrFolder:
         return [number for number in self.numbers if number in self.files["reference"]]
 
     def frame_files(self, number: int) -> list[Path]:
-        """The files of one frame but its references, and those that say how all are read."""
+        """The files of one frame without its references, and the files that describe all frames."""
         own = [files[number] for name, files in self.files.items() if name != "reference" and number in files]
         return own + [path for path in (self.path / _DESCRIPTION, self.path / MATRICES) if path.is_file()]
 
@@ -151,7 +151,7 @@ class BmfrFolder:
         self, number: int, *, reference: bool = True, realisation: int = 0, buffers: Collection[str] | None = None
     ) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
-        unwanted = frozenset() if buffers is None else PARTS - set(buffers)
+        unwanted = frozenset() if buffers is None else LIGHT_PARTS - set(buffers)
         sources: dict[str, Mapping[int, Path]] = dict(self.files)
         if realisation:
             sources |= self.more[realisation - 1]
@@ -214,10 +214,10 @@ def find_frames(path: Path) -> dict[str, dict[int, Path]] | None:
 
 
 def is_bmfr(path: Path) -> bool:
-    """Whether the images of a folder are in this layout, by their names: at least they say nothing else.
+    """Whether the names of a folder's images have this layout, and no other.
 
     Raises:
-        InputError: as :func:`find_frames`.
+        InputError: see :func:`find_frames`.
     """
     files = find_frames(path)
     if files is None:
@@ -233,7 +233,7 @@ def is_bmfr(path: Path) -> bool:
 
 
 def realisation_folder(folder: Path, realisation: int) -> Path:
-    """Where the colors of one realisation of the noise are: 0 in the folder itself, k in ``realisation{k}``."""
+    """The folder of a noise seed's colors: the folder itself for 0, ``realisation{k}`` for k."""
     return folder / f"realisation{realisation}" if realisation else folder
 
 
@@ -256,14 +256,14 @@ def _list_files(path: Path, stems: Mapping[str, str]) -> dict[str, dict[int, Pat
 def open_bmfr(
     path: Path, files: Mapping[str, Mapping[int, Path]], numbers: list[int], color_has_albedo: bool | None = None
 ) -> BmfrFolder:
-    """Check the chosen frames of a folder, from file names and headers, and what the first one's values say.
+    """Check the selected frames of a folder by file names and headers, and the values of the first frame.
 
     Args:
         path: the folder.
-        files: what :func:`find_frames` found there.
+        files: result of :func:`find_frames`.
         numbers: the frames to use, ascending; each has a color file.
-        color_has_albedo: whether color is radiance with the albedo in it; what ``camera.json`` says, or else what the
-            values tell, by default.
+        color_has_albedo: whether color is radiance including albedo; by default as stated in ``camera.json``, or else
+            determined from the values.
 
     Raises:
         InputError: a file is missing or unreadable, or sizes or channels differ from what is expected.
@@ -290,9 +290,9 @@ def open_bmfr(
 
 
 def _with_parts(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
-    """Without diffuse and specular light that do not add up to the color, and samples whose mean it is not."""
+    """Remove diffuse and specular light that do not add up to the color, and samples whose mean is not the color."""
     number, warnings, dropped = folder.numbers[0], [], set()
-    given = {name for name in PARTS & folder.files.keys() if folder.files[name]}
+    given = {name for name in LIGHT_PARTS & folder.files.keys() if folder.files[name]}
     if not given:
         return folder
 
@@ -319,7 +319,7 @@ def _with_parts(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
 
 
 def _read_samples(path: Path, size: tuple[int, int]) -> Image:
-    """``(S, C, H, W)`` of ``samplesN.exr``."""
+    """Read ``(S, C, H, W)`` from ``samplesN.exr``."""
     parts = read_image_header(path).parts
     layers, _ = split_samples(layers_of(0, "", parts))
     if layers is None or parts[0].size != size:
@@ -333,9 +333,9 @@ def _read_samples(path: Path, size: tuple[int, int]) -> Image:
 
 
 def _look(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
-    """What the values of the first frame say that nobody has stated."""
+    """Determine from the values of the first frame what is not stated."""
     number = folder.numbers[0]
-    # What is stated is not looked for, and the pixels of most files are not read twice.
+    # Skip stated properties, and do not read the pixels of a file twice.
     looked_at = {"position", "normal"} | ({"color", "albedo", "reference"} if stated is None else set())
     images = {
         name: folder._read(name, files[number])[0].permute(1, 2, 0).numpy()
@@ -396,7 +396,7 @@ def _look(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
 
 
 def _pairs(folder: BmfrFolder) -> list[Pair]:
-    """Neighbouring frames, by which the convention of their motion is told."""
+    """Pairs of consecutive frames, for determining the convention of their motion."""
     kept = [name for name in ("albedo", "normal") if folder.files.get(name)] or ["color"]
 
     def features(number: int) -> dict[str, Image]:
@@ -411,7 +411,7 @@ def _pairs(folder: BmfrFolder) -> list[Pair]:
 
 
 def _others(path: Path) -> list[str]:
-    """Images that the layout does not know, such as `normal#.exr`, which it calls otherwise."""
+    """Images whose names the layout does not use, such as `normal#.exr`."""
     names = [each.name for each in find_files([path]) if not _KNOWN.fullmatch(each.name)]
     return list(dict.fromkeys(re.sub("[0-9]+", "#", name) for name in names))
 
@@ -419,7 +419,7 @@ def _others(path: Path) -> list[str]:
 def _find_realisations(
     path: Path, numbers: list[int], first: ExrHeader, used: set[str]
 ) -> list[dict[str, dict[int, Path]]]:
-    """Files of the realisations 1, 2, ... up to the first whose color some frame lacks: it is still being rendered."""
+    """Files of the noise seeds 1, 2, ..., up to the first seed that lacks a color and so is still being rendered."""
     found: list[dict[str, dict[int, Path]]] = []
     while os.path.isdir(folder := realisation_folder(path, 1 + len(found))):
         files = _list_files(folder, {name: _STEMS[name] for name in used})
@@ -443,11 +443,11 @@ def write_bmfr_frame(
 ) -> None:
     """Write the buffers of one frame: 32-bit floats for positions (and depths beyond half's range), half for the rest.
 
-    The color file is written last. A folder without ``camera.json`` gets one that says that color is radiance.
+    The color file is written last. A folder without ``camera.json`` gets one, which states that color is radiance.
     ``view_projection`` is not written: see :func:`mcdenoise.data.camera_matrices.write_camera_matrices`.
 
     Args:
-        folder: where to write; made if it does not exist.
+        folder: folder to write to; created if it does not exist.
         number: frame number.
         frame: batch of 1. Infinite depths are stored as 0.
         metadata: attributes for every file.
@@ -462,7 +462,7 @@ def write_bmfr_frame(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from error
-    # Without it a reader must take the folder for published BMFR data, whose color is divided by albedo.
+    # Without it, a reader must assume published BMFR data, whose color is divided by albedo.
     if not (folder / _DESCRIPTION).exists():
         write_text(folder / _DESCRIPTION, json.dumps({"color_includes_albedo": True}) + "\n")
     buffers = dict(frame.items())
@@ -474,12 +474,12 @@ def write_bmfr_frame(
 def write_buffer(
     folder: Path, number: int, name: str, buffer: Tensor, *, metadata: Mapping[str, MetadataValue] | None = None
 ) -> None:
-    """Write one buffer of a frame, whole or not at all, as :func:`write_bmfr_frame` does.
+    """Write one buffer of a frame atomically, like :func:`write_bmfr_frame`.
 
     Args:
-        folder: where to write. It must exist.
+        folder: folder to write to. It must exist.
         number: frame number.
-        name: which buffer, such as ``"reference"``.
+        name: name of the buffer, such as ``"reference"``.
         buffer: ``(1, C, H, W)``; samples are ``(1, S, C, H, W)``.
         metadata: attributes for the file.
 
@@ -498,15 +498,15 @@ def write_buffer(
 
 
 def has_buffer(folder: Path, number: int, name: str, size: tuple[int, int]) -> bool:
-    """Whether a buffer of a frame is there, and whole: its pixels are read, once in a process.
+    """Whether a complete file of a buffer exists: its pixels are read, once per process.
 
-    A file that is damaged, empty or of another size, as a power cut may leave it, is none.
+    A file that is damaged, empty or of another size, for example after a power failure, does not count.
 
     Args:
-        folder: where it would be.
+        folder: folder of the file.
         number: frame number.
-        name: which buffer.
-        size: width and height in pixels that it has to have.
+        name: name of the buffer.
+        size: expected width and height in pixels.
     """
     path = folder / f"{_STEMS[name]}{number}.exr"
     try:
@@ -530,7 +530,7 @@ CLEAN = "clean"
 
 
 def write_clean_features(folder: Path, number: int, albedo: Tensor, normal: Tensor) -> None:
-    """Write the features that belong to a reference, of many samples: ``clean/albedoN.exr`` and so on.
+    """Write the converged features of a reference: ``clean/albedoN.exr`` and so on.
 
     Args:
         folder: ``inputs`` of a sequence.
@@ -551,7 +551,7 @@ def write_clean_features(folder: Path, number: int, albedo: Tensor, normal: Tens
 
 
 def read_clean_features(folder: Path, number: int) -> tuple[Tensor, Tensor] | None:
-    """Albedo and normal of :func:`write_clean_features`, ``(1, 3, H, W)`` each; ``None`` where there are none.
+    """Read albedo and normal of :func:`write_clean_features`, ``(1, 3, H, W)`` each, or ``None``.
 
     Raises:
         InputError: a file is damaged.
@@ -564,7 +564,7 @@ def read_clean_features(folder: Path, number: int) -> tuple[Tensor, Tensor] | No
 
 
 def _check_header(name: str, path: Path, first: ExrHeader) -> None:
-    """A file has the channels of its buffer, and the same pixels as the first color."""
+    """Check that a file has the channels of its buffer and the data window of the first color."""
     header = read_exr_header(path)
     _check_file(name, path, header.size, header.channels, first.size)
     if header.origin != first.origin:
@@ -593,13 +593,13 @@ def _check_file(
 
 
 def _color_has_albedo(path: Path, albedo_present: bool) -> bool | None:
-    """What ``camera.json`` says of it; ``None`` without one: then its values tell the published data from others."""
+    """Read it from ``camera.json``; ``None`` without that file: then the values have to tell."""
     description = path / _DESCRIPTION
     if not os.path.lexists(description):
-        # Without albedo there is nothing to multiply back: somebody's plain radiance, not the published data.
+        # Without albedo there is nothing to multiply by: this is ordinary radiance, not the published data.
         return None if albedo_present else True
     try:
-        # A pipe would wait for ever, a device never end.
+        # Opening a pipe would block, and a device has no end.
         if not os.path.isfile(description):
             raise OSError("no file")
         with description.open(encoding="utf-8") as file:
@@ -618,18 +618,18 @@ def _color_has_albedo(path: Path, albedo_present: bool) -> bool | None:
 
 
 def _view_depth(matrix: Array, position: Tensor) -> tuple[Array, Tensor]:
-    """Clip w of every position; the matrix comes back with the sign that makes it positive in front of the camera."""
+    """Clip w of every position, and the matrix with the sign that makes it positive in front of the camera."""
     w = position[0].double().permute(1, 2, 0) @ torch.from_numpy(matrix[:3, 3]) + matrix[3, 3]
-    # A matrix and its negative project alike; what was seen lies in front.
+    # A matrix and its negative give the same projection; visible points lie in front.
     if w.median() < 0:
         matrix, w = -matrix, -w
     return matrix, w.float()[None, None]
 
 
 def _with_infinite_background(depth: Tensor, albedo: Tensor | None, normal: Tensor | None) -> Tensor:
-    """Infinity where nothing was hit: depth 0, a placeholder behind the camera, or neither albedo nor normal."""
+    """Set depth to infinity where nothing was hit: at depth 0, behind the camera, or without albedo and normal."""
     nothing = torch.from_numpy(nothing_hit(depth.numpy()))
     if albedo is not None and normal is not None:
-        # Both: mirrors and glass have no albedo, but they have a normal.
+        # Both must be zero: mirrors and glass have no albedo, but they have a normal.
         nothing |= ((albedo == 0) & (normal == 0)).all(dim=1, keepdim=True)
     return torch.where(nothing, torch.inf, depth)

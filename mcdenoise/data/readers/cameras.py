@@ -1,4 +1,4 @@
-"""Cameras and the positions that they see: each tells whether the other is what it is said to be."""
+"""Consistency of cameras and positions: fitting a camera to positions, and checking a given one."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from mcdenoise.data.camera_matrices import Array
 from mcdenoise.data.exr import Image, Mask
 
-# Pixels are compared on a grid of about so many.
+# Approximate number of sampled pixels.
 _POINTS = 4096
-# How often those that miss are left out anew.
+# Number of times that outliers are rejected.
 _ROUNDS = 10
-# Pixels by which a point may miss its own, in the median: filters and lenses move points, and offsets by one at most.
+# Largest median reprojection error in pixels: filters and lenses move points, and pixel offsets differ by one at most.
 _NEAR = 2.0
-# How much a second solution has to be worse for the first one to be told: points of one plane have many.
+# Ratio of the second smallest to the smallest singular value: coplanar points have many solutions.
 _UNIQUE = 10.0
 
 
 class FittedCamera(NamedTuple):
-    """The camera that sees given points at their pixels.
+    """The camera that projects given points to their pixels.
 
     Args:
         matrix: float64 ``(4, 4)`` row-vector world-to-clip matrix, clip y down, clip w the depth along the view axis.
-        error: by how many pixels a point misses its own, in the median.
-        eye: where the camera is.
+        error: median reprojection error in pixels.
+        eye: position of the camera.
     """
 
     matrix: Array
@@ -34,18 +34,19 @@ class FittedCamera(NamedTuple):
 
 
 def fit_camera(position: Image | Array, seen: Mask) -> FittedCamera | None:
-    r"""Find the camera from the positions that its pixels show, by the direct linear transform.
+    r"""Fit a camera to the positions in an image by the direct linear transform.
 
-    Each pixel says :math:`P a = u\,P c` and :math:`P b = v\,P c` of the columns a, b, c of the matrix (Hartley and
-    Zisserman, Multiple View Geometry, 7.1); the smallest singular vector of all of them solves these. Then again
-    without the points that miss their pixel by most: at edges, filters make means of points that nobody sees.
+    Each pixel gives :math:`P a = u\,P c` and :math:`P b = v\,P c` for the columns a, b, c of the matrix (Hartley and
+    Zisserman, Multiple View Geometry, 7.1); the singular vector of the smallest singular value solves all of them. The
+    fit is repeated without the points of the largest error: at edges, pixel filters average positions of different
+    surfaces.
 
     Args:
         position: ``(H, W, 3)``.
-        seen: ``(H, W)`` bool, where something was hit.
+        seen: ``(H, W)`` bool, true where something was hit.
 
     Returns:
-        ``None`` where the points do not tell: too few, all in one plane, or not those of a camera.
+        ``None`` if the points do not determine a camera: too few, coplanar, or not seen by a pinhole camera.
     """
     points, pixels, size = _sampled(position, seen)
     if len(points) < 32:
@@ -75,7 +76,7 @@ def fit_camera(position: Image | Array, seen: Mask) -> FittedCamera | None:
     world = np.concatenate([world, [[0.0], [0.0], [0.0], [1.0]]], 1)
     matrix = world @ matrix
     axis = np.linalg.norm(matrix[:3, 2])
-    # Without a perspective w is the same everywhere, and no depth.
+    # For an orthographic camera w is constant, so it is not the depth.
     matrix /= axis if axis * scale > 1e-4 * abs(matrix[3, 2]) else abs(matrix[3, 2])
     error = float(np.median(errors))
     if not (np.isfinite(matrix).all() and error < _NEAR):
@@ -85,7 +86,7 @@ def fit_camera(position: Image | Array, seen: Mask) -> FittedCamera | None:
 
 
 def miss(matrix: Array, position: Image | Array, seen: Mask) -> float:
-    """By how many pixels points miss their own, in the median, seen by a row-vector matrix with clip y down."""
+    """Median reprojection error in pixels of a row-vector matrix with clip y down."""
     points, pixels, size = _sampled(position, seen)
     if not len(points):
         return 0.0
@@ -95,7 +96,7 @@ def miss(matrix: Array, position: Image | Array, seen: Mask) -> float:
 
 
 def motion_to(matrix: Array, position: Image | Array, seen: Mask) -> Array:
-    """``(H, W, 2)`` pixels from each pixel to where a matrix, as in :func:`miss`, sees its point; NaN where none is."""
+    """``(H, W, 2)`` pixels from each pixel to the projection of its point by a matrix as in :func:`miss`, or NaN."""
     height, width = seen.shape
     rows, columns = np.mgrid[:height, :width]
     clip = np.where(seen[..., None], position, np.nan) @ matrix[:3] + matrix[3]
@@ -106,11 +107,11 @@ def motion_to(matrix: Array, position: Image | Array, seen: Mask) -> Array:
 
 
 def read_as(matrix: Array, position: Image | Array, seen: Mask) -> tuple[str, float]:
-    """The convention by which a matrix sees a frame's positions at their pixels.
+    """Find the convention by which a matrix projects a frame's positions to their pixels.
 
     Returns:
-        What is to be done with it: empty where it is right as it stands, or ``transposed``, ``y up``, or both, or
-        ``unknown``; and by how many pixels points miss their own then.
+        The conversion that is needed: empty for none, ``transposed``, ``y up``, both, or ``unknown``; and the remaining
+        median reprojection error in pixels.
     """
     errors = {name: miss(convert(matrix, name), position, seen) for name in _CONVENTIONS}
     if errors[""] <= _NEAR:
@@ -123,7 +124,7 @@ _CONVENTIONS = ("", "y up", "transposed", "transposed, y up")
 
 
 def convert(matrix: Array, convention: str) -> Array:
-    """The matrix as this project keeps it: for row vectors, clip y down."""
+    """Convert a matrix to this package's convention: row vectors, clip y down."""
     result = matrix.T.copy() if "transposed" in convention else matrix.copy()
     if "y up" in convention:
         result[:, 1] *= -1
@@ -131,7 +132,7 @@ def convert(matrix: Array, convention: str) -> Array:
 
 
 def _sampled(position: Image | Array, seen: Mask) -> tuple[Array, Array, Array]:
-    """Points ``(N, 3)`` of a grid of pixels, and where they are seen, in pixels from the corner; width and height."""
+    """Points ``(N, 3)`` on a grid of pixels, their pixel coordinates, and the image's width and height."""
     height, width = position.shape[:2]
     step = max(1, int(np.sqrt(height * width / _POINTS)))
     rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]

@@ -1,4 +1,4 @@
-"""Which layer is which buffer: by its name, by what somebody says, or else by its values."""
+"""Assignment of layers to buffers: by name, by the user's mapping, or else by values."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from mcdenoise.data.readers.values import is_direction
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS
 
-# Buffers that somebody may map a layer to; the rest is no image of a frame.
+# Buffers to which the user may map a layer.
 MAPPABLE = sorted(set(BUFFERS) - {"current", "length"})
 _ALL, _LOWEST = slice(None), slice(-16, None)
-# Numbers that are compared at a time: 64 MiB.
+# Number of values to compare at a time: 64 MiB.
 _AT_ONCE = 2**24
-# What is more than single letters.
+# Names that are longer than a single letter.
 _WORDS = re.compile(r"[^\W_]{2}")
 
 
 @dataclass
 class Choice:
-    """The layers of a frame that are used.
+    """The selected layers of a frame.
 
     Args:
-        layers: by buffer.
-        reasons: why, where it is not the name that says so.
-        written: the layers that the result replaces: mostly that of the color, and those that are equal to it.
-        unused: layers that look like buffers and are not used.
-        unknown: layers with names that say nothing.
+        layers: selected layer by buffer.
+        reasons: reason by buffer, if the layer was not selected by its name.
+        written: the layers that the result replaces: usually that of the color, and layers equal to it.
+        unused: layers that look like buffers but are not used.
+        unknown: layers with unknown names.
     """
 
     layers: dict[str, Layer] = field(default_factory=dict)
@@ -44,21 +44,21 @@ class Choice:
     unknown: list[Layer] = field(default_factory=list)
 
 
-# Some rows of the pixels of a layer in the first frame.
+# Reads some rows of a layer in the first frame.
 Read: TypeAlias = Callable[[Layer, slice], Image]
 
 
 def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read: Read) -> Choice:
-    """Choose the layer of each buffer.
+    """Select a layer for each buffer.
 
     Args:
-        where: what the layers are of, for messages.
-        layers: all of a frame.
-        mapping: names of layers by buffer, as somebody gave them; an empty one stands for none.
-        read: what to look at where names do not tell.
+        where: description of the files, for messages.
+        layers: all layers of a frame.
+        mapping: the user's names of layers by buffer; an empty name stands for no layer.
+        read: reads pixels if names do not tell.
 
     Raises:
-        InputError: there is no color, or two layers that might be it; or what is asked for is not there.
+        InputError: there is no color or more than one candidate, or a requested layer does not exist.
     """
     choice = Choice()
     candidates: dict[str, list[tuple[int, Layer]]] = {buffer: [] for buffer in NAMES}
@@ -70,7 +70,7 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
         else:
             strangers.append(layer)
     if not candidates["color"]:
-        # A shot may have a letter for a name, such as a_0001.exr or [n].hdr, that stands for a buffer elsewhere.
+        # The name of a shot may be a letter, as in a_0001.exr or [n].hdr, which is a buffer's name elsewhere.
         for ranked in candidates.values():
             strangers += [layer for _, layer in ranked if _is_letter(layer)]
             ranked[:] = [(rank, layer) for rank, layer in ranked if not _is_letter(layer)]
@@ -79,7 +79,7 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
             choice.layers[buffer] = _mapped(where, layers, buffer, text)
             choice.reasons[buffer] = "as asked for"
     if not candidates["color"] and "color" not in mapping and len(references := candidates["reference"]) == 1:
-        # Alone it is a picture like any other.
+        # A single layer is an ordinary picture.
         candidates["color"], candidates["reference"] = references, []
     color = choice.layers.get("color") or _color(where, candidates["color"], strangers, layers)
     choice.layers["color"] = color
@@ -90,7 +90,7 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
                 choice.layers[buffer] = best
     own = [layer for layer in strangers if not color.family or layer.family == color.family]
     _by_values(choice, own, mapping, read)
-    # What has been denoised already stands beside what has not: there the result belongs.
+    # Both a denoised and a noisy layer exist: read the noisy one, and write the result to the denoised one.
     finished = [layer for rank, layer in candidates["color"] if layer.family == color.family and rank == 1]
     choice.written = [color]
     if (0, color) in candidates["color"] and len(finished) == 1:
@@ -107,10 +107,10 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
 
 
 def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
-    """Read ``--map`` options, such as ``albedo=RGBA.diff``; ``motion=`` stands for none.
+    """Parse ``--map`` options, such as ``albedo=RGBA.diff``; ``motion=`` stands for no layer.
 
     Raises:
-        InputError: one is something else.
+        InputError: an option has another form.
     """
     mapping: dict[str, str] = {}
     for text in texts:
@@ -147,7 +147,7 @@ def _color(
     where: str, candidates: Sequence[tuple[int, Layer]], strangers: Sequence[Layer], layers: Sequence[Layer]
 ) -> Layer:
     if not candidates:
-        # A single picture of unknown name is what is to be denoised.
+        # A single picture of unknown name is the noisy color.
         pictures = [layer for layer in strangers if layer.is_color]
         if len(pictures) == 1:
             return pictures[0]
@@ -165,7 +165,7 @@ def _color(
 
 
 def _best(where: str, buffer: str, candidates: Sequence[tuple[int, Layer]], color: Layer) -> Layer | None:
-    """The preferred layer of the same image as the color; a file of its own belongs to every image."""
+    """The preferred layer of the same image as the color; a layer in a separate file may belong to any image."""
     own = [(rank, layer) for rank, layer in candidates if layer.family == color.family or layer.anonymous] or (
         list(candidates) if color.anonymous or not color.family else []
     )
@@ -182,11 +182,11 @@ def _best(where: str, buffer: str, candidates: Sequence[tuple[int, Layer]], colo
 
 
 def _twins(color: Layer, strangers: Sequence[Layer], read: Read) -> list[Layer]:
-    """Layers that hold the color once more: Mitsuba writes that of a nested integrator twice."""
+    """Layers equal to the color: Mitsuba writes the color of a nested integrator twice."""
     others = [layer for layer in strangers if layer.is_color and (layer.group, layer.part) == (color.group, color.part)]
     if not others:
         return []
-    # A few rows of all of them tell most apart: each reading decompresses all layers of its rows.
+    # Compare a few rows first, since every read decompresses all layers of these rows.
     first, *rest = _together(read, [color, *others], _LOWEST)
     alike = [layer for layer, pixels in zip(others, rest, strict=True) if np.array_equal(first, pixels, equal_nan=True)]
     if not alike:
@@ -203,13 +203,13 @@ def _twins(color: Layer, strangers: Sequence[Layer], read: Read) -> list[Layer]:
 
 
 def _together(read: Read, layers: Sequence[Layer], rows: slice) -> list[Image]:
-    """Some rows of the colors of layers of the same part, in one reading."""
+    """Some rows of several layers of one part, in a single read."""
     every = replace(layers[0], channels=tuple(name for layer in layers for name in layer.channels[:3]))
     return np.split(read(every, rows), len(layers), -1)
 
 
 def _by_values(choice: Choice, strangers: Sequence[Layer], mapping: Mapping[str, str], read: Read) -> None:
-    """Layers with names of somebody's own, such as those of Mitsuba: depths end in T, normals have unit length."""
+    """Recognise layers with unknown names, such as Mitsuba's: depths end in T, normals have unit length."""
     depths = [layer for layer in strangers if layer.components == ("t",)]
     directions: list[Layer] = []
     points: list[Layer] = []

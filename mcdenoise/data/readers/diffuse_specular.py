@@ -1,12 +1,12 @@
-"""Diffuse and specular light of what renderers write, used where it adds up to the color.
+"""Diffuse and specular light in the files of renderers, used if they add up to the color.
 
-KPCN (Bako et al. 2017) and its successors filter the two by networks of their own. ``specular`` is all light that is
-not diffuse, so that the sum stays whole: glossy reflection, what comes through glass and volumes, coats and sheen, and
-what is seen of lamps and of the background. The latter are no ``emission``: under a pixel filter or behind a lens they
-have noise. Light by subsurface scattering is diffuse.
+KPCN (Bako et al. 2017) and its successors filter both with separate networks. ``specular`` is all light that is not
+diffuse, so that the sum is complete: glossy reflection, transmission through glass and volumes, coats and sheen, and
+directly visible lamps and background. The latter are not ``emission``, because they have noise under a pixel filter or
+behind a lens. Light by subsurface scattering is diffuse.
 
-A renderer that is not known here, or somebody's own, names two layers (or files) ``diffuse`` and ``specular``, with the
-colors of the surfaces in them, and perhaps ``emission``, which is without noise then, and ``specular_albedo``.
+For a renderer that is not listed here, name two layers (or files) ``diffuse`` and ``specular``, including the colors of
+the surfaces, and optionally ``emission``, which must be free of noise, and ``specular_albedo``.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from mcdenoise.data.readers.lights import Light, color_of
 from mcdenoise.frame import LARGEST_RADIANCE
 
 DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO = "diffuse", "specular", "emission", "specular_albedo"
-# Buffers of which a frame may have some more, at the price of reading them, and which few methods use.
-PARTS = frozenset({DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO, "samples"})
-# What a renderer writes: diffuse light, all other light, the color of glossy reflection.
+# Optional buffers that few methods use and that are slow to read.
+LIGHT_PARTS = frozenset({DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO, "samples"})
+# Layers of known renderers: diffuse light, all other light, the color of glossy reflection.
 _RENDERERS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     (
         ("DiffDir", "DiffInd"),
@@ -61,22 +61,22 @@ _RENDERERS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
     ),
 )
 _KNOWN = {title for diffuse, others, _ in _RENDERERS for title in (*diffuse, *others)}
-# Half floats round light, the color that it was divided by, and the sum, by 2^-11 each: three of these, and one to
-# spare. Near 0 they are 2^-24 apart.
+# Half floats round light, the color that it was divided by, and the sum, by 2^-11 each: allow for four roundings. Near
+# 0 the spacing is 2^-24.
 _ROUNDING, _SMALLEST_HALF = 4 * 2.0**-11, 2.0**-24
-# Of the pixels: those that are brighter than the largest half float do not add up.
+# Largest fraction of pixels that do not add up, such as those brighter than the largest half float.
 _MOST_OFF = 1e-3
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 
 
 @dataclass(frozen=True)
 class Split:
-    """Which layers are the parts of the color.
+    """The layers that are parts of the color.
 
     Args:
-        parts: layers of light by buffer: diffuse, specular, perhaps emission.
-        specular_albedo: of the specular light, if there is one.
-        absent: titles of layers that the renderer might have written, too.
+        parts: layers of light by buffer: diffuse, specular, and optionally emission.
+        specular_albedo: layer of the specular albedo, if there is one.
+        absent: names of layers that the renderer can also write.
     """
 
     parts: Mapping[str, tuple[Light, ...]]
@@ -85,18 +85,18 @@ class Split:
 
     @property
     def names(self) -> frozenset[str]:
-        """Of the buffers that a frame has of it."""
+        """Names of the buffers that a frame gets."""
         return frozenset(self.parts) | ({SPECULAR_ALBEDO} if self.specular_albedo is not None else frozenset())
 
     @property
     def layers(self) -> dict[str, Layer]:
-        """Every layer that is to be read, by a key for :meth:`buffers`."""
+        """Every layer to read, by a key for :meth:`buffers`."""
         lights = [light for own in self.parts.values() for light in own]
         keyed = {f"light {i} {j}": each for i, light in enumerate(lights) for j, each in enumerate(light.layers)}
         return keyed | ({} if self.specular_albedo is None else {SPECULAR_ALBEDO: self.specular_albedo})
 
     def sums(self, images: Mapping[str, Image]) -> dict[str, Image]:
-        """The parts, ``(H, W, 3)`` by buffer, of the images of :attr:`layers`."""
+        """The parts, ``(H, W, 3)`` by buffer, from the images of :attr:`layers`."""
         lights, number = {}, 0
         for name, own in self.parts.items():
             total: Image = np.zeros((), np.float32)
@@ -108,15 +108,15 @@ class Split:
         return lights
 
     def off(self, sums: Mapping[str, Image], color: Image) -> tuple[float, float]:
-        """:func:`off` of the parts."""
+        """Apply :func:`off` to the parts."""
         return off(sums, color, count=1 + sum(len(own) for own in self.parts.values()))
 
     def buffers(self, images: Mapping[str, Image], color: Image) -> dict[str, Image] | None:
-        """What a frame has of them, in the range of buffers; ``None`` where they do not add up to its color."""
+        """The buffers of a frame, in their legal ranges; ``None`` if the parts do not add up to its color."""
         sums = self.sums(images)
         if not adds_up(self.off(sums, color)):
             return None
-        # A pixel of the color that is not finite is mended later on, and these need only be numbers.
+        # Invalid pixels of the color are repaired later; the parts only need to be finite there.
         found = {name: np.clip(np.nan_to_num(each), 0, LARGEST_RADIANCE) for name, each in sums.items()}
         if self.specular_albedo is not None:
             found[SPECULAR_ALBEDO] = np.clip(np.nan_to_num(images[SPECULAR_ALBEDO], posinf=1, neginf=0), 0, 1)
@@ -124,15 +124,15 @@ class Split:
 
 
 def off(sums: Mapping[str, Image], color: Image, *, count: int) -> tuple[float, float]:
-    """How far parts are from adding up to a color, apart from the rounding of half floats.
+    """How far parts are from adding up to a color, beyond the rounding of half floats.
 
     Args:
-        sums: ``(H, W, 3)`` of each part.
-        color: likewise.
-        count: how many images were rounded.
+        sums: ``(H, W, 3)`` each part.
+        color: ``(H, W, 3)``.
+        count: number of images that were rounded.
 
     Returns:
-        The fraction of the pixels in which they do not, and the light of all over that of the color.
+        The fraction of the pixels that do not add up, and the light of all parts over that of the color.
     """
     total: Image = np.asarray(sum(sums.values()))
     known = (np.isfinite(total) & np.isfinite(color)).all(-1)
@@ -143,17 +143,17 @@ def off(sums: Mapping[str, Image], color: Image, *, count: int) -> tuple[float, 
 
 
 def adds_up(off: tuple[float, float]) -> bool:
-    """Whether :meth:`Split.off` is no more than rounding."""
+    """Whether the result of :meth:`Split.off` is within rounding."""
     return off[0] <= _MOST_OFF
 
 
 def find_splits(layers: Sequence[Layer], color: Layer, asked: Mapping[str, Layer]) -> list[Split]:
-    """What may be the parts of a color, by the names of layers; only their values tell whether they are.
+    """Find candidates for the parts of a color by names of layers; only their values tell whether they are.
 
     Args:
-        layers: all of a frame.
-        color: that of the radiance.
-        asked: layers that somebody has chosen for a buffer. With diffuse and specular there is nothing else to find.
+        layers: all layers of a frame.
+        color: layer of the color.
+        asked: layers that the user has mapped to buffers; diffuse and specular among them replace the search.
     """
     if {DIFFUSE, SPECULAR} <= asked.keys():
         chosen = {name: (Light((asked[name],)),) for name in (DIFFUSE, SPECULAR, EMISSION) if name in asked}
@@ -177,13 +177,13 @@ def find_splits(layers: Sequence[Layer], color: Layer, asked: Mapping[str, Layer
         albedo = next((each for each in own if _says(each, SPECULAR_ALBEDO)), None)
         named = {name: (Light((layer,)),) for name, layer in plain.items() if layer is not None}
         without = {name: each for name, each in named.items() if name != EMISSION}
-        # Lamps may be in the specular light, and once more in a layer of their own.
+        # Lamps may be included in the specular light, and also have their own layer.
         found += [Split(each, albedo) for each in ([named, without] if EMISSION in named else [named])]
     return found
 
 
 def _says(layer: Layer, name: str) -> bool:
-    """Whether the last words of a layer's name are that of a buffer: ``diffuse``, ``shot_diffuse``, ``shotDiffuse``."""
+    """Whether a layer's name ends with a buffer's name: ``diffuse``, ``shot_diffuse``, ``shotDiffuse``."""
     wanted = name.split("_")
     words = [word.lower() for word in _WORD.findall(layer.title)]
     return layer.title not in _KNOWN - {EMISSION} and words[-len(wanted) :] == wanted

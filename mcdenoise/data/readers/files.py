@@ -1,4 +1,4 @@
-"""Frames as renderers write them: one EXR with many layers, or one file a buffer, with names of any kind."""
+"""Frames as renderers write them: one EXR with many layers, or one file per buffer, with arbitrary names."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from mcdenoise.data.readers.values import USUAL_MOTION, Convention, Row, nothing
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame, scale_samples
 
-# What is light or a fraction of it: these samples of a PNG went through a transfer function, those of a normal did not.
+# Buffers of light and reflectance, which a PNG stores with a transfer function; it stores normals without.
 _LIGHT = {"color", "albedo", "reference", "diffuse", "specular", "specular_albedo", "emission"}
-# How much farther than everything else the sky is.
+# Distance of the sky relative to everything else.
 _SKY = 1000.0
-# How far below 0 lossy compression leaves black.
+# Lossy compression may change black to a negative value of at most this size.
 _LOSSY = 1e-3
 
 
@@ -43,14 +43,14 @@ class RenderedFiles:
 
     Args:
         groups: the kinds of files.
-        parts: of the first file of each kind.
+        parts: the parts of the first file of each kind.
         numbers: frames in use, ascending.
-        choice: which layer is which buffer.
+        choice: the layer of each buffer.
         lights: additive layers of radiance, which are denoised with the color, by name.
-        cameras: what a ``camera_matrices.h`` beside the files says.
-        color_has_albedo: whether radiance has the albedo in it.
-        split: which layers are diffuse and specular light, if they add up to the color.
-        samples: which layers are single samples, if their mean is the color.
+        cameras: contents of a ``camera_matrices.h`` beside the files.
+        color_has_albedo: whether the radiance includes the albedo.
+        split: the layers of diffuse and specular light, if they add up to the color.
+        samples: the layers of single samples, if their mean is the color.
     """
 
     groups: Sequence[FileGroup]
@@ -101,24 +101,24 @@ class RenderedFiles:
 
     @property
     def folders(self) -> set[Path]:
-        """Where the files lie."""
+        """The folders of the files."""
         return {path.parent for group in self.groups for path in group.files.values()}
 
     @property
     def unused(self) -> list[str]:
-        """Layers that look like buffers and are not used."""
+        """Layers that look like buffers but are not used."""
         lit = self._lit
         return [layer.place for layer in self.choice.unused if layer not in lit]
 
     @property
     def unknown(self) -> list[str]:
-        """Layers with names that say nothing, and that nobody has asked for."""
+        """Layers with unknown names that the user has not requested."""
         lit = self._lit
         return [layer.place for layer in self.choice.unknown if layer not in lit and not is_light(layer)]
 
     @property
     def _lit(self) -> set[Layer]:
-        """Layers that are taken for light or its color."""
+        """Layers that are used as light or as its color."""
         of_split = [] if self.split is None else self.split.layers.values()
         return {*(layer for light in self.lights.values() for layer in light.layers), *of_split}
 
@@ -129,7 +129,7 @@ class RenderedFiles:
         return [] if layer is None else [n for n in self.numbers if n in self.groups[layer.group].files]
 
     def frame_files(self, number: int) -> list[Path]:
-        """The files of one frame that have layers in use, but for references alone."""
+        """The files of one frame with layers in use, without files that hold only a reference."""
         used = {layer.group for name, layer in self.choice.layers.items() if name != "reference"}
         used |= {layer.group for layer in (*self.choice.written, *self._lit)}
         used |= {layer.group for layer in (self.samples.layers.values() if self.samples else ())}
@@ -209,7 +209,7 @@ class RenderedFiles:
         output_layer: str | None = None,
         full_float: bool = False,
     ) -> Path:
-        """Write the files of a frame as they were read, clean; see :meth:`mcdenoise.data.Sequence.write`."""
+        """Write the files of a frame with the denoised image; see :meth:`mcdenoise.data.Sequence.write`."""
         layer = self.choice.written[0]
         files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
         added: dict[str, Image] = {}
@@ -236,7 +236,7 @@ class RenderedFiles:
         return out / self.file(layer, number).name
 
     def _lights(self, number: int, radiances: Mapping[str, Image]) -> dict[int, dict[tuple[int, str], Image]]:
-        """For each kind of file the channels of its layers of light, of clean radiances."""
+        """For each kind of file, the channels of its layers of light for given denoised radiances."""
         if not radiances:
             return {}
         colors = self.read(
@@ -267,13 +267,13 @@ class RenderedFiles:
         if "motion" in images:
             images["motion"] = motion = self.motion.apply(images["motion"])
             if seen is not None and motion.any():
-                # Renderers that follow surfaces write 0 where there is none, although the camera moves.
+                # Renderers that track surfaces write 0 where there is none, even if the camera moves.
                 images["motion"] = np.where(seen | (motion != 0), motion, np.float32(np.inf))
         matrix = self.camera(number, images, seen)
         if matrix is not None and "position" in images:
             known = hit(images, seen)
             position = np.where(known[..., None], images["position"], 0)
-            # In double precision, without a copy of all positions in it.
+            # In double precision, without converting all positions to it at once.
             w = np.einsum("hwc,c->hw", position, matrix[:3, 3]) + matrix[3, 3]
             images.setdefault("depth", np.where(known & (w > 0), w, 0)[..., None].astype(np.float32))
             position[~known] = _far_points(matrix, float(w[known].max(initial=1)), ~known)
@@ -289,7 +289,7 @@ class RenderedFiles:
         return Frame(**buffers, layers={name: _tensor(radiance) for name, radiance in lights.items()})
 
     def camera(self, number: int, images: Mapping[str, Image], seen: Mask | None) -> Array | None:
-        """The world-to-clip matrix of a frame: the given one, or else that by which its positions are seen."""
+        """The world-to-clip matrix of a frame: the given one, or one fitted to its positions."""
         if self.cameras is not None:
             return convert(self.cameras.view_projection(number, self.size), self.camera_convention)
         if not self.has_camera or "position" not in images:
@@ -298,15 +298,15 @@ class RenderedFiles:
         return None if found is None else found.matrix
 
     def part(self, layer: Layer) -> Part:
-        """The part that a layer is in, of the first file of its kind."""
+        """The part that contains a layer, in the first file of its kind."""
         return self.parts[layer.group][layer.part]
 
     def file(self, layer: Layer, number: int) -> Path:
-        """The file that has a layer of a frame."""
+        """The file that contains a layer of a frame."""
         return self.groups[layer.group].files[number]
 
     def read(self, number: int, layers: Mapping[str, Layer]) -> dict[str, Image]:
-        """Layers of one frame, each file opened once."""
+        """Read layers of one frame, opening each file once."""
         files: defaultdict[Path, dict[int, list[str]]] = defaultdict(lambda: defaultdict(list))
         for layer in layers.values():
             channels = files[self.file(layer, number)][layer.part]
@@ -323,7 +323,7 @@ class RenderedFiles:
         return images
 
     def in_world(self, number: int, position: Image) -> Image:
-        """Positions in the space of a camera that the file's attribute ``worldToCamera`` is of; none where it is 0."""
+        """Convert camera-space positions to world space by the attribute ``worldToCamera``; 0 is no position."""
         to_camera = world_to_camera(self.metadata(number))
         if to_camera is None:
             raise InputError(
@@ -341,7 +341,7 @@ class RenderedFiles:
                 f"{path}: expected {width} x {height} pixels like the first color file, found "
                 f"{found_width} x {found_height}; render all buffers and frames at one size"
             )
-        # Layers of light have names of their own.
+        # Layers of light are not buffers.
         if self.part(layer).display_referred and (name in _LIGHT or name not in BUFFERS):
             pixels = np.concatenate([decode(pixels[..., :3]), pixels[..., 3:]], -1)
         channels = BUFFERS[name].channels if name in BUFFERS else 3
@@ -353,25 +353,25 @@ class RenderedFiles:
 
 
 def _without_lossy_black(radiance: Image) -> Image:
-    """Radiance without what rounding and lossy compression leave below 0 where it was black."""
+    """Remove small negative values that rounding and lossy compression leave in black pixels."""
     clean: Image = np.where((radiance < 0) & (radiance > -_LOSSY), 0, radiance)
     return clean
 
 
 def seen_of(images: Mapping[str, Image]) -> Mask | None:
-    """``(H, W, 1)`` where the depth says that something was hit; ``None`` without one."""
+    """``(H, W, 1)`` true where the depth shows a hit; ``None`` without a depth."""
     return ~nothing_hit(images["depth"]) if "depth" in images else None
 
 
 def hit(images: Mapping[str, Image], seen: Mask | None) -> Mask:
-    """``(H, W)`` where something was hit: as the depth says or, without one, where there is a position."""
+    """``(H, W)`` true where something was hit: by the depth, or without one by the position."""
     position = images["position"]
     known: Mask = np.isfinite(position).all(-1) & ((position != 0).any(-1) if seen is None else seen[..., 0])
     return known
 
 
 def world_to_camera(metadata: Metadata) -> Array | None:
-    """The matrix for row vectors that a file has as an attribute, whichever way it is written there."""
+    """The row-vector matrix in a file's attribute, whichever way it is stored there."""
     for name, value in metadata.items():
         if name.lower() == "worldtocamera" and isinstance(value, tuple) and len(value) == 16:
             matrix = np.reshape(np.array(value, np.float64), (4, 4))
@@ -382,7 +382,7 @@ def world_to_camera(metadata: Metadata) -> Array | None:
 
 
 def _far_points(matrix: Array, depth: float, sky: Mask) -> Array:
-    """``(N, 3)`` points far behind all others that a camera sees where the sky is, so that it can be followed."""
+    """``(N, 3)`` points far behind all others for pixels of the sky, so that the sky can be reprojected."""
     (height, width), (rows, columns) = sky.shape, np.nonzero(sky)
     screen = np.stack([(columns + 0.5) / width * 2 - 1, (rows + 0.5) / height * 2 - 1, np.ones(len(rows))], -1)
     columns_used = matrix[:, [0, 1, 3]]

@@ -1,4 +1,4 @@
-"""Layers: the channels of a file that belong together, and which buffer their name says they are."""
+"""Layers: groups of channels in a file, and recognising buffers by the names of layers."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 from mcdenoise.data.images import Part
 from mcdenoise.frame import BUFFERS
 
-# Names that renderers give a buffer, in small letters and digits only, the preferred ones first; field by field from
-# Blender, Mitsuba, pbrt, Arnold, RenderMan, V-Ray, Redshift, Octane, Corona, LuxCore, Falcor, Tungsten, OIDN and BMFR.
+# Renderers' names of each buffer, in lower-case letters and digits, in order of preference; for Blender, Mitsuba, pbrt,
+# Arnold, RenderMan, V-Ray, Redshift, Octane, Corona, LuxCore, Falcor, Tungsten, OIDN and BMFR.
 NAMES: dict[str, tuple[str, ...]] = {
     "color": (
-        # What is not denoised yet comes before what may be.
+        # Noisy images are preferred to those that may have been denoised.
         "noisyimage beautynoisy noisybeauty rgbanoisy",
         "color colour beauty combined rgba rgb ci radiance hdr noisy rgbimagepipeline accumulatepass path2sppillum",
     ),
@@ -41,7 +41,7 @@ NAMES: dict[str, tuple[str, ...]] = {
 _RANKS = {
     name: (buffer, rank) for buffer, ranks in NAMES.items() for rank, row in enumerate(ranks) for name in row.split()
 }
-# Also of a layer that nobody has named: alone, in the file that has a frame's name.
+# Preference of a layer without a name: the only layer of a file named after the frame.
 _ROOT_RANK = 1
 _ORDER = {
     spelling: place
@@ -50,11 +50,11 @@ _ORDER = {
 }
 _EYES = {"left", "right"}
 _COLORS = ({"r", "g", "b"}, {"red", "green", "blue"})
-# These words speak of something about a buffer, and not of itself.
+# A name with one of these words denotes a property of a buffer, not the buffer itself.
 _ABOUT = {"variance", "var", "mse", "noice", "error", "count"}
-# And what stands behind these is a buffer of another kind of light.
+# A buffer name after one of these words denotes a buffer of another kind of light.
 _OTHERS = {"specular", "glossy", "transmission", "light", "shadow", "forward", "relative"}
-# Tungsten's `colorA` and `colorB` are means of half the samples each: what they are halves of comes first.
+# Tungsten's `colorA` and `colorB` are means of half the samples each; the full mean is preferred.
 _HALF = re.compile(r"(?<=[a-z])[AB]")
 _HALF_RANK = 10
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+")
@@ -62,16 +62,16 @@ _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+")
 
 @dataclass(frozen=True)
 class Layer:
-    """Channels of one part of a kind of file that belong together.
+    """A group of channels in one part of a kind of file.
 
     Args:
-        group: which kind of file, by its place among those of a frame.
-        part: index of the part of the file.
-        name: such as ``ViewLayer.Denoising Albedo``; of a file of one picture, what its own name says; or empty.
-        channels: their names in the file: R, G, B, A or X, Y, Z, W.
-        components: the last words of these, in small letters.
-        anonymous: whether only the name of the file says what it is.
-        files: how the files are called, for people.
+        group: index of the kind of file.
+        part: index of the part in the file.
+        name: such as ``ViewLayer.Denoising Albedo``; for a file with one picture the file's own name; or empty.
+        channels: names in the file: R, G, B, A or X, Y, Z, W.
+        components: last words of the channel names, in lower case.
+        anonymous: whether only the name of the file tells what the layer is.
+        files: name of the files, for messages.
     """
 
     group: int
@@ -88,12 +88,12 @@ class Layer:
 
     @property
     def place(self) -> str:
-        """Its files and, unless these alone say what it is, itself; for people."""
+        """Files and layer name, for messages; only the files if their name tells what it is."""
         return self.files if self.anonymous and self.files else f"{self.files} {self}".strip()
 
     @property
     def title(self) -> str:
-        """The word of its name that says what it is: without view layer, and without the eye of a stereo image."""
+        """The significant word of the name: without view layer, and without the eye of a stereo image."""
         if self.anonymous:
             return self.name
         words = self.name.split(".")
@@ -101,7 +101,7 @@ class Layer:
 
     @property
     def family(self) -> tuple[str, ...]:
-        """What it has in common with the other layers of one image: all the rest of its name."""
+        """The rest of the name, which all layers of one image have in common."""
         words = self.name.split(".")
         return tuple(words[:-2] + words[-1:]) if len(words) > 1 and words[-1] in _EYES else tuple(words[:-1])
 
@@ -112,12 +112,12 @@ class Layer:
 
 
 def layers_of(group: int, label: str, parts: Sequence[Part]) -> list[Layer]:
-    """The layers of a file.
+    """Group the channels of a file into layers.
 
     Args:
-        group: which kind of file.
-        label: what its name says, without the number: names the layer of a file that has no names of its own.
-        parts: of the file.
+        group: index of the kind of file.
+        label: file name without the number; it names the layer of a file whose channels have no layer name.
+        parts: parts of the file.
     """
     found: list[Layer] = []
     for index, part in enumerate(parts):
@@ -126,14 +126,14 @@ def layers_of(group: int, label: str, parts: Sequence[Part]) -> list[Layer]:
         roots = {channel.lower() for channel in usable if "." not in channel}
         together = roots & set(_ORDER)
         if any(colors <= roots for colors in _COLORS):
-            # Z beside R, G, B is a depth, and not a third coordinate.
+            # Z beside R, G, B is a depth, not a third coordinate.
             together &= {"r", "g", "b", "a", "red", "green", "blue", "alpha"}
         elif not {"x", "y"} <= roots and not {"u", "v"} <= roots and roots != {"r", "g"}:
             together = set()
         for channel in usable:
             prefix, dot, _ = channel.rpartition(".")
             if not dot and channel.lower() not in together:
-                # `Nsx, Nsy, Nsz` of pbrt are one layer, and `dzdx, dzdy` none.
+                # pbrt's `Nsx, Nsy, Nsz` are one layer, but `dzdx, dzdy` are not.
                 stem, three = channel[:-1], [channel[:-1] + letter for letter in "xyz"]
                 prefix = stem if stem and channel in three and set(three) <= set(usable) else channel
             channels.setdefault(prefix, []).append(channel)
@@ -143,28 +143,28 @@ def layers_of(group: int, label: str, parts: Sequence[Part]) -> list[Layer]:
             order = sorted(range(len(own)), key=lambda place: (_ORDER.get(components[place], 9), place))
             name = prefix
             if len(parts) > 1 and prefix and part.name.startswith(prefix):
-                # Blender's eyes have parts of their own, with the same channels: `ViewLayer.Combined-left`.
+                # Blender writes each eye to its own part, with the same channels: `ViewLayer.Combined-left`.
                 eye = part.name.removeprefix(prefix).strip("-._ ")
                 name = f"{prefix}.{eye}" if eye in _EYES else prefix
             elif part.name and len(parts) > 1 and not prefix.startswith(part.name):
                 name = ".".join(filter(None, (part.name, prefix)))
             found.append(Layer(group, index, name, tuple(own[i] for i in order), tuple(components[i] for i in order)))
-    # A file of one picture is what its own name says: `albedo_0001.exr`.
+    # A file with one picture is named after its buffer: `albedo_0001.exr`.
     if len(parts) == 1 and len(found) == 1:
         (only,) = found
         picture = Layer(group, 0, label or only.name, only.channels, only.components, anonymous=True)
         says = recognise(picture)
-        # `reference_0001.exr` is one, whatever its only layer is called.
+        # `reference_0001.exr` is a reference, whatever the name of its only layer is.
         if not only.name or len(only.channels) == 1 or (says is not None and says[1] <= _ROOT_RANK):
             return [picture]
     return found
 
 
 def recognise(layer: Layer) -> tuple[str, int] | None:
-    """Which buffer a layer's name says that it is, and how much its name is preferred: 0 is best; or ``None``.
+    """The buffer that a layer's name denotes and the rank of the name (0 is the best), or ``None``.
 
-    The last words of the name count: ``Main Layer.Denoising Albedo``, ``kitchen_albedo``, ``kitchenAlbedo``. A name
-    that speaks of something about a buffer, such as ``albedo_variance``, is none of that buffer.
+    The last words of the name decide: ``Main Layer.Denoising Albedo``, ``kitchen_albedo``, ``kitchenAlbedo``. A name
+    that denotes a property of a buffer, such as ``albedo_variance``, is not that buffer.
     """
     if not layer.name:
         return ("color", _ROOT_RANK) if layer.is_color else None
@@ -175,13 +175,13 @@ def recognise(layer: Layer) -> tuple[str, int] | None:
             return whole[0], whole[1] + _HALF_RANK
     words = [word.lower() for word in _WORD.findall(last)]
     starts = [(words[start:], words[:start]) for start in range(len(words))]
-    # What a file is may also stand before its shot.
+    # A file name may also begin with the buffer.
     ends: list[tuple[list[str], list[str]]] = (
         [(words[:end], []) for end in range(len(words) - 1, 0, -1)] if layer.anonymous else []
     )
     for said, before in starts + ends:
         found = _RANKS.get("".join(said))
-        # `albedoA` is no alpha: a short name stands alone.
+        # `albedoA` is not an alpha: a short name must be the whole word.
         if found is None or (len(said) < len(words) and len("".join(said)) < 3 and said[0] not in _split(last)):
             continue
         buffer, rank = found
@@ -189,7 +189,7 @@ def recognise(layer: Layer) -> tuple[str, int] | None:
             buffer == "variance" and any("".join(before[i:]) in _RANKS for i in range(len(before)))
         ):
             return None
-        # The compositor's layer is what has been made of the renderer's.
+        # The compositor's layer is not a direct output of the renderer.
         return buffer, rank + (buffer == "color" and layer.name.lower().startswith("composite"))
     if layer.anonymous and layer.is_color and not (_ABOUT | _OTHERS) & set(words):
         return "color", _ROOT_RANK + 1
@@ -197,7 +197,7 @@ def recognise(layer: Layer) -> tuple[str, int] | None:
 
 
 def is_about_a_buffer(layer: Layer) -> bool:
-    """Whether a layer's name speaks of something about a buffer that is not the color, such as ``albedoVariance``."""
+    """Whether a layer's name denotes a property of a buffer other than the color, such as ``albedoVariance``."""
     words = [word.lower() for word in _WORD.findall(layer.title)]
     return bool(_ABOUT & set(words[-1:])) and any("".join(words[i:-1]) in _RANKS for i in range(len(words) - 1))
 
@@ -207,10 +207,10 @@ def _split(name: str) -> list[str]:
 
 
 def fits(buffer: str, layer: Layer) -> bool:
-    """Whether a layer has the channels that a buffer needs; one channel may be stored as grey."""
+    """Whether a layer has the channels of a buffer; a single channel may be stored as grey."""
     count = len(layer.channels)
     if BUFFERS[buffer].channels == 1:
-        # Or, as Falcor's depth, with its derivative.
+        # Falcor's depth has its derivative as a second channel.
         return count <= 2 or layer.is_color
     if buffer == "motion":
         return count in (2, 3, 4)
@@ -220,9 +220,9 @@ def fits(buffer: str, layer: Layer) -> bool:
 
 
 def named(layers: Sequence[Layer], text: str) -> list[Layer]:
-    """Layers that somebody means by a text.
+    """Find layers by the user's text.
 
-    It is a name with or without its view layer and with or without its channels; or some channels, with commas.
+    The text is a name with or without its view layer and its channels; or a list of channels, separated by commas.
 
     Example:
         >>> channels = ("View.DiffCol.R", "View.DiffCol.G", "View.DiffCol.B")

@@ -13,7 +13,7 @@ from mcdenoise.data.readers.layers import Layer, named, recognise
 from mcdenoise.errors import InputError
 
 ALL = "all"
-# Blender divides light by the color of what it fell on: `DiffDir` times `DiffCol` is what adds up.
+# Blender divides light by the surface color: `DiffDir` times `DiffCol` is the additive part.
 _DIVIDED = {
     f"{kind}{way}": f"{kind}{color}"
     for kinds, ways, color in (
@@ -23,7 +23,7 @@ _DIVIDED = {
     for kind in kinds
     for way in ways
 }
-# What adds up in Blender, Arnold, RenderMan, V-Ray and LuxCore, where all of it is asked for.
+# Additive layers of Blender, Arnold, RenderMan, V-Ray and LuxCore, for ``all``.
 _ADDED = {
     *_DIVIDED,
     *("Emit", "Env", "VolumeDir", "VolumeInd", "Emission", "Environment", "Volume Direct", "Volume Indirect"),
@@ -43,7 +43,7 @@ _ADDED = {
 }
 
 
-# Of a color that light is divided by.
+# Smallest color by which light is divided.
 _DARKEST = 1e-3
 
 
@@ -52,24 +52,24 @@ class Light:
     """A layer of radiance.
 
     Args:
-        layers: its own and, where it is stored divided by a color, that color.
+        layers: its own layer, and the color by which it is divided, if any.
     """
 
     layers: tuple[Layer, ...]
 
     def radiance(self, images: Sequence[Image]) -> Image:
-        """What adds up to the color, of the pixels of its layers; invalid values are left to who checks the color."""
+        """Compute the additive radiance from the pixels of its layers; invalid values are handled later."""
         result: Image = images[0] if len(images) == 1 else images[0] * images[1]
         return result
 
 
 def keeps(color: Image | None) -> Mask | bool:
-    """Where a layer that is divided by a color, or by none, can hold light: not where that is nearly 0."""
+    """Where a layer can store light: not where the color by which it is divided is nearly 0."""
     return True if color is None else np.greater(color, _DARKEST)
 
 
 def stored(radiance: Image, color: Image | None) -> Image:
-    """Radiance as its layer keeps it, so that :meth:`Light.radiance` of it is the same again."""
+    """Convert radiance to stored pixels, the inverse of :meth:`Light.radiance`."""
     if color is None:
         return radiance
     result: Image = np.divide(radiance, color, out=np.zeros_like(radiance), where=color > _DARKEST)
@@ -77,13 +77,13 @@ def stored(radiance: Image, color: Image | None) -> Image:
 
 
 def kept_together(radiances: Mapping[str, Image], kept: Mapping[str, Mask | bool]) -> dict[str, Image]:
-    """Layers of the same sum, each with light only where it can hold some.
+    """Move light of each layer from pixels where it cannot be stored to the other layers, preserving the sum.
 
-    Filters carry light over an edge to where a layer is divided by a color of 0; there the others share it.
+    Filters carry light across an edge to pixels where a layer is divided by a color of 0.
 
     Args:
         radiances: ``(H, W, 3)`` by layer.
-        kept: where each can hold light.
+        kept: where each layer can store light.
     """
     total = sum(radiances.values())
     held = {name: np.where(kept[name], radiance, 0) for name, radiance in radiances.items()}
@@ -93,27 +93,27 @@ def kept_together(radiances: Mapping[str, Image], kept: Mapping[str, Mask | bool
 
 
 def is_light(layer: Layer) -> bool:
-    """Whether a layer is known as light, or as a color that light is divided by, or as none: mattes of objects."""
+    """Whether a layer is known as light, as a color that light is divided by, or as neither (object mattes)."""
     colors, mattes = set(_DIVIDED.values()), ("Crypto", "Debug", "Index", "Material Index", "Object Index")
     return layer.title in _ADDED | colors or layer.title.startswith(("Combined_", *mattes))
 
 
 def color_of(layer: Layer, layers: Sequence[Layer]) -> list[Layer]:
-    """The color that a layer of light is divided by, if there is one."""
+    """The color by which a layer of light is divided, if there is one."""
     return [each for each in layers if each.title == _DIVIDED.get(layer.title) and each.family == layer.family][:1]
 
 
 def find_lights(where: str, layers: Sequence[Layer], color: Layer, names: Sequence[str]) -> Mapping[str, Light]:
-    """The layers of light that somebody asks for.
+    """Find the requested layers of light.
 
     Args:
-        where: what the layers are of, for messages.
-        layers: all of a frame.
-        color: that of the radiance; of several view layers, its own is meant.
-        names: of layers, also as patterns such as ``Combined_*``; ``all`` for those that are known to add up.
+        where: description of the files, for messages.
+        layers: all layers of a frame.
+        color: layer of the color; it determines the view layer.
+        names: names or patterns such as ``Combined_*``; ``all`` for all known additive layers.
 
     Raises:
-        InputError: there is no such layer, or it has no three channels.
+        InputError: a layer does not exist, or has fewer than three channels.
     """
     own = [layer for layer in layers if (layer.family == color.family or layer.anonymous) and layer != color]
     expanded: list[str] = []

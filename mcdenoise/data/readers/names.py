@@ -1,4 +1,4 @@
-"""File names: which digits of them count the frames, and which files are the same kind of buffer."""
+"""File names: which digits are the frame number, and which files are of the same kind."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from pathlib import Path
 from mcdenoise.data.images import FORMATS
 from mcdenoise.errors import InputError
 
-# OIDN's training data: `name_0008spp.hdr.exr`, whose digits count samples.
+# OIDN's training data, `name_0008spp.hdr.exr`: the digits are the number of samples.
 _OIDN = re.compile(r"(?P<name>.+?)_(?P<samples>[0-9]{1,9})spp\.(?P<buffer>hdr|ldr|alb|nrm|z)", re.IGNORECASE)
 _PLACEHOLDER = re.compile(r"#+|%0?[0-9]*d")
-# A minus counts where no word goes before it: `shot_-0002`, and not `shot-0002`.
+# A minus sign counts only if no word precedes it: in `shot_-0002`, but not in `shot-0002`.
 _DIGITS = re.compile(r"((?:(?<=[_. ])-)?[0-9]{1,18})")
 
 
 @dataclass(frozen=True)
 class FileGroup:
-    """Files of one kind, one for each frame.
+    """Files of one kind, one per frame.
 
     Args:
-        label: what their names say besides the number, such as ``shot_albedo``.
+        label: the file names without the number, such as ``shot_albedo``.
         files: by frame number.
     """
 
@@ -34,21 +34,21 @@ class FileGroup:
 
 
 def find_files(inputs: Sequence[Path]) -> list[Path]:
-    """Image files that somebody means by folders, files and patterns, sorted.
+    """Find the image files for given folders, files and patterns, sorted.
 
     Args:
-        inputs: folders, of which all images are taken that are not hidden; files; and patterns, in whose last part
-            ``####``, ``%04d``, ``*``, ``?`` and ``[...]`` stand for what varies.
+        inputs: folders, for all images in them that are not hidden; files; and patterns, whose last part may contain
+            ``####``, ``%04d``, ``*``, ``?`` and ``[...]``.
 
     Raises:
-        InputError: nothing is there.
+        InputError: a path or pattern matches nothing.
     """
     found: dict[Path, None] = {}
     for given in inputs:
         if os.path.isdir(given):
             new = _listed(given)
         elif os.path.lexists(given):
-            # Whatever it is: opening it says what is wrong with it.
+            # It may be anything; opening it reports the error.
             new = [given]
         else:
             new = _matches(given)
@@ -66,7 +66,7 @@ def _listed(folder: Path) -> list[Path]:
 
 def _matches(pattern: Path) -> list[Path]:
     folder, name = pattern.parent, pattern.name
-    # Digits alone stand for a number: `shot_####.exr` is not `shot_0001_mask.exr`.
+    # Hash marks match only digits: `shot_####.exr` does not match `shot_0001_mask.exr`.
     pieces = re.split(f"({_PLACEHOLDER.pattern})", name)
     wild = any(mark in name for mark in "*?[")
     if len(pieces) == 1 and not wild:
@@ -77,7 +77,7 @@ def _matches(pattern: Path) -> list[Path]:
     if not os.path.isdir(folder):
         raise InputError(f"{pattern}: expected files, found no folder {folder}; check the path")
     listed = _listed(folder)
-    # Brackets are a part of some names; where they are none, they and the other marks stand for what varies.
+    # Brackets may be part of a file name; they are placeholders only if no such file exists.
     for translated in (re.escape, _translated) if wild else (re.escape,):
         expression = "".join(
             rf"[0-9]{{{_least_digits(piece)},9}}" if i % 2 else translated(piece) for i, piece in enumerate(pieces)
@@ -97,15 +97,15 @@ def _least_digits(placeholder: str) -> int:
 
 
 def _translated(text: str) -> str:
-    """A glob as a regular expression, without what anchors it."""
+    """A glob as a regular expression without anchors."""
     return fnmatch.translate(text).removeprefix("(?s:")[: -len(r")\Z")]
 
 
 def group_files(paths: Sequence[Path]) -> tuple[list[FileGroup], str]:
-    """Sort files by kind.
+    """Group files by kind.
 
-    Names are alike but for digits. The digits that vary among files which are alike otherwise count the frames; where
-    none do, the last ones.
+    Files of a kind have equal names except for digits. The digits that vary within such a group are the frame number;
+    if none varies, the last digits are.
 
     Args:
         paths: the files.
@@ -114,7 +114,7 @@ def group_files(paths: Sequence[Path]) -> tuple[list[FileGroup], str]:
         The kinds, and the name of the layout.
 
     Raises:
-        InputError: two numbers vary, or two files are the same frame of a kind.
+        InputError: two numbers vary, or two files of a kind have the same frame number.
     """
     oidn = [(path, match) for path in paths if (match := _OIDN.fullmatch(path.stem))]
     if oidn and len(oidn) == len(paths):
@@ -136,7 +136,7 @@ def _split_by_number(texts: tuple[str, ...], members: list[tuple[Path, list[str]
     if not count:
         return [FileGroup(texts[0], {0: path}) for path, _ in members]
     if len(varying) > 1:
-        # The last one counts; each shot is a kind of its own, so that nobody mixes them.
+        # Use the last number; files that differ in another number are separate kinds, so that shots are not mixed.
         shots: defaultdict[tuple[str, ...], list[tuple[Path, list[str]]]] = defaultdict(list)
         for path, digits in members:
             shots[tuple(digits[:-1])].append((path, digits))
@@ -153,7 +153,7 @@ def _split_by_number(texts: tuple[str, ...], members: list[tuple[Path, list[str]
 
 
 def _with_stills(groups: list[FileGroup]) -> list[FileGroup]:
-    """Buffers of one still may be numbered in their own way: `albedo.exr` beside `render_0007.exr` belongs to it."""
+    """Add stills with other numbering: `albedo.exr` beside `render_0007.exr` belongs to that frame."""
     if len(groups) > 1 and all(len(group.files) == 1 for group in groups):
         numbers = {number for group in groups for number in group.files} - {0}
         if len(numbers) == 1:
@@ -163,7 +163,7 @@ def _with_stills(groups: list[FileGroup]) -> list[FileGroup]:
 
 
 def _oidn_groups(found: Iterable[tuple[Path, re.Match[str]]]) -> list[FileGroup]:
-    """One kind a buffer; the image with the most samples a pixel is the reference, that with the fewest is denoised."""
+    """One kind per buffer; the image with the most samples is the reference, that with the fewest is denoised."""
     shots: defaultdict[str, dict[str, dict[int, Path]]] = defaultdict(lambda: defaultdict(dict))
     for path, match in found:
         shots[match["name"]][match["buffer"].lower()][int(match["samples"])] = path
@@ -178,7 +178,7 @@ def _oidn_groups(found: Iterable[tuple[Path, re.Match[str]]]) -> list[FileGroup]
 
 
 def pattern_of(group: FileGroup) -> str:
-    """The names of a kind of files, with # for the digits of the frame."""
+    """The file names of a kind, with # for the digits of the frame number."""
     path = next(iter(group.files.values()))
     digits = list(_DIGITS.finditer(path.stem))
     if len(group.files) > 1:

@@ -1,8 +1,8 @@
-"""The data sets of Noisebase: samples of each pixel in Zarr arrays, zipped (Balint et al., NPPD, SIGGRAPH 2023).
+"""The data sets of Noisebase: samples of each pixel in zipped Zarr arrays (Balint et al., NPPD, SIGGRAPH 2023).
 
-One zip is a frame (the test sets) or a sequence whose arrays have a first axis of frames (the training set). Arrays are
-those of Zarr's format 2, channels first and samples last, their chunks compressed by Blosc; they are read here chunk by
-chunk, each checked before it is decompressed, so that a sequence of terabytes takes the memory of one frame's means.
+One zip holds a frame (test sets) or a sequence whose arrays have a first axis of frames (training set). The arrays have
+Zarr's format 2, channels first and samples last, in chunks compressed by Blosc. They are read chunk by chunk, and each
+chunk is checked before it is decompressed, so that a sequence of terabytes needs only the memory for one frame's means.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 
 SUFFIX = ".zip"
-# Channels and types of the arrays; sizes of a frame's are [C, H, W, S], or [C, H, W] of the reference.
+# Channels and dtypes of the arrays. The arrays of a frame are [C, H, W, S], or [C, H, W] for the reference.
 _IMAGES = {
     "color": (4, "|u1"),
     "diffuse": (3, "<f2"),
@@ -41,20 +41,20 @@ _IMAGES = {
     "reference": (3, "<f4"),
 }
 _NUMBERS = {"exposure": ((2,), "<f4"), "view_proj_mat": ((4, 4), "<f4"), "crop_offset": ((2,), "<i4")}
-# These say nothing that `view_proj_mat` does not.
+# These arrays are redundant with `view_proj_mat`.
 _SILENT = {"camera_position", "camera_target", "camera_up", "proj_mat"}
-# The images of which a training crop and a test frame were rendered, where they are not whole.
+# Sizes of the full images from which training crops and test frames were cut.
 _RENDERED = (1080, 1920)
-# Bytes of a chunk in a byte of its file: the limit of LZ4 is 255. Small chunks are no harm.
+# Largest compression ratio of a chunk: LZ4's limit is 255. Small chunks are harmless.
 _LARGEST_RATIO, _SMALL = 300, 2**16
 _LARGEST_DESCRIPTION, _LARGEST_SAMPLES, _BLOSC_HEADER = 2**16, 4096, 16
-# Pixels by which points may miss their own, in the median: samples are spread over a pixel.
+# Largest median reprojection error in pixels: samples are spread over a pixel.
 _NEAR = 1.5
 
 
 @dataclass(frozen=True)
 class _ZarrArray:
-    """What a ``.zarray`` says of an array."""
+    """The contents of a ``.zarray``."""
 
     name: str
     shape: tuple[int, ...]
@@ -74,14 +74,14 @@ class NoisebaseFiles:
 
     Args:
         files: the zip of each frame.
-        axis: whether the arrays have one of frames.
+        axis: whether the arrays have an axis of frames.
         numbers: frames in use, ascending.
         size: height and width in pixels.
-        arrays: names of those that every zip has.
-        view: size of the whole image that the matrices are of, and whether the files' offset of the crop counts;
-            ``None`` where positions are not seen at their pixels either way.
-        table: what each buffer was taken from.
-        warnings: what is probably wrong.
+        arrays: names of the arrays that every zip has.
+        view: size of the full image of the matrices, and whether the files' crop offset applies; ``None`` if positions
+            are not projected to their pixels either way.
+        table: the source of each buffer.
+        warnings: probable mistakes.
         unused: arrays that are not used.
     """
 
@@ -100,7 +100,7 @@ class NoisebaseFiles:
 
     @property
     def folders(self) -> set[Path]:
-        """Where the files lie."""
+        """The folders of the files."""
         return {path.parent for path in self.files.values()}
 
     @property
@@ -120,11 +120,11 @@ class NoisebaseFiles:
         return self.numbers if "reference" in self.arrays else []
 
     def frame_files(self, number: int) -> list[Path]:
-        """The zip of one frame, or that of all."""
+        """The zip of one frame, or of all frames."""
         return [self.files[number]]
 
     def metadata(self, number: int) -> Metadata:
-        """Nothing: the arrays have no attributes of pictures."""
+        """Empty, because the arrays have no attributes."""
         return {}
 
     def reference(self, number: int) -> Tensor:
@@ -137,7 +137,7 @@ class NoisebaseFiles:
     ) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`.
 
-        ``color`` is the mean over the samples, ``variance`` that of this mean; features are means over the samples.
+        ``color`` is the mean over the samples, and ``variance`` the variance of this mean; features are means, too.
         """
         index = self._index(number)
         sampled = self.samples > 1 and (buffers is None or "samples" in buffers)
@@ -165,10 +165,10 @@ class NoisebaseFiles:
         return Frame(color=_tensor(color), **found)
 
     def write(self, out: Path, number: int, image: Image, *, full_float: bool = False) -> Path:
-        """Write an EXR of the name of the zip with R, G, B: the arrays are of samples, and no place for an image.
+        """Write an EXR with R, G, B, named after the zip, because the arrays hold samples rather than images.
 
-        Where one zip holds all frames, the number of the frame stands behind its name. See
-        :meth:`mcdenoise.data.Sequence.write`; there is neither alpha nor a layer.
+        If one zip holds all frames, the frame number is appended to the name. There is neither alpha nor a layer. See
+        :meth:`mcdenoise.data.Sequence.write`.
         """
         source = self.files[number]
         target = out / (f"{source.stem}_{number:04d}.exr" if self.axis else f"{source.stem}.exr")
@@ -187,7 +187,7 @@ class NoisebaseFiles:
     def _matrix(
         self, file: zipfile.ZipFile, index: int | None, view: tuple[tuple[int, int], bool] | None = None
     ) -> Array:
-        """World to clip for row vectors, y down, of these pixels: of the image that they were cropped from, y up."""
+        """World-to-clip matrix for row vectors, y down, of the crop; the files have y up and the full image."""
         whole, cropped = view or self.view or (self.size, False)
         top, left = self._numbers(file, "crop_offset", index) if cropped else (0, 0)
         given = self._numbers(file, "view_proj_mat", index)
@@ -200,12 +200,12 @@ class NoisebaseFiles:
         return matrix
 
 
-# Buffer to array, but for those that are made of several.
+# Array of each buffer that is read from a single array.
 _SOURCES = {"albedo": "diffuse", "normal": "normal", "position": "position", "reference": "reference"}
 
 
 def find_zips(given: Sequence[Path]) -> list[Path]:
-    """The zips that somebody means: files, or those of a folder; none if there is anything else."""
+    """The zips among the given files, or in the given folder; empty if there are other files."""
     if len(given) == 1 and os.path.isdir(given[0]):
         try:
             names = sorted(name for name in os.listdir(given[0]) if not name.startswith("."))
@@ -218,15 +218,16 @@ def find_zips(given: Sequence[Path]) -> list[Path]:
 def open_noisebase(
     paths: Sequence[Path], choose_numbers: Callable[[list[int]], list[int]], *, where: str
 ) -> NoisebaseFiles:
-    """Check zips, and see whether the first frame's positions are seen at their pixels.
+    """Check zips, and whether the first frame's positions are projected to their pixels.
 
     Args:
-        paths: one for a sequence, or one for each frame.
-        choose_numbers: which of the frames to use.
-        where: what they are, for messages.
+        paths: one zip for a sequence, or one for each frame.
+        choose_numbers: selects the frames to use.
+        where: description of the files, for messages.
 
     Raises:
-        InputError: the package numcodecs is missing; a zip is damaged, holds something else or differs from the first.
+        InputError: the package numcodecs is missing; or a zip is damaged, has other contents or differs from the first
+            one.
     """
     first = _shapes(paths[0])
     axis = len(first["color"]) == 5
@@ -258,7 +259,7 @@ def open_noisebase(
 
 
 def _look(shot: NoisebaseFiles) -> None:
-    """Find out which pixels the matrices are of, from the positions of the first frame."""
+    """Determine the full image of the matrices from the positions of the first frame."""
     mean = f"mean of {shot.samples} samples"
     words = {"color": f"radiance, {mean}", "variance": f"variance of the {mean}", "reference": "radiance"}
     words["samples"] = f"{shot.samples} of a pixel: radiance"
@@ -295,7 +296,7 @@ def _look(shot: NoisebaseFiles) -> None:
 
 
 def _seen(means: Mapping[str, Array]) -> Mask:
-    """Where something was hit: what has neither normal nor reflectance in any sample was not."""
+    """Where something was hit: a pixel with neither normal nor reflectance in any sample was not."""
     told = [means[name] for name in ("normal", "diffuse") if name in means]
     seen: Mask = np.all(np.isfinite(means["position"]), axis=0)
     if told:
@@ -306,7 +307,7 @@ def _seen(means: Mapping[str, Array]) -> Mask:
 def _radiance(
     file: zipfile.ZipFile, array: _ZarrArray, exposure: Array, index: int | None, samples_out: Image | None = None
 ) -> tuple[Array, Array | None]:
-    r"""Mean radiance ``(3, H, W)`` and the variance of that mean, ``None`` of one sample; ``(S, 3, H, W)`` gets all.
+    r"""Mean radiance ``(3, H, W)`` and the variance of the mean, ``None`` for one sample; fills ``(S, 3, H, W)``.
 
     A sample is :math:`c / 255 \exp(e (b - a) + a)` of its three bytes c, with :math:`e = (E + 1) / 256` of its fourth
     and the exposure (a, b), natural logarithms.
@@ -328,7 +329,7 @@ def _radiance(
 
 
 def _mean(file: zipfile.ZipFile, array: _ZarrArray, index: int | None) -> Array:
-    """``(C, H, W)`` mean over the samples, where there are any."""
+    """``(C, H, W)`` mean over the samples, if there are several."""
     sampled = array.name != "reference"
     count = array.shape[-1] if sampled else 1
     places = array.shape[-4:-1] if sampled else array.shape[-3:]
@@ -339,7 +340,7 @@ def _mean(file: zipfile.ZipFile, array: _ZarrArray, index: int | None) -> Array:
 
 
 def _pieces(file: zipfile.ZipFile, array: _ZarrArray, index: int | None) -> Iterator[tuple[tuple[slice, ...], Array]]:
-    """The chunks of a frame and where each lies in it, one after the other."""
+    """The chunks of a frame with their positions, one after the other."""
     first = 0 if index is None else 1
     lead = [] if index is None else [index // array.chunks[0]]
     counts = [math.ceil(n / m) for n, m in zip(array.shape, array.chunks, strict=True)][first:]
@@ -357,7 +358,7 @@ def _pieces(file: zipfile.ZipFile, array: _ZarrArray, index: int | None) -> Iter
 def _chunk(file: zipfile.ZipFile, array: _ZarrArray, place: Sequence[int]) -> Array:
     content = _read(file, f"{array.name}/{array.separator.join(map(str, place))}", array.chunk_bytes + _BLOSC_HEADER)
     if array.compressed:
-        # Told before memory is taken for it: what a chunk says of its size, and the size that it has to have.
+        # Compare the chunk's stated size with the expected one before memory is allocated.
         promised = int.from_bytes(content[4:8], "little") if len(content) >= _BLOSC_HEADER else -1
         if promised != array.chunk_bytes or promised > _LARGEST_RATIO * len(content) + _SMALL:
             raise _damaged(file, f"a chunk of '{array.name}' of another size")
@@ -377,7 +378,7 @@ def _read(file: zipfile.ZipFile, name: str, limit: int) -> bytes:
 
 
 def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Shapes of the arrays of a zip, of which those that are known are checked, and all their chunks looked for."""
+    """Shapes of the arrays of a zip; known arrays are checked, and all their chunks must exist."""
     _blosc()
     with _opened(path) as file:
         entries = set(file.namelist())
@@ -397,12 +398,12 @@ def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
             shape = (*lead, *(shape[:3] if name == "reference" else shape))
             if array.shape != shape or array.dtype != np.dtype(kind):
                 raise _damaged(file, f"'{name}' of {array.dtype} {array.shape} beside 'color' {color}")
-            # Numbers, and a sample's bytes, in one piece.
+            # Small arrays, and the bytes of one sample, must be in one chunk.
             whole = array.shape[len(lead) :] if name in _NUMBERS else array.shape[len(lead) :][: name == "color"]
             if array.chunks[len(lead) :][: len(whole)] != whole:
                 raise _damaged(file, f"chunks of '{name}' of shape {array.chunks}")
             counts = [math.ceil(n / m) for n, m in zip(array.shape, array.chunks, strict=True)]
-            # A chunk that is not there would be black.
+            # Zarr would read a missing chunk as zeros, that is, as black.
             if math.prod(counts) > len(entries) or any(
                 f"{name}/{array.separator.join(map(str, place))}" not in entries
                 for place in product(*map(range, counts))
@@ -427,7 +428,7 @@ def _described(file: zipfile.ZipFile, name: str) -> _ZarrArray:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
-    """A zip; whatever goes wrong with it is told in one line."""
+    """Open a zip, and convert every error to one line."""
     if not os.path.isfile(path):
         raise InputError(f"{path}: expected a zip of Noisebase, found none; check the path")
     try:
@@ -437,7 +438,7 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
         raise
     except MemoryError as error:
         raise InputError(f"{path}: expected a zip of Noisebase, found no memory for a frame of it") from error
-    # zipfile, json and numcodecs raise a dozen kinds of errors for bytes that are damaged.
+    # zipfile, json and numcodecs raise a dozen different exceptions for damaged data.
     except Exception as error:
         reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         raise InputError(f"{path}: expected a zip of Noisebase, found it damaged ({reason}); copy it again") from error

@@ -1,4 +1,4 @@
-"""Finding out what the files of a shot hold: by names and headers, and by the values of its first frames."""
+"""Determining the contents of a shot's files by names and headers, and by the values of the first frames."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ from mcdenoise.data.readers.values import (
 )
 from mcdenoise.errors import InputError
 
-# How motion is stored where the name of its layer tells: Blender's points to the frame before, in pixels, y up.
+# Motion conventions known by layer name: Blender's points to the previous frame, in pixels, y up.
 _MOTION = {"vector": Convention(1, -1, "previous - current, y up, pixels")}
-# Pixels by which points move where a camera moves.
+# Smallest motion in pixels that shows a moving camera.
 _MOVED = 0.3
-# How far from the origin a camera is that sees positions in its own space, in distances of what it sees.
+# Largest distance of a camera from the origin, relative to the distance of visible points, in camera space.
 _ORIGIN = 1e-2
 
 
@@ -60,18 +60,18 @@ def open_files(
     color_has_albedo: bool | None = None,
     lights: Sequence[str] = (),
 ) -> RenderedFiles:
-    """Find out what the files of a shot hold: by names and headers, and by the values of its first frames.
+    """Open the files of a shot: determine their contents by names, headers, and values of the first frames.
 
     Args:
         groups: kinds of files.
-        choose_numbers: which of the frames to use.
-        where: what they are, for messages.
+        choose_numbers: selects the frames to use.
+        where: description of the files, for messages.
         mapping: see :func:`mcdenoise.data.readers.choice.choose`.
-        color_has_albedo: whether radiance has the albedo in it; told by the data by default.
+        color_has_albedo: whether the radiance includes the albedo; by default determined from the values.
         lights: names of additive layers of radiance that are denoised with the color.
 
     Raises:
-        InputError: the files do not tell what they are, do not fit together, or cannot be read.
+        InputError: the files cannot be recognised, do not match one another, or cannot be read.
     """
     headers = [read_image_header(next(iter(group.files.values()))) for group in groups]
     layers = [
@@ -104,11 +104,11 @@ def open_files(
 
 @dataclass(frozen=True)
 class Result:
-    """The radiance of one file: that which has been denoised, if it holds some that has not as well.
+    """The radiance in one file: the denoised one, if there is also a noisy one.
 
     Args:
         path: the file.
-        layer: of the radiance.
+        layer: layer of the radiance.
         size: height and width in pixels.
     """
 
@@ -117,7 +117,7 @@ class Result:
     size: tuple[int, int]
 
     def read(self) -> tuple[Tensor, Metadata]:
-        """``(1, 3, H, W)`` radiance, and the attributes of the file.
+        """Read ``(1, 3, H, W)`` radiance, and the attributes of the file.
 
         Raises:
             InputError: the file is damaged.
@@ -128,10 +128,10 @@ class Result:
 
 
 def open_result(path: Path) -> Result:
-    """Find the radiance of a file that a denoiser wrote, alone or among other layers.
+    """Find the radiance in a denoiser's output file, which may have other layers.
 
     Raises:
-        InputError: the file cannot be read, or does not tell which layer is its radiance.
+        InputError: the file cannot be read, or its radiance cannot be determined.
     """
     parts = read_image_header(path).parts
     layers = layers_of(0, "", parts)
@@ -145,7 +145,7 @@ def open_result(path: Path) -> Result:
 
 
 def _check(shot: RenderedFiles) -> None:
-    """Every frame has every buffer, of one size and place."""
+    """Check that every frame has every buffer, with the same data window."""
     color = shot.choice.layers["color"]
     main = shot.part(color)
     for name, layer in sorted(shot.choice.layers.items()):
@@ -193,7 +193,7 @@ def _window(part: Part) -> str:
 
 
 def _look(shot: RenderedFiles, color_has_albedo: bool | None) -> None:
-    """Read the first frame, and the next ones where there is motion, and decide what their values mean."""
+    """Read the first frame, and the next ones if there is motion, and determine the meaning of their values."""
     number, chosen = shot.numbers[0], dict(shot.choice.layers)
     images = shot.read(
         number,
@@ -289,7 +289,7 @@ def _look_at_positions(shot: RenderedFiles, images: dict[str, Image], readings: 
             readings["position"].append("in the space of the camera, brought to the world by 'worldToCamera'")
             _look_at_positions(shot, images, readings)
             return
-        # Where a point was in the frame before is not told.
+        # The previous positions of points are unknown.
         shot.drops_positions, shot.has_camera = True, "depth" not in images
         readings["position"].append("in the space of the camera: only its depth is used")
         readings.pop("view_projection")
@@ -299,13 +299,13 @@ def _look_at_positions(shot: RenderedFiles, images: dict[str, Image], readings: 
 
 
 def _is_origin(camera: FittedCamera, position: Image, known: Mask) -> bool:
-    """Whether a camera is the origin of the positions that it sees."""
+    """Whether a camera fitted to positions is at their origin."""
     distance = np.linalg.norm(position[known], axis=-1)
     return bool(np.linalg.norm(camera.eye) < _ORIGIN * np.median(distance))
 
 
 def _ends_at_origin(shot: RenderedFiles) -> bool:
-    """Whether the camera of the last frame is: one that moves in the world may have begun there."""
+    """Whether the last frame's camera is also at the origin: one that moves in the world may have begun there."""
     layers = {name: each for name, each in shot.choice.layers.items() if name in ("position", "depth")}
     images = shot.read(shot.numbers[-1], layers)
     known = hit(images, seen_of(images))
@@ -314,11 +314,11 @@ def _ends_at_origin(shot: RenderedFiles) -> bool:
 
 
 def _motion(shot: RenderedFiles, first: Mapping[str, Image]) -> tuple[Convention, str]:
-    """The convention of the motion, by comparing neighbouring frames; motion that is none goes.
+    """Determine the convention of the motion by comparing consecutive frames; motion that is all zero is removed.
 
     Args:
         shot: the files.
-        first: all of its first frame.
+        first: all images of its first frame.
     """
     layer = shot.choice.layers["motion"]
     given = _MOTION.get(layer.title.lower(), USUAL_MOTION)
@@ -356,7 +356,7 @@ def _motion(shot: RenderedFiles, first: Mapping[str, Image]) -> tuple[Convention
 def _seen_elsewhere(
     shot: RenderedFiles, before: tuple[int, Mapping[str, Image]], now: tuple[int, Mapping[str, Image]]
 ) -> Array | None:
-    """Pixels from each point of a frame to where the camera of the one before sees it, where these are known."""
+    """Pixels from each point of a frame to its projection by the previous frame's camera, if both are known."""
     if not shot.has_camera:
         return None
     matrix, known = shot.camera(*before, seen_of(before[1])), hit(now[1], seen_of(now[1]))
@@ -366,19 +366,19 @@ def _seen_elsewhere(
 
 
 def _splits(layers: Sequence[Layer], choice: Choice, mapping: Mapping[str, str]) -> list[Split]:
-    """What may be diffuse and specular light, unless somebody says that nothing is."""
+    """Candidates for diffuse and specular light, unless the user has excluded them."""
     if "" in {mapping.get(DIFFUSE), mapping.get(SPECULAR)}:
         return []
     asked = {name: choice.layers[name] for name in mapping if name in choice.layers}
     if {DIFFUSE, SPECULAR} <= asked.keys():
-        # They are read as parts, and no other way.
+        # These layers are read as parts only.
         for name in {DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO} & asked.keys():
             del choice.layers[name]
     return find_splits(layers, choice.layers["color"], asked)
 
 
 def _look_at_parts(shot: RenderedFiles, splits: Sequence[Split]) -> None:
-    """Take the first split that adds up to the color of the first frame and is there in all."""
+    """Use the first candidate that adds up to the color of the first frame and exists in all frames."""
     number, color = shot.numbers[0], shot.choice.layers["color"]
     refused = []
     for split in (each for each in splits if _is_everywhere(shot, each.layers.values())):
@@ -414,7 +414,7 @@ def _look_at_parts(shot: RenderedFiles, splits: Sequence[Split]) -> None:
 
 
 def _look_at_samples(shot: RenderedFiles, samples: SampleLayers) -> None:
-    """Take samples that are there in all frames and whose mean is the color of the first one."""
+    """Use samples that exist in all frames and whose mean is the color in the first one."""
     number, color = shot.numbers[0], shot.choice.layers["color"]
     if not _is_everywhere(shot, samples.layers.values()):
         shot.warnings.append("'samples': some frames have others, or of other pixels, or none: not used")
@@ -432,7 +432,7 @@ def _look_at_samples(shot: RenderedFiles, samples: SampleLayers) -> None:
 
 
 def _is_everywhere(shot: RenderedFiles, layers: Collection[Layer]) -> bool:
-    """Whether all frames have these layers, in the pixels of the color."""
+    """Whether all frames have these layers, with the data window of the color."""
     main = shot.part(shot.choice.layers["color"])
     for layer in set(layers):
         files = shot.groups[layer.group].files

@@ -1,4 +1,4 @@
-"""Writing a file as it was read, with some channels replaced or added, and all else passed through untouched."""
+"""Writing a copy of a file with some channels replaced or added, and everything else unchanged."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ def write_like(
     like: str = "",
     full_float: bool = False,
 ) -> None:
-    """Write ``target`` as ``source`` is: the same container, parts, channels, types, attributes, windows, compression.
+    """Write a copy of ``source`` with the same container, parts, channels, types, attributes, windows, compression.
 
     Args:
-        source: a file that has been read.
-        target: the file to be written, whole or not at all. Its folder must exist.
+        source: an existing image file.
+        target: the file to write, atomically. Its folder must exist.
         replaced: ``(H, W)`` pixels by part and channel.
-        added: the same of new channels, by name.
-        part: the part that they are added to.
-        like: the channel of that part whose type they have.
-        full_float: store all of these as 32-bit floats, whatever was there.
+        added: ``(H, W)`` pixels of new channels, by name.
+        part: the part that gets the new channels.
+        like: the channel of that part whose type the new channels get.
+        full_float: store all these channels as 32-bit floats, whatever the types were.
 
     Raises:
         InputError: the file cannot be written, or a layer is to be added to a file that has none.
@@ -68,11 +68,11 @@ def _write_exr(
     like: str,
     full_float: bool,
 ) -> str:
-    # Reading and writing raise whatever the library below has to say.
+    # Reading and writing may raise any exception of the underlying library.
     try:
         expected = read_image_header(source).parts
-        # A part that it cannot read it leaves out, and prints that: to keep it quiet would be to take from all other
-        # threads what they print meanwhile.
+        # The library skips unreadable parts with a printed warning. Suppressing that would also suppress the output of
+        # all other threads.
         with readable(source, target.with_suffix(".copy.exr")) as (path, strange):
             file = OpenEXR.File(str(path), separate_channels=True)
         whole = len(file.parts) == len(expected) and all(map(_is_whole, file.parts, expected))
@@ -97,7 +97,7 @@ def _write_exr(
         if strange:
             put_back(target, strange)
         written = read_image_header(target).parts
-        # The library does not tell when the last few kilobytes no longer fit on the disk: see whether they are there.
+        # OpenEXR does not report a full disk for the last few kilobytes, so read them back.
         for index, each in enumerate(written):
             read_channels(target, {index: each.channels}, slice(each.size[0] - 1, each.size[0]))
     except _LIBRARY_ERRORS as error:
@@ -110,7 +110,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _is_whole(found: Any, part: Part) -> bool:
-    """Whether a part has been read: all its channels, as the other library sees them."""
+    """Whether the other library has read a part with all of its channels."""
     channels = found.channels
     return set(channels) == set(part.channels) and all(each.pixels.shape == part.size for each in channels.values())
 
@@ -120,7 +120,7 @@ def _stored(image: Image, kind: Any) -> Any:
 
 
 def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image]) -> str:
-    """A file of one picture: its other channels, and what kind of numbers it has, stay."""
+    """Write a file with one picture, with its other channels and its pixel type unchanged."""
     spec, part, pixels = read_picture(source)
     light = np.stack([replaced[name] for name in part.channels[:3]], -1)
     pixels[..., :3] = encode(light) if part.display_referred else light
@@ -132,7 +132,7 @@ def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image]) ->
     written = output.write_image(pixels)
     if not output.close() or not written:
         return pending_error(output) or "writing failed"
-    # A disk that is full is not told: see whether the pixels are there.
+    # A full disk is not reported, so read the pixels back.
     try:
         read_picture(target)
     except InputError as error:

@@ -1,8 +1,8 @@
-"""Single samples of the pixels of a frame: layers ``sample0.RGB``, ``sample1.RGB``, ... of an EXR.
+"""Single samples of a frame's pixels: layers ``sample0.RGB``, ``sample1.RGB``, ... of an EXR.
 
-They lie beside the color, or in a file of their own for each frame, such as ``samples_0001.exr``; in the BMFR layout it
-is ``samplesN.exr``. Each may have the features that it has seen: ``sample0.albedo.RGB``, ``sample0.normal.XYZ`` and
-``sample0.depth.Z``. Their mean is the color, or they are not used.
+They are in the file of the color, or in a separate file per frame, such as ``samples_0001.exr``; in the BMFR layout it
+is ``samplesN.exr``. Each sample may have its own features: ``sample0.albedo.RGB``, ``sample0.normal.XYZ`` and
+``sample0.depth.Z``. Samples are used only if their mean is the color.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import numpy as np
 from mcdenoise.data.exr import LARGEST_HALF, Image, write_exr
 from mcdenoise.data.readers.layers import Layer
 
-# Channels behind the radiance, in this order where every sample has them.
+# Channels after the radiance, in this order, if every sample has them.
 FEATURES = {"albedo": "RGB", "normal": "XYZ", "depth": "Z"}
 _NAME = re.compile(r"(?:.*[._ ])?sample[ _]?([0-9]{1,4})(?:\.(albedo|normal|depth))?", re.IGNORECASE)
-# Of the mean of half floats, and of the color, each 2^-11; and as much to spare.
+# Rounding of the mean of half floats, and of the color, 2^-11 each; doubled.
 _ROUNDING, _SMALLEST_HALF = 4 * 2.0**-11, 2.0**-24
-_MOST_OFF = 1e-3  # of the pixels: brighter than a half float can be
+_MOST_OFF = 1e-3  # largest fraction of deviating pixels, such as those brighter than a half float
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class SampleLayers:
     """The layers of the samples of a frame.
 
     Args:
-        radiance: of each sample.
-        features: likewise, by name; only those that every sample has.
+        radiance: layer of each sample.
+        features: layers of each sample by feature; only features that every sample has.
     """
 
     radiance: tuple[Layer, ...]
@@ -39,12 +39,12 @@ class SampleLayers:
 
     @property
     def layers(self) -> dict[str, Layer]:
-        """All of them, by a key for :meth:`samples`."""
+        """All layers, by a key for :meth:`samples`."""
         rows = {"radiance": self.radiance, **self.features}
         return {f"sample {i} {name}": layer for name, own in rows.items() for i, layer in enumerate(own)}
 
     def samples(self, images: Mapping[str, Image]) -> Image:
-        """``(S, C, H, W)`` of the images of :attr:`layers`: radiance, and features as far as there are any."""
+        """``(S, C, H, W)`` from the images of :attr:`layers`: radiance, followed by features."""
         found = [
             np.concatenate(
                 [
@@ -63,7 +63,7 @@ class SampleLayers:
 
 
 def split_samples(layers: Sequence[Layer]) -> tuple[SampleLayers | None, list[Layer]]:
-    """The layers of samples, if there are any, and all other layers: the features of a sample are no buffers."""
+    """Separate the layers of samples from all other layers: features of a sample are not buffers."""
     found: dict[str, dict[int, Layer]] = {}
     others = []
     for layer in layers:
@@ -95,8 +95,8 @@ def write_samples(path: Path, samples: Image) -> None:
     """Write samples as layers of an EXR.
 
     Args:
-        path: of the file.
-        samples: ``(S, C, H, W)``: radiance, and behind it albedo, normal and depth, or nothing.
+        path: the file.
+        samples: ``(S, C, H, W)``: radiance, optionally followed by albedo, normal and depth.
 
     Raises:
         InputError: the file cannot be written.

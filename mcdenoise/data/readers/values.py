@@ -1,6 +1,6 @@
-"""What the values of a buffer say of themselves: encodings, placeholders, units and signs that no name tells.
+"""Properties of a buffer that its values reveal: encodings, placeholders, units and signs.
 
-All arrays are ``(H, W, C)``; every decision comes with the words for the person who reads the table of what was read.
+All arrays are ``(H, W, C)``. Every decision comes with a description for the table of buffers.
 """
 
 from __future__ import annotations
@@ -16,43 +16,43 @@ import torch.nn.functional as F
 from mcdenoise.data.camera_matrices import Array
 from mcdenoise.data.exr import LARGEST_HALF, Image, Mask
 
-# No scene is so deep, and what renderers write for nothing is deeper: 1e10 (Blender), 1e30, 3.4e38.
+# Larger than any scene's depth; placeholders of renderers are larger still: 1e10 (Blender), 1e30, 3.4e38.
 _FARTHEST = 1e9
 _BLOCK = 8
-# Elasticities of 1 and of 0 are told apart here, since gloss and light between colored walls lower both (measured: 0.47
-# to 1.17 and -0.53 to 0.19), where the value is so many of its standard errors away, and these are no larger than that.
+# Elasticities near 1 and near 0 are distinguished, although gloss and light between colored walls lower both (measured:
+# 0.47 to 1.17 and -0.53 to 0.19). The value must exceed this many standard errors, and errors must be below this limit.
 _THRESHOLD, _SIGMAS, _LARGEST_ERROR = 1 / 3, 3.0, 0.15
-# Ratio of second differences over one pixel and over two, without albedo: 1 where each pixel has noise of its own
-# (measured on 132 shots of Mitsuba and Cycles: 0.82 to 1.14), less where samples count in several (0.41 to 0.80 on 34
-# through Gaussian, Mitchell and tent filters). The difference, in parts of the mean, that a noisy pixel has at least,
-# and that half of the pixels have: edges and textures of references had up to 0.035.
+# Ratio of second differences over one pixel and over two, without albedo: 1 if the noise of pixels is independent
+# (measured on 132 shots of Mitsuba and Cycles: 0.82 to 1.14), less if samples are spread over several pixels (0.41 to
+# 0.80 on 34 with Gaussian, Mitchell and tent filters). Smallest relative difference of noisy pixels, which half of the
+# pixels must exceed: edges and textures of references had up to 0.035.
 _SPREAD, _NOISE, _LEAST_NOISY, _TYPICAL_NOISE = 0.78, 0.02, 4000, 0.04
-_MIDDLE = 640  # pixels of a side that are looked at
-# By how much one reading has to be nearer to the reference than the other.
+_MIDDLE = 640  # side of the central region that is examined, in pixels
+# One reading must be closer to the reference than the other by this factor.
 _NEARER = 1.5
 _LARGEST_MOTION = 1e5
-# A pixel that moves by less says little of the sign; fewer pixels than this say nothing.
+# Pixels that move less do not determine the sign; a smaller number of pixels is not sufficient.
 _MOVES, _LEAST_MOVING = 0.5, 64
-# Another sign is taken where it matches so much better than the one that the format has.
+# Another sign is chosen only if it matches this much better than the usual one of the format.
 _BETTER = 0.85
-# Those that lead where cameras see the same points miss by no more than this, of how far these move.
+# Largest error relative to the motion of points, if cameras determine the convention.
 _EXACT = 0.5
-# And motion says something where it matches so much better than none.
+# Motion is meaningful if it matches this much better than no motion.
 _TELLING = 0.98
-# It contradicts the frames where it is so much worse than none, and moves so many pixels this far: less blurs what it
-# compares, and is no evidence.
+# Motion contradicts the frames if it matches this much worse than no motion, and moves this many pixels by this
+# distance; smaller motion only blurs the compared image, which proves nothing.
 _CONTRADICTS, _FAR = 1.1, 2.0
-# How many pairs of frames are looked at.
+# Number of compared pairs of frames.
 MOTION_PAIRS = 3
 
 
 class Row(NamedTuple):
-    """What one buffer was taken from.
+    """The source of one buffer.
 
     Args:
-        buffer: its name.
+        buffer: name of the buffer.
         source: file and layer.
-        reading: how its values are read, and why.
+        reading: how its values are interpreted, and why.
     """
 
     buffer: str
@@ -61,12 +61,12 @@ class Row(NamedTuple):
 
 
 class Albedo(NamedTuple):
-    """Whether radiance has the albedo in it.
+    """Whether radiance includes the albedo.
 
     Args:
-        included: ``None`` where the data does not tell.
-        elasticity: by how many percent the radiance grows with one percent of albedo: near 1 if it is in, 0 if not.
-        error: the standard error of that.
+        included: ``None`` if the data does not tell.
+        elasticity: percentage by which the radiance grows with one percent of albedo: near 1 if included, 0 if not.
+        error: standard error of the elasticity.
     """
 
     included: bool | None
@@ -75,12 +75,12 @@ class Albedo(NamedTuple):
 
 
 def albedo_included(color: Image, albedo: Image) -> Albedo:
-    """Tell from a frame whether its radiance has been divided by its albedo.
+    """Determine from a frame whether its radiance includes the albedo.
 
-    Two regressions over blocks of pixels, neither of which noise can bend: of the ratios of two channels (a path's
-    noise is nearly the same in all three), and of the fourth root of the brightness over its mean (under which one path
-    in a thousand that finds a lamp weighs no more than ten others). The standard error is that of leaving out each
-    stripe of blocks in turn.
+    Two regressions over blocks of pixels are combined, both of them insensitive to noise: of the ratios of two channels
+    (a path's noise is nearly the same in all three), and of the fourth root of the relative brightness (under which one
+    path in a thousand that hits a lamp has the weight of ten others). The standard error is that of a jackknife over
+    stripes of blocks.
     """
     usable: Mask = np.all([(albedo > 0.02).all(-1), (color >= 0).all(-1), np.isfinite(color).all(-1)], axis=0)
     sums = []
@@ -93,7 +93,7 @@ def albedo_included(color: Image, albedo: Image) -> Albedo:
     roots = [np.sqrt(np.sqrt(np.maximum(image.mean(-1), 0))) for image in (albedo, color)]
     sums.append(_slopes(roots[0], roots[1], usable, relative=True))
     stripes = np.stack(sums, 0)
-    # Each way of looking weighs as its own error allows.
+    # Weight each estimate by its inverse variance.
     found = [_jackknife(each) for each in stripes]
     weights = np.array([1 / max(error, 1e-3) ** 2 if np.isfinite(error) else 0.0 for _, error in found])
     if not weights.sum():
@@ -105,14 +105,14 @@ def albedo_included(color: Image, albedo: Image) -> Albedo:
 
 
 def albedo_included_as_in(reference: Image, color: Image, albedo: Image) -> bool | None:
-    """Whether radiance has the albedo in it as its reference has; ``None`` where neither reading is clearly nearer."""
+    """Whether radiance includes the albedo by comparison with its reference; ``None`` if neither is clearly closer."""
     with_it, without = (_distance(image, reference) for image in (color, color * albedo))
     return with_it < without if max(with_it, without) > _NEARER * min(with_it, without) else None
 
 
 def noise_is_spread(color: Image, albedo: Image | None) -> bool:
-    """Whether neighbouring pixels share noise, since the film's filter lets each sample count in several of them."""
-    # The middle of a large image tells as well as all of it.
+    """Whether neighbouring pixels have correlated noise, because the film's filter spreads each sample."""
+    # The centre of a large image suffices.
     middle = tuple(slice(max(side - _MIDDLE, 0) // 2, (side + _MIDDLE) // 2) for side in color.shape[:2])
     color, albedo = color[middle], None if albedo is None else albedo[middle]
     light = (color if albedo is None else color / np.maximum(albedo, 0.02)).mean(-1)
@@ -121,7 +121,7 @@ def noise_is_spread(color: Image, albedo: Image | None) -> bool:
         two, one, here, other, far = (x[:, i : x.shape[1] - 4 + i] for i in range(5))
         mean = np.maximum(two + one + 2 * here + other + far, 1e-9)
         near, wide = np.abs(one - 2 * here + other) / mean, np.abs(two - 2 * here + far) / mean
-        # Pixels without noise are alike because of what they show.
+        # Pixels without noise are correlated by the image content.
         noisy = near + wide > _NOISE
         if noisy.sum() < _LEAST_NOISY or np.median(wide) < _TYPICAL_NOISE:
             return False
@@ -130,7 +130,7 @@ def noise_is_spread(color: Image, albedo: Image | None) -> bool:
 
 
 def _distance(image: Image, reference: Image) -> float:
-    """Mean relative difference of large blocks, in which noise is averaged."""
+    """Mean relative difference of large blocks, which average the noise."""
     one, other = (
         F.adaptive_avg_pool2d(torch.from_numpy(np.nan_to_num(each)).permute(2, 0, 1).contiguous(), (6, 8))
         for each in (image, reference)
@@ -159,7 +159,7 @@ def _slopes(x: Image, y: Image, usable: Mask, *, relative: bool = False) -> Arra
     within = (inside > 0) & known[:, None] & (count > _BLOCK**2 / 2)
     dx, dy = np.where(within, xs - mean_x, 0), np.where(within, ys - mean_y, 0)
     pairs = np.stack([(dx * dy).sum(1), (dx * dx).sum(1)], 1)
-    # What is uniform but for rounding and noise of the features tells nothing.
+    # Blocks that are uniform up to rounding and feature noise carry no information.
     pairs[pairs[:, 1] < count[:, 0] * 1e-4] = 0
     return np.stack([pairs[k::16].sum(0) for k in range(16)])
 
@@ -177,10 +177,10 @@ def _jackknife(stripes: Array) -> tuple[float, float]:
 def read_radiance(
     color: Image, albedo: Image, reference: Image | None, stated: bool | None
 ) -> tuple[bool, str, list[str]]:
-    """Whether radiance has the albedo in it: as stated, or as its values tell, or else it is ordinary radiance.
+    """Determine whether radiance includes the albedo: as stated, or by its values, or by default yes.
 
     Returns:
-        The answer, the words for it, and what to warn of.
+        The answer, its description, and warnings.
     """
     readings = {True: "radiance with albedo", False: "radiance without albedo, which is multiplied back"}
     if stated is not None:
@@ -192,7 +192,8 @@ def read_radiance(
         included = told.included
         why = f"1 % of albedo makes {told.elasticity:.2f} +- {told.error:.2f} % of light"
         if included is None:
-            # What has no texture at all says nothing, and is what it is called; what says something else is doubtful.
+            # Without any texture the values cannot tell, which is fine; with a contradicting texture the answer is
+            # doubtful.
             doubtful = told.elasticity + _SIGMAS * told.error < 2 / 3
             warning = (
                 "'color': taken as ordinary radiance; its values do not tell whether it was divided by the albedo. If "
@@ -207,7 +208,7 @@ def read_radiance(
 
 
 def normal_is_encoded(normal: Image) -> bool:
-    """Whether a normal is stored as ``n / 2 + 1 / 2``: nothing is negative, and it has unit length when decoded."""
+    """Whether a normal is stored as ``n / 2 + 1 / 2``: no value is negative, and decoding gives unit length."""
     present = (normal != 0).any(-1) & np.isfinite(normal).all(-1)
     if not present.any() or normal[present].min() < -0.05 or normal[present].max() > 1.05:
         return False
@@ -217,14 +218,14 @@ def normal_is_encoded(normal: Image) -> bool:
 
 
 def is_direction(vectors: Image) -> bool:
-    """Whether most vectors have unit length or none at all."""
+    """Whether most vectors have length one or zero."""
     length = np.linalg.norm(np.nan_to_num(vectors), axis=-1)
     present = length > 1e-3
     return bool(present.any() and (np.abs(length[present] - 1) < 0.05).mean() > 0.9)
 
 
 def nothing_hit(depth: Image) -> Mask:
-    """Where a depth is what a renderer writes for nothing: 0 or less, 1e9 or more, half's largest, or no number."""
+    """Where a depth is a placeholder for no hit: 0 or less, 1e9 or more, the largest half float, or NaN."""
     with np.errstate(invalid="ignore"):
         nothing: Mask = ~((depth > 0) & (depth < _FARTHEST) & (depth != LARGEST_HALF))
     return nothing
@@ -234,9 +235,9 @@ class Convention(NamedTuple):
     """How a motion buffer is stored: ``previous = current + (x * scale_x, y * scale_y)`` in pixels, y down.
 
     Args:
-        scale_x: of the first channel.
-        scale_y: of the second.
-        words: for people.
+        scale_x: factor of the first channel.
+        scale_y: factor of the second channel.
+        words: description.
     """
 
     scale_x: float
@@ -244,7 +245,7 @@ class Convention(NamedTuple):
     words: str
 
     def apply(self, motion: Image) -> Image:
-        """``(H, W, 2)`` in pixels, y down; infinite where a renderer writes something huge or no number."""
+        """Convert to ``(H, W, 2)`` pixels, y down; infinite where the stored value is huge or NaN."""
         scaled: Image = motion[..., :2] * np.array([self.scale_x, self.scale_y], np.float32)
         with np.errstate(invalid="ignore"):
             known = (np.abs(scaled) < _LARGEST_MOTION).all(-1, keepdims=True)
@@ -255,7 +256,7 @@ USUAL_MOTION = Convention(1, 1, "previous - current, y down, pixels")
 
 
 def conventions(size: tuple[int, int], motion: Image) -> list[Convention]:
-    """Those that a motion buffer may have: two signs each, in pixels; in parts of the image where that may be."""
+    """Possible conventions of a motion buffer: two signs per axis, in pixels or, if plausible, image fractions."""
     height, width = size
     finite = motion[..., :2][np.isfinite(motion[..., :2])]
     scales = [(1.0, 1.0, "pixels")]
@@ -271,16 +272,16 @@ def conventions(size: tuple[int, int], motion: Image) -> list[Convention]:
     ]
 
 
-# Features of a frame by name, those of the frame before, and the motion as stored.
+# Features of a frame by name, those of the previous frame, and the stored motion.
 Pair: TypeAlias = tuple[Mapping[str, Image], Mapping[str, Image], Image]
 
 
 def read_motion(
     pairs: Sequence[Pair], given: Convention, seen_elsewhere: Sequence[tuple[Image, Array]] = ()
 ) -> tuple[Convention | None, str, list[str]]:
-    """The convention of motion, with the words for it, and what to warn of.
+    """The convention of the motion, its description, and warnings.
 
-    Cameras tell it best, see :func:`match_cameras`, and else what the frames show, see :func:`match_motion`.
+    Cameras determine it best, see :func:`match_cameras`; otherwise the frames, see :func:`match_motion`.
     """
     by_cameras = match_cameras(seen_elsewhere, given)
     chosen, told = (by_cameras, True) if by_cameras else match_motion(pairs, given)
@@ -296,15 +297,15 @@ def read_motion(
 
 
 def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention | None, bool]:
-    """Which convention of motion leads to the pixels of the frame before that look alike.
+    """Find the motion convention that leads to matching pixels in the previous frame.
 
     Args:
-        pairs: of neighbouring frames.
-        given: the convention that the format is known for.
+        pairs: pairs of consecutive frames.
+        given: the usual convention of the format.
 
     Returns:
-        The given one, unless another fits clearly better; ``None`` where none is better than no motion at all, although
-        much moves; and whether the frames tell anything.
+        The usual convention, unless another matches clearly better; ``None`` if none matches better than no motion
+        although much moves; and whether the frames are conclusive.
     """
     if not pairs:
         return given, False
@@ -314,29 +315,29 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
     if moving < _LEAST_MOVING and len(units) == 1:
         return given, False
     errors = {each: float(np.mean([_mismatch(*pair, each) for pair in pairs])) for each in candidates}
-    # Interpolation smooths what it moves by half a pixel: of two units that fit about as well, it is the usual one.
+    # Interpolation blurs by half a pixel: between two units that match about equally well, prefer the usual one.
     best = min(errors, key=lambda each: errors[each] / (_BETTER if "half" in each.words else 1))
     at_rest = float(np.mean([_mismatch(*pair, Convention(0, 0, "")) for pair in pairs]))
     better = errors[best] < _BETTER * errors[given]
-    # No better than none, or hardly: that says something only where the given one is far worse.
+    # Hardly better than no motion: this is conclusive only if the usual convention is far worse.
     if errors[best] > at_rest or (errors[best] > _TELLING * at_rest and not better):
         far = sum(int((np.abs(given.apply(m)).max(-1) > _FAR).sum()) for *_, m in pairs)
         contradicts = errors[best] > _CONTRADICTS * at_rest and far > _LEAST_MOVING
         return (None, True) if contradicts else (given, False)
-    # What hardly moves as it is given, and leads to what looks alike in another unit, is in that unit.
+    # If the usual unit gives hardly any motion and another unit matches, the motion is in that unit.
     rescaled = moving < _LEAST_MOVING and abs(best.scale_x) != abs(given.scale_x)
     return (best, True) if rescaled or better else (given, True)
 
 
 def match_cameras(pairs: Sequence[tuple[Image, Array]], given: Convention) -> Convention | None:
-    """Which convention of motion leads where the camera of the frame before sees the points of this one.
+    """Find the motion convention that agrees with the projection of this frame's points by the previous camera.
 
     Args:
-        pairs: motion as stored, and ``(H, W, 2)`` pixels to where these points were seen, NaN where there is none.
-        given: the convention that the format is known for.
+        pairs: stored motion, and ``(H, W, 2)`` pixels to the previous projection of the points, or NaN.
+        given: the usual convention of the format.
 
     Returns:
-        The given one, unless another fits clearly better; ``None`` where points hardly move or none fits.
+        The usual convention, unless another fits clearly better; ``None`` if points hardly move or none fits.
     """
     if not pairs:
         return None
@@ -358,17 +359,17 @@ def match_cameras(pairs: Sequence[tuple[Image, Array]], given: Convention) -> Co
 
 
 def _candidates(motions: Sequence[Image], given: Convention) -> tuple[Convention, list[Convention]]:
-    """The given convention, and all that are to be compared, with it."""
+    """The usual convention, and all conventions to compare, including it."""
     found = conventions(motions[0].shape[:2], np.concatenate(motions))
     known = next((each for each in found if each[:2] == given[:2]), None)
     return known or given, found if known else [given, *found]
 
 
 def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Image, convention: Convention) -> float:
-    """Mean difference of features and of those to which a motion leads.
+    """Mean difference of features and of the previous features to which a motion leads.
 
-    What it leads outside counts as twice what would differ at rest: a fast pan is no worse for it than others, and a
-    motion that leads everything outside is.
+    A pixel led outside the image counts twice its difference without motion. So a fast pan is judged fairly, but a
+    motion that leads every pixel outside is rejected.
     """
     moved = convention.apply(motion) if convention.scale_x else np.zeros_like(motion[..., :2])
     height, width = moved.shape[:2]

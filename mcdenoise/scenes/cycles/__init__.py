@@ -1,6 +1,6 @@
-"""Random scenes rendered by Blender's Cycles, to train on what Blender's users have.
+"""Random scenes rendered by Blender's Cycles, for training on images as Blender's users have them.
 
-Blender is optional: another Python that has its module ``bpy`` renders, in a process of its own.
+Blender is optional: a separate process, with a Python that has the module ``bpy``, does the rendering.
 """
 
 from mcdenoise.scenes.cycles.process import Blender

@@ -1,8 +1,8 @@
-"""Runs in Blender's Python: builds the scenes that it is told of, renders their frames, and answers in lines of JSON.
+"""The script for Blender's Python: builds scenes, renders their frames, and answers in lines of JSON.
 
-This script stands alone: it needs ``bpy`` and numpy, which comes with it, and nothing of mcdenoise. It reads one
-command a line from its input, such as ``{"do": "render", "frame": 0, ...}``, and answers each with one line,
-``{"ok": ...}`` or ``{"error": ...}``. Whatever Blender itself says goes to the standard error.
+The script needs ``bpy`` and its numpy, and nothing of mcdenoise. It reads one command per line from its input, such as
+``{"do": "render", "frame": 0, ...}``, and answers each with one line, ``{"ok": ...}`` or ``{"error": ...}``. Blender's
+own output goes to the standard error.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ Matrix: Any
 try:
     bpy = importlib.import_module("bpy")
     Matrix = importlib.import_module("mathutils").Matrix
-except ImportError:  # mcdenoise's own Python need not have it.
+except ImportError:  # The script is also imported without Blender.
     bpy = Matrix = None
 
-# Mitsuba's cameras look along +z with +x to the left, Blender's along -z with +x to the right.
+# Mitsuba's cameras look along +z with +x to the left; Blender's look along -z with +x to the right.
 _CAMERA = np.diag((-1.0, 1.0, -1.0, 1.0))
 
 
 def main() -> None:
-    """Serve until the input ends."""
-    # What is printed by Blender's own code must not be taken for an answer.
+    """Answer commands until the input ends."""
+    # Output of Blender's own code must not be mixed with the answers.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     if bpy is None:
@@ -43,18 +43,18 @@ def main() -> None:
         command = json.loads(line)
         try:
             answer = {"ok": commands[command.pop("do")](**command)}
-        except Exception as error:  # Whatever it is, the one who asked is told.
+        except Exception as error:  # Every error is sent as an answer.
             answer = {"error": f"{type(error).__name__}: {error}"}
         print(json.dumps(answer), file=answers, flush=True)
 
 
 def build(folder: str, settings: dict[str, Any]) -> None:
-    """Build the scene that ``scene.json`` and ``scene.npz`` of a folder describe.
+    """Build the scene described by ``scene.json`` and ``scene.npz`` in a folder.
 
     Args:
-        folder: where they are.
-        settings: ``size``, ``threads``, ``filter_width``, ``box``, ``cameras`` and ``fov_x`` and ``moves`` of every
-            frame, from one before the first to one after the last, ``aperture`` and ``focus``, ``shutter``.
+        folder: folder of the files.
+        settings: ``size``, ``threads``, ``filter_width``, ``box``; ``cameras``, ``fov_x`` and ``moves`` for every
+            frame, from one before the first to one after the last; ``aperture`` and ``focus``, ``shutter``.
     """
     content = json.loads((Path(folder) / "scene.json").read_text(encoding="utf-8"))
     with np.load(Path(folder) / "scene.npz", allow_pickle=False) as file:
@@ -79,9 +79,9 @@ def render(frame: int, samples: int, seed: int, out: str) -> None:
     """Render one frame to a multilayer EXR.
 
     Args:
-        frame: which.
-        samples: a pixel.
-        seed: of the noise.
+        frame: number of the frame.
+        samples: samples per pixel.
+        seed: noise seed.
         out: the file, ending in ``.exr``.
     """
     scene = bpy.context.scene
@@ -95,7 +95,7 @@ def _set_up(scene: Any, settings: dict[str, Any]) -> None:
     scene.render.engine = "CYCLES"
     scene.render.resolution_x, scene.render.resolution_y = settings["size"]
     scene.render.resolution_percentage = 100
-    # The scene stays in Cycles between renderings: to bring it there takes longer than a sample a pixel.
+    # Keep the scene in Cycles between renderings, because loading it takes longer than one sample per pixel.
     scene.render.use_persistent_data = True
     if settings["threads"]:
         scene.render.threads_mode, scene.render.threads = "FIXED", settings["threads"]
@@ -107,9 +107,9 @@ def _set_up(scene: Any, settings: dict[str, Any]) -> None:
     cycles.device = "CPU"
     cycles.use_adaptive_sampling = cycles.use_denoising = False
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0
-    # A threshold of brightness would make the result depend on the unit of radiance.
+    # A brightness threshold would make the result depend on the unit of radiance.
     cycles.light_sampling_threshold = 0
-    # Cycles takes a box filter as one pixel wide whatever the width says, so the narrow one is the default kind.
+    # A box filter in Cycles is always one pixel wide, so the narrow filter has the default type.
     cycles.pixel_filter_type = "BOX" if settings["box"] else "BLACKMAN_HARRIS"
     cycles.filter_width = settings["filter_width"]
     image = scene.render.image_settings
@@ -128,7 +128,7 @@ def _set_up(scene: Any, settings: dict[str, Any]) -> None:
     scene.camera = camera
     data.sensor_fit = "HORIZONTAL"
     data.clip_start, data.clip_end = 1e-3, 1e6
-    # Before and after the frames there are places too, for motion blur.
+    # Motion blur also needs placements before and after the frames.
     for index, fov in enumerate(settings["fov_x"]):
         data.angle = math.radians(fov)
         data.keyframe_insert("lens", frame=index - 1)
@@ -140,7 +140,7 @@ def _set_up(scene: Any, settings: dict[str, Any]) -> None:
 
 
 def _defocus(scene: Any, data: Any, pose: Any, settings: dict[str, Any]) -> None:
-    """Focus on what a pixel sees, and open the lens until what is infinitely far is blurred over so many pixels."""
+    """Focus on the surface at a pixel, and open the lens until infinitely far points are blurred over given pixels."""
     extent = math.tan(math.radians(settings["fov_x"][1]) / 2)
     width, height = settings["size"]
     x, y = settings["focus"]
@@ -148,7 +148,7 @@ def _defocus(scene: Any, data: Any, pose: Any, settings: dict[str, Any]) -> None
     length = float(np.linalg.norm(ray))
     graph = bpy.context.evaluated_depsgraph_get()
     hit, place, *_ = scene.ray_cast(graph, pose[:3, 3].tolist(), (ray / length).tolist())
-    # Along the axis of view, where it is focused.
+    # The focus distance is along the viewing axis.
     distance = float((np.array(place) - pose[:3, 3]) @ -pose[:3, 2]) if hit else 3.0
     data.dof.use_dof = True
     data.dof.focus_distance = distance
@@ -157,14 +157,15 @@ def _defocus(scene: Any, data: Any, pose: Any, settings: dict[str, Any]) -> None
 
 
 def _animate(thing: Any, poses: Any) -> None:
-    """Keyframes of an object, one before the first frame, and one after the last."""
+    """Keyframes of an object, from one before the first frame to one after the last."""
     bpy.context.preferences.edit.keyframe_new_interpolation_type = "LINEAR"
     thing.rotation_mode = "QUATERNION"
     before = None
     for index, pose in enumerate(poses):
         location, rotation, scale = Matrix(np.array(pose).tolist()).decompose()
         if before is not None:
-            # A rotation has two quaternions; between those of both signs the object would turn around.
+            # Two quaternions describe a rotation; interpolating between opposite signs would rotate the object once
+            # around.
             rotation.make_compatible(before)
         before = rotation
         thing.location, thing.rotation_quaternion, thing.scale = location, rotation, scale
@@ -195,7 +196,7 @@ def _object(entry: dict[str, Any], arrays: dict[str, Any], materials: list[Any])
 
 
 def _image(name: str, pixels: Any) -> Any:
-    """An image of linear numbers; its first row is where v is 0, as in Mitsuba, but for the sky's."""
+    """An image of linear values; the first row is at v = 0, as in Mitsuba, except for the sky's."""
     height, width, _ = pixels.shape
     image = bpy.data.images.new(name, width, height, alpha=False, float_buffer=True, is_data=True)
     rows = pixels[::-1] if name == "sky" else pixels
@@ -265,8 +266,8 @@ def _principled(tree: Any, entry: dict[str, Any], images: dict[str, Any]) -> Any
 
 
 def _pane(tree: Any, entry: dict[str, Any], images: dict[str, Any]) -> Any:
-    """Glass that does not bend light: it mirrors 2 F / (1 + F) of it and lets the rest through."""
-    # The node takes the inverse index where a surface is seen from behind, and a pane has no behind.
+    """Glass without refraction: it reflects 2 F / (1 + F) of the light and transmits the rest."""
+    # The Fresnel node inverts the index on the back side of a surface, but a pane has no inside.
     behind = tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"]
     exponent = _math(tree, "MULTIPLY_ADD", behind)
     exponent.inputs[1].default_value, exponent.inputs[2].default_value = -2.0, 1.0
@@ -301,7 +302,7 @@ def _light(number: int, light: dict[str, Any]) -> Any:
     data = bpy.data.lights.new(f"light{number}", light["type"].upper())
     strength = max(light["intensity"])
     data.color = [channel / strength for channel in light["intensity"]]
-    # Watts in all directions, from watts per steradian.
+    # Convert watts per steradian to total watts.
     data.energy = 4 * math.pi * strength
     data.shadow_soft_size = 0.0
     thing = bpy.data.objects.new(data.name, data)
@@ -323,7 +324,8 @@ def _world(sky: dict[str, Any] | None, images: dict[str, Any]) -> Any:
     if sky is not None and "texture" in sky:
         texture = tree.nodes.new("ShaderNodeTexEnvironment")
         texture.image, texture.interpolation = images[sky["texture"]], "Linear"
-        # Blender's images are around z and begin at -x, Mitsuba's around y and at -z: (z, x, y) instead of (x, y, z).
+        # Blender's images are around z and begin at -x, Mitsuba's around y and begin at -z: (z, x, y) instead of (x, y,
+        # z).
         parts, turned = tree.nodes.new("ShaderNodeSeparateXYZ"), tree.nodes.new("ShaderNodeCombineXYZ")
         tree.links.new(tree.nodes.new("ShaderNodeTexCoord").outputs["Generated"], parts.inputs[0])
         for old, new in ((2, 0), (0, 1), (1, 2)):

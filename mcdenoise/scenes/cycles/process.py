@@ -1,4 +1,4 @@
-"""Blender in a process of its own: it is under another license, large, and wants a Python of its own."""
+"""Blender in a separate process, because of its license, its size, and its required version of Python."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _LAST_WORDS = 2000
 
 
 class Blender:
-    """A Blender that builds scenes and renders their frames, started once for many; a context manager.
+    """A running Blender that builds scenes and renders their frames; a context manager, started once for many scenes.
 
     Args:
         python: an interpreter that can import ``bpy``; by default that of the environment variable
             ``BLENDER_PYTHON``, or else this one.
 
     Attributes:
-        python: the interpreter.
-        version: of Blender.
+        python: path of the interpreter.
+        version: version of Blender.
 
     Raises:
-        InputError: there is no such interpreter, or it has no ``bpy``.
+        InputError: the interpreter does not exist, or has no ``bpy``.
     """
 
     def __init__(self, python: Path | None = None) -> None:
@@ -38,7 +38,7 @@ class Blender:
         self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
         try:
             self._process = subprocess.Popen(
-                # -P: the modules beside the script are none of Blender's.
+                # -P: do not import the modules beside the script.
                 [str(self.python), "-P", str(_SCRIPT)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -69,10 +69,10 @@ class Blender:
         self.close()
 
     def ask(self, do: str, **arguments: Any) -> None:
-        """Give a command of ``blender.py`` and wait until it is done.
+        """Send a command to ``blender.py`` and wait until it is done.
 
         Raises:
-            InputError: Blender could not do it, or died.
+            InputError: the command failed, or Blender died.
         """
         try:
             assert self._process.stdin is not None

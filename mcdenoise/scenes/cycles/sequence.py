@@ -1,11 +1,11 @@
-"""Render a random scene with Cycles to a sequence to train on, in the BMFR layout.
+"""Rendering a random scene with Cycles to a training sequence in the BMFR layout.
 
-Each noisy color has features of its own, from the same samples, as users have them: anti-aliased, and noisy
-through glass, depth of field and motion blur. They hold what :func:`mcdenoise.data.open_sequence` makes of a file of
-Blender, but for normals, which are turned from the camera's space to the world's.
+Each noisy color has features from its own samples, as users' files do: anti-aliased, and noisy through glass, depth of
+field and motion blur. They equal those that :func:`mcdenoise.data.open_sequence` reads from a Blender file, except that
+normals are converted from camera space to world space.
 
-Cycles takes depth and position from the first sample of a pixel alone, and puts that at the pixel centre, whatever the
-filter: these are noisy through a lens and a shutter only, and an image of one sample a pixel is not filtered at all.
+Cycles takes depth and position from the first sample of a pixel only, and treats them as at the pixel centre, whatever
+the filter: they are noisy only through lens and shutter, and an image of one sample per pixel is not filtered at all.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from mcdenoise.scenes.random.takes import CLEANER
 from mcdenoise.scenes.render.folder import ReferenceState, write_reference
 from mcdenoise.scenes.render.tracer import scene_digest
 
-# Names of Blender 4.5 and, behind them, of 5.0.
+# Names of the passes in Blender 4.5 and, if they differ, in 5.0.
 _PASSES = {
     "Combined": ("Combined",),
     "Denoising Albedo": ("Denoising Albedo",),
@@ -48,12 +48,12 @@ _PASSES = {
     "Position": ("Position",),
     "IndexOB": ("IndexOB", "Object Index"),
 }
-# Those of the light, as Blender's Python calls them.
+# Light passes, by the names in Blender's Python.
 _LIGHT = [
     *(f"{kind}_{part}" for kind in ("diffuse", "glossy", "transmission") for part in ("direct", "indirect", "color")),
     *("emit", "environment"),
 ]
-# How much farther than everything else the sky is, as the reader has it.
+# Distance of the sky relative to everything else; the reader uses the same value.
 _SKY = 1000.0
 _REFERENCE_STREAM = 1
 _CONVENTIONS: dict[str, Any] = {
@@ -89,34 +89,34 @@ def render_cycles(
     threads: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Render a random scene by Cycles on the processor.
+    """Render a random scene with Cycles on the CPU.
 
-    Frames that are there are kept, so a stopped run can be resumed.
+    Existing frames are kept, so an interrupted run can be resumed.
 
     Args:
-        made: the scene, its cameras and what moves in it.
+        made: the scene, its cameras and its moving objects.
         out: folder of the sequence; the files go to ``out/inputs``.
-        blender: the process that renders.
+        blender: the rendering process.
         size: width and height in pixels.
-        seed: of the noise, and of the settings that are drawn.
-        view: another number gives other noise and settings, for another take of the same scene.
-        samples: a pixel of the noisy colors; drawn by default, see :func:`draw_settings`.
-        realisations: how many noisy colors, with features of their own. Those after the first go to
+        seed: seed of the noise, and of the random settings.
+        view: selects other noise and settings, for another take of the same scene.
+        samples: samples per pixel of the noisy colors; random by default, see :func:`draw_settings`.
+        realisations: number of noise seeds, each with its own color and features. Those after the first are written to
             ``out/inputs/realisation{1,2,...}``.
-        reference_samples: a pixel of the references, but at least four times as many as of the noisy colors; 0 for no
-            references.
-        settings: filter, lens and shutter; drawn by default.
+        reference_samples: samples per pixel of the references, but at least four times as many as of the noisy colors;
+            0 for no references.
+        settings: filter, lens and shutter; random by default.
         parts: also write the diffuse and the specular light of the noisy colors, see
             :mod:`mcdenoise.data.readers.diffuse_specular`.
-        threads: of the processor; all by default. The images do not depend on it.
-        progress: called with the finished and the total number of samples a pixel, summed over all frames.
+        threads: number of CPU threads; all by default. The images do not depend on it.
+        progress: called with the finished and the total number of samples per pixel, summed over all frames.
 
     Returns:
-        The folder with the files, ``out/inputs``.
+        The folder of the files, ``out/inputs``.
 
     Raises:
-        InputError: a setting is unusable, the scene has something that Cycles cannot be given, Blender failed, or
-            ``out`` cannot be written or holds a sequence with other settings.
+        InputError: a setting is invalid, Cycles does not support a part of the scene, Blender failed, or ``out`` cannot
+            be written or holds a sequence with other settings.
     """
     lowest = {"realisations": (realisations, 1), "reference_samples": (reference_samples, 0), "threads": (threads, 0)}
     lowest |= {"seed": (seed, 0), "view": (view, 0), "samples": (1 if samples is None else samples, 1)}
@@ -127,7 +127,7 @@ def render_cycles(
     chosen = settings or draw_settings(seed, view=view, samples=samples, moving=count > 1)
     clean_samples = max(reference_samples, CLEANER * chosen.samples) if reference_samples else 0
     moves = check_moves(made.moves, count)
-    # One after the other, so that an index of Blender's tells which object it is.
+    # Sorted, so that Blender's index of an object identifies it.
     movers = [name for name in made.scene if name in moves]
     description = translate(made.scene, movers, seed=seed)
     folder = _Folder(out / "inputs", made, size, chosen, (seed, view), blender.version)
@@ -159,8 +159,8 @@ def render_cycles(
             advance(samples)
             return images
 
-        # What has few samples comes before what has many: a scene that stays in Cycles keeps the pattern of the most
-        # samples that it has seen, and the noise of a frame would depend on what was rendered before it.
+        # Render images with few samples first: a scene that stays in Cycles keeps the sampling pattern of the largest
+        # number of samples so far, and the noise of a frame must not depend on previous renderings.
         for number, realisation in noisy:
             back = {index + 1: _back(moves[name], number) for index, name in enumerate(movers)}
             seen = _View(made.cameras[number], size, back)
@@ -175,12 +175,12 @@ def render_cycles(
     return folder.path
 
 
-# Those that every frame has, as `_View` gives them.
+# Buffers that every frame has, as `_View` returns them.
 _FEATURES = ("albedo", "normal", "position", "depth")
 
 
 class _Folder:
-    """``inputs`` of a sequence, with its description."""
+    """The folder ``inputs`` of a sequence, with its description."""
 
     def __init__(
         self,
@@ -237,7 +237,7 @@ class _Folder:
     def _check(self, described: Path, content: Mapping[str, Any]) -> None:
         try:
             before = json.loads(read_text(described))
-            # What was rendered before there were several views is the first one.
+            # Descriptions without a view are from before there were several, and stand for the first one.
             changed = [key for key in _IDENTITY if {"view": 0, **before}[key] != content[key]]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(
@@ -249,16 +249,16 @@ class _Folder:
             )
 
     def has(self, name: str, number: int, realisation: int) -> bool:
-        """Whether a frame has one of its noisy colors, which is written behind its features, with another buffer."""
+        """Whether a frame has a buffer and the color of a noise seed, which is written last."""
         place = realisation_folder(self.path, realisation)
         return all(has_buffer(place, number, each, self.size) for each in (*_FEATURES, name, "color"))
 
     def has_reference(self, number: int) -> bool:
-        """Whether a frame has its reference."""
+        """Whether a frame has a reference."""
         return has_buffer(self.path, number, "reference", self.size)
 
     def write(self, number: int, realisation: int, buffers: Mapping[str, Image]) -> None:
-        """Write one noisy color and its features, the color last."""
+        """Write a noisy color and its features, the color last."""
         place = realisation_folder(self.path, realisation)
         try:
             place.mkdir(exist_ok=True)
@@ -269,29 +269,29 @@ class _Folder:
 
 
 class _View:
-    """What the passes of one frame mean.
+    """Conversion of one frame's passes to buffers.
 
     Args:
-        camera: of the frame.
+        camera: camera of the frame.
         size: width and height in pixels.
-        back: for each index of an object the transform of its points to the frame before.
+        back: for each object index, the transform of its points to the previous frame.
     """
 
     def __init__(self, camera: Camera, size: tuple[int, int], back: Mapping[int, Array]) -> None:
         self._camera, self._size, self._back = camera, size, back
 
     def buffers(self, images: Mapping[str, Image]) -> dict[str, Image]:
-        """Buffers of the BMFR layout, the color last."""
+        """Buffers in the BMFR layout, the color last."""
         width, height = self._size
         pose, position, depth = self._camera.to_world, images["Position"], images["Depth"]
         known = (~nothing_hit(depth)) & np.isfinite(position).all(-1, keepdims=True)
-        # As the reader does to a user's file: the sky is put far behind everything, so that it can be followed.
+        # Like the reader for a user's file: put the sky far behind everything, so that it can be reprojected.
         rays = pixel_rays(self._camera, width, height)
         axis = (rays.directions @ pose[:3, 2]).reshape(height, width, 1)
         far = _SKY * float(depth[known].max(initial=1))
         sky = rays.origin + far / axis * rays.directions.reshape(height, width, 3)
         position = np.where(known, position, sky)
-        # x is to the right in Blender's Denoising Normal, y up, and z into the scene.
+        # In Blender's Denoising Normal, x points right, y up, and z into the scene.
         normal = np.nan_to_num(images["Denoising Normal"], nan=0, posinf=0, neginf=0) * (-1, 1, 1)
         buffers: dict[str, Any] = {
             "albedo": np.clip(np.nan_to_num(images["Denoising Albedo"], nan=0, posinf=1, neginf=0), 0, 1),
@@ -311,7 +311,7 @@ class _View:
 
 
 def _back(move: Array, number: int) -> Array:
-    """From where an object is in a frame to where it was in the one before; the first frame has none before it."""
+    """Transform of an object from a frame to the previous one; the identity for the first frame."""
     return np.asarray(move[max(number - 1, 0)] @ np.linalg.inv(move[number]))
 
 
@@ -341,7 +341,7 @@ def _for_blender(
 
 
 def _prolonged(poses: Array) -> Array:
-    """Rigid transforms with one before the first and one after the last, as if the motion went on."""
+    """Extrapolate rigid transforms by one before the first and one after the last."""
     if len(poses) == 1:
         return np.repeat(poses, 3, 0)
     first = poses[0] @ np.linalg.inv(poses[1]) @ poses[0]
@@ -371,7 +371,7 @@ def _read(path: Path, with_parts: bool) -> dict[str, Image]:
 
 
 def _extent(made: RandomScene) -> float:
-    """About how far apart things are, metres."""
+    """Approximate extent of the scene, metres."""
     eye = made.cameras[0].to_world[:3, 3]
     shapes = [entry for entry in made.scene.values() if isinstance(entry, Mapping) and "to_world" in entry]
     away = [float(np.linalg.norm(np.asarray(shape["to_world"])[:3, 3] - eye)) for shape in shapes]

@@ -1,4 +1,4 @@
-"""How a Cycles sequence is rendered, drawn from its seed as Blender's users have it."""
+"""The settings of a Cycles sequence, drawn at random to resemble those of Blender's users."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ import numpy as np
 
 _SAMPLES = (1, 2, 4, 8, 16, 32)
 _SAMPLES_P = (0.5, 0.16, 0.14, 0.1, 0.08, 0.02)
-# Blackman-Harris over 1.5 pixels is Blender's default; one of 0.01 pixels puts every sample at the pixel centre.
+# Blender's default is Blackman-Harris over 1.5 pixels; a width of 0.01 pixels puts every sample at the pixel centre.
 _FILTERS = ("blackman_harris", "box", "centre")
 _FILTERS_P = (0.5, 0.25, 0.25)
 WIDTHS = {"blackman_harris": 1.5, "box": 1.0, "centre": 0.01}
 _DEFOCUSED, _BLURRED = 0.2, 0.15
 _SHUTTER = 0.5
-# Of the streams of a seed, that of the settings.
+# Stream of a seed from which settings are drawn.
 _STREAM = 0x6379636C
 
 
 @dataclass(frozen=True)
 class CyclesSettings:
-    """What is the same in all frames of a sequence.
+    """Settings that all frames of a sequence have in common.
 
     Args:
-        samples: a pixel, of the noisy colors.
+        samples: samples per pixel of the noisy colors.
         pixel_filter: ``blackman_harris``, ``box`` or ``centre``.
-        aperture: over how many pixels the lens blurs what is infinitely far; 0 for a pinhole.
-        focus: where in the first image it is focused, parts of its width and height from the top left.
-        shutter: how long it is open, in frames; 0 for no motion blur.
+        aperture: blur of infinitely far points in pixels; 0 for a pinhole.
+        focus: point of focus in the first image, as fractions of width and height from the top left.
+        shutter: exposure time in frames; 0 for no motion blur.
     """
 
     samples: int
@@ -39,15 +39,16 @@ class CyclesSettings:
 
 
 def draw_settings(seed: int, *, view: int = 0, samples: int | None = None, moving: bool = True) -> CyclesSettings:
-    """The settings of a sequence; the same for the same seed.
+    """Draw the settings of a sequence; the same seed gives the same settings.
 
-    Half of all have one sample a pixel, the others up to 32. Half have Blender's default pixel filter, a quarter a box
-    of one pixel, a quarter every sample at the pixel centre. A fifth have depth of field, and some motion blur.
+    Half of all sequences have one sample per pixel, the others up to 32. Half have Blender's default pixel filter, a
+    quarter a box of one pixel, a quarter every sample at the pixel centre. A fifth have depth of field, and some motion
+    blur.
 
     Args:
-        seed: of the scene.
-        view: another number draws other settings for the same scene.
-        samples: a pixel, if they are not to be drawn.
+        seed: seed of the scene.
+        view: selects other settings for the same scene.
+        samples: samples per pixel, if they should not be drawn.
         moving: whether there is more than one frame; a still has no motion blur.
 
     Example:

@@ -1,4 +1,4 @@
-"""The shapes of a Mitsuba dictionary as triangles, since Cycles knows no others."""
+"""The shapes of a Mitsuba dictionary as triangle meshes, which Cycles requires."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError
 
-# Cycles chooses between all triangles that shine, for every sample: lamps have few.
+# Lamps get few triangles, because Cycles chooses among all emitting triangles for every sample.
 _AROUND, _AROUND_A_LAMP = 64, 20
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles.
+    """A triangle mesh.
 
     Args:
         vertices: ``(N, 3)``.
-        triangles: ``(F, 3)`` indices, counterclockwise as seen from outside.
-        uv: ``(F, 3, 2)`` texture coordinates of each corner, as Mitsuba gives them.
+        triangles: ``(F, 3)`` indices, counterclockwise seen from outside.
+        uv: ``(F, 3, 2)`` texture coordinates of each corner, as in Mitsuba.
         smooth: whether normals are interpolated.
-        closed: whether there is an inside, so that the back of no triangle is seen from outside.
+        closed: whether the mesh is closed, so that back faces are not visible from outside.
     """
 
     vertices: Array
@@ -36,24 +36,24 @@ class Mesh:
     closed: bool
 
     def placed(self, matrix: Array) -> Mesh:
-        """The same in another space, by an affine ``(4, 4)`` matrix for column vectors."""
+        """Transform the mesh by an affine ``(4, 4)`` matrix for column vectors."""
         vertices = self.vertices @ matrix[:3, :3].T + matrix[:3, 3]
         if np.linalg.det(matrix[:3, :3]) > 0:
             return Mesh(vertices, self.triangles, self.uv, self.smooth, self.closed)
-        # A mirrored shape is turned inside out otherwise.
+        # A reflection would turn the mesh inside out.
         return Mesh(vertices, self.triangles[:, ::-1], self.uv[:, ::-1], self.smooth, self.closed)
 
 
 def tessellate(kind: str, where: str, *, shines: bool = False) -> Mesh:
-    """A shape plugin of Mitsuba in its own space: ``cube``, ``sphere``, ``cylinder``, ``disk`` or ``rectangle``.
+    """Tessellate a shape plugin of Mitsuba: ``cube``, ``sphere``, ``cylinder``, ``disk`` or ``rectangle``.
 
     Args:
-        kind: which of them.
-        where: what has this shape, for the error.
-        shines: whether it is a lamp, and gets fewer triangles.
+        kind: name of the plugin.
+        where: description of the object, for the error.
+        shines: whether it is a lamp, which gets fewer triangles.
 
     Raises:
-        InputError: it is another shape.
+        InputError: the shape is not supported.
 
     Example:
         >>> tessellate("cube", "a box").triangles.shape
@@ -177,10 +177,10 @@ _SHAPES: dict[str, Callable[[int], Mesh]] = {
 
 
 def as_matrix(value: Any, where: str) -> Array:
-    """A ``(4, 4)`` transform of a dictionary.
+    """Check a ``(4, 4)`` transform of a dictionary.
 
     Raises:
-        InputError: it is something else.
+        InputError: it is not a finite matrix of that shape.
     """
     matrix = np.asarray(value, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():

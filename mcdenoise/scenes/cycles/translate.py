@@ -1,6 +1,6 @@
-"""A Mitsuba dictionary in words that Blender understands: triangles, Principled materials, lights and a sky.
+"""Translation of a Mitsuba dictionary for Blender: triangles, Principled materials, lights and a sky.
 
-Plain Python and numpy; neither Mitsuba nor Blender is needed. The axes stay as they are: y is up.
+This is plain Python and numpy, without Mitsuba or Blender. The axes are not changed: y is up.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.cycles.shapes import Mesh, as_matrix, tessellate
 
-# What each metal reflects at normal incidence, linear sRGB.
+# Reflectance of each metal at normal incidence, linear sRGB.
 _METALS = {
     "Ag": (0.962, 0.949, 0.922),
     "Al": (0.912, 0.914, 0.920),
@@ -30,20 +30,20 @@ _METALS = {
 }
 _SHAPE_KEYS = {"type", "to_world", "bsdf", "emitter"}
 _PLASTIC_IOR, _GLASS_IOR = 1.49, 1.5046
-# Mitsuba compiles scenes faster that are made alike, so they have shapes that nobody sees. Cycles needs none.
+# Invisible shapes of random scenes, which speed up compilation in Mitsuba; they are not translated.
 _SPARE = "spare_"
-# Parts of a wedge of light in which it is even, as Mitsuba has it by default.
+# Fraction of a spot light's cone with constant intensity, Mitsuba's default.
 _BEAM = 0.75
 
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """A scene for the script that builds it in Blender; all of it is numbers, texts and arrays.
+    """A scene for the script in Blender, as numbers, strings and arrays.
 
     Args:
-        content: ``objects`` (all that rests is one; those that move have ids and, in the order of the scene, indices
-            from 1), ``materials``, ``lights`` and ``sky``.
-        arrays: vertices and triangles of the objects, and textures, by the names that ``content`` gives them.
+        content: ``objects`` (all static shapes are one; moving ones have ids and indices from 1, in the order of the
+            scene), ``materials``, ``lights`` and ``sky``.
+        arrays: vertices and triangles of the objects, and textures, by the names in ``content``.
     """
 
     content: dict[str, Any]
@@ -57,7 +57,7 @@ class Description:
         """
         try:
             (folder / "scene.json").write_text(json.dumps(self.content), encoding="utf-8")
-            # Plain arrays of numbers: nothing is pickled.
+            # Arrays of numbers only, so nothing is pickled.
             np.savez(folder / "scene.npz", **self.arrays)  # type: ignore[arg-type]
         except OSError as error:
             raise InputError(f"{folder}: cannot be written ({error.strerror}); free space or check it") from error
@@ -67,13 +67,14 @@ def translate(scene: Mapping[str, Any], movers: Collection[str] = (), *, seed: i
     """Translate a scene.
 
     Args:
-        scene: a Mitsuba dictionary as :func:`mcdenoise.scenes.random.random_scene` makes it: arrays stand for
+        scene: a Mitsuba dictionary as returned by :func:`mcdenoise.scenes.random.random_scene`, with arrays for
             transforms and bitmaps.
-        movers: ids of the shapes that move; they become objects of their own.
-        seed: whether a lacquer is a specular base or a coat over a matt one, as artists make either, is drawn from it.
+        movers: ids of the moving shapes, which become separate objects.
+        seed: decides at random whether a lacquer becomes a specular base or a coat on a diffuse one, as artists use
+            both.
 
     Raises:
-        InputError: the scene has something that is not known here, or ``movers`` names no shape of it.
+        InputError: the scene has an unsupported part, or ``movers`` names a shape that does not exist.
     """
     translator = _Translator(scene, np.random.default_rng((seed, 0x6C6163)))
     return translator.run(movers)
@@ -118,7 +119,7 @@ class _Translator:
         material = self._bsdf(where, entry["bsdf"]) if "bsdf" in entry else _principled(_color((0.5, 0.5, 0.5)))
         radiance = _radiance(entry, where)
         if any(radiance):
-            # Mitsuba's lamps shine to the side of their normal; Cycles' to both.
+            # Mitsuba's lamps emit on the side of their normal, Cycles' on both sides.
             material = {**material, "radiance": radiance, "one_sided": not mesh.closed}
         return mesh.placed(as_matrix(entry.get("to_world", np.eye(4)), where)), self._number(material)
 
@@ -130,7 +131,7 @@ class _Translator:
         return self._numbers[key]
 
     def _object(self, number: int, name: str, parts: list[tuple[Mesh, int]]) -> dict[str, Any]:
-        """One object of many shapes: Blender is slow with many objects, and not with many triangles."""
+        """Merge shapes into one object: Blender is slow with many objects, but not with many triangles."""
         starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in parts)])
         arrays = {
             "vertices": np.concatenate([mesh.vertices for mesh, _ in parts]).astype(np.float32),
@@ -159,7 +160,7 @@ class _Translator:
         return getattr(self, f"_{bsdf['type']}")(where, bsdf)  # type: ignore[no-any-return]
 
     def _twosided(self, where: str, bsdf: Mapping[str, Any]) -> dict[str, Any]:
-        # Every surface of Cycles has two sides.
+        # All surfaces in Cycles are two-sided.
         return self._bsdf(where, bsdf["bsdf"])
 
     def _mask(self, where: str, bsdf: Mapping[str, Any]) -> dict[str, Any]:
@@ -186,7 +187,7 @@ class _Translator:
 
     def _roughconductor(self, where: str, bsdf: Mapping[str, Any]) -> dict[str, Any]:
         alpha = bsdf.get("alpha", 0.1)
-        # Artists' roughness is the root of GGX's alpha.
+        # Artists' roughness is the square root of GGX's alpha.
         rough = {**alpha, "bitmap": np.sqrt(alpha["bitmap"])} if isinstance(alpha, Mapping) else math.sqrt(alpha)
         return self._metal(where, bsdf, self._value(where, rough))
 
@@ -216,7 +217,7 @@ class _Translator:
         return {"type": "pane", "ior": float(bsdf.get("int_ior", _GLASS_IOR))}
 
     def _value(self, where: str, value: Any) -> dict[str, Any]:
-        """A number, a color or a texture: ``{"value": [...]}`` or ``{"texture": name, "scale": [u, v]}``."""
+        """Translate a number, a color or a texture: ``{"value": [...]}`` or ``{"texture": name, "scale": [u, v]}``."""
         if isinstance(value, int | float):
             return _color((float(value),) * 3)
         if not isinstance(value, Mapping) or value["type"] not in ("rgb", "bitmap"):
@@ -294,7 +295,7 @@ def _radiance(shape: Mapping[str, Any], where: str) -> list[float]:
 
 
 def _principled(base: dict[str, Any], **settings: Any) -> dict[str, Any]:
-    """Matt, unless the settings say something else."""
+    """A Principled material, diffuse by default."""
     numbers = {
         "roughness": 1.0,
         "metallic": 0.0,

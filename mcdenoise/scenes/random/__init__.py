@@ -1,8 +1,8 @@
-"""Training scenes without limit: random rooms, courts and still lifes, each the same again for the same seed.
+"""Random training scenes: rooms, courts and still lifes; the same seed gives the same scene.
 
-They are made for variety of what a denoiser meets: light through windows, small and large lamps, sun, gloss, glass,
-fine and coarse textures, thin parts, and cameras and objects that move. The description is plain Python and numpy, in
-the form :func:`mcdenoise.scenes.render.render_sequence` takes; Mitsuba is not needed to build it.
+They vary what a denoiser has to handle: light through windows, small and large lamps, sun, gloss, glass, fine and
+coarse textures, thin parts, and moving cameras and objects. The description is plain Python and numpy, as
+:func:`mcdenoise.scenes.render.render_sequence` expects it; Mitsuba is not needed to build it.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
+from mcdenoise.scenes.random.builder import SceneBuilder, bounds, rotate
 from mcdenoise.scenes.random.cameras import shoot
 from mcdenoise.scenes.random.rooms import build
 from mcdenoise.scenes.random.shiny import shine
-from mcdenoise.scenes.random.stage import Stage, bounds, rotate
 
 __all__ = ["RandomScene", "random_scene"]
 
 _MOVING_SHARE = 0.15
-# Of the streams of a seed, the one of further views.
+# Stream of a seed from which further views are drawn.
 _VIEWS = 100
 _NEAREST_FOCUS = 0.3
 
@@ -32,11 +32,11 @@ class RandomScene:
     """A scene with its camera path.
 
     Args:
-        scene: a Mitsuba dictionary in the form :func:`mcdenoise.scenes.render.render_sequence` takes; metres, y is up.
+        scene: a Mitsuba dictionary for :func:`mcdenoise.scenes.render.render_sequence`; units are metres, y is up.
         cameras: one per frame.
-        moves: id of an object in ``scene`` to ``(T, 4, 4)`` transforms in world space, one per frame, applied to the
-            object where the scene places it. Empty for most seeds.
-        focus: distance along the viewing axis of the first camera to what it looks at.
+        moves: id of an object in ``scene`` to ``(T, 4, 4)`` world-space transforms, one per frame, applied after the
+            scene has placed the object. Empty for most seeds.
+        focus: distance along the viewing axis of the first camera to the point that it looks at.
     """
 
     scene: dict[str, Any]
@@ -46,15 +46,15 @@ class RandomScene:
 
 
 def random_scene(seed: int, frames: int = 8, zoom: float = 1.0, *, shiny: bool = False, view: int = 0) -> RandomScene:
-    """A random scene; the same for the same seed, and a longer shot begins like a shorter one.
+    """Make a random scene. The same seed gives the same scene, and a longer shot begins like a shorter one.
 
     Args:
-        seed: which of the scenes, 0 or more.
+        seed: seed of the scene, 0 or more.
         frames: number of cameras.
-        zoom: the cameras see the middle of the image only, this many times as large: what a crop of a larger image
-            shows, with its wide even surfaces and fast motion, for the price of a small one.
-        shiny: the same place, with coats, mirrors, glass and metal in it, and cameras that look at them.
-        view: another number gives other cameras in the same place.
+        zoom: enlargement of the image's centre: the cameras see a crop of a larger image, with large uniform surfaces
+            and fast motion, at the cost of a small image.
+        shiny: add coats, mirrors, glass and metal, and let the cameras look at them.
+        view: selects other cameras in the same scene.
 
     Example:
         >>> made = random_scene(3, frames=2)
@@ -66,21 +66,21 @@ def random_scene(seed: int, frames: int = 8, zoom: float = 1.0, *, shiny: bool =
     )
     if view:
         camera_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_VIEWS, view)))
-    stage = build(place_rng)
+    builder = build(place_rng)
     if shiny:
-        shine(stage, shine_rng)
-    cameras = shoot(stage, camera_rng, frames)
-    moves = _movements(stage, move_rng, frames, cameras[0]) if move_rng.random() < _MOVING_SHARE else {}
+        shine(builder, shine_rng)
+    cameras = shoot(builder, camera_rng, frames)
+    moves = _movements(builder, move_rng, frames, cameras[0]) if move_rng.random() < _MOVING_SHARE else {}
     if zoom != 1:
         cameras = [replace(camera, fov_x=_narrowed(camera.fov_x, zoom)) for camera in cameras]
-    scene = _exposed(stage.scene(), 10 ** float(level_rng.uniform(-1.5, 1.5)))
-    return RandomScene(scene, cameras, moves, _distance(stage, cameras[0]))
+    scene = _exposed(builder.scene(), 10 ** float(level_rng.uniform(-1.5, 1.5)))
+    return RandomScene(scene, cameras, moves, _distance(builder, cameras[0]))
 
 
-def _distance(stage: Stage, camera: Camera) -> float:
-    """How far away along the viewing axis the point is that a camera looks at."""
+def _distance(builder: SceneBuilder, camera: Camera) -> float:
+    """Distance along the viewing axis to the point of interest that a camera looks at."""
     origin, forward = camera.to_world[:3, 3], camera.to_world[:3, 2]
-    ways = np.array([point - origin for point in stage.points]).reshape(-1, 3)
+    ways = np.array([point - origin for point in builder.points]).reshape(-1, 3)
     depth = ways @ forward
     ways, depth = ways[depth > _NEAREST_FOCUS], depth[depth > _NEAREST_FOCUS]
     if len(depth) == 0:
@@ -92,23 +92,23 @@ def _narrowed(fov: float, zoom: float) -> float:
     return math.degrees(2 * math.atan(math.tan(math.radians(fov) / 2) / zoom))
 
 
-def _movements(stage: Stage, rng: np.random.Generator, frames: int, camera: Camera) -> dict[str, Array]:
-    """Let one to three small objects slide, swing or spin, or a lamp swing."""
+def _movements(builder: SceneBuilder, rng: np.random.Generator, frames: int, camera: Camera) -> dict[str, Array]:
+    """Let one to three small objects slide, swing or rotate, or let a lamp swing."""
     moves: dict[str, Array] = {}
-    bulbs = [name for name in stage.lamps if _is_small(stage, [name])]
+    bulbs = [name for name in builder.lamps if _is_small(builder, [name])]
     if bulbs and rng.random() < 0.3:
-        moves.update(_motion(stage, rng, frames, [bulbs[int(rng.integers(len(bulbs)))]]))
-    groups = [names for names in stage.groups.values() if _is_small(stage, names)]
-    # Those in front of the camera first.
-    groups.sort(key=lambda names: -_facing(stage, names, camera))
+        moves.update(_motion(builder, rng, frames, [bulbs[int(rng.integers(len(bulbs)))]]))
+    groups = [names for names in builder.groups.values() if _is_small(builder, names)]
+    # Objects in front of the camera come first.
+    groups.sort(key=lambda names: -_facing(builder, names, camera))
     for index in rng.permutation(min(len(groups), 5))[: int(rng.integers(1, 4))]:
-        moves.update(_motion(stage, rng, frames, groups[int(index)]))
+        moves.update(_motion(builder, rng, frames, groups[int(index)]))
     return moves
 
 
-def _motion(stage: Stage, rng: np.random.Generator, frames: int, names: list[str]) -> dict[str, Array]:
-    """One movement for all shapes of a group; at frame 0 they are where the scene places them."""
-    center = _center(stage, names)
+def _motion(builder: SceneBuilder, rng: np.random.Generator, frames: int, names: list[str]) -> dict[str, Array]:
+    """One movement for all shapes of a group; at frame 0 they are in their original place."""
+    center = _center(builder, names)
     direction = rng.normal(0, 1, 3) * (1, 0.2, 1)
     direction *= math.exp(rng.uniform(math.log(0.005), math.log(0.08))) / np.linalg.norm(direction)
     spin = float(rng.choice([0.0, rng.uniform(-12, 12)]))
@@ -122,25 +122,25 @@ def _motion(stage: Stage, rng: np.random.Generator, frames: int, names: list[str
     return {name: transforms.copy() for name in names}
 
 
-def _center(stage: Stage, names: list[str]) -> Array:
-    return np.asarray(np.mean([stage.placed(name)[:3, 3] for name in names], axis=0))
+def _center(builder: SceneBuilder, names: list[str]) -> Array:
+    return np.asarray(np.mean([builder.placed(name)[:3, 3] for name in names], axis=0))
 
 
-def _is_small(stage: Stage, names: list[str]) -> bool:
-    """Whether a group is less than 1.5 metres long, wide and high."""
-    corners = [bounds("cube", stage.placed(name)) for name in names]
+def _is_small(builder: SceneBuilder, names: list[str]) -> bool:
+    """Whether a group is smaller than 1.5 metres in each direction."""
+    corners = [bounds("cube", builder.placed(name)) for name in names]
     low, high = np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
     return bool((high - low).max() < 1.5)
 
 
-def _facing(stage: Stage, names: list[str], camera: Camera) -> float:
+def _facing(builder: SceneBuilder, names: list[str], camera: Camera) -> float:
     """Cosine of the angle between the viewing direction and the direction to a group."""
-    way = _center(stage, names) - camera.to_world[:3, 3]
+    way = _center(builder, names) - camera.to_world[:3, 3]
     return float(way @ camera.to_world[:3, 2] / max(float(np.linalg.norm(way)), 1e-9))
 
 
 def _exposed(scene: dict[str, Any], level: float) -> dict[str, Any]:
-    """The same scene with all its lights scaled: a denoiser must not depend on the unit of radiance."""
+    """Scale all lights of the scene, because a denoiser must not depend on the unit of radiance."""
     scaled: dict[str, Any] = {}
     for name, entry in scene.items():
         if not isinstance(entry, dict):

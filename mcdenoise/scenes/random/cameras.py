@@ -1,4 +1,4 @@
-"""Cameras: free places to stand, something to look at, and ways to move."""
+"""Random camera paths: free positions, points of interest, and movements."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.scenes.random.stage import Stage
+from mcdenoise.scenes.random.builder import SceneBuilder
 
 Rng = np.random.Generator
-# The last frame of a path; a longer shot goes back and forth on it.
+# Last frame of a path; a longer shot goes back and forth.
 _HORIZON = 16
-# Metres to the box around anything.
+# Minimum distance in metres to the bounding box of any object.
 _CLEARANCE = 0.12
 _TRIES = 150
 
@@ -26,17 +26,17 @@ class _View:
     fov_x: float
 
 
-def shoot(stage: Stage, rng: Rng, frames: int) -> list[Camera]:
-    """A camera path through free space; the first frames do not depend on how many there are."""
-    boxes = stage.boxes()
+def shoot(builder: SceneBuilder, rng: Rng, frames: int) -> list[Camera]:
+    """A camera path through free space; its first frames do not depend on its length."""
+    boxes = builder.boxes()
     moving = rng.random() > 0.2
     best: tuple[float, list[_View]] = (-1.0, [])
     for _ in range(_TRIES):
-        start = _propose(stage, rng)
+        start = _propose(builder, rng)
         path = _way_to_move(start, rng) if moving else _stay
         views = [path(start, frame) for frame in range(_HORIZON + 1)]
         score = 0.0
-        if _is_free(stage, boxes, views):
+        if _is_free(builder, boxes, views):
             score = min(_score(boxes, views[frame]) for frame in (0, _HORIZON // 2, _HORIZON))
         if score > best[0]:
             best = (score, views)
@@ -46,29 +46,29 @@ def shoot(stage: Stage, rng: Rng, frames: int) -> list[Camera]:
     return [Camera.look_at(one.origin.tolist(), one.target.tolist(), one.fov_x) for one in seen]
 
 
-def _propose(stage: Stage, rng: Rng) -> _View:
-    low, high = stage.low + 0.25, stage.high - 0.25
+def _propose(builder: SceneBuilder, rng: Rng) -> _View:
+    low, high = builder.low + 0.25, builder.high - 0.25
     origin = rng.uniform(low, high)
     if rng.random() < 0.7 and high[1] > 1.5:
-        # Mostly at the height of eyes.
+        # Mostly at eye level.
         origin[1] = np.clip(rng.normal(1.35, 0.3), low[1], high[1])
-    points = stage.points or [(low + high) / 2]
+    points = builder.points or [(low + high) / 2]
     target = points[int(rng.integers(len(points)))] + rng.normal(0, 0.15, 3)
     fov = float(rng.uniform(45, 75) if rng.random() < 0.6 else rng.uniform(20, 45))
     return _View(origin, target, fov)
 
 
-def _is_free(stage: Stage, boxes: tuple[Array, Array], views: list[_View]) -> bool:
-    """Whether every camera of a path is inside the stage and outside everything on it."""
+def _is_free(builder: SceneBuilder, boxes: tuple[Array, Array], views: list[_View]) -> bool:
+    """Whether every camera of a path is inside the bounds and outside all objects."""
     origins = np.array([view.origin for view in views])[:, None]
     lows, highs = boxes
     inside = ((origins > lows - _CLEARANCE) & (origins < highs + _CLEARANCE)).all(axis=-1)
-    out = (origins < stage.low) | (origins > stage.high)
+    out = (origins < builder.low) | (origins > builder.high)
     return not (inside.any() or out.any())
 
 
 def _score(boxes: tuple[Array, Array], view: _View) -> float:
-    """1 or more for a camera that sees several things, none of them too close; boxes stand for the things."""
+    """1 or more if a camera sees several objects at sufficient distance; objects are represented by their boxes."""
     lows, highs = boxes
     forward = view.target - view.origin
     distance = float(np.linalg.norm(forward))
@@ -102,7 +102,7 @@ def _stay(view: _View, frame: int) -> _View:
 
 
 def _way_to_move(view: _View, rng: Rng) -> Callable[[_View, int], _View]:
-    """A way to move at 0.3 to 12 pixels a frame in an image 256 pixels wide."""
+    """A movement of 0.3 to 12 pixels per frame in an image 256 pixels wide."""
     speed = float(np.exp(rng.uniform(math.log(0.3), math.log(12))))
     angle = math.radians(view.fov_x) / 256 * speed
     step = angle * float(np.linalg.norm(view.target - view.origin))
@@ -110,7 +110,7 @@ def _way_to_move(view: _View, rng: Rng) -> Callable[[_View, int], _View]:
     sign = float(rng.choice([-1, 1]))
     drift = rng.normal(0, 1, 3) * (1, 0.3, 1)
     drift *= step / np.linalg.norm(drift)
-    # Sway of a hand: sums of waves, so that any frame can be had without those before it.
+    # A hand's sway is a sum of waves, so that any frame can be computed without the previous ones.
     sway = rng.choice([0.0, rng.uniform(0.1, 1.5)], p=[0.5, 0.5]) * math.radians(view.fov_x) / 256
     waves, phases = rng.uniform(0.4, 2.2, (3, 2)), rng.uniform(0, 2 * math.pi, (3, 2))
 
@@ -124,7 +124,7 @@ def _way_to_move(view: _View, rng: Rng) -> Callable[[_View, int], _View]:
             offset = sign * frame * step * left
             origin, target = origin + offset, target + 0.7 * offset
         elif kind == "forward":
-            # Straight ahead the image moves at its edges only, and by less.
+            # Moving straight ahead moves only the edges of the image, and by less.
             origin = origin + sign * min(2 * frame * step, 0.6 * length) * forward / length
             target = target + sign * forward
         elif kind == "orbit":

@@ -1,4 +1,4 @@
-"""Furniture and ornaments from simple shapes; each stands on y = 0 around the vertical axis, in metres."""
+"""Furniture and ornaments made of simple shapes; each stands on y = 0 around the vertical axis, in metres."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from mcdenoise.scenes.random.builder import Part, SceneBuilder, ball, box, drum, place, plate, rod, rotate, sheet
 from mcdenoise.scenes.random.materials import (
     diffuse,
     foliage,
@@ -16,16 +17,15 @@ from mcdenoise.scenes.random.materials import (
     random_metal,
     random_opaque,
 )
-from mcdenoise.scenes.random.stage import Part, Stage, ball, box, drum, place, plate, rod, rotate, sheet
 from mcdenoise.scenes.random.textures import picture, random_color
 
 Rng = np.random.Generator
 Ref = dict[str, str]
 
 
-def ornament(stage: Stage, rng: Rng, size: float) -> list[Part]:
-    """A small thing of about ``size`` metres to put on a table."""
-    makers: list[Callable[[Stage, Rng, float], list[Part]]] = [
+def ornament(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
+    """A small object of about ``size`` metres to put on a table."""
+    makers: list[Callable[[SceneBuilder, Rng, float], list[Part]]] = [
         _ball,
         _ball,
         _block,
@@ -38,12 +38,12 @@ def ornament(stage: Stage, rng: Rng, size: float) -> list[Part]:
         _stack,
         _plant,
     ]
-    return makers[int(rng.integers(len(makers)))](stage, rng, size)
+    return makers[int(rng.integers(len(makers)))](builder, rng, size)
 
 
-def furniture(stage: Stage, rng: Rng, height: float) -> tuple[list[Part], float, float]:
-    """A piece for the floor of a room of that height, its radius, and the height of its top (0 if nothing fits)."""
-    makers: list[Callable[[Stage, Rng, float], tuple[list[Part], float, float]]] = [
+def furniture(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part], float, float]:
+    """A piece of furniture for a room of that height, its radius, and the height of its top (0 if it has none)."""
+    makers: list[Callable[[SceneBuilder, Rng, float], tuple[list[Part], float, float]]] = [
         _table,
         _table,
         _chair,
@@ -57,26 +57,26 @@ def furniture(stage: Stage, rng: Rng, height: float) -> tuple[list[Part], float,
         _pedestal,
         _railing,
     ]
-    return makers[int(rng.integers(len(makers)))](stage, rng, height)
+    return makers[int(rng.integers(len(makers)))](builder, rng, height)
 
 
-def picture_frame(stage: Stage, rng: Rng) -> list[Part]:
-    """A picture of about a metre that hangs on a wall and faces +z, its centre in the origin."""
+def picture_frame(builder: SceneBuilder, rng: Rng) -> list[Part]:
+    """A picture of about a metre to hang on a wall; it faces +z, with its centre at the origin."""
     width, height = rng.uniform(0.3, 1.4), rng.uniform(0.3, 1.1)
-    frame = stage.material(random_opaque(rng, textured=0.2))
-    image = stage.material(diffuse(picture(rng)))
+    frame = builder.material(random_opaque(rng, textured=0.2))
+    image = builder.material(diffuse(picture(rng)))
     parts = [
         box((0, 0, 0.02), (width + 0.1, height + 0.1, 0.04), frame),
         sheet((0, 0, 0.045), (width / 2, height / 2), image, np.eye(4)),
     ]
     if rng.random() < 0.3:
-        parts.append(sheet((0, 0, 0.06), (width / 2, height / 2), stage.material(pane()), np.eye(4)))
+        parts.append(sheet((0, 0, 0.06), (width / 2, height / 2), builder.material(pane()), np.eye(4)))
     return parts
 
 
-def curtain(stage: Stage, rng: Rng, width: float, height: float) -> list[Part]:
-    """Folded cloth that hangs from y = 0 down, along x."""
-    cloth = stage.material(random_opaque(rng, (0.2, 3)))
+def curtain(builder: SceneBuilder, rng: Rng, width: float, height: float) -> list[Part]:
+    """Folded cloth along x that hangs down from y = 0."""
+    cloth = builder.material(random_opaque(rng, (0.2, 3)))
     folds = int(np.clip(width / rng.uniform(0.06, 0.14), 4, 30))
     step = width / folds
     slope = rng.uniform(25, 60)
@@ -91,8 +91,8 @@ def curtain(stage: Stage, rng: Rng, width: float, height: float) -> list[Part]:
     ]
 
 
-def decorate(stage: Stage, rng: Rng, center: tuple[float, float, float], radius: float, count: int) -> None:
-    """Put ornaments onto a surface, apart from each other."""
+def decorate(builder: SceneBuilder, rng: Rng, center: tuple[float, float, float], radius: float, count: int) -> None:
+    """Put ornaments onto a surface without overlap."""
     taken: list[tuple[float, float, float]] = []
     for _ in range(3 * count):
         size = float(rng.uniform(0.15, 0.5)) * min(radius, 1.0)
@@ -101,36 +101,36 @@ def decorate(stage: Stage, rng: Rng, center: tuple[float, float, float], radius:
         if any(math.hypot(x - a, z - b) < 0.5 * (size + c) for a, b, c in taken):
             continue
         taken.append((x, z, size))
-        stage.add(ornament(stage, rng, size), place((x, center[1], z), rng.uniform(0, 360)), movable=True)
-        stage.points.append(np.array((x, center[1] + 0.5 * size, z)))
+        builder.add(ornament(builder, rng, size), place((x, center[1], z), rng.uniform(0, 360)), movable=True)
+        builder.points.append(np.array((x, center[1] + 0.5 * size, z)))
         if len(taken) == count:
             return
 
 
-def glass_block(stage: Stage, rng: Rng, size: float) -> list[Part]:
-    """A solid piece of glass that throws caustics."""
-    material = stage.material(glass(float(rng.uniform(1.4, 1.7))))
+def glass_block(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
+    """A solid piece of glass that causes caustics."""
+    material = builder.material(glass(float(rng.uniform(1.4, 1.7))))
     if rng.random() < 0.6:
         return [ball((0, size / 2, 0), size / 2, material)]
     return [box((0, size / 2, 0), (size * 0.6, size, size * 0.6), material, rng.uniform(0, 90))]
 
 
-def _ball(stage: Stage, rng: Rng, size: float) -> list[Part]:
-    return [ball((0, size / 2, 0), size / 2, stage.material(random_material(rng)))]
+def _ball(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
+    return [ball((0, size / 2, 0), size / 2, builder.material(random_material(rng)))]
 
 
-def _block(stage: Stage, rng: Rng, size: float) -> list[Part]:
+def _block(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
     width, height, depth = size * rng.uniform(0.4, 1, 3)
-    return [box((0, height / 2, 0), (width, height, depth), stage.material(random_material(rng)))]
+    return [box((0, height / 2, 0), (width, height, depth), builder.material(random_material(rng)))]
 
 
-def _can(stage: Stage, rng: Rng, size: float) -> list[Part]:
-    return drum((0, 0, 0), size * rng.uniform(0.5, 1.2), size * rng.uniform(0.15, 0.4), _any(stage, rng))
+def _can(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
+    return drum((0, 0, 0), size * rng.uniform(0.5, 1.2), size * rng.uniform(0.15, 0.4), _any(builder, rng))
 
 
-def _goblet(stage: Stage, rng: Rng, size: float) -> list[Part]:
+def _goblet(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
     """Foot, stem and bowl: a glass, a candlestick, a lamp without light."""
-    material = _any(stage, rng)
+    material = _any(builder, rng)
     bowl = size * rng.uniform(0.2, 0.35)
     return [
         *drum((0, 0, 0), 0.04 * size, bowl * 0.9, material),
@@ -139,9 +139,9 @@ def _goblet(stage: Stage, rng: Rng, size: float) -> list[Part]:
     ]
 
 
-def _ring(stage: Stage, rng: Rng, size: float) -> list[Part]:
+def _ring(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
     """Beads along an upright or a lying circle."""
-    material = stage.material(random_opaque(rng) if rng.random() < 0.5 else random_metal(rng))
+    material = builder.material(random_opaque(rng) if rng.random() < 0.5 else random_metal(rng))
     beads, radius = int(rng.integers(10, 25)), 0.4 * size
     bead = min(radius * math.sin(math.pi / beads) * rng.uniform(0.8, 1.4), 0.2 * size)
     upright = rng.random() < 0.5
@@ -152,9 +152,9 @@ def _ring(stage: Stage, rng: Rng, size: float) -> list[Part]:
     return parts
 
 
-def _heap(stage: Stage, rng: Rng, size: float) -> list[Part]:
-    """Balls thrown together: fruit, stones, a blob."""
-    materials = [_any(stage, rng) for _ in range(int(rng.integers(1, 4)))]
+def _heap(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
+    """Overlapping balls: fruit, stones, a blob."""
+    materials = [_any(builder, rng) for _ in range(int(rng.integers(1, 4)))]
     parts = []
     for _ in range(int(rng.integers(5, 16))):
         radius = size * rng.uniform(0.08, 0.24)
@@ -164,9 +164,9 @@ def _heap(stage: Stage, rng: Rng, size: float) -> list[Part]:
     return parts
 
 
-def _urchin(stage: Stage, rng: Rng, size: float) -> list[Part]:
-    """A ball with spikes: detail finer than a pixel."""
-    material = stage.material(random_opaque(rng) if rng.random() < 0.7 else random_metal(rng))
+def _urchin(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
+    """A ball with spikes, which are thinner than a pixel."""
+    material = builder.material(random_opaque(rng) if rng.random() < 0.7 else random_metal(rng))
     center = np.array((0, 0.5 * size, 0))
     parts = [ball(center, 0.15 * size, material)]
     for _ in range(int(rng.integers(20, 45))):
@@ -176,11 +176,11 @@ def _urchin(stage: Stage, rng: Rng, size: float) -> list[Part]:
     return parts
 
 
-def _book_pile(stage: Stage, rng: Rng, size: float) -> list[Part]:
+def _book_pile(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
     parts, top = [], 0.0
     for _ in range(int(rng.integers(2, 7))):
         thick = size * rng.uniform(0.05, 0.16)
-        material = stage.material(random_opaque(rng))
+        material = builder.material(random_opaque(rng))
         where = (*(rng.uniform(-0.05, 0.05, 1) * size), top + thick / 2, 0.0)
         sizes = (size * rng.uniform(0.6, 0.9), thick, size * rng.uniform(0.45, 0.65))
         parts.append(box(where, sizes, material, rng.uniform(-25, 25)))
@@ -188,9 +188,9 @@ def _book_pile(stage: Stage, rng: Rng, size: float) -> list[Part]:
     return parts
 
 
-def _stack(stage: Stage, rng: Rng, size: float) -> list[Part]:
-    """Turned shapes on top of each other: a vase, a bottle, a chess piece."""
-    material = _any(stage, rng)
+def _stack(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
+    """Bodies of revolution on top of each other: a vase, a bottle, a chess piece."""
+    material = _any(builder, rng)
     parts, top = [], 0.0
     for _ in range(int(rng.integers(2, 5))):
         radius = size * rng.uniform(0.1, 0.3)
@@ -204,10 +204,10 @@ def _stack(stage: Stage, rng: Rng, size: float) -> list[Part]:
     return parts
 
 
-def _plant(stage: Stage, rng: Rng, size: float) -> list[Part]:
-    pot = stage.material(random_opaque(rng))
+def _plant(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
+    pot = builder.material(random_opaque(rng))
     green = (rng.uniform(0.03, 0.2), rng.uniform(0.15, 0.45), rng.uniform(0.02, 0.15))
-    leaf = stage.material(foliage(rng, green if rng.random() < 0.8 else random_color(rng)))
+    leaf = builder.material(foliage(rng, green if rng.random() < 0.8 else random_color(rng)))
     parts = drum((0, 0, 0), 0.3 * size, 0.17 * size, pot)
     for _ in range(int(rng.integers(10, 28))):
         turn, lean, length = rng.uniform(0, 360), rng.uniform(5, 80), size * rng.uniform(0.3, 0.75)
@@ -218,8 +218,8 @@ def _plant(stage: Stage, rng: Rng, size: float) -> list[Part]:
     return parts
 
 
-def _table(stage: Stage, rng: Rng, _: float) -> tuple[list[Part], float, float]:
-    top, legs = stage.material(random_opaque(rng, textured=0.6)), _any_opaque(stage, rng)
+def _table(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+    top, legs = builder.material(random_opaque(rng, textured=0.6)), _any_opaque(builder, rng)
     height, thick = rng.uniform(0.4, 0.95), rng.uniform(0.02, 0.07)
     if rng.random() < 0.35:
         radius = rng.uniform(0.3, 0.8)
@@ -242,8 +242,8 @@ def _table(stage: Stage, rng: Rng, _: float) -> tuple[list[Part], float, float]:
     return parts, math.hypot(width, depth) / 2, height
 
 
-def _chair(stage: Stage, rng: Rng, _: float) -> tuple[list[Part], float, float]:
-    wood, seat = _any_opaque(stage, rng), _any_opaque(stage, rng)
+def _chair(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+    wood, seat = _any_opaque(builder, rng), _any_opaque(builder, rng)
     back = rng.uniform(0.8, 1.15)
     parts = [box((0, 0.45, 0), (0.44, 0.04, 0.44), seat)]
     for x in (-0.2, 0.2):
@@ -258,12 +258,12 @@ def _chair(stage: Stage, rng: Rng, _: float) -> tuple[list[Part], float, float]:
     return parts, 0.35, 0.0
 
 
-def _shelf(stage: Stage, rng: Rng, height: float) -> tuple[list[Part], float, float]:
-    """Boards with books and jars, open towards +z."""
-    wood = stage.material(random_opaque(rng, textured=0.5))
+def _shelf(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part], float, float]:
+    """Shelves with books and jars, open towards +z."""
+    wood = builder.material(random_opaque(rng, textured=0.5))
     width, depth, boards = rng.uniform(0.7, 1.4), rng.uniform(0.22, 0.35), int(rng.integers(2, 5))
     top = min(rng.uniform(0.8, 2.1), height - 0.3)
-    covers = [_any_opaque(stage, rng) for _ in range(6)] + [stage.material(random_material(rng))]
+    covers = [_any_opaque(builder, rng) for _ in range(6)] + [builder.material(random_material(rng))]
     parts = [box((x * width / 2, top / 2, 0), (0.03, top, depth), wood) for x in (-1, 1)]
     parts.append(box((0, top / 2, -depth / 2), (width, top, 0.015), wood))
     for y in np.linspace(0.05, top, boards + 1):
@@ -284,8 +284,8 @@ def _shelf(stage: Stage, rng: Rng, height: float) -> tuple[list[Part], float, fl
     return parts, 0.5 * width, 0.0
 
 
-def _sofa(stage: Stage, rng: Rng, _: float) -> tuple[list[Part], float, float]:
-    cloth = stage.material(random_opaque(rng, (3, 3)))
+def _sofa(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+    cloth = builder.material(random_opaque(rng, (3, 3)))
     width = rng.uniform(0.8, 2.0)
     parts = [
         box((0, 0.22, 0), (width, 0.36, 0.8), cloth),
@@ -294,14 +294,14 @@ def _sofa(stage: Stage, rng: Rng, _: float) -> tuple[list[Part], float, float]:
         box((width / 2, 0.32, 0), (0.16, 0.55, 0.8), cloth),
     ]
     for _cushion in range(int(rng.integers(0, 4))):
-        cushion = stage.material(random_opaque(rng, textured=0.7))
+        cushion = builder.material(random_opaque(rng, textured=0.7))
         x = rng.uniform(-0.35, 0.35) * width
         parts.append(box((x, 0.55, -0.1), (0.4, 0.4, 0.12), cushion, rng.uniform(-30, 30), -20))
     return parts, math.hypot(width, 0.8) / 2, 0.0
 
 
-def _stairs(stage: Stage, rng: Rng, height: float) -> tuple[list[Part], float, float]:
-    stone, rail = _any_opaque(stage, rng), _any_opaque(stage, rng)
+def _stairs(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part], float, float]:
+    stone, rail = _any_opaque(builder, rng), _any_opaque(builder, rng)
     steps, width = int(rng.integers(4, 10)), rng.uniform(0.6, 1.2)
     rise, tread = min(0.18, (height - 0.5) / steps), 0.26
     parts = []
@@ -314,9 +314,9 @@ def _stairs(stage: Stage, rng: Rng, height: float) -> tuple[list[Part], float, f
     return parts, steps * tread / 2 + 0.2, 0.0
 
 
-def _screen(stage: Stage, rng: Rng, height: float) -> tuple[list[Part], float, float]:
+def _screen(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part], float, float]:
     """A folding screen: closed panels or slats."""
-    material = stage.material(random_opaque(rng, textured=0.6))
+    material = builder.material(random_opaque(rng, textured=0.6))
     tall, panels, slope = min(rng.uniform(1.0, 1.9), height - 0.4), int(rng.integers(2, 5)), rng.uniform(20, 60)
     slats = rng.random() < 0.4
     parts: list[Part] = []
@@ -331,40 +331,40 @@ def _screen(stage: Stage, rng: Rng, height: float) -> tuple[list[Part], float, f
     return parts, 0.25 * panels + 0.1, 0.0
 
 
-def _crates(stage: Stage, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+def _crates(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
     parts: list[Part] = []
     for _crate in range(int(rng.integers(1, 5))):
         edge = rng.uniform(0.2, 0.6)
         x, z = rng.uniform(-0.3, 0.3, 2)
-        parts.append(box((x, edge / 2, z), (edge, edge, edge), _any_opaque(stage, rng), rng.uniform(0, 90)))
+        parts.append(box((x, edge / 2, z), (edge, edge, edge), _any_opaque(builder, rng), rng.uniform(0, 90)))
     if rng.random() < 0.5:
-        parts.append(box((0, 0.6 + 0.15, 0), (0.3, 0.3, 0.3), _any(stage, rng), rng.uniform(0, 90)))
+        parts.append(box((0, 0.6 + 0.15, 0), (0.3, 0.3, 0.3), _any(builder, rng), rng.uniform(0, 90)))
     return parts, 0.6, 0.0
 
 
-def _big_plant(stage: Stage, rng: Rng, height: float) -> tuple[list[Part], float, float]:
+def _big_plant(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part], float, float]:
     size = min(rng.uniform(0.8, 1.7), height - 0.6)
-    return _plant(stage, rng, size), 0.3 * size, 0.0
+    return _plant(builder, rng, size), 0.3 * size, 0.0
 
 
-def _pedestal(stage: Stage, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+def _pedestal(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
     height, radius = rng.uniform(0.3, 1.1), rng.uniform(0.2, 0.4)
-    material = stage.material(random_opaque(rng, textured=0.6))
+    material = builder.material(random_opaque(rng, textured=0.6))
     if rng.random() < 0.5:
         return drum((0, 0, 0), height, radius, material), radius, height
     return [box((0, height / 2, 0), (1.4 * radius, height, 1.4 * radius), material)], radius, height
 
 
-def _railing(stage: Stage, rng: Rng, _: float) -> tuple[list[Part], float, float]:
-    material, length = stage.material(random_metal(rng) if rng.random() < 0.3 else random_opaque(rng)), 1.6
+def _railing(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+    material, length = builder.material(random_metal(rng) if rng.random() < 0.3 else random_opaque(rng)), 1.6
     bars = int(rng.integers(8, 24))
     parts = [rod((x, 0, 0), (x, 1, 0), 0.01, material) for x in np.linspace(-length / 2, length / 2, bars)]
     return [*parts, box((0, 1, 0), (length, 0.04, 0.06), material)], length / 2, 0.0
 
 
-def _any(stage: Stage, rng: Rng) -> Ref:
-    return stage.material(random_material(rng))
+def _any(builder: SceneBuilder, rng: Rng) -> Ref:
+    return builder.material(random_material(rng))
 
 
-def _any_opaque(stage: Stage, rng: Rng) -> Ref:
-    return stage.material(random_opaque(rng, textured=0.25))
+def _any_opaque(builder: SceneBuilder, rng: Rng) -> Ref:
+    return builder.material(random_opaque(rng, textured=0.25))

@@ -1,4 +1,4 @@
-"""Skies and lamps. Powers are chosen by what they light, so that small lamps are bright and cause bright outliers."""
+"""Skies and lamps. Lamps get the power that their surroundings need, so small lamps are bright and cause fireflies."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import math
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
+from mcdenoise.scenes.random.builder import Part, SceneBuilder, ball, box, drum, plate, rgb, rod, rotate, sheet
 from mcdenoise.scenes.random.materials import diffuse, random_metal, random_opaque
-from mcdenoise.scenes.random.stage import Part, Stage, ball, box, drum, plate, rgb, rod, rotate, sheet
 from mcdenoise.scenes.random.textures import Color
 
 Rng = np.random.Generator
@@ -51,7 +51,7 @@ def sky(rng: Rng, level: float, sun: Array | None, sun_share: float) -> Array:
     image = np.where((up < skyline)[..., None], ground * rng.uniform(0.4, 1), image)
     image = np.where((up < 0)[..., None], ground, image)
     if sun is not None:
-        # One or four pixels: they stay small enough for hard shadows.
+        # One or four pixels, small enough for hard shadows.
         lit = np.argsort(-(direction @ sun), axis=None)[: int(rng.choice([1, 4]))]
         solid = (math.pi / rows) * (2 * math.pi / columns) * np.sin(polar.ravel()[lit // columns])
         warmth = np.array(colorsys.hsv_to_rgb(0.09, rng.uniform(0, 0.6) * (1 - sun[1]), 1))
@@ -60,7 +60,7 @@ def sky(rng: Rng, level: float, sun: Array | None, sun_share: float) -> Array:
 
 
 def _clouds(rng: Rng, direction: Array) -> Array:
-    """Soft patches in [0, 1] from a few waves over the direction."""
+    """Smooth patches in [0, 1] from a few waves over the direction."""
     total = np.zeros(direction.shape[:-1])
     for octave in range(4):
         for _ in range(3):
@@ -70,7 +70,7 @@ def _clouds(rng: Rng, direction: Array) -> Array:
 
 
 def sun_direction(rng: Rng, towards: float | None = None) -> Array:
-    """A unit vector to the sun at a random height; ``towards`` is an azimuth, degrees, that it should be close to."""
+    """A unit vector to the sun at a random height; ``towards`` is its approximate azimuth in degrees."""
     azimuth = math.radians(rng.uniform(0, 360) if towards is None else towards + rng.uniform(-65, 65))
     elevation = math.radians(rng.uniform(6, 75) if towards is None else rng.uniform(6, 50))
     level = math.cos(elevation)
@@ -78,7 +78,7 @@ def sun_direction(rng: Rng, towards: float | None = None) -> Array:
 
 
 def studio(rng: Rng, level: float) -> Array:
-    """A dark surrounding with a few bright panels of different colours."""
+    """Dark surroundings with a few bright panels of different colours."""
     rows, columns = 64, 128
     image = np.full((rows, columns, 3), level * rng.uniform(0.02, 0.3))
     for _ in range(int(rng.integers(1, 5))):
@@ -90,7 +90,7 @@ def studio(rng: Rng, level: float) -> Array:
 
 
 def light_color(rng: Rng) -> Color:
-    """From candle to cold daylight; sometimes a party."""
+    """A color from candle light to cold daylight, sometimes saturated."""
     if rng.random() < 0.15:
         color = colorsys.hsv_to_rgb(float(rng.random()), float(rng.uniform(0.4, 0.95)), 1)
     else:
@@ -102,8 +102,8 @@ def light_color(rng: Rng) -> Color:
     return color[0] / mean, max(color[1], 0.02) / mean, max(color[2], 0.02) / mean
 
 
-def add_lamps(stage: Stage, rng: Rng, low: Array, high: Array, count: int, brightness: float) -> None:
-    """Hang, stand and hide lamps in a room; together they light its surfaces to about ``brightness``."""
+def add_lamps(builder: SceneBuilder, rng: Rng, low: Array, high: Array, count: int, brightness: float) -> None:
+    """Add hanging, standing and hidden lamps to a room; together they light its surfaces to about ``brightness``."""
     width, height, depth = high - low
     flux = brightness * math.pi * 2 * (width * height + height * depth + depth * width) * 0.5
     for share in rng.dirichlet(np.full(count, 1.5)):
@@ -117,28 +117,30 @@ def add_lamps(stage: Stage, rng: Rng, low: Array, high: Array, count: int, brigh
         ceiling = float(high[1])
         if kind == "panel":
             half = np.exp(rng.uniform(math.log(0.04), math.log(0.5 * min(width, depth) / 2), 2))
-            _panel(stage, (x, ceiling - 0.02, z), (float(half[0]), float(half[1])), power, color)
+            _panel(builder, (x, ceiling - 0.02, z), (float(half[0]), float(half[1])), power, color)
         elif kind == "tube":
-            _panel(stage, (x, ceiling - 0.1, z), (0.03, 0.3 * float(depth) / 2), power, color)
+            _panel(builder, (x, ceiling - 0.1, z), (0.03, 0.3 * float(depth) / 2), power, color)
         elif kind == "bulb":
-            _pendant(stage, rng, (x, ceiling, z), float(height), power, color)
+            _pendant(builder, rng, (x, ceiling, z), float(height), power, color)
         elif kind == "standing":
-            _standing(stage, rng, (x, float(low[1]), z), float(height), power, color)
+            _standing(builder, rng, (x, float(low[1]), z), float(height), power, color)
         elif kind == "cove":
-            _cove(stage, rng, low, high, power, color)
+            _cove(builder, rng, low, high, power, color)
         elif kind == "chandelier":
-            _chandelier(stage, rng, (x, ceiling, z), power, color)
+            _chandelier(builder, rng, (x, ceiling, z), power, color)
         else:
             point = np.array((x, ceiling - 0.15, z))
             target = np.array((x, low[1], z)) + rng.uniform(-1, 1, 3) * (0.3 * width, 0, 0.3 * depth)
-            add_spot(stage, rng, point, target, power, color, narrow=kind == "spot")
+            add_spot(builder, rng, point, target, power, color, narrow=kind == "spot")
 
 
-def add_spot(stage: Stage, rng: Rng, origin: Array, target: Array, power: float, color: Color, narrow: bool) -> None:
-    """A spot that shines at a target, or a point light."""
+def add_spot(
+    builder: SceneBuilder, rng: Rng, origin: Array, target: Array, power: float, color: Color, narrow: bool
+) -> None:
+    """A spot light directed at a target, or a point light."""
     if not narrow:
         intensity = _scaled(color, power / (4 * math.pi))
-        stage.add_light({"type": "point", "position": origin.tolist(), "intensity": rgb(intensity)})
+        builder.add_light({"type": "point", "position": origin.tolist(), "intensity": rgb(intensity)})
         return
     cutoff = float(rng.uniform(15, 55))
     solid = 2 * math.pi * (1 - math.cos(math.radians(cutoff)))
@@ -148,15 +150,15 @@ def add_spot(stage: Stage, rng: Rng, origin: Array, target: Array, power: float,
     side /= np.linalg.norm(side)
     pose = np.eye(4)
     pose[:3] = np.stack((side, np.cross(axis, side), axis, origin), axis=1)
-    stage.add_light({"type": "spot", "to_world": pose, "cutoff_angle": cutoff, "intensity": rgb(intensity)})
+    builder.add_light({"type": "spot", "to_world": pose, "cutoff_angle": cutoff, "intensity": rgb(intensity)})
 
 
-def softbox(stage: Stage, rng: Rng, origin: Array, target: Array, power: float) -> None:
-    """A rectangle or a ball of light that faces a target."""
+def softbox(builder: SceneBuilder, rng: Rng, origin: Array, target: Array, power: float) -> None:
+    """An emitting rectangle or ball that faces a target."""
     color, size = light_color(rng), float(np.exp(rng.uniform(math.log(0.03), math.log(0.6))))
-    black = stage.material(diffuse((0.02, 0.02, 0.02)))
+    black = builder.material(diffuse((0.02, 0.02, 0.02)))
     if rng.random() < 0.4:
-        stage.add([ball(origin, size / 2, black, _scaled(color, power / (math.pi**2 * size**2)))])
+        builder.add([ball(origin, size / 2, black, _scaled(color, power / (math.pi**2 * size**2)))])
         return
     axis = (target - origin) / np.linalg.norm(target - origin)
     side = np.cross((0.0, 1.0, 0.0), axis)
@@ -165,34 +167,34 @@ def softbox(stage: Stage, rng: Rng, origin: Array, target: Array, power: float) 
     rotation[:3, :3] = np.stack((side, np.cross(axis, side), axis), axis=1)
     half = (size, size * float(rng.uniform(0.3, 1)))
     radiance = _scaled(color, power / (math.pi * 4 * half[0] * half[1]))
-    stage.add([sheet(origin, half, black, rotation, radiance)])
+    builder.add([sheet(origin, half, black, rotation, radiance)])
 
 
 def _panel(
-    stage: Stage, center: tuple[float, float, float], half: tuple[float, float], power: float, color: Color
+    builder: SceneBuilder, center: tuple[float, float, float], half: tuple[float, float], power: float, color: Color
 ) -> None:
-    white = stage.material(diffuse((0.8, 0.8, 0.8)))
+    white = builder.material(diffuse((0.8, 0.8, 0.8)))
     radiance = _scaled(color, power / (math.pi * 4 * half[0] * half[1]))
-    stage.add([sheet(center, half, white, rotate("x", 90), radiance)])
+    builder.add([sheet(center, half, white, rotate("x", 90), radiance)])
     frame = (center[0], center[1] + 0.012, center[2])
-    stage.add([box(frame, (2 * half[0] + 0.06, 0.02, 2 * half[1] + 0.06), white)])
+    builder.add([box(frame, (2 * half[0] + 0.06, 0.02, 2 * half[1] + 0.06), white)])
 
 
 def _pendant(
-    stage: Stage, rng: Rng, hook: tuple[float, float, float], height: float, power: float, color: Color
+    builder: SceneBuilder, rng: Rng, hook: tuple[float, float, float], height: float, power: float, color: Color
 ) -> None:
-    """A bulb on a cord, bare or under a shade that keeps its light from the ceiling."""
+    """A bulb on a cord, bare or under a shade that blocks the light to the ceiling."""
     radius = float(np.exp(rng.uniform(math.log(0.02), math.log(0.2))))
     y = hook[1] - float(rng.uniform(0.15, 0.45)) * height
     center = (hook[0], y, hook[2])
-    cord = stage.material(diffuse((0.05, 0.05, 0.05)))
-    stage.add([rod((hook[0], y + radius, hook[2]), hook, 0.006, cord)])
-    stage.add([_bulb(center, radius, cord, power, color)])
-    stage.points.append(np.array(center))
+    cord = builder.material(diffuse((0.05, 0.05, 0.05)))
+    builder.add([rod((hook[0], y + radius, hook[2]), hook, 0.006, cord)])
+    builder.add([_bulb(center, radius, cord, power, color)])
+    builder.points.append(np.array(center))
     if rng.random() < 0.4:
-        shade = stage.material(random_opaque(rng))
+        shade = builder.material(random_opaque(rng))
         wide = radius * float(rng.uniform(1.3, 2.5))
-        stage.add(
+        builder.add(
             [
                 rod((hook[0], y - radius, hook[2]), (hook[0], y + 1.5 * radius, hook[2]), wide, shade),
                 plate((hook[0], y + 1.5 * radius, hook[2]), wide, shade),
@@ -201,46 +203,46 @@ def _pendant(
 
 
 def _standing(
-    stage: Stage, rng: Rng, foot: tuple[float, float, float], height: float, power: float, color: Color
+    builder: SceneBuilder, rng: Rng, foot: tuple[float, float, float], height: float, power: float, color: Color
 ) -> None:
-    metal = stage.material(random_metal(rng))
+    metal = builder.material(random_metal(rng))
     x, y, z = foot
     top = float(rng.uniform(0.35, 0.7)) * height
     radius = float(rng.uniform(0.04, 0.15))
-    stage.add([*drum(foot, 0.03, 0.15, metal), rod((x, y, z), (x, y + top - radius, z), 0.015, metal)])
-    stage.add([_bulb((x, y + top, z), radius, metal, power, color)])
-    stage.points.append(np.array((x, y + top, z)))
+    builder.add([*drum(foot, 0.03, 0.15, metal), rod((x, y, z), (x, y + top - radius, z), 0.015, metal)])
+    builder.add([_bulb((x, y + top, z), radius, metal, power, color)])
+    builder.points.append(np.array((x, y + top, z)))
     if rng.random() < 0.5:
-        shade = stage.material(random_opaque(rng))
-        stage.add([rod((x, y + top - 1.4 * radius, z), (x, y + top + 1.4 * radius, z), 1.8 * radius, shade)])
+        shade = builder.material(random_opaque(rng))
+        builder.add([rod((x, y + top - 1.4 * radius, z), (x, y + top + 1.4 * radius, z), 1.8 * radius, shade)])
 
 
-def _cove(stage: Stage, rng: Rng, low: Array, high: Array, power: float, color: Color) -> None:
-    """A strip of light behind a board under the ceiling: everything below is lit indirectly."""
-    white = stage.material(diffuse((0.8, 0.8, 0.8)))
+def _cove(builder: SceneBuilder, rng: Rng, low: Array, high: Array, power: float, color: Color) -> None:
+    """A light strip behind a board under the ceiling, so that everything below is lit indirectly."""
+    white = builder.material(diffuse((0.8, 0.8, 0.8)))
     side = int(rng.choice([-1, 1]))
     x = float(low[0] if side < 0 else high[0]) - side * 0.12
     y, z = float(high[1]) - 0.35, float(low[2] + high[2]) / 2
     length = 0.85 * float(high[2] - low[2])
     half = (0.04, length / 2)
     radiance = _scaled(color, 1.5 * power / (math.pi * 4 * half[0] * half[1]))
-    stage.add([sheet((x, y + 0.03, z), half, white, rotate("x", -90), radiance)])
-    stage.add(
+    builder.add([sheet((x, y + 0.03, z), half, white, rotate("x", -90), radiance)])
+    builder.add(
         [box((x, y, z), (0.2, 0.03, length), white), box((x - side * 0.1, y + 0.06, z), (0.02, 0.15, length), white)]
     )
 
 
-def _chandelier(stage: Stage, rng: Rng, hook: tuple[float, float, float], power: float, color: Color) -> None:
-    metal = stage.material(random_metal(rng))
+def _chandelier(builder: SceneBuilder, rng: Rng, hook: tuple[float, float, float], power: float, color: Color) -> None:
+    metal = builder.material(random_metal(rng))
     bulbs, radius = 3, float(rng.uniform(0.2, 0.5))
     y = hook[1] - float(rng.uniform(0.4, 0.8))
-    stage.add([rod((hook[0], y, hook[2]), hook, 0.012, metal)])
+    builder.add([rod((hook[0], y, hook[2]), hook, 0.012, metal)])
     for number in range(bulbs):
         angle = 2 * math.pi * number / bulbs
         end = (hook[0] + radius * math.cos(angle), y + 0.08, hook[2] + radius * math.sin(angle))
-        stage.add([rod((hook[0], y, hook[2]), end, 0.01, metal)])
-        stage.add([_bulb((end[0], end[1] + 0.05, end[2]), 0.04, metal, power / bulbs, color)])
-    stage.points.append(np.array((hook[0], y, hook[2])))
+        builder.add([rod((hook[0], y, hook[2]), end, 0.01, metal)])
+        builder.add([_bulb((end[0], end[1] + 0.05, end[2]), 0.04, metal, power / bulbs, color)])
+    builder.points.append(np.array((hook[0], y, hook[2])))
 
 
 def _bulb(

@@ -1,7 +1,7 @@
-"""Materials of a random scene, drawn from a fixed set of kinds.
+"""Materials of random scenes, drawn from a fixed set of types.
 
-A vectorised renderer compiles its program anew for another set of plugins; therefore a plain colour is a small bitmap
-too, every scene has every kind, and :mod:`mcdenoise.scenes.random.stage` sees to it.
+A vectorised renderer compiles a new program for every new set of plugins. Therefore a plain colour is also a small
+bitmap, and every scene contains every type, which :mod:`mcdenoise.scenes.random.builder` ensures.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ _METALS = ("Ag", "Al", "Au", "Cu", "Cr", "W")
 
 
 def diffuse(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
-    """A matt surface."""
+    """A diffuse surface."""
     return _two_sided({"type": "diffuse", "reflectance": _bitmap(reflectance, repeat)})
 
 
 def plastic(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
-    """A matt surface under a clear coat."""
+    """A diffuse surface under a smooth clear coat."""
     return _two_sided({"type": "plastic", "diffuse_reflectance": _bitmap(reflectance, repeat)})
 
 
 def lacquer(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1), nonlinear: bool = True) -> Bsdf:
-    """A matt surface under a smooth clear coat, whose color deepens with every reflection inside if ``nonlinear``."""
+    """A diffuse surface under a smooth clear coat; ``nonlinear`` saturates the color by internal reflections."""
     return _two_sided({"type": "plastic", "diffuse_reflectance": _bitmap(reflectance, repeat), "nonlinear": nonlinear})
 
 
 def rough_plastic(reflectance: Color | Array, alpha: float, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
-    """A matt surface under a rough coat."""
+    """A diffuse surface under a rough coat."""
     return _two_sided({"type": "roughplastic", "diffuse_reflectance": _bitmap(reflectance, repeat), "alpha": alpha})
 
 
 def rough_metal(material: str, alpha: float | Array, tint: Color | Array = (1, 1, 1)) -> Bsdf:
-    """A metal that blurs what it mirrors; ``alpha`` may be a ``(H, W, 1)`` texture."""
+    """A rough metal; ``alpha`` may be a ``(H, W, 1)`` texture."""
     roughness = np.full((2, 2, 1), alpha) if isinstance(alpha, float) else alpha
     return _two_sided(
         {
@@ -61,18 +61,18 @@ def glass(index: float = 1.5) -> Bsdf:
 
 
 def pane() -> Bsdf:
-    """Thin glass that does not bend light."""
+    """Thin glass without refraction."""
     return {"type": "thindielectric", "int_ior": 1.5}
 
 
 def foliage(rng: np.random.Generator, color: Color) -> Bsdf:
-    """A twig of leaves cut out of a rectangle."""
+    """A twig of leaves, cut out of a rectangle by a mask."""
     shade = np.clip(np.array(color) * rng.uniform(0.6, 1.4, (16, 16, 1)), 0.02, 0.9)
     return {"type": "mask", "opacity": _bitmap(leaf_mask(rng)), "bsdf": diffuse(shade)}
 
 
 def every_kind() -> list[Bsdf]:
-    """One material of each kind."""
+    """One material of each type."""
     gray = (0.5, 0.5, 0.5)
     rng = np.random.default_rng(0)
     return [
@@ -88,7 +88,7 @@ def every_kind() -> list[Bsdf]:
 
 
 def random_metal(rng: np.random.Generator) -> Bsdf:
-    """A rough metal: plain, tinted or brushed."""
+    """A rough metal: untinted, tinted or brushed."""
     material, alpha = str(rng.choice(_METALS)), float(np.exp(rng.uniform(np.log(0.02), np.log(0.4))))
     if rng.random() < 0.25:
         pattern = texture(rng).mean(axis=-1, keepdims=True)
@@ -99,7 +99,7 @@ def random_metal(rng: np.random.Generator) -> Bsdf:
 
 
 def random_opaque(rng: np.random.Generator, repeat: tuple[float, float] = (1, 1), textured: float = 0.4) -> Bsdf:
-    """Paint, wood, cloth, lacquer: diffuse or with a coat, textured with the given probability."""
+    """Paint, wood, cloth or lacquer: diffuse or coated, textured with the given probability."""
     look = texture(rng) if rng.random() < textured else random_color(rng)
     kind = rng.random()
     if kind < 0.55:
@@ -110,7 +110,7 @@ def random_opaque(rng: np.random.Generator, repeat: tuple[float, float] = (1, 1)
 
 
 def random_material(rng: np.random.Generator) -> Bsdf:
-    """Anything a small closed object can be made of."""
+    """Any material for a small closed object."""
     kind = rng.random()
     if kind < 0.66:
         return random_opaque(rng)
@@ -127,5 +127,5 @@ def _two_sided(bsdf: Bsdf) -> Bsdf:
 
 def _bitmap(look: Color | Array, repeat: tuple[float, float] = (1, 1)) -> dict[str, Any]:
     image = np.tile(np.array(look, dtype=np.float64), (2, 2, 1)) if isinstance(look, tuple) else look
-    # raw: the numbers are reflectances already, and no sRGB values to be decoded.
+    # raw: the values are reflectances, not sRGB values to be decoded.
     return {"type": "bitmap", "bitmap": image, "raw": True, "to_uv": np.diag((*repeat, 1.0, 1.0))}

@@ -1,4 +1,4 @@
-"""The kinds of places: rooms lit through windows or by lamps, still lifes, colonnades, light experiments."""
+"""Types of random scenes: rooms lit through windows or by lamps, still lifes, colonnades, light experiments."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
+from mcdenoise.scenes.random.builder import SceneBuilder, ball, box, place, rod, sheet
 from mcdenoise.scenes.random.furniture import curtain, decorate, furniture, glass_block, ornament, picture_frame
 from mcdenoise.scenes.random.lights import add_lamps, sky, softbox, studio, sun_direction
 from mcdenoise.scenes.random.materials import (
@@ -19,226 +20,231 @@ from mcdenoise.scenes.random.materials import (
     rough_metal,
     rough_plastic,
 )
-from mcdenoise.scenes.random.stage import Stage, ball, box, place, rod, sheet
 from mcdenoise.scenes.random.textures import texture, wall_color
 
 Rng = np.random.Generator
-# A room with more shapes than this gets no further furniture.
+# A room with more shapes than this gets no more furniture.
 _ENOUGH_SHAPES = 290
 _WALL = 0.25
 
 
-def build(rng: Rng) -> Stage:
-    """A random place with everything in it but the camera."""
-    kinds: list[Callable[[Rng], Stage]] = [_daylight_room, _lamp_room, _still_life, _colonnade, _light_experiment]
+def build(rng: Rng) -> SceneBuilder:
+    """A random scene without its cameras."""
+    kinds: list[Callable[[Rng], SceneBuilder]] = [
+        _daylight_room,
+        _lamp_room,
+        _still_life,
+        _colonnade,
+        _light_experiment,
+    ]
     return kinds[int(rng.choice(len(kinds), p=[0.32, 0.26, 0.2, 0.14, 0.08]))](rng)
 
 
-def _daylight_room(rng: Rng) -> Stage:
-    """A room that the sky and often the sun light through its windows."""
-    stage, size = _empty_room(rng)
+def _daylight_room(rng: Rng) -> SceneBuilder:
+    """A room lit through its windows by the sky and often the sun."""
+    builder, size = _empty_room(rng)
     lit_walls = rng.permutation(4)[: int(rng.choice([1, 2, 3], p=[0.6, 0.3, 0.1]))]
     opening = 0.0
     for wall in range(4):
         if wall in lit_walls:
-            opening += _wall_with_windows(stage, rng, size, wall)
+            opening += _wall_with_windows(builder, rng, size, wall)
         else:
-            _closed_wall(stage, rng, size, wall)
+            _closed_wall(builder, rng, size, wall)
     surface = 2 * float(size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
     level = float(np.clip(0.25 * surface / max(opening, 0.1), 1.5, 40)) * float(np.exp(rng.uniform(-0.7, 0.7)))
     sun = sun_direction(rng, _outwards(int(lit_walls[0]))) if rng.random() < 0.65 else None
-    stage.set_sky(sky(rng, level, sun, float(np.exp(rng.uniform(-1, 1.6)))))
+    builder.set_sky(sky(rng, level, sun, float(np.exp(rng.uniform(-1, 1.6)))))
     if rng.random() < 0.25:
-        add_lamps(stage, rng, stage.low, stage.high, int(rng.integers(1, 3)), 0.1)
-    _furnish(stage, rng, size)
-    return stage
+        add_lamps(builder, rng, builder.low, builder.high, int(rng.integers(1, 3)), 0.1)
+    _furnish(builder, rng, size)
+    return builder
 
 
-def _lamp_room(rng: Rng) -> Stage:
-    """A room with lamps, and sometimes a window into the night or the dusk."""
-    stage, size = _empty_room(rng)
+def _lamp_room(rng: Rng) -> SceneBuilder:
+    """A room with lamps, and sometimes a window with a night or dusk sky."""
+    builder, size = _empty_room(rng)
     window = int(rng.integers(4)) if rng.random() < 0.3 else -1
     for wall in range(4):
         if wall == window:
-            _wall_with_windows(stage, rng, size, wall)
+            _wall_with_windows(builder, rng, size, wall)
         else:
-            _closed_wall(stage, rng, size, wall)
+            _closed_wall(builder, rng, size, wall)
     if window >= 0:
-        stage.set_sky(sky(rng, float(np.exp(rng.uniform(-5, -0.5))), None, 0))
-    add_lamps(stage, rng, stage.low, stage.high, int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), 0.35)
-    _furnish(stage, rng, size)
-    return stage
+        builder.set_sky(sky(rng, float(np.exp(rng.uniform(-5, -0.5))), None, 0))
+    add_lamps(builder, rng, builder.low, builder.high, int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), 0.35)
+    _furnish(builder, rng, size)
+    return builder
 
 
-def _still_life(rng: Rng) -> Stage:
+def _still_life(rng: Rng) -> SceneBuilder:
     """Ornaments on a table or on the ground, under the sky or in a studio."""
-    stage = Stage((-1.9, 0.05, -1.9), (1.9, 1.5, 1.9))
+    builder = SceneBuilder((-1.9, 0.05, -1.9), (1.9, 1.5, 1.9))
     repeat = float(rng.integers(6, 25))
-    top = stage.material(random_opaque(rng, (repeat, repeat), textured=0.7))
-    stage.add([box((0, -0.05, 0), (12, 0.1, 12), top)])
+    top = builder.material(random_opaque(rng, (repeat, repeat), textured=0.7))
+    builder.add([box((0, -0.05, 0), (12, 0.1, 12), top)])
     if rng.random() < 0.5:
-        back = stage.material(random_opaque(rng, (4, 2)))
-        stage.add([box((0, 1.5, -1.5), (12, 3.2, 0.1), back)])
-        stage.low[2] = -1.4
+        back = builder.material(random_opaque(rng, (4, 2)))
+        builder.add([box((0, 1.5, -1.5), (12, 3.2, 0.1), back)])
+        builder.low[2] = -1.4
         if rng.random() < 0.5:
-            stage.add([box((-1.9, 1.5, 0), (0.1, 3.2, 6), stage.material(random_opaque(rng, (2, 1))))])
-            stage.low[0] = -1.8
-    decorate(stage, rng, (0, 0, 0), float(rng.uniform(0.6, 1.1)), int(rng.integers(6, 16)))
+            builder.add([box((-1.9, 1.5, 0), (0.1, 3.2, 6), builder.material(random_opaque(rng, (2, 1))))])
+            builder.low[0] = -1.8
+    decorate(builder, rng, (0, 0, 0), float(rng.uniform(0.6, 1.1)), int(rng.integers(6, 16)))
     for _ in range(int(rng.integers(0, 4))):
         size = float(rng.uniform(0.15, 0.6))
         x, z = rng.uniform(-0.7, 0.7, 2)
-        stage.add(glass_block(stage, rng, size), place((x, 0, z)), movable=True)
-        stage.points.append(np.array((x, size / 2, z)))
+        builder.add(glass_block(builder, rng, size), place((x, 0, z)), movable=True)
+        builder.points.append(np.array((x, size / 2, z)))
     light = rng.random()
     if light < 0.45:
         sun = sun_direction(rng) if rng.random() < 0.7 else None
-        stage.set_sky(sky(rng, float(rng.uniform(0.3, 1)), sun, float(np.exp(rng.uniform(-0.7, 1.8)))))
+        builder.set_sky(sky(rng, float(rng.uniform(0.3, 1)), sun, float(np.exp(rng.uniform(-0.7, 1.8)))))
     elif light < 0.6:
-        stage.set_sky(studio(rng, 0.5))
+        builder.set_sky(studio(rng, 0.5))
     if light > 0.45:
         lights = int(rng.integers(1, 5))
         for _ in range(lights):
             angle, away = rng.uniform(0, 2 * math.pi), rng.uniform(0.8, 2.0)
             origin = np.array((away * math.cos(angle), rng.uniform(0.8, 2.4), away * math.sin(angle)))
-            softbox(stage, rng, origin, rng.uniform(-0.4, 0.4, 3) * (1, 0, 1), float(rng.uniform(8, 40)) / lights)
-    return stage
+            softbox(builder, rng, origin, rng.uniform(-0.4, 0.4, 3) * (1, 0, 1), float(rng.uniform(8, 40)) / lights)
+    return builder
 
 
-def _colonnade(rng: Rng) -> Stage:
-    """A court under the sky with columns, and galleries around it that see little of the sky."""
+def _colonnade(rng: Rng) -> SceneBuilder:
+    """A courtyard under the sky with columns, surrounded by galleries that receive little light from the sky."""
     width, depth, height = rng.uniform(4, 9), rng.uniform(6, 14), rng.uniform(2.6, 4.2)
     aisle, floors = rng.uniform(1.5, 3), int(rng.integers(1, 3))
     outer = width / 2 + aisle
-    stage = Stage((-outer + 0.4, 0.3, -depth / 2), (outer - 0.4, height * floors, depth / 2))
-    stone = stage.material(_coat(rng, wall_color(rng)))
-    wall = stage.material(random_opaque(rng, (4, 2), textured=0.7))
-    shaft = stage.material(random_opaque(rng, (2, 3), textured=0.5))
-    floor = stage.material(random_opaque(rng, (float(round(width)), float(round(depth))), textured=0.8))
-    stage.add([box((0, -0.1, 0), (2 * outer + 2, 0.2, depth + 4), floor)])
+    builder = SceneBuilder((-outer + 0.4, 0.3, -depth / 2), (outer - 0.4, height * floors, depth / 2))
+    stone = builder.material(_coat(rng, wall_color(rng)))
+    wall = builder.material(random_opaque(rng, (4, 2), textured=0.7))
+    shaft = builder.material(random_opaque(rng, (2, 3), textured=0.5))
+    floor = builder.material(random_opaque(rng, (float(round(width)), float(round(depth))), textured=0.8))
+    builder.add([box((0, -0.1, 0), (2 * outer + 2, 0.2, depth + 4), floor)])
     columns = int(rng.integers(3, 8))
     radius, round_shafts = rng.uniform(0.12, 0.35), rng.random() < 0.7
     for side in (-1, 1):
-        stage.add([box((side * outer, floors * height / 2, 0), (0.3, floors * height, depth), wall)])
+        builder.add([box((side * outer, floors * height / 2, 0), (0.3, floors * height, depth), wall)])
         for level in range(floors):
             base, x = level * height, side * width / 2
             for z in np.linspace(-depth / 2 + 0.4, depth / 2 - 0.4, columns):
                 if round_shafts:
-                    stage.add([rod((x, base, z), (x, base + height - 0.3, z), radius, shaft)])
+                    builder.add([rod((x, base, z), (x, base + height - 0.3, z), radius, shaft)])
                 else:
-                    stage.add([box((x, base + height / 2, z), (2 * radius, height, 2 * radius), shaft)])
-                stage.add([box((x, base + height - 0.3, z), (2.8 * radius, 0.15, 2.8 * radius), stone)])
-                stage.add([box((x, base + 0.06, z), (2.8 * radius, 0.12, 2.8 * radius), stone)])
+                    builder.add([box((x, base + height / 2, z), (2 * radius, height, 2 * radius), shaft)])
+                builder.add([box((x, base + height - 0.3, z), (2.8 * radius, 0.15, 2.8 * radius), stone)])
+                builder.add([box((x, base + 0.06, z), (2.8 * radius, 0.12, 2.8 * radius), stone)])
             roof = (side * (width / 2 + aisle / 2), base + height - 0.1, 0)
-            stage.add([box(roof, (aisle + 2 * radius, 0.2, depth), stone)])
+            builder.add([box(roof, (aisle + 2 * radius, 0.2, depth), stone)])
     for end in (-1, 1):
         if rng.random() < 0.75:
-            stage.add(
+            builder.add(
                 [box((0, floors * height / 2, end * (depth / 2 + 0.15)), (2 * outer, floors * height, 0.3), wall)]
             )
     for z in np.linspace(-depth / 2, depth / 2, int(rng.integers(2, 6))):
         if rng.random() < 0.5:
             cloth = place((float(rng.choice([-1, 1])) * (width / 2 - radius), height - 0.2, z), 90)
-            stage.add(curtain(stage, rng, 1.0, rng.uniform(0.8, 1.8)), cloth)
+            builder.add(curtain(builder, rng, 1.0, rng.uniform(0.8, 1.8)), cloth)
     for _ in range(int(rng.integers(2, 7))):
-        _put_on_floor(stage, rng, [])
+        _put_on_floor(builder, rng, [])
     for _ in range(6):
-        stage.points.append(rng.uniform(stage.low * (1, 1, 0.9), stage.high * (1, 0.7, 0.9)))
+        builder.points.append(rng.uniform(builder.low * (1, 1, 0.9), builder.high * (1, 0.7, 0.9)))
     sun = sun_direction(rng) if rng.random() < 0.75 else None
-    stage.set_sky(sky(rng, float(rng.uniform(0.6, 1.8)), sun, float(np.exp(rng.uniform(-0.5, 1.8)))))
-    return stage
+    builder.set_sky(sky(rng, float(rng.uniform(0.6, 1.8)), sun, float(np.exp(rng.uniform(-0.5, 1.8)))))
+    return builder
 
 
-def _light_experiment(rng: Rng) -> Stage:
-    """Glossy plates that mirror balls of light of very different sizes."""
-    stage = Stage((-2.4, 0.3, -1.2), (2.4, 2.6, 4))
-    stage.add([box((0, -0.1, 1), (8, 0.2, 8), stage.material(random_opaque(rng, (3, 3))))])
-    stage.add([box((0, 2, -2.2), (8, 5, 0.2), stage.material(random_opaque(rng, (3, 2))))])
+def _light_experiment(rng: Rng) -> SceneBuilder:
+    """Glossy plates that reflect emitting balls of very different sizes."""
+    builder = SceneBuilder((-2.4, 0.3, -1.2), (2.4, 2.6, 4))
+    builder.add([box((0, -0.1, 1), (8, 0.2, 8), builder.material(random_opaque(rng, (3, 3))))])
+    builder.add([box((0, 2, -2.2), (8, 5, 0.2), builder.material(random_opaque(rng, (3, 2))))])
     metal = rng.random() < 0.6
     plates, lights = int(rng.integers(3, 6)), int(rng.integers(3, 6))
     for number in range(plates):
         alpha = float(np.exp(rng.uniform(math.log(0.02), math.log(0.4))))
         look = texture(rng) if rng.random() < 0.3 else wall_color(rng)
-        material = stage.material(rough_metal("Al", alpha) if metal else _coat(rng, look, alpha))
+        material = builder.material(rough_metal("Al", alpha) if metal else _coat(rng, look, alpha))
         angle = 12 + 50 * number / plates
         center = (0, 0.15 + 0.7 * (1 - math.cos(math.radians(angle))) * 1.6, 0.9 - 0.55 * number)
-        stage.add([box(center, (3.6, 0.03, 0.45), material, tilt=angle)])
-        stage.points.append(np.array(center))
-    black = stage.material(diffuse((0.02, 0.02, 0.02)))
+        builder.add([box(center, (3.6, 0.03, 0.45), material, tilt=angle)])
+        builder.points.append(np.array(center))
+    black = builder.material(diffuse((0.02, 0.02, 0.02)))
     for number, radius in enumerate(np.geomspace(0.02, 0.35, lights)):
         x = (number - (lights - 1) / 2) * 3.4 / lights
         power = 6 * float(np.exp(rng.uniform(-0.7, 0.7))) / lights
         radiance = np.array(wall_color(rng)) * power / (math.pi * radius**2)
         glow = (float(radiance[0]), float(radiance[1]), float(radiance[2]))
-        stage.add([ball((x, rng.uniform(1.6, 2.1), -1.2), float(radius), black, glow)], movable=True)
-    # Without it the far corners would be black.
-    stage.set_sky(studio(rng, float(rng.uniform(0.03, 0.2))))
+        builder.add([ball((x, rng.uniform(1.6, 2.1), -1.2), float(radius), black, glow)], movable=True)
+    # Without this light the far corners would be black.
+    builder.set_sky(studio(rng, float(rng.uniform(0.03, 0.2))))
     for _ in range(int(rng.integers(1, 5))):
         where = (rng.uniform(-1.8, 1.8), 0, rng.uniform(1.2, 2.2))
-        stage.add(ornament(stage, rng, rng.uniform(0.2, 0.5)), place(where, rng.uniform(0, 360)), movable=True)
-    return stage
+        builder.add(ornament(builder, rng, rng.uniform(0.2, 0.5)), place(where, rng.uniform(0, 360)), movable=True)
+    return builder
 
 
-def _empty_room(rng: Rng) -> tuple[Stage, Array]:
-    """Floor, ceiling, beams and pillars; the walls come later."""
+def _empty_room(rng: Rng) -> tuple[SceneBuilder, Array]:
+    """Floor, ceiling, beams and pillars; the walls are added later."""
     large = rng.random() < 0.25
     size = rng.uniform((2.4, 2.3, 3.0), (5.5, 3.2, 6.5)) * ((1.6, 1.4, 1.6) if large else (1, 1, 1))
     width, height, depth = size
-    stage = Stage((-width / 2, 0, -depth / 2), (width / 2, height, depth / 2))
+    builder = SceneBuilder((-width / 2, 0, -depth / 2), (width / 2, height, depth / 2))
     repeat = float(rng.integers(1, 6))
     ground = random_opaque(rng, (repeat, round(repeat * depth / width)), textured=0.85)
-    stage.add([box((0, -0.1, 0), (width + 2 * _WALL, 0.2, depth + 2 * _WALL), stage.material(ground))])
-    white = stage.material(diffuse(wall_color(rng)))
-    stage.add([box((0, height + 0.1, 0), (width + 2 * _WALL, 0.2, depth + 2 * _WALL), white)])
+    builder.add([box((0, -0.1, 0), (width + 2 * _WALL, 0.2, depth + 2 * _WALL), builder.material(ground))])
+    white = builder.material(diffuse(wall_color(rng)))
+    builder.add([box((0, height + 0.1, 0), (width + 2 * _WALL, 0.2, depth + 2 * _WALL), white)])
     if rng.random() < 0.35:
-        wood = stage.material(random_opaque(rng, (1, 4), textured=0.6))
+        wood = builder.material(random_opaque(rng, (1, 4), textured=0.6))
         for z in np.linspace(-depth / 2, depth / 2, int(rng.integers(3, 9)))[1:-1]:
-            stage.add([box((0, height - 0.09, z), (width, 0.18, 0.12), wood)])
+            builder.add([box((0, height - 0.09, z), (width, 0.18, 0.12), wood)])
     if rng.random() < 0.3:
-        pillar = stage.material(random_opaque(rng, (1, 3)))
+        pillar = builder.material(random_opaque(rng, (1, 3)))
         x, z = rng.uniform(-0.3, 0.3, 2) * (width, depth)
-        stage.add([rod((x, 0, z), (x, height, z), rng.uniform(0.06, 0.2), pillar)])
+        builder.add([rod((x, 0, z), (x, height, z), rng.uniform(0.06, 0.2), pillar)])
     if rng.random() < 0.5:
-        rug = stage.material(random_opaque(rng, textured=0.95))
+        rug = builder.material(random_opaque(rng, textured=0.95))
         where = (*(rng.uniform(-0.15, 0.15, 1) * width), 0.006, 0.0)
-        stage.add([box(where, (width * rng.uniform(0.3, 0.7), 0.012, depth * rng.uniform(0.3, 0.6)), rug)])
-    return stage, size
+        builder.add([box(where, (width * rng.uniform(0.3, 0.7), 0.012, depth * rng.uniform(0.3, 0.6)), rug)])
+    return builder, size
 
 
 def _wall_frame(size: Array, wall: int) -> tuple[Array, float]:
-    """Where a wall is (+z points into the room, y = 0 is the floor) and how long it is."""
+    """Placement of a wall (+z points into the room, y = 0 is the floor), and its length."""
     width, _, depth = size
     position = [(0, 0, -depth / 2), (-width / 2, 0, 0), (0, 0, depth / 2), (width / 2, 0, 0)][wall]
     return place(position, (0, 90, 180, -90)[wall]), float(width if wall % 2 == 0 else depth)
 
 
 def _outwards(wall: int) -> float:
-    """Azimuth of the direction out of a wall, degrees from +z towards +x."""
+    """Azimuth of a wall's outward direction, degrees from +z towards +x."""
     return (180.0, -90.0, 0.0, 90.0)[wall]
 
 
-def _closed_wall(stage: Stage, rng: Rng, size: Array, wall: int) -> None:
+def _closed_wall(builder: SceneBuilder, rng: Rng, size: Array, wall: int) -> None:
     frame, length = _wall_frame(size, wall)
     height = float(size[1])
     look = texture(rng) if rng.random() < 0.35 else wall_color(rng)
-    surface = stage.material(_coat(rng, look, repeat=(float(rng.integers(1, 5)), float(rng.integers(1, 4)))))
+    surface = builder.material(_coat(rng, look, repeat=(float(rng.integers(1, 5)), float(rng.integers(1, 4)))))
     parts = [box((0, height / 2, -_WALL / 2), (length + 2 * _WALL, height, _WALL), surface)]
     if rng.random() < 0.6:
-        trim = stage.material(diffuse(wall_color(rng)))
+        trim = builder.material(diffuse(wall_color(rng)))
         parts.append(box((0, 0.05, 0.01), (length, 0.1, 0.02), trim))
     if rng.random() < 0.3:
-        door = stage.material(random_opaque(rng, textured=0.5))
+        door = builder.material(random_opaque(rng, textured=0.5))
         x = rng.uniform(-0.3, 0.3) * length
         parts.append(box((x, 1.0, 0.015), (0.85, 2.0, 0.05), door))
-        parts.append(ball((x + 0.35, 1.0, 0.07), 0.03, stage.material(random_metal(rng))))
-    stage.add(parts, frame)
+        parts.append(ball((x + 0.35, 1.0, 0.07), 0.03, builder.material(random_metal(rng))))
+    builder.add(parts, frame)
     for _ in range(int(rng.integers(0, 4))):
         where = place((rng.uniform(-0.4, 0.4) * length, rng.uniform(0.45, 0.75) * height, 0.0))
-        stage.add(picture_frame(stage, rng), frame @ where)
-        stage.points.append((frame @ where)[:3, 3])
+        builder.add(picture_frame(builder, rng), frame @ where)
+        builder.points.append((frame @ where)[:3, 3])
 
 
-def _wall_with_windows(stage: Stage, rng: Rng, size: Array, wall: int) -> float:
-    """A wall with a row of windows, with bars, blinds or curtains; returns the area of the openings."""
+def _wall_with_windows(builder: SceneBuilder, rng: Rng, size: Array, wall: int) -> float:
+    """A wall with a row of windows, with bars, blinds or curtains; returns the area of the windows."""
     frame, length = _wall_frame(size, wall)
     height = float(size[1])
     count = int(rng.integers(1, 4)) if length > 3 else 1
@@ -246,8 +252,8 @@ def _wall_with_windows(stage: Stage, rng: Rng, size: Array, wall: int) -> float:
     top = float(rng.uniform(0.75, 0.95)) * height
     pitch = length / count
     wide = pitch * float(rng.uniform(0.25, 0.85))
-    surface = stage.material(_coat(rng, wall_color(rng)))
-    bar = stage.material(diffuse(wall_color(rng)))
+    surface = builder.material(_coat(rng, wall_color(rng)))
+    bar = builder.material(diffuse(wall_color(rng)))
     over = height - top
     parts = [box((0, height - over / 2, -_WALL / 2), (length + 2 * _WALL, over, _WALL), surface)]
     if sill > 0:
@@ -271,7 +277,7 @@ def _wall_with_windows(stage: Stage, rng: Rng, size: Array, wall: int) -> float:
         for n in range(rows):
             parts.append(box((x, sill + tall * (n + 1) / (rows + 1), -0.12), (wide, 0.04, 0.05), bar))
         if glazed:
-            parts.append(sheet((x, sill + tall / 2, -0.14), (wide / 2, tall / 2), stage.material(pane()), np.eye(4)))
+            parts.append(sheet((x, sill + tall / 2, -0.14), (wide / 2, tall / 2), builder.material(pane()), np.eye(4)))
         if dressing == "blinds":
             slats = int(np.clip(tall / 0.08, 6, 24))
             tilt = float(rng.uniform(-50, 50))
@@ -283,32 +289,32 @@ def _wall_with_windows(stage: Stage, rng: Rng, size: Array, wall: int) -> float:
             part = wide * float(rng.uniform(0.2, 0.45))
             for side in (-1, 1):
                 hook = place((x + side * (wide - part) / 2, top + 0.1, 0.12))
-                stage.add(curtain(stage, rng, part, top if rng.random() < 0.5 else tall + 0.2), frame @ hook)
-    stage.add(parts, frame)
-    stage.points.append((frame @ np.array((middles[0], (sill + top) / 2, 0.3, 1.0)))[:3])
+                builder.add(curtain(builder, rng, part, top if rng.random() < 0.5 else tall + 0.2), frame @ hook)
+    builder.add(parts, frame)
+    builder.points.append((frame @ np.array((middles[0], (sill + top) / 2, 0.3, 1.0)))[:3])
     return count * wide * (top - sill) * (0.5 if dressing != "none" else 1)
 
 
-def _furnish(stage: Stage, rng: Rng, size: Array) -> None:
-    """Fill the floor with furniture, the more the larger it is."""
+def _furnish(builder: SceneBuilder, rng: Rng, size: Array) -> None:
+    """Put furniture on the floor, in proportion to its area."""
     taken: list[tuple[float, float, float]] = []
     pieces = int(np.clip(size[0] * size[2] / rng.uniform(2.5, 6), 2, 9))
     for _ in range(pieces):
-        if len(stage.boxes()[0]) > _ENOUGH_SHAPES:
+        if len(builder.boxes()[0]) > _ENOUGH_SHAPES:
             break
-        _put_on_floor(stage, rng, taken)
+        _put_on_floor(builder, rng, taken)
 
 
-def _put_on_floor(stage: Stage, rng: Rng, taken: list[tuple[float, float, float]]) -> None:
-    """Find a free place for a piece of furniture, mostly along the walls, and put things on it.
+def _put_on_floor(builder: SceneBuilder, rng: Rng, taken: list[tuple[float, float, float]]) -> None:
+    """Find a free place for a piece of furniture, usually along the walls, and put objects on it.
 
     Args:
-        stage: where to put it.
+        builder: collects the objects.
         rng: the source of randomness.
-        taken: x, z and radius of the pieces that it must not stand in; it is added to them.
+        taken: x, z and radius of existing pieces; the new one is added.
     """
-    low, high = stage.low, stage.high
-    parts, radius, top = furniture(stage, rng, float(high[1]))
+    low, high = builder.low, builder.high
+    parts, radius, top = furniture(builder, rng, float(high[1]))
     for _ in range(12):
         x, z = (
             float(rng.uniform(low[axis] + radius, max(high[axis] - radius, low[axis] + radius + 0.01)))
@@ -326,19 +332,19 @@ def _put_on_floor(stage: Stage, rng: Rng, taken: list[tuple[float, float, float]
             )[wall]
         if all(math.hypot(x - a, z - b) > radius + c for a, b, c in taken):
             taken.append((x, z, radius))
-            names = stage.add(parts, place((x, 0, z), turn), movable=len(parts) < 12 and top == 0)
-            lows, highs = stage.boxes()
+            names = builder.add(parts, place((x, 0, z), turn), movable=len(parts) < 12 and top == 0)
+            lows, highs = builder.boxes()
             middle = (lows[-len(names) :].min(axis=0) + highs[-len(names) :].max(axis=0)) / 2
-            stage.points.append(middle)
+            builder.points.append(middle)
             if top > 0:
-                decorate(stage, rng, (x, top, z), 0.6 * radius, int(rng.integers(1, 5)))
+                decorate(builder, rng, (x, top, z), 0.6 * radius, int(rng.integers(1, 5)))
             return
 
 
 def _coat(
     rng: Rng, look: tuple[float, float, float] | Array, alpha: float = 0.0, repeat: tuple[float, float] = (1, 1)
 ) -> Bsdf:
-    """Paint for walls: matt, or glossy with the given roughness."""
+    """Paint for walls: diffuse, or glossy with the given roughness."""
     if alpha == 0 and rng.random() < 0.7:
         return diffuse(look, repeat)
     return rough_plastic(look, alpha or float(rng.uniform(0.1, 0.4)), repeat)

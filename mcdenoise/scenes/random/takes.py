@@ -1,6 +1,6 @@
-"""How a random scene is photographed: one clip or several stills, and by which sampling, filter, lens and samples.
+"""Takes of a random scene: one clip or several stills, with sampling, filter, lens and number of samples.
 
-Each is drawn from a stream of its own, so that a scene is the same whatever is asked of it here.
+Each of these is drawn from its own random stream, so that the scene does not depend on them.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from mcdenoise.scenes.render.film import Film
 Sampling: TypeAlias = Literal["centre", "filtered", "mixed"]
 
 _Value = TypeVar("_Value")
-# Samples of a reference for each one of the noisy color: hardly less noisy than that, it would teach nothing.
+# Minimum ratio of reference samples to noisy samples: a reference with nearly the same noise would teach nothing.
 CLEANER = 4
 _STREAM = 101
 _CENTRE_SHARE = 1 / 3
 _FILTERS = {"box": 0.5, "gaussian": 0.25, "tent": 0.1, "mitchell": 0.15}
 _SAMPLES = {1: 0.5, 2: 0.14, 4: 0.14, 8: 0.1, 16: 0.08, 32: 0.025, 64: 0.015}
 _LENS_SHARE = 0.2
-# Pixels across: what a point is blurred to at twice the distance that is sharp.
+# Blur in pixels of a point at twice the focus distance.
 _BLUR = (1.0, 8.0)
 
 
 @dataclass(frozen=True)
 class Take:
-    """A sequence to be rendered.
+    """A sequence to render.
 
     Args:
-        name: of its folder.
+        name: name of its folder.
         made: the scene with the cameras of this take.
         film: filter and lens, ``None`` for samples at the pixel centre.
-        spp: samples a pixel of the noisy color.
-        view: which of several takes of one scene.
+        spp: samples per pixel of the noisy color.
+        view: number of the take among those of the scene.
     """
 
     name: str
@@ -60,17 +60,17 @@ def random_takes(
     shiny: bool = False,
     width: int = 160,
 ) -> list[Take]:
-    """The takes of a seed: one clip of so many frames, or as many stills as half of that, each by its own film.
+    """The takes of a seed: one clip of ``frames`` frames, or half as many stills, each with its own film.
 
     Args:
-        seed: which of the scenes, 0 or more.
-        frames: of a clip.
+        seed: seed of the scene, 0 or more.
+        frames: number of frames of a clip.
         zoom: see :func:`mcdenoise.scenes.random.random_scene`.
-        sampling: at the pixel centre, through a filter, or for a third of the takes the one and for the rest the other.
-        spp: samples a pixel of the noisy color; ``None`` draws them, from 1 (half of the takes) to 64 (rarely).
-        stills: fraction of the seeds that give stills.
+        sampling: at the pixel centre, through a filter, or mixed: a third at the centre and the rest filtered.
+        spp: samples per pixel of the noisy color; ``None`` draws them, from 1 (half of the takes) to 64 (rarely).
+        stills: fraction of the seeds with stills.
         shiny: see :func:`mcdenoise.scenes.random.random_scene`.
-        width: of the image in pixels.
+        width: width of the image in pixels.
 
     Example:
         >>> [take.name for take in random_takes(3, 2)]
@@ -92,7 +92,7 @@ def random_takes(
 def _take(
     name: str, made: RandomScene, rng: np.random.Generator, sampling: Sampling, spp: int | None, width: int
 ) -> Take:
-    # All is drawn whether it is used or not: what one option leaves alone another one must not change.
+    # Draw all values, used or not, so that one option does not change what another option draws.
     centre, drawn = rng.random() < _CENTRE_SHARE, _draw(rng, _SAMPLES)
     film = _film(rng, made.cameras[0], made.focus, width)
     filtered = sampling == "filtered" or (sampling == "mixed" and not centre)
@@ -104,7 +104,7 @@ def _film(rng: np.random.Generator, camera: Camera, focus: float, width: int) ->
     if not lens:
         return Film(name)
     pixel = 2 * focus * math.tan(math.radians(camera.fov_x) / 2) / width
-    # A point at distance z is blurred to 2 aperture |z - focus| / z on the plane that is sharp.
+    # The plane of focus shows a point at distance z with a blur of 2 aperture |z - focus| / z.
     return Film(name, aperture=blur * pixel, focus=focus)
 
 

@@ -1,4 +1,4 @@
-"""Procedural textures: reflectances in [0.02, 0.9] as ``(H, W, 3)`` arrays that repeat without a seam where easy."""
+"""Procedural textures: reflectances in [0.02, 0.9] as ``(H, W, 3)`` arrays, most of which tile seamlessly."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def random_color(rng: np.random.Generator) -> Color:
 
 
 def wall_color(rng: np.random.Generator) -> Color:
-    """Mostly bright paint, so that light gets around; now and then anything."""
+    """A bright paint in most cases, for indirect light; sometimes any color."""
     if rng.random() < 0.25:
         return random_color(rng)
     red, green, blue = colorsys.hsv_to_rgb(float(rng.random()), float(rng.uniform(0, 0.25)), rng.uniform(0.5, 0.88))
@@ -42,7 +42,7 @@ def wall_color(rng: np.random.Generator) -> Color:
 
 
 def texture(rng: np.random.Generator) -> Array:
-    """One of all patterns, in random colours and at a random fineness."""
+    """A random pattern in random colours and at a random scale."""
     patterns: list[Callable[[np.random.Generator], Array]] = [
         checker,
         tiles,
@@ -83,7 +83,7 @@ def tiles(rng: np.random.Generator) -> Array:
 
 
 def planks(rng: np.random.Generator) -> Array:
-    """Boards with grain and gaps."""
+    """Boards with wood grain and gaps."""
     y, x = _grid(_side(rng))
     boards, pieces = int(rng.integers(3, 14)), int(rng.integers(1, 4))
     board = np.floor(x * boards).astype(int)
@@ -114,7 +114,7 @@ def dots(rng: np.random.Generator) -> Array:
 
 
 def marble(rng: np.random.Generator) -> Array:
-    """Smooth noise of several octaves, as it is or folded into veins."""
+    """Smooth noise of several octaves, unchanged or folded into veins."""
     side = _side(rng)
     first, gain = int(2 ** rng.integers(1, 6)), rng.uniform(0.35, 0.8)
     value = np.zeros((side, side))
@@ -140,7 +140,7 @@ def wallpaper(rng: np.random.Generator) -> Array:
 
 
 def glyphs(rng: np.random.Generator) -> Array:
-    """Lines of small random signs, like print."""
+    """Lines of small random signs that resemble print."""
     side, cell = 256, int(rng.choice([8, 12, 16]))
     page = np.zeros((side, side))
     for top in range(cell, side - cell, cell + cell // 2):
@@ -152,7 +152,7 @@ def glyphs(rng: np.random.Generator) -> Array:
 
 
 def picture(rng: np.random.Generator) -> Array:
-    """Coloured noise with the spectrum of photographs, and a few flat shapes on it."""
+    """Coloured noise with the spectrum of photographs, overlaid with a few flat shapes."""
     side = _side(rng)
     frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
     frequency[0, 0] = 1

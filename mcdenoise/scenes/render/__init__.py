@@ -1,4 +1,4 @@
-"""Mitsuba 3: a scene and a camera path in, a noisy sequence with features and references out, in the BMFR layout."""
+"""Rendering with Mitsuba 3: from a scene and a camera path to a noisy sequence with features and references."""
 
 from mcdenoise.data.camera_path import Camera, Shot, load_shot, view_projection
 from mcdenoise.scenes.render.film import FILTERS, Film

@@ -1,7 +1,7 @@
-"""Sampling as Mitsuba's own renderer does it: jittered samples through a pixel filter and a lens, features with them.
+"""Rendering as Mitsuba's own renderer does: jittered samples through a pixel filter and a lens, with features.
 
-What a user of Mitsuba gets of `aov` around `path` on an `hdrfilm`: the features of a pixel are means over its samples,
-anti-aliased and, behind a lens or at edges, as noisy as the color.
+This gives the result of Mitsuba's `aov` around `path` on an `hdrfilm`: the features of a pixel are means over its
+samples, anti-aliased and, behind a lens or at edges, as noisy as the color.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from mcdenoise.errors import InputError
 from mcdenoise.scenes.render.tracer import STRATIFIED_PATHS, Tracer
 
 FILTERS = ("box", "gaussian", "tent", "mitchell")
-# Samples of one pass over the image: what a laptop's memory holds.
+# Number of samples in one pass over the image, limited by a laptop's memory.
 _SAMPLES = 2**23
-# Of `aov`, around an integrator whose color comes first and once more with alpha.
+# Integrator `aov` around an integrator that returns the color twice, the second time with alpha.
 _AOVS = "albedo:albedo,normal:sh_normal,position:position,distance:depth"
 _ALBEDO, _NORMAL, _POSITION, _DISTANCE = slice(4, 7), slice(7, 10), slice(10, 13), 13
 _WIDTHS = {"albedo": 3, "normal": 3, "position": 3, "previous_position": 3}
@@ -29,7 +29,7 @@ _WIDTHS = {"albedo": 3, "normal": 3, "position": 3, "previous_position": 3}
 
 @dataclass(frozen=True)
 class Film:
-    """How the samples of a pixel are spread.
+    """Distribution of the samples of a pixel.
 
     Args:
         filter: one of ``FILTERS``, with Mitsuba's widths: a box of one pixel, a Gaussian of deviation 0.5, a tent of
@@ -38,7 +38,7 @@ class Film:
         focus: distance along the viewing axis at which a lens is sharp, scene units.
 
     Raises:
-        InputError: there is no such filter, or a number is not usable.
+        InputError: the filter is unknown, or a number is invalid.
     """
 
     filter: str = "box"
@@ -58,10 +58,10 @@ class FilmRenderer:
     """Renders images of a scene on a film.
 
     Args:
-        tracer: of the scene.
+        tracer: tracer of the scene.
         film: filter and lens.
         size: width and height in pixels.
-        reach: at which distance the background is put, scene units.
+        reach: distance of the background in scene units.
     """
 
     def __init__(self, tracer: Tracer, film: Film, size: tuple[int, int], reach: float) -> None:
@@ -72,31 +72,32 @@ class FilmRenderer:
         self._color = _integrator(tracer, None, reach)
 
     def paths_per_pass(self) -> int:
-        """How many samples a pixel are best taken by one call."""
+        """The best number of samples per pixel for one call."""
         return max(1, _SAMPLES // (self._size[0] * self._size[1]))
 
     def radiance(self, camera: Camera, paths: int, seed: Sequence[int]) -> Array:
-        """Mean radiance ``(H*W, 3)`` of ``STRATIFIED_PATHS`` samples a pixel, spread evenly; negative by some filters.
+        """Mean radiance ``(H*W, 3)`` of stratified samples; some filters give negative values.
 
         Args:
-            camera: where it is seen from.
-            paths: samples a pixel. Where they are not ``STRATIFIED_PATHS``, each is drawn for itself.
-            seed: of the noise.
+            camera: the camera.
+            paths: samples per pixel. Other numbers than ``STRATIFIED_PATHS`` are sampled independently.
+            seed: noise seed.
         """
         sampler = "multijitter" if paths == STRATIFIED_PATHS else "independent"
         return self._render(self._color, camera, sampler, paths, seed)
 
     def frame(self, camera: Camera, before: dict[str, Array], paths: int, seed: Sequence[int]) -> dict[str, Array]:
-        """Color and features of the same samples, each drawn for itself, by the names of buffers, ``(H*W, C)``.
+        """Color and features of the same independent samples, by buffer names, ``(H*W, C)``.
 
-        Normals are turned to the viewer sample by sample and as long as their mean is; albedo is clamped to [0, 1]
-        (Mitsuba's of rough metals has no bound); the background lies at the distance ``reach``, with neither.
+        Normals are flipped towards the viewer for each sample, and their mean is not normalised; albedo is clamped to
+        [0, 1] (Mitsuba's for rough metals is unbounded); the background has the distance ``reach``, and neither normal
+        nor albedo.
 
         Args:
-            camera: where it is seen from.
-            before: for each mover of the tracer ``(4, 4)``, where a point of it was in the frame before.
-            paths: samples a pixel.
-            seed: of the noise.
+            camera: the camera.
+            before: for each moving object of the tracer, the ``(4, 4)`` transform of its points to the previous frame.
+            paths: samples per pixel.
+            seed: noise seed.
         """
         self._features.set_moves(before)
         table = self._render(self._features, camera, "independent", paths, seed)
@@ -107,7 +108,7 @@ class FilmRenderer:
                 found[name] = table[:, start : start + width]
             start += width
         found["albedo"] = np.clip(found["albedo"], 0, 1)
-        # A filter with negative lobes may leave the range of what it averages.
+        # A filter with negative lobes may exceed the range of its input.
         length = np.linalg.norm(found["normal"], axis=1, keepdims=True)
         found["normal"] = found["normal"] / np.maximum(length, 1)
         forward = camera.to_world[:3, 2]
@@ -138,19 +139,19 @@ class FilmRenderer:
         state = int(np.random.SeedSequence(seed).generate_state(1)[0])
         image = mi.render(self._tracer.scene, sensor=mi.load_dict(sensor), integrator=integrator, spp=paths, seed=state)
         table = np.array(image, dtype=np.float64).reshape(width * height, -1)
-        # A pixel whose weights cancel has no mean.
+        # A pixel whose filter weights cancel has no mean.
         return np.where(np.isfinite(table), table, 0)
 
 
 def _integrator(tracer: Tracer, with_features: Any, reach: float) -> Any:
-    """The path integrator, whose 0/0 counts as black, with features or without: one of Mitsuba, written in Python.
+    """The path integrator in Python, with 0/0 treated as black, and optionally with features.
 
-    The class is made here because Mitsuba has another base class in every variant.
+    The class is defined in a function because each variant of Mitsuba has its own base class.
     """
     mi, dr = tracer.mitsuba, importlib.import_module("drjit")
 
     class Integrator(mi.SamplingIntegrator):  # type: ignore[misc, name-defined]
-        """Color and, from the samples of `aov`, albedo, normal, position and where the point was before."""
+        """Color and, from the samples of `aov`, albedo, normal, position and previous position."""
 
         def __init__(self) -> None:
             super().__init__(mi.Properties())
@@ -176,7 +177,7 @@ def _integrator(tracer: Tracer, with_features: Any, reach: float) -> Any:
                 return radiance, valid, []
             albedo, normal = mi.Color3f(*found[_ALBEDO]), mi.Normal3f(*found[_NORMAL])
             position, distance = mi.Point3f(*found[_POSITION]), mi.Float(found[_DISTANCE])
-            # What a lamp shows of its surface, and an albedo at a grazing angle, may be 0/0.
+            # The albedo of a lamp's surface, or at a grazing angle, may be 0/0.
             albedo = dr.select(dr.all(dr.isfinite(albedo)), dr.maximum(albedo, 0), mi.Color3f(0))
             normal = dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
             hit = distance > 0

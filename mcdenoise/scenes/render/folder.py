@@ -1,4 +1,4 @@
-"""The folder of a rendered sequence: its cameras, what it was rendered with, and which of its files are there."""
+"""The folder of a rendered sequence: cameras, settings, and the state of its files."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _CONVENTIONS: dict[str, Any] = {
         "transform that the scene gives it",
     },
 }
-# What differs on a film; see :mod:`mcdenoise.scenes.render.film`.
+# Differences on a film; see :mod:`mcdenoise.scenes.render.film`.
 _ON_A_FILM: dict[str, Any] = {
     "pixel_sampling": "jittered samples through the pixel filter and the lens of 'film'; features are means over the "
     "samples of their color, and each folder realisation{1,2,...} has its own",
@@ -56,7 +56,7 @@ _ON_A_FILM: dict[str, Any] = {
     "alpha_masks": "features are of the first surface, be it see-through",
     "shading_normal": "world space, turned to the side the camera sees, averaged and not normalised",
 }
-# Frames rendered with different values of these do not belong into one folder.
+# Frames rendered with different values of these settings must not be in one folder.
 _IDENTITY = (
     "scene",
     "scene_sha256",
@@ -72,19 +72,19 @@ _IDENTITY = (
     "rr_depth",
     "seed",
 )
-# One entry per frame, by which the cameras of two runs are compared, and which the longer run contributes.
+# Entries with one value per frame: two runs are compared by the common frames, and the longer run adds the others.
 _POSES = ("camera_to_world", "camera_matrices")
 _PER_FRAME = ("frames", *_POSES, "world_to_clip", "pixel_offsets", "moves")
 
 
 @dataclass(frozen=True)
 class ReferenceState:
-    """How far a reference that is on disk has come.
+    """Progress of a reference on disk.
 
     Args:
         spp: paths per pixel.
-        passes: how many passes they took, which is the number of the next one's seed.
-        noise: its estimated SMAPE against the truth; ``None`` where unknown.
+        passes: number of passes so far, which is also the seed number of the next pass.
+        noise: its estimated SMAPE against the truth; ``None`` if unknown.
     """
 
     spp: int
@@ -93,15 +93,15 @@ class ReferenceState:
 
 
 class SequenceFolder:
-    """``out/inputs`` with its camera files.
+    """The folder ``out/inputs`` with its camera files.
 
     Args:
-        out: the folder of the sequence; it is made if it does not exist.
-        settings: what goes into ``camera.json`` beside the conventions. ``reference_spp`` and ``reference_noise`` are
-            added here: they tell of the references that are on disk.
+        out: folder of the sequence; created if it does not exist.
+        settings: contents of ``camera.json`` besides the conventions. ``reference_spp`` and ``reference_noise`` are
+            added here, for the references on disk.
 
     Raises:
-        InputError: the folder cannot be made, or what is there was rendered with other settings.
+        InputError: the folder cannot be created, or was rendered with other settings.
     """
 
     def __init__(self, out: Path, settings: dict[str, Any]) -> None:
@@ -126,7 +126,7 @@ class SequenceFolder:
         write_camera_matrices(self.path / "camera_matrices.h", matrices, _CONVENTIONS["conventions"]["camera_matrices"])
 
     def note_reference(self, number: int, state: ReferenceState) -> None:
-        """Say in ``camera.json`` how far a reference has come.
+        """Record the progress of a reference in ``camera.json``.
 
         Raises:
             InputError: the file cannot be written.
@@ -163,17 +163,17 @@ class SequenceFolder:
         return before
 
     def _find_references(self, known_spp: dict[int, int]) -> dict[int, ReferenceState]:
-        """From the headers, which are written together with the pixels."""
+        """Read the states of references from their headers, which are written together with the pixels."""
         found: dict[int, ReferenceState] = {}
         for number in range(self._settings["frames"]):
             path = self.path / f"reference{number}.exr"
-            # One that is damaged is rendered again, as any other file of a frame.
+            # A damaged reference is rendered again, like any other damaged file.
             if not has_buffer(self.path, number, "reference", (self._settings["width"], self._settings["height"])):
                 continue
             header = read_exr_header(path).metadata
             spp, passes, noise = (header.get(f"reference_{name}") for name in ("spp", "passes", "noise"))
             if spp is None and number in known_spp:
-                # Of an older version, without a header of its own: there were no more passes than paths.
+                # Older versions wrote no number of passes: there cannot be more passes than paths.
                 spp = passes = known_spp[number]
             if not isinstance(spp, int) or not isinstance(passes, int):
                 raise InputError(f"{path}: expected a header that says how many paths it has, found none; remove it")
@@ -189,13 +189,13 @@ class SequenceFolder:
 
 
 def write_reference(folder: Path, number: int, image: Tensor, state: ReferenceState) -> None:
-    """Write ``referenceN.exr``; how far it has come stands in its header, so that the two always belong together.
+    """Write ``referenceN.exr`` with its progress in the header, so that both always match.
 
     Args:
         folder: ``inputs`` of a sequence.
         number: frame number.
         image: ``(1, 3, H, W)``.
-        state: how far it has come.
+        state: progress of the reference.
 
     Raises:
         InputError: the file cannot be written.
@@ -206,7 +206,7 @@ def write_reference(folder: Path, number: int, image: Tensor, state: ReferenceSt
 
 
 def read_reference(folder: Path, number: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """``(H*W, 3)`` pixels of ``referenceN.exr``.
+    """Read the ``(H*W, 3)`` pixels of ``referenceN.exr``.
 
     Raises:
         InputError: the file is damaged.
@@ -215,12 +215,12 @@ def read_reference(folder: Path, number: int) -> np.ndarray[Any, np.dtype[np.flo
 
 
 def write_realisation(folder: Path, number: int, realisation: int, buffers: Mapping[str, Tensor]) -> None:
-    """Write what one realisation of the noise has of its own: its noisy color, and perhaps features.
+    """Write the buffers of one noise seed: its noisy color, and possibly features.
 
     Args:
         folder: ``inputs`` of a sequence.
         number: frame number.
-        realisation: of the noise.
+        realisation: index of the noise seed.
         buffers: ``(1, C, H, W)`` by name, in the order of writing.
 
     Raises:
@@ -236,7 +236,7 @@ def write_realisation(folder: Path, number: int, realisation: int, buffers: Mapp
 
 
 def _merged(before: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
-    """Rendering fewer frames or realisations than before must not make the folder forget the others."""
+    """Merge descriptions, so that rendering fewer frames or noise seeds than before keeps the others."""
     longer = {key: before[key] for key in _PER_FRAME if key in before} if before else {}
     kept = longer if before and before["frames"] > settings["frames"] else {}
     return {**settings, **kept, "realisations": max(settings["realisations"], before.get("realisations", 1))}

@@ -1,4 +1,4 @@
-"""One frame of a rendered sequence: which of its files are missing, and the rendering of those."""
+"""Rendering the missing files of one frame of a sequence."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write
 from mcdenoise.scenes.render.halves import ReferenceHalves
 from mcdenoise.scenes.render.tracer import STRATIFIED_PATHS, Tracer
 
-# Too few paths have not met the rare bright ones yet, and seem to have less noise than they do.
+# With fewer paths, rare bright ones have not been hit yet, and the noise is underestimated.
 _FEWEST_PATHS_IN_A_HALF = 16
 _SMALLEST_HALF = 1 / 8
 _SECONDS_BETWEEN_SAVES = 60.0
@@ -30,23 +30,23 @@ Seed: TypeAlias = tuple[int, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class FrameJob:
-    """What all frames have in common, and what was there before; see :func:`mcdenoise.scenes.render.render_sequence`.
+    """Settings common to all frames, and the state on disk; see :func:`mcdenoise.scenes.render.render_sequence`.
 
     Args:
         folder: ``inputs`` of the sequence.
-        cameras: of each frame.
-        moves: of each object that moves.
+        cameras: camera of each frame.
+        moves: transforms of each moving object.
         size: width and height in pixels.
-        reach: at which distance the background is put, scene units.
+        reach: distance of the background in scene units.
         spp: paths per pixel of the noisy colours.
-        realisations: how many noisy colours.
+        realisations: number of noise seeds.
         reference_spp: paths per pixel of a finished reference.
         noise_level: or its estimated noise.
         references: frames that get a reference.
-        started: how far the references on disk have come.
-        seed: of the noise.
+        started: progress of the references on disk.
+        seed: noise seed.
         film: filter and lens of jittered samples; ``None`` for samples at the pixel centre.
-        keep_samples: whether the single samples of the noisy colours are written, too.
+        keep_samples: whether the single samples of the noisy colours are also written.
     """
 
     folder: Path
@@ -65,24 +65,24 @@ class FrameJob:
     keep_samples: bool = False
 
     def is_finished(self, number: int) -> bool:
-        """Whether a frame has everything."""
+        """Whether all files of a frame exist."""
         colors = all(self.has_color(number, realisation) for realisation in range(self.realisations))
         folders = {0, *(range(self.realisations) if self.film is not None else ())}
         features = all(self.has_features(number, realisation) for realisation in folders)
         return colors and features and (number not in self.references or self.has_reference(number))
 
     def has_color(self, number: int, realisation: int) -> bool:
-        """Whether a frame has one of its noisy colours, whole."""
+        """Whether a frame has a complete noisy colour of a noise seed."""
         return has_buffer(realisation_folder(self.folder, realisation), number, "color", self.size)
 
     def has_features(self, number: int, realisation: int = 0) -> bool:
-        """Whether a frame has everything but colours and reference, in the folder of a realisation."""
+        """Whether a frame has all features of a noise seed, that is, everything but colours and reference."""
         folder = realisation_folder(self.folder, realisation)
         names = ["albedo", "normal", "position", "depth", *(["previous_position"] if self.moves else [])]
         return all(has_buffer(folder, number, name, self.size) for name in names)
 
     def has_reference(self, number: int) -> bool:
-        """Whether a frame has a reference that is good enough."""
+        """Whether a frame has a finished reference."""
         state = self.started.get(number)
         if state is None:
             return False
@@ -90,12 +90,12 @@ class FrameJob:
         return self.is_good(state.spp, state.noise if reliable else None)
 
     def is_good(self, spp: int, noise: float | None) -> bool:
-        """Whether so many paths, or so little noise, are enough for a reference."""
+        """Whether this number of paths, or this noise, is sufficient for a reference."""
         quiet = self.noise_level is not None and noise is not None and noise <= self.noise_level
         return spp >= self.reference_spp or quiet
 
     def paths_there(self) -> int:
-        """Paths per pixel that need not be traced again, summed over all frames."""
+        """Number of paths per pixel that are already on disk, summed over all frames."""
         frames = range(len(self.cameras))
         colors = sum(self.has_color(number, k) for number in frames for k in range(self.realisations))
         states = [(number, self.started[number]) for number in self.references if number in self.started]
@@ -105,19 +105,19 @@ class FrameJob:
 
 
 def render_frame(job: FrameJob, tracer: Tracer, number: int, advance: Callable[[int], None]) -> ReferenceState | None:
-    """Write what a frame lacks, the first colour last: a frame that has it is complete.
+    """Write the missing files of a frame. The first colour is last: a frame that has it is complete.
 
     Args:
-        job: what all frames have in common.
-        tracer: of the scene.
-        number: which frame.
+        job: settings common to all frames.
+        tracer: tracer of the scene.
+        number: frame number.
         advance: called with the number of paths per pixel after each pass.
 
     Returns:
-        How far its reference has come; ``None`` if there was nothing to do for it.
+        Progress of its reference; ``None`` if nothing was done for it.
 
     Raises:
-        InputError: a file cannot be written, or what there is of a reference is damaged.
+        InputError: a file cannot be written, or the unfinished reference is damaged.
     """
     width, height = job.size
     tracer.place(number)
@@ -150,7 +150,7 @@ def _render_filtered(
     advance: Callable[[int], None],
     wanted: bool,
 ) -> ReferenceState | None:
-    """As :func:`render_frame`, on a film: every realisation of the noise has the features of its own samples."""
+    """Like :func:`render_frame`, but on a film: every noise seed has the features of its own samples."""
     camera = job.cameras[number]
     state = None
     if wanted:
@@ -180,7 +180,7 @@ def _render_filtered(
     return state
 
 
-# Samples of the features that belong to a reference, and where their noise differs from that of its passes.
+# Number of samples of a reference's features, and a seed number that its passes do not use.
 _CLEAN_PATHS, _CLEAN_STREAM = 16, 2**20
 
 
@@ -204,8 +204,8 @@ def _features(job: FrameJob, tracer: Tracer, number: int, rays: PixelRays) -> di
 
 
 def _moved_back(job: FrameJob, number: int) -> dict[str, Array]:
-    """For each object that moves ``(4, 4)``: from where a point of it is to where it was in the frame before."""
-    # The first frame has no frame before it; a look back at itself leaves everything where it is.
+    """For each moving object, the ``(4, 4)`` transform of its points to the previous frame."""
+    # The first frame has no previous one; the transform to itself is the identity.
     earlier = max(number - 1, 0)
     still = {name: np.array_equal(moved[earlier], moved[number]) for name, moved in job.moves.items()}
     return {
@@ -217,7 +217,7 @@ def _moved_back(job: FrameJob, number: int) -> dict[str, Array]:
 def _color(
     job: FrameJob, tracer: Tracer, rays: PixelRays, seed: tuple[int, int, int], advance: Callable[[int], None]
 ) -> tuple[Array, list[Array]]:
-    """The mean radiance of all paths and, where they are kept, that of each."""
+    """The mean radiance of all paths and, if they are kept, the radiance of each path."""
     per_pass = 1 if job.keep_samples else min(job.spp, tracer.paths_per_pass(rays))
     total, samples = np.zeros_like(rays.directions), []
     for number, start in enumerate(range(0, job.spp, per_pass)):
@@ -232,9 +232,9 @@ def _color(
 def _refine_reference(
     job: FrameJob, trace: Callable[[int, Seed, bool], Array], number: int, advance: Callable[[int], None]
 ) -> ReferenceState:
-    """Add passes to what there is of a reference until it is good, and write it.
+    """Add passes to a reference until it is finished, and write it.
 
-    ``trace`` gives the mean radiance of so many paths a pixel, with a seed, drawn evenly or each for itself.
+    ``trace`` returns the mean radiance of a number of paths per pixel for a seed, stratified or independent.
     """
     unfinished = job.folder / f"reference{number}.partial.npz"
     before = job.started.get(number, ReferenceState(0, 0, None))
@@ -248,7 +248,7 @@ def _refine_reference(
     while not job.is_good(halves.spp, _reliable_noise(halves)):
         missing = job.reference_spp - halves.spp
         stratified = missing >= (STRATIFIED_PATHS if halves.passes else 2 * STRATIFIED_PATHS)
-        # The noise can only be told from two passes.
+        # Estimating the noise requires two passes.
         rest = missing if halves.passes else (missing + 1) // 2
         paths = STRATIFIED_PATHS if stratified else rest
         seed = (job.seed, number, 1, halves.passes)

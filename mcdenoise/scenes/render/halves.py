@@ -1,4 +1,4 @@
-"""References in the making: refined pass by pass, with an estimate of the noise that is left."""
+"""Progressive references: refined pass by pass, with an estimate of the remaining noise."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class ReferenceHalves:
 
     .. math:: \mathrm{noise} = \mathrm{mean} \frac{\sqrt{n_A n_B}}{n_A + n_B} \frac{|A - B|}{2 R + 0.01}
 
-    It holds as far as the mean absolute error follows the variance: rare bright paths that the halves have not met yet
-    are not in it. In the demonstration's room it is 5 to 8 % too low from 128 paths on, and 15 % too low at 32.
+    The estimate misses rare bright paths that the halves have not hit yet. In the demonstration's room it is 5 to 8 %
+    too low from 128 paths on, and 15 % too low at 32.
 
     Args:
-        sums: ``(2, N, 3)`` radiance of all paths of each half.
-        paths: how many paths per pixel each half has.
-        passes: how many passes were made, which is the number of the next one's seed.
+        sums: ``(2, N, 3)`` summed radiance of each half.
+        paths: paths per pixel of each half.
+        passes: number of passes so far, which is also the seed number of the next pass.
     """
 
     def __init__(self, sums: Array, paths: tuple[int, int], passes: int) -> None:
@@ -44,12 +44,12 @@ class ReferenceHalves:
 
     @classmethod
     def start(cls, mean: Array, spp: int, passes: int) -> ReferenceHalves:
-        """From what there is: ``(N, 3)`` mean radiance of ``spp`` paths (possibly 0), which becomes the first half."""
+        """Start from an existing ``(N, 3)`` mean of ``spp`` paths (possibly 0), which becomes the first half."""
         return cls(np.stack([mean * spp, np.zeros_like(mean)]), (spp, 0), passes)
 
     @classmethod
     def load(cls, path: Path, size: tuple[int, int]) -> ReferenceHalves:
-        """Read what :meth:`save` wrote.
+        """Read a file written by :meth:`save`.
 
         Args:
             path: the file.
@@ -70,7 +70,7 @@ class ReferenceHalves:
         return cls(sums, (first, second), passes)
 
     def save(self, path: Path) -> None:
-        """Write everything, whole or not at all.
+        """Write the state atomically.
 
         Raises:
             InputError: the file cannot be written.
@@ -80,18 +80,18 @@ class ReferenceHalves:
 
     @property
     def spp(self) -> int:
-        """Paths per pixel of both halves."""
+        """Paths per pixel of both halves together."""
         return sum(self.paths)
 
     def add(self, mean: Array, paths: int) -> None:
-        """Add a pass, ``(N, 3)`` mean radiance of so many paths, to the half that has fewer of them."""
+        """Add a pass, ``(N, 3)`` mean radiance of ``paths`` paths, to the half with fewer paths."""
         half = 0 if self.paths[0] <= self.paths[1] else 1
         self._sums[half] += mean * paths
         self.paths = (self.paths[0] + paths, self.paths[1]) if half == 0 else (self.paths[0], self.paths[1] + paths)
         self.passes += 1
 
     def mean(self) -> Array:
-        """``(N, 3)`` the reference."""
+        """The reference, ``(N, 3)``."""
         return np.asarray(self._sums.sum(axis=0) / self.spp)
 
     def noise(self) -> float | None:
@@ -100,5 +100,5 @@ class ReferenceHalves:
             return None
         first, second = (total / paths for total, paths in zip(self._sums, self.paths, strict=True))
         scale = np.sqrt(self.paths[0] * self.paths[1]) / self.spp
-        # In single precision, as it comes back from the header of a file.
+        # In single precision, like the value read back from a file's header.
         return float(np.float32(np.mean(scale * np.abs(first - second) / (2 * self.mean() + NOISE_EPSILON))))

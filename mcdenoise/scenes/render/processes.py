@@ -1,4 +1,4 @@
-"""Frames rendered side by side by several processes, each with a scene of its own."""
+"""Rendering frames in several processes, each of which loads the scene itself."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from mcdenoise.scenes.render.frames import FrameJob, render_frame
 from mcdenoise.scenes.render.tracer import Scene, Tracer
 
 _SECONDS_BETWEEN_LOOKS = 0.2
-# Which an interrupted process has to end by itself, with what it is just writing.
+# Time in seconds for an interrupted process to finish writing and exit.
 _SECONDS_TO_END = 0.4
 
 
 @dataclass(frozen=True)
 class TracerSource:
-    """What a process needs to trace rays: the arguments of :class:`mcdenoise.scenes.render.tracer.Tracer`."""
+    """The arguments of :class:`mcdenoise.scenes.render.tracer.Tracer`, for another process."""
 
     scene: Scene
     variant: str
@@ -40,26 +40,26 @@ class TracerSource:
         return Tracer(self.scene, self.variant, self.max_depth, self.moves)
 
     def check_portable(self) -> None:
-        """Make sure that other processes can have it.
+        """Check that it can be sent to other processes.
 
         Raises:
-            InputError: a scene dictionary holds something that only this process knows.
+            InputError: a scene dictionary contains an object that cannot be sent.
         """
         try:
             ForkingPickler.dumps(self)
-        except Exception as error:  # whatever an object of somebody else's refuses with
+        except Exception as error:  # a third-party object may raise anything
             raise InputError(
                 f"scene dictionary: expected plain Python and numpy for more than one worker, found {error}"
             ) from error
 
 
 class _Stopped(Exception):
-    """Another frame failed or the run was interrupted: this one is given up."""
+    """Raised to stop a frame because another frame failed or the run was interrupted."""
 
 
 @dataclass
 class _Process:
-    """What a worker process keeps from frame to frame."""
+    """State of a worker process between frames."""
 
     source: TracerSource
     job: FrameJob
@@ -73,14 +73,14 @@ _process: _Process | None = None
 
 def _start_process(source: TracerSource, job: FrameJob, paths: Synchronized[int], stop: Event) -> None:
     global _process
-    # Where it could not be made deaf from its first moment on.
+    # Ignore Ctrl+C, in case the process was not started ignoring it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _process = _Process(source, job, paths, stop)
 
 
 def _end_with_parent() -> None:
-    # A pool whose owner was killed would wait for its next frame for ever, with all the memory it has.
+    # A worker whose parent was killed would wait forever for its next frame and keep its memory.
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -111,20 +111,20 @@ def render_in_processes(
     advance: Callable[[int], None],
     on_reference: Callable[[int, ReferenceState], None],
 ) -> None:
-    """Render frames as :func:`mcdenoise.scenes.render.frames.render_frame` does, several at a time.
+    """Render several frames at a time with :func:`mcdenoise.scenes.render.frames.render_frame`.
 
     Args:
         source: the scene.
-        job: what all frames have in common.
-        numbers: which frames.
-        workers: how many processes.
-        advance: called with the number of paths per pixel that were traced since the last call.
-        on_reference: called with the number of each finished frame that has got or refined a reference.
+        job: settings common to all frames.
+        numbers: frame numbers.
+        workers: number of processes.
+        advance: called with the number of paths per pixel traced since the last call.
+        on_reference: called with the number of each finished frame whose reference was created or refined.
 
     Raises:
-        InputError: as ``render_frame``, or a process died.
+        InputError: see ``render_frame``; or a process died.
     """
-    # A fresh interpreter each: Mitsuba's threads and what it holds on a GPU do not survive a fork.
+    # Spawn new interpreters, because Mitsuba's threads and GPU state do not survive a fork.
     context = multiprocessing.get_context("spawn")
     paths, stop = context.Value("q", 0), context.Event()
     seen = 0
@@ -156,7 +156,7 @@ def render_in_processes(
         except KeyboardInterrupt:
             stop.set()
             pool.shutdown(wait=False, cancel_futures=True)
-            # One that loads a scene, or traces many paths at once, would be waited for.
+            # Do not wait for a process that is loading a scene or tracing many paths.
             for child in set(multiprocessing.active_children()) - others:
                 child.join(_SECONDS_TO_END / workers)
                 child.kill()

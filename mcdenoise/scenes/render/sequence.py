@@ -1,7 +1,7 @@
-"""Render a sequence: what is asked for, what is there already, and who renders which frame.
+"""Rendering a sequence: checks settings, finds missing files, and distributes the frames.
 
-Everything is sampled at the pixel centre: features, noisy colour and reference, so that the expectation of the colour
-is the reference, and dividing by the albedo is consistent. Or everything is sampled as Mitsuba does it, see
+By default all samples are at the pixel centre: features, noisy colour and reference. The expectation of the colour is
+then the reference, and demodulation is consistent. Alternatively everything is sampled as Mitsuba does it, see
 :class:`mcdenoise.scenes.render.film.Film`.
 """
 
@@ -55,9 +55,9 @@ def render_sequence(
 ) -> Path:
     """Render a sequence in the BMFR layout.
 
-    What is already there is kept, so a stopped run can be resumed, and realisations, frames and better references can
-    be added later: a reference with fewer paths or more noise than asked for is refined by further passes with seeds
-    of their own. It continues from the half floats of its file, whose rounding (0.02 %) is far below its noise. An
+    Existing files are kept, so an interrupted run can be resumed, and noise seeds, frames and better references can be
+    added later: a reference with fewer paths or more noise than requested is refined by further passes with other
+    seeds, starting from the half floats of its file, whose rounding error (0.02 %) is far below its noise. An
     unfinished reference is saved once a minute, as ``referenceN.partial.npz``.
 
     Args:
@@ -66,38 +66,37 @@ def render_sequence(
         cameras: one camera per frame.
         out: the folder of the sequence; the files go to ``out/inputs``.
         size: width and height in pixels.
-        frames: render the first so many cameras; all by default.
+        frames: number of cameras to render, from the first; all by default.
         spp: paths per pixel of the noisy colour.
-        realisations: how many noisy colours each frame gets, with independent noise. Those after the first go to
-            ``out/inputs/realisation{1,2,...}``.
-        reference_spp: paths per pixel of the references; with ``noise_level`` the most.
+        realisations: number of noise seeds, that is, of independent noisy colours per frame. Those after the first are
+            written to ``out/inputs/realisation{1,2,...}``.
+        reference_spp: paths per pixel of the references; with ``noise_level`` the maximum.
         noise_level: a reference is finished early when its estimated SMAPE against the truth is this small; see
-            :class:`mcdenoise.scenes.render.halves.ReferenceHalves`. ``camera.json`` has what was reached, frame by
-            frame.
+            :class:`mcdenoise.scenes.render.halves.ReferenceHalves`. ``camera.json`` records the noise of each frame.
         reference_frames: numbers of the frames that get a reference; all by default.
-        moves: for each object of the scene that moves, by its id, ``(T, 4, 4)``: one world-space transform per camera,
-            applied to the object where the scene places it. Frames of a scene with moves have a ``previous_position``.
-        seed: every (seed, frame, realisation) has its own noise, and always the same.
-        max_depth: longest path, in segments.
-        workers: processes that render frames side by side, each with a scene of its own; the files do not depend on
-            it. It pays with ``scalar_rgb``; the other variants use all processors anyway. A script that asks for more
-            than one must protect its main part by ``if __name__ == "__main__":``.
+        moves: for each moving object of the scene, by id, ``(T, 4, 4)``: one world-space transform per camera, applied
+            after the scene has placed the object. Frames of a scene with moves have a ``previous_position``.
+        seed: every (seed, frame, noise seed) has its own, reproducible noise.
+        max_depth: maximum path length, in segments.
+        workers: number of processes that render frames in parallel, each with its own copy of the scene; the files do
+            not depend on it. It helps with ``scalar_rgb``; the other variants use all processors anyway. A script that
+            passes more than one must protect its main part by ``if __name__ == "__main__":``.
         variant: one of ``VARIANTS``; by default the one Mitsuba is already set to, else ``cuda_ad_rgb`` or
             ``llvm_ad_rgb`` where they work, else ``scalar_rgb``.
-        film: filter and lens of jittered samples, as Mitsuba's own renderer takes them: noisy colours then come with
-            noisy features of the same samples, those of realisation k in its folder, and so does the reference. With
-            several threads its sums differ by rounding from run to run. By default all samples are at the pixel centre.
+        film: filter and lens of jittered samples, as in Mitsuba's own renderer: noisy colours and references then have
+            noisy features of the same samples, for every noise seed its own. With several threads the sums differ by
+            rounding from run to run. By default all samples are at the pixel centre.
         keep_samples: also write the single paths of each noisy colour, as layers of ``samplesN.exr``; on a film with
-            the features of each.
+            the features of each path.
         progress: called with the finished and the total number of paths per pixel, summed over all frames. A reference
             that reaches the noise level early counts as complete.
 
     Returns:
-        The folder with the files, ``out/inputs``.
+        The folder of the files, ``out/inputs``.
 
     Raises:
-        InputError: Mitsuba is missing, the scene cannot be loaded, a setting is unusable, an object that is to move
-            is not there, a worker process died, or ``out`` cannot be written or holds a sequence with other settings.
+        InputError: Mitsuba is missing, the scene cannot be loaded, a setting is invalid, a moving object does not
+            exist, a worker process died, or ``out`` cannot be written or holds a sequence with other settings.
     """
     width, height = size
     cameras = list(cameras)
@@ -136,7 +135,7 @@ def render_sequence(
         "far": far,
         "noisy_spp": spp,
         "film": None if film is None else asdict(film),
-        # Nothing where they are not, as in folders of the time before they could be.
+        # Omitted if unused, as in folders of versions without this setting.
         "samples_kept": True if keep_samples else None,
         "realisations": realisations,
         "max_depth": max_depth,

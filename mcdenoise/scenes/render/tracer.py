@@ -1,7 +1,7 @@
-"""Mitsuba 3 behind a small interface: given rays in, what they hit and the light that comes back out.
+"""A small interface to Mitsuba 3: it traces given rays, and returns hits and radiance.
 
-Mitsuba's own renderer always jitters inside the pixel; therefore the rays are built here, and Mitsuba traces them; what
-its own renderer gives is :mod:`mcdenoise.scenes.render.film`. Mitsuba is optional and imported on first use.
+Mitsuba's own renderer always jitters samples inside the pixel. Therefore the rays are generated here and traced by
+Mitsuba; :mod:`mcdenoise.scenes.render.film` uses Mitsuba's own renderer. Mitsuba is optional and imported on first use.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ _MOST_NAMES = 20
 
 
 class Hits(NamedTuple):
-    """What N rays hit.
+    """The first hits of N rays.
 
     Args:
         distance: ``(N,)`` along the ray, ``inf`` without a hit.
-        normal: ``(N, 3)`` unit shading normal, turned to where the ray comes from; 0 without a hit.
+        normal: ``(N, 3)`` unit shading normal, flipped towards the ray's origin; 0 without a hit.
         albedo: ``(N, 3)`` in [0, 1].
-        mover: ``(N,)`` which of :attr:`Tracer.movers` was hit, -1 for what stands still.
+        mover: ``(N,)`` index of the hit object in :attr:`Tracer.movers`, -1 for static objects.
     """
 
     distance: Array
@@ -57,12 +57,12 @@ class Tracer:
         max_depth: longest path, in segments.
         moves: see :class:`mcdenoise.data.camera_path.Shot`.
 
-    ``mitsuba`` is its module, ``scene`` and ``path`` are its scene and integrator, ``moving`` the shapes that move by
-    their ids, which ``movers`` lists.
+    ``mitsuba`` is its module, ``scene`` and ``path`` are its scene and integrator, ``moving`` the moving shapes by id,
+    and ``movers`` the list of these ids.
 
     Raises:
-        InputError: Mitsuba is missing, the variant does not run here, the scene cannot be loaded, or an object that
-            is to move is not there.
+        InputError: Mitsuba is missing, the variant does not work here, the scene cannot be loaded, or a moving object
+            does not exist.
     """
 
     def __init__(self, scene: Scene, variant: str, max_depth: int, moves: Mapping[str, Array] | None = None) -> None:
@@ -72,11 +72,11 @@ class Tracer:
         except ImportError as error:
             raise InputError(f"Mitsuba variant '{variant}' does not run here: {_first_line(error)}") from error
         self._dr = importlib.import_module("drjit")
-        # On a single core, loading a scene whose parts refer to each other waits for a second thread forever.
+        # On a single core, parallel loading of a scene whose parts refer to each other deadlocks.
         self._dr.set_thread_count(max(2, self._dr.thread_count()))
         self._scalar = variant.startswith("scalar")
         self.name = f"mitsuba {mi.__version__} ({variant}, drjit {self._dr.__version__}), path integrator"
-        # Merged meshes could no longer move each for itself.
+        # Merged meshes could not move separately.
         self.scene = _load_scene(mi, scene, merge=not moves)
         self.path = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": RR_DEPTH})
         self._independent = mi.load_dict({"type": "independent"})
@@ -92,10 +92,10 @@ class Tracer:
         self._boxes = {identity: _box(shape) for identity, shape in self.moving.items()}
 
     def place(self, frame: int) -> None:
-        """Put every object that moves where it is in a frame.
+        """Put every moving object to its place in a frame.
 
         Raises:
-            InputError: Mitsuba cannot transform an object like this.
+            InputError: Mitsuba cannot apply the transform to an object.
         """
         for identity, placement in self._at_rest.items():
             matrix = self._moves[identity][frame]
@@ -108,7 +108,7 @@ class Tracer:
                 raise InputError(f"frame {frame}: Mitsuba cannot move the objects: {_first_line(error)}") from error
 
     def reach(self, cameras: Sequence[Camera]) -> float:
-        """A distance that lies behind everything in the scene, from each camera: where the background is put."""
+        """A distance from each camera that is behind everything in the scene: the distance of the background."""
         box = self.scene.bbox()
         if not box.valid():
             return 1.0
@@ -119,46 +119,46 @@ class Tracer:
         low, high = np.min(corners, axis=0), np.max(corners, axis=0)
         diagonal = float(np.linalg.norm(high - low))
         away = [float(np.linalg.norm((low + high) / 2 - camera.to_world[:3, 3])) for camera in cameras]
-        # Generous, and the same for any number of frames unless the camera travels far.
+        # Rounded up, so that it does not depend on the number of frames unless the camera travels far.
         return max(diagonal + away[0], diagonal / 2 + max(away))
 
     def features(self, rays: PixelRays) -> Hits:
-        """What the rays hit first, looking through what is see-through."""
+        """The first hits of the rays, ignoring transparent surfaces."""
         if self._scalar:
             found = [self._hit(ray) for ray in self._scalar_rays(rays)]
             table = np.array([(d, *normal, *albedo, mover) for d, normal, albedo, mover in found], dtype=np.float64)
         else:
             distance, normal, albedo, mover = self._hit(self._wavefront(rays, 1))
             columns = (distance, *normal, *albedo, mover)
-            self._dr.eval(*columns)  # all at once: each by itself would trace the rays again
+            self._dr.eval(*columns)  # evaluate all together, because each evaluation traces the rays
             count = len(rays.directions)  # a constant column has one entry
             table = np.stack([np.broadcast_to(np.array(c, dtype=np.float64), count) for c in columns], axis=1)
-        # A few BSDFs only approximate their albedo, by a value that can exceed 1.
+        # A few BSDFs return an approximate albedo that can exceed 1.
         clean = np.clip(np.nan_to_num(table[:, 4:7]), 0, 1)
         return Hits(table[:, 0], table[:, 1:4], clean, table[:, 7].astype(np.int64))
 
     def paths_per_pass(self, rays: PixelRays) -> int:
-        """How many independent paths per ray are best traced by one call of :meth:`radiance`."""
+        """The best number of independent paths per ray for one call of :meth:`radiance`."""
         return _SCALAR_PASS if self._scalar else max(1, _WAVEFRONT // len(rays.directions))
 
     def radiance(self, rays: PixelRays, paths: int, seed: Sequence[int], *, stratified: bool = False) -> Array:
-        """Mean radiance ``(N, 3)`` of so many paths per ray; another seed gives independent noise.
+        """Mean radiance ``(N, 3)`` of independent paths; another seed gives independent noise.
 
         Args:
             rays: N rays.
-            paths: how many per ray; with ``stratified`` it is ``STRATIFIED_PATHS``.
-            seed: of the noise.
-            stratified: spread the paths of each ray evenly over what they choose from (correlated multi-jittered
-                sampling), instead of drawing each for itself. The expectation is the same, the error mostly smaller.
+            paths: paths per ray; with ``stratified`` it must be ``STRATIFIED_PATHS``.
+            seed: noise seed.
+            stratified: stratify the paths of each ray (correlated multi-jittered sampling) instead of sampling
+                independently. The expectation is the same, and the error usually smaller.
         """
         count = len(rays.directions)
-        # Hashed: with sums of seed, frame and pass, two frames could share their noise.
+        # Hash the seed: with a sum of seed, frame and pass, two frames could have the same noise.
         state = int(np.random.SeedSequence(seed).generate_state(1)[0])
         sampler = self._stratified if stratified else self._independent
         if self._scalar:
             return self._scalar_radiance(self._scalar_rays(rays), paths, sampler, state, stratified)
         copies = max(n for n in range(1, paths + 1) if paths % n == 0 and (n == 1 or n * count <= _WAVEFRONT))
-        # A stratified sampler wants the copies of a ray one after the other.
+        # A stratified sampler requires the copies of a ray to be adjacent.
         wavefront = self._wavefront(rays, copies, interleaved=not stratified)
         if stratified:
             sampler.set_samples_per_wavefront(copies)
@@ -166,8 +166,8 @@ class Tracer:
         total = np.zeros((count, 3))
         for _ in range(paths // copies):
             radiance = self.path.sample(self.scene, sampler, wavefront)[0]
-            # All channels at once: each by itself would trace the paths again. With them where the sampler has come to:
-            # the next pass would otherwise trace these paths again to find out.
+            # Evaluate all channels together, because each evaluation traces the paths; and the sampler's state with
+            # them, because evaluating it in the next pass would trace these paths again.
             sampler.schedule_state()
             self._dr.eval(radiance)
             samples = _finite(np.stack([np.array(channel) for channel in radiance], axis=1))
@@ -177,7 +177,7 @@ class Tracer:
         return total / paths
 
     def _placement(self, identity: str, shapes: Mapping[str, Any]) -> dict[str, tuple[Any, Array]]:
-        """What has to change when an object moves: for each of its parameters its type and its value at rest."""
+        """The parameters to change when an object moves, with their types and initial values."""
         emitters = {emitter.id() for emitter in self.scene.emitters()}
         present = [
             key for key in ("to_world", "vertex_positions", "position") if f"{identity}.{key}" in self._parameters
@@ -206,7 +206,7 @@ class Tracer:
         return placement
 
     def _scalar_rays(self, rays: PixelRays) -> list[Any]:
-        # Kept for the next pass: they cost as much as tracing them once.
+        # Cached for the next pass, because creating them takes as long as tracing them once.
         if self._last_rays is None or self._last_rays[0] is not rays:
             self._last_rays = (rays, self._make_scalar_rays(rays))
         return self._last_rays[1]
@@ -241,12 +241,12 @@ class Tracer:
         directions = rays.directions.astype(np.float32)
         columns = (np.tile(directions, (copies, 1)) if interleaved else np.repeat(directions, copies, axis=0)).T
         direction = mi.Vector3f(*(mi.Float(_aligned(column)) for column in columns))
-        # Numbers known to the compiler would become part of the kernel: seconds of compilation for each frame.
+        # Opaque to the compiler: constants would become part of the kernel, which is compiled for seconds per frame.
         origin = mi.Point3f(*(self._dr.opaque(mi.Float, value) for value in rays.origin.tolist()))
         return mi.RayDifferential3f(mi.Ray3f(origin, direction))
 
     def _hit(self, ray: Any) -> tuple[Any, Any, Any, Any]:
-        """Distance, normal, albedo and mover of the first surface that is not see-through, the same in all variants."""
+        """Distance, normal, albedo and moving object of the first opaque surface, the same in all variants."""
         mi, dr = self.mitsuba, self._dr
         hit = self.scene.ray_intersect(ray)
         for _ in range(_SEE_THROUGH_LAYERS):
@@ -260,13 +260,13 @@ class Tracer:
             hit = dr.select(through, behind, hit)
         valid = hit.is_valid()
         black = mi.Color3f(0)
-        if not dr.any(valid):  # a scalar ray that hit nothing has no BSDF to ask
+        if not dr.any(valid):  # a scalar ray without a hit has no BSDF
             return dr.select(valid, mi.Float(0), mi.Float(dr.inf)), black, black, mi.Float(-1)
         normal = hit.sh_frame.n
         normal = dr.select(valid, dr.select(dr.dot(normal, ray.d) > 0, -normal, normal), mi.Normal3f(0))
         bsdf = hit.bsdf(ray)
         diffuse = valid & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
-        # select instead of ~diffuse, which is no boolean for a Python bool.
+        # Use select instead of ~diffuse, which is not a logical negation for a Python bool.
         glossy = valid & dr.select(diffuse, False, mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyReflection))
         albedo = dr.select(diffuse, bsdf.eval_diffuse_reflectance(hit, diffuse), black)
         if dr.any(glossy):
@@ -278,15 +278,15 @@ class Tracer:
         return dr.select(valid, dr.dot(hit.p - ray.o, ray.d), dr.inf), normal, albedo, mover
 
     def _directional_albedo(self, bsdf: Any, hit: Any, active: Any) -> Any:
-        """What a rough metal reflects of a white world towards the viewer: a fixed 4x4 grid of samples, so no noise."""
+        """Directional albedo of a rough metal towards the viewer, by a fixed 4x4 grid of samples, so without noise."""
         mi, dr = self.mitsuba, self._dr
-        # Known from here on: each of the samples would otherwise trace the rays again.
+        # Evaluate the inputs first; otherwise each sample would trace the rays again.
         dr.eval(hit, active)
         total = mi.Color3f(0)
         grid = [(i + 0.5) / 4 for i in range(4)]
         for x in grid:
             for y in grid:
-                # Evaluated one by one, from numbers unknown to the compiler: one small kernel, used 16 times.
+                # Evaluate one sample at a time with opaque inputs: one small kernel, used 16 times.
                 point = mi.Point2f(dr.opaque(mi.Float, x), dr.opaque(mi.Float, y))
                 total += bsdf.sample(self._context, hit, 0.5, point, active)[1]
                 dr.eval(total)
@@ -294,10 +294,10 @@ class Tracer:
 
 
 def choose_variant(variant: str | None) -> str:
-    """The variant to use: the given one, else the one Mitsuba is set to, else the fastest that works here.
+    """Choose the variant: the given one, the one that Mitsuba is set to, or the fastest that works here.
 
     Raises:
-        InputError: Mitsuba is missing, or there is no such variant.
+        InputError: Mitsuba is missing, or the variant is unknown.
     """
     if variant is None:
         current = _import_mitsuba().variant()
@@ -311,7 +311,7 @@ def choose_variant(variant: str | None) -> str:
 def first_working(variants: tuple[str, ...]) -> str | None:
     """The first of these variants that can render here; ``None`` if none can.
 
-    An LLVM that is too old for the processor aborts the process, so a child tries them.
+    The variants are tried in a child process, because an LLVM that is too old for the processor aborts the process.
     """
     trial = f"""
 import mitsuba as mi
@@ -328,13 +328,13 @@ for variant in {variants!r}:
         child = subprocess.run([sys.executable, "-c", trial], capture_output=True, text=True, timeout=120, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    # With other words around it, such as the warnings of a driver.
+    # The output may also contain other text, such as warnings of a driver.
     found = [variant for variant in variants if f"works: {variant}" in child.stdout]
     return found[0] if found else None
 
 
 def scene_name(scene: Scene) -> str:
-    """What to call a scene: the folder of a ``scene.xml``, the name of any other file."""
+    """Name of a scene: the folder of a ``scene.xml``, the name of any other file."""
     if isinstance(scene, Mapping):
         return "in memory"
     path = Path(scene).resolve()
@@ -342,7 +342,7 @@ def scene_name(scene: Scene) -> str:
 
 
 def scene_digest(scene: Scene) -> str:
-    """Tells one description of a scene from another; of the files that an XML names, only the names count."""
+    """Checksum of a scene's description; of the files that an XML refers to, only the names are included."""
     digest = hashlib.sha256()
 
     def feed(value: Any) -> None:
@@ -357,7 +357,7 @@ def scene_digest(scene: Scene) -> str:
             for item in value:
                 feed(item)
         elif isinstance(value, np.generic):
-            # How numpy writes its own numbers is a setting of the process, which colour-science changes.
+            # numpy's formatting of its scalars is a global setting, which colour-science changes.
             feed(value.item())
         else:
             digest.update(f"{value!r};".encode())
@@ -406,7 +406,7 @@ def _to_mitsuba(mi: Any, value: Any) -> Any:
 
 
 def _aligned(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A copy at a multiple of 64 bytes: drjit makes the alignment of memory it borrows a part of the kernel."""
+    """A copy at an address divisible by 64: drjit compiles the alignment of borrowed memory into the kernel."""
     room = np.empty(values.nbytes + 64, np.uint8)
     start = -room.ctypes.data % 64
     copy = room[start : start + values.nbytes].view(np.float32)
@@ -415,19 +415,19 @@ def _aligned(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _finite(samples: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A path that ran into 0/0 counts as black: one of them would spoil a whole reference pixel."""
+    """Replace NaN samples (0/0) by black, because a single one would spoil a whole reference pixel."""
     return np.where(np.isfinite(samples).all(axis=-1, keepdims=True), samples, np.float32(0))
 
 
 def _box(shape: Any) -> Array:
-    """``(8, 3)`` corners of what bounds a shape."""
+    """Corners ``(8, 3)`` of a shape's bounding box."""
     box = shape.bbox()
     ends = np.array([box.min, box.max], dtype=np.float64)
     return np.array([[ends[x, 0], ends[y, 1], ends[z, 2]] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
 def _transformed(key: str, value: Array, matrix: Array) -> tuple[Any, ...]:
-    """Arguments for the type of a parameter: its value at rest with a transform applied."""
+    """Constructor arguments of a parameter: its initial value with a transform applied."""
     linear, offset = matrix[:3, :3], matrix[:3, 3]
     if key == "to_world":
         return (matrix @ value,)

@@ -1,4 +1,4 @@
-"""The stage: where the parts of a random scene are put together, and what is known about free space in it."""
+"""Assembly of a random scene from parts, with bounding boxes for finding free space."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from mcdenoise.scenes.random.textures import Color
 
 Vector: TypeAlias = Sequence[float] | Array
 
-# Lights that never shine fill every scene up to this number, because it is part of a vectorised renderer's program.
+# Every scene is filled up to this number with lights that do not emit, since it is part of a vectorised renderer's
+# program.
 _LIGHTS = 16
-# low and high corner of each shape in its own space
+# Lower and upper corner of each shape in its own space.
 _BOUNDS = {
     "cube": ((-1, -1, -1), (1, 1, 1)),
     "sphere": ((-1, -1, -1), (1, 1, 1)),
@@ -29,13 +30,13 @@ _BOUNDS = {
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A shape with its material, in the space of the group it belongs to.
+    """A shape with its material, in the coordinates of its group.
 
     Args:
         kind: a shape plugin of Mitsuba.
-        to_group: ``(4, 4)`` from the shape's own space.
-        material: what :meth:`Stage.material` returned.
-        radiance: what it emits, if it is a light.
+        to_group: ``(4, 4)`` transform from the shape's own space.
+        material: result of :meth:`SceneBuilder.material`.
+        radiance: emitted radiance, if it is a light.
     """
 
     kind: str
@@ -44,11 +45,11 @@ class Part:
     radiance: Color | None = None
 
 
-class Stage:
+class SceneBuilder:
     """Collects materials, shapes and lights as a Mitsuba dictionary.
 
-    ``low`` and ``high`` bound where people and cameras may be. ``points`` are worth looking at. ``groups`` are objects
-    that could move, with the ids of their shapes. ``lamps`` are the ids of the shapes that shine.
+    ``low`` and ``high`` are the bounds for people and cameras. ``points`` are points of interest for cameras.
+    ``groups`` are movable objects, with the ids of their shapes. ``lamps`` are the ids of the emitting shapes.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
@@ -63,13 +64,13 @@ class Stage:
         self._bounds: list[tuple[Array, Array]] = []
 
     def material(self, bsdf: Bsdf) -> dict[str, str]:
-        """Register a material that many shapes can share."""
+        """Register a material, which several shapes can use."""
         name = f"material_{len(self._materials)}"
         self._materials[name] = bsdf
         return {"type": "ref", "id": name}
 
     def areas(self) -> dict[str, float]:
-        """For each material the largest side of a box around a shape that has it, square metres."""
+        """For each material, the largest face area of the bounding box of a shape with it, square metres."""
         areas: dict[str, float] = {}
         for shape, (low, high) in zip(self._objects.values(), self._bounds, strict=True):
             name, size = shape["bsdf"]["id"], np.sort(high - low)
@@ -77,11 +78,11 @@ class Stage:
         return areas
 
     def change_materials(self, change: Callable[[str, Bsdf], Bsdf]) -> None:
-        """Give every material another look: called with its id and its description."""
+        """Replace every material by the result of ``change`` for its id and description."""
         self._materials = {name: change(name, bsdf) for name, bsdf in self._materials.items()}
 
     def add(self, parts: Iterable[Part], to_world: Array | None = None, movable: bool = False) -> list[str]:
-        """Put a group of parts into the world; returns the ids of its shapes."""
+        """Add a group of parts to the scene; returns the ids of its shapes."""
         names = []
         for part in parts:
             matrix = part.to_group if to_world is None else to_world @ part.to_group
@@ -98,19 +99,19 @@ class Stage:
         return names
 
     def add_light(self, light: dict[str, Any]) -> None:
-        """Add a light without a surface: a point or a spot."""
+        """Add a light without a surface: a point or spot light."""
         self._lights[f"light_{len(self._lights)}"] = {**light, "sampling_weight": 1.0}
 
     def set_sky(self, image: Array) -> None:
-        """Light from everywhere around, as a lat-long image whose top row is the zenith."""
+        """Set the environment light, a lat-long image whose top row is the zenith."""
         self._sky = {"type": "envmap", "bitmap": image, "sampling_weight": 1.0}
 
     def placed(self, name: str) -> Array:
-        """Where a shape is: its own space to world."""
+        """Transform of a shape from its own space to world space."""
         return np.asarray(self._objects[name]["to_world"])
 
     def boxes(self) -> tuple[Array, Array]:
-        """Low and high corners ``(N, 3)`` of the boxes around all shapes, in the order they were added."""
+        """Lower and upper corners ``(N, 3)`` of the bounding boxes of all shapes, in order of insertion."""
         lows, highs = ([box[end] for box in self._bounds] for end in (0, 1))
         return np.array(lows).reshape(-1, 3), np.array(highs).reshape(-1, 3)
 
@@ -119,7 +120,7 @@ class Stage:
         return {"type": "scene", **self._materials, **self._objects, **self._lights, **self._rest()}
 
     def _rest(self) -> dict[str, Any]:
-        """Tiny shapes below the floor of every kind, and lights that do not shine, so that all scenes are alike."""
+        """Tiny hidden shapes of every type and lights that do not emit, so that all scenes use the same plugins."""
         rest: dict[str, Any] = {}
         below = float(self.boxes()[0][:, 1].min()) - 0.01
         x, z = (self.low[[0, 2]] + self.high[[0, 2]]) / 2
@@ -150,12 +151,12 @@ class Stage:
 
 
 def rgb(color: Color) -> dict[str, Any]:
-    """A colour as Mitsuba wants it."""
+    """A colour as a Mitsuba dictionary."""
     return {"type": "rgb", "value": [float(channel) for channel in color]}
 
 
 def bounds(kind: str, matrix: Array) -> tuple[Array, Array]:
-    """Low and high corner of a placed shape's axis-aligned box."""
+    """Lower and upper corner of a transformed shape's axis-aligned bounding box."""
     ends = np.array(_BOUNDS[kind], dtype=np.float64)
     corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     world = corners @ matrix[:3, :3].T + matrix[:3, 3]
@@ -163,7 +164,7 @@ def bounds(kind: str, matrix: Array) -> tuple[Array, Array]:
 
 
 def place(position: Vector, turn: float = 0, scale: Vector = (1, 1, 1), rotation: Array | None = None) -> Array:
-    """A transform: scale, rotate, turn around the vertical by degrees, move."""
+    """A transform: scale, rotate, rotate about the vertical axis by ``turn`` degrees, translate."""
     matrix = rotate("y", turn)
     if rotation is not None:
         matrix = matrix @ rotation
@@ -183,7 +184,7 @@ def rotate(axis: str, degrees: float) -> Array:
 
 
 def box(center: Vector, size: Vector, material: dict[str, str], turn: float = 0, tilt: float = 0) -> Part:
-    """A box of full ``size``, tilted around x, then turned around y, degrees."""
+    """A box of full ``size``, tilted about x, then rotated about y, in degrees."""
     half = [0.5 * length for length in size]
     return Part("cube", place(center, turn, half, rotate("x", tilt)), material)
 
@@ -194,7 +195,7 @@ def ball(center: Vector, radius: float, material: dict[str, str], radiance: Colo
 
 
 def rod(start: Vector, end: Vector, radius: float, material: dict[str, str]) -> Part:
-    """An open tube from one point to another."""
+    """An open tube between two points."""
     axis = np.subtract(end, start, dtype=np.float64)
     length = float(np.linalg.norm(axis))
     axis /= length
@@ -207,13 +208,13 @@ def rod(start: Vector, end: Vector, radius: float, material: dict[str, str]) -> 
 
 
 def drum(foot: Vector, height: float, radius: float, material: dict[str, str]) -> list[Part]:
-    """An upright cylinder that is closed at both ends."""
+    """An upright cylinder with caps."""
     top = (foot[0], foot[1] + height, foot[2])
     return [rod(foot, top, radius, material), plate(top, radius, material), plate(foot, radius, material, up=False)]
 
 
 def plate(center: Vector, radius: float, material: dict[str, str], up: bool = True) -> Part:
-    """A level disc."""
+    """A horizontal disc."""
     return Part("disk", place(center, 0, (radius, radius, 1), rotate("x", -90 if up else 90)), material)
 
 
@@ -224,5 +225,5 @@ def sheet(
     rotation: Array,
     radiance: Color | None = None,
 ) -> Part:
-    """A rectangle that faces +z before it is rotated."""
+    """A rectangle that faces +z before the rotation."""
     return Part("rectangle", place(center, 0, (*half, 1), rotation), material, radiance)
