@@ -806,7 +806,7 @@ def test_a_json_in_the_place_of_an_input_is_refused(
     with pytest.raises(SystemExit) as stop:
         main(["inspect", str(small_sequence), "--json", str(path)])
     assert stop.value.code == 2
-    assert "which is read" in capsys.readouterr().err
+    assert "which is an input" in capsys.readouterr().err
     assert path.read_bytes() == before
 
 
