@@ -590,7 +590,7 @@ def test_evaluate_what_cannot_be_compared(
     (colors / "frame.0001.exr").unlink()
     assert "found none of frame 1" in refused(*evaluate)
     (colors / "other.exr").touch()
-    assert "one number that tells the frame" in refused(*evaluate)
+    assert "differ in one number, that of the frame" in refused(*evaluate)
     for path in (small_sequence / "inputs").glob("reference*.exr"):
         path.unlink()
     assert "expected references" in refused(*evaluate)
@@ -806,7 +806,7 @@ def test_a_json_in_the_place_of_an_input_is_refused(
     with pytest.raises(SystemExit) as stop:
         main(["inspect", str(small_sequence), "--json", str(path)])
     assert stop.value.code == 2
-    assert "which is read" in capsys.readouterr().err
+    assert "which is an input" in capsys.readouterr().err
     assert path.read_bytes() == before
 
 

@@ -1,4 +1,4 @@
-"""Results of many methods, settings and scenes in short: means, the best settings, and who is ahead."""
+"""Summaries of results over methods, settings and scenes: means, best settings, and comparisons of two models."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class Score:
     """Mean errors of one method on one scene.
 
     Args:
-        scene: its name.
-        method: what made the images: a method's name, with ``", STAGE"`` for an image on the way to its result.
+        scene: name of the scene.
+        method: name of the method, with ``", STAGE"`` for an intermediate image.
         frames: number of frames with a reference.
-        values: mean by metric, see :data:`mcdenoise.evaluate.METRICS`. What could not be computed is not in it.
-        family: the model, where the results have it with several settings.
-        settings: of the model.
-        chosen: of the best of several settings, which one it is, by metric.
+        values: mean by metric, see :data:`mcdenoise.evaluate.METRICS`, without the metrics that cannot be computed.
+        family: the model, if the results have it with several settings; otherwise empty.
+        settings: settings of the model.
+        chosen: for the best of several settings, the method with the best value, by metric.
     """
 
     scene: str
@@ -36,9 +36,9 @@ class Score:
 
 
 def scores_of(results: Results) -> list[Score]:
-    """Every method and setting on every scene, scene by scene; images on the way go before their result.
+    """Scores of every method and setting, scene by scene; intermediate images precede their result.
 
-    A method that is missing, or failed on a scene, has no score there.
+    A method has no score for a scene on which it failed, and none at all if it is missing.
     """
     counts = Counter(method.model for method in results.methods if method.settings)
     scores = []
@@ -56,10 +56,10 @@ def scores_of(results: Results) -> list[Score]:
 
 
 def mean_over_scenes(scores: Iterable[Score]) -> list[Score]:
-    """Every scene counts the same, however many frames it has.
+    """Mean over the scenes, in which every scene has the same weight, however many frames it has.
 
     Returns:
-        One score for each method, under the name ``mean of N``; a metric that one of its scenes lacks is skipped.
+        One score for each method, for the scene ``mean of N``; metrics that a scene lacks are skipped.
     """
     by_method: dict[str, list[Score]] = {}
     for score in scores:
@@ -74,16 +74,17 @@ def mean_over_scenes(scores: Iterable[Score]) -> list[Score]:
 
 
 def folded(scores: Iterable[Score], by: Collection[str] = ()) -> list[Score]:
-    """Fold the settings of every model to a row for each value of some of them, and one, ``MODEL, best of N settings``.
+    """Combine the settings of each model into one row per value of the settings ``by``, and one over all settings.
 
-    In such a row every metric is that of the setting which is best in it, by the reference: it flatters.
+    The last row is named ``MODEL, best of N settings``. Each of its metrics is that of the setting with the best value,
+    chosen by means of the reference, so the row flatters the model.
 
     Args:
         scores: of :func:`scores_of`.
-        by: settings whose values have rows of their own, such as ``("quality", "source")``.
+        by: settings whose values get rows of their own, such as ``("quality", "source")``.
 
     Returns:
-        Scores of each scene in their order, with ``chosen`` in the rows that stand for several settings.
+        Scores of each scene in order, with ``chosen`` in rows that combine several settings.
     """
     rows = []
     for _, scene in groupby(scores, lambda score: score.scene):
@@ -116,15 +117,15 @@ def _best(settings: list[Score], method: str) -> Score:
 
 
 def summary(scores: Iterable[Score], by: Collection[str] = ()) -> list[Score]:
-    """The mean over the scenes, with each model of several settings twice: in one for all scenes, and the best of each.
+    """Mean over the scenes, with each model's best setting for all scenes, and with its best setting for each scene.
 
     Args:
         scores: of :func:`scores_of`, for several scenes.
         by: see :func:`folded`.
 
     Returns:
-        As :func:`folded` of :func:`mean_over_scenes`, where ``best of N settings`` is the best one for all scenes;
-        after it, ``MODEL, best of each scene``: the mean of the scenes' best, each with a setting of its own.
+        As :func:`folded` of :func:`mean_over_scenes`, where ``best of N settings`` is one setting for all scenes. The
+        row ``MODEL, best of each scene`` follows it: the mean of the best values of each scene.
     """
     scores = list(scores)
     of_each = {row.family: row for row in _best_of_each_scene(scores)}
@@ -146,17 +147,17 @@ def _best_of_each_scene(scores: Iterable[Score]) -> list[Score]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A method against a model of several settings, in one metric.
+    """Comparison of a method with a model that has several settings, in one metric.
 
     Args:
         metric: name in :data:`METRICS`.
-        method: whose image it is.
-        family: the model of several settings.
-        value: mean over the scenes of the method.
-        single: mean over the scenes of that setting of the other which has the best mean.
-        setting: its name.
-        best: mean over the scenes of the other's best setting for each scene.
-        scenes: for each scene the method's value, and that of the other's best setting for it.
+        method: name of the method.
+        family: the model that has several settings.
+        value: the method's mean over the scenes.
+        single: the model's mean over the scenes with its best single setting.
+        setting: name of that setting.
+        best: the model's mean over the scenes with its best setting for each scene.
+        scenes: for each scene, the method's value and the value of the model's best setting for it.
     """
 
     metric: str
@@ -170,17 +171,17 @@ class Verdict:
 
     @property
     def ahead(self) -> bool:
-        """Whether the method is better than the other's best single setting."""
+        """Whether the method is better than the model's best single setting."""
         return METRICS[self.metric].better(self.value, self.single)
 
     @property
     def won(self) -> list[str]:
-        """Scenes in which the method is better than the other's best setting for that scene."""
+        """Scenes on which the method is better than the model's best setting for that scene."""
         better = METRICS[self.metric].better
         return [scene for scene, (value, other) in self.scenes.items() if better(value, other)]
 
     def __str__(self) -> str:
-        """The verdict in one line; errors are compared by their ratio, similarities by their difference."""
+        """The verdict in one line; errors are compared by ratio, similarities by difference."""
         line = (
             f"{self.metric}: {self.method} {self.value:.4g}; {self.family}'s best single setting {self.single:.4g} "
             f"({self.setting}): {self._against(self.single)}; its best setting of each scene {self.best:.4g}: "
@@ -196,21 +197,21 @@ class Verdict:
 
 
 def verdicts(scores: Iterable[Score], method: str, family: str = "oidn") -> list[Verdict]:
-    """Compare a method with a model of several settings, metric by metric.
+    """Compare a method with a model that has several settings, metric by metric.
 
     Args:
         scores: of :func:`scores_of`.
-        method: a method's name.
-        family: a model's name.
+        method: name of the method.
+        family: name of the model.
 
     Raises:
-        ValueError: the scores have no such method or model.
+        ValueError: the scores do not contain the method or the model.
     """
     scores = list(scores)
     ours = {score.scene: score for score in scores if score.method == method}
     theirs = [score for score in scores if score.family == family]
     if not ours or not theirs:
-        raise ValueError(f"scores: expected those of '{method}' and of '{family}', found one of them missing")
+        raise ValueError(f"scores: expected scores of '{method}' and of '{family}', found only one of them")
     (mean,) = mean_over_scenes(ours.values())
     single = _best(mean_over_scenes(theirs), family)
     (best,) = _best_of_each_scene(theirs)

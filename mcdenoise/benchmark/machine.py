@@ -1,4 +1,4 @@
-"""What it is measured on: the machine, its threads, its clock, its memory."""
+"""The machine that a benchmark runs on: its description, device, threads, free memory and background load."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from mcdenoise.interruption import deaf_children
 from mcdenoise.results import Machine
 
 _PACKAGES = ("torch", "kornia", "numpy", "openimageio", "pyoidn", "flip-evaluator")
-# Keeps a core busy.
+# Python program that keeps a core busy.
 _SPIN = "while True: sum(range(100_000))"
-# Runs a command again and again, until it fails or the process that asked for it is gone, however that ended.
+# Python program that repeats a command until it fails or the parent process has ended, for whatever reason.
 _REPEAT = """
 import os, signal, subprocess, sys, time
 command = None
@@ -41,19 +41,19 @@ _CGROUP = Path("/sys/fs/cgroup")
 
 
 def check_device(device: str) -> None:
-    """See that torch can use a device.
+    """Check that torch can use a device.
 
     Raises:
-        InputError: it cannot.
+        InputError: the device is unknown, or torch cannot use it.
     """
     if device not in ("cpu", "cuda"):
         raise InputError(f"--device: expected cpu or cuda, found '{device}'")
     if device == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device: expected a GPU that torch can use, found none; take cpu")
+        raise InputError("--device: expected a GPU that torch can use, found none; use cpu")
 
 
 def fix_threads(threads: int) -> None:
-    """Let torch, and the reading and writing of EXRs, use so many threads."""
+    """Set the number of threads of torch, and of reading and writing EXRs."""
     torch.set_num_threads(threads)
     oiio.attribute("threads", threads)
     oiio.attribute("exr_threads", threads)
@@ -61,18 +61,18 @@ def fix_threads(threads: int) -> None:
 
 @contextmanager
 def busy_machine(cores: int, command: str = "") -> Iterator[None]:
-    """Run other processes meanwhile: some that each keep a core busy, and a command, which begins again when it ends.
+    """Run other processes inside this block: some that each keep a core busy, and a command that is repeated.
 
     Args:
-        cores: processes that never wait.
-        command: as a shell splits it; its output is dropped. Empty for none.
+        cores: number of processes that compute without waiting.
+        command: a command line, split as by a shell; its output is discarded. Empty for none.
 
     Raises:
         InputError: the command does not exist, or ended with a status other than 0.
     """
     arguments = shlex.split(command)
     if arguments and shutil.which(arguments[0]) is None:
-        raise InputError(f"--beside: expected a command, found '{arguments[0]}', which is no program; give its path")
+        raise InputError(f"--beside: expected a command, found '{arguments[0]}', which is not a program; give its path")
     commands = [[sys.executable, "-I", "-S", "-c", _SPIN]] * cores + ([arguments] if arguments else [])
     started: list[subprocess.Popen[bytes]] = []
     try:
@@ -91,7 +91,7 @@ def busy_machine(cores: int, command: str = "") -> Iterator[None]:
         for process in started:
             if process.poll() is not None:
                 raise InputError(
-                    f"--beside: expected a command that goes on or ends with status 0, found status "
+                    f"--beside: expected a command that keeps running or ends with status 0, found status "
                     f"{process.returncode}; run it by itself to see why"
                 )
     finally:
@@ -102,7 +102,7 @@ def busy_machine(cores: int, command: str = "") -> Iterator[None]:
 
 
 def describe_machine(device: str) -> Machine:
-    """The machine as it is, with the threads that torch has now."""
+    """Describe this machine, with torch's current number of threads."""
     return Machine(
         processor=_processor(),
         cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
@@ -115,10 +115,10 @@ def describe_machine(device: str) -> Machine:
 
 
 def available_memory(device: str) -> int | None:
-    """Bytes that could be allocated on the device now; ``None`` where the system does not say."""
+    """Bytes that can be allocated on the device now; ``None`` if the system does not report it."""
     if device == "cuda":
         return torch.cuda.mem_get_info()[0]
-    sizes = [size for size in (_free_memory(), _left_of_limit()) if size is not None]
+    sizes = [size for size in (_free_memory(), _free_in_container()) if size is not None]
     return min(sizes, default=None)
 
 
@@ -130,8 +130,8 @@ def _free_memory() -> int | None:
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
 
 
-def _left_of_limit() -> int | None:
-    """Of a container."""
+def _free_in_container() -> int | None:
+    """Bytes up to the memory limit of the container; ``None`` without a limit."""
     try:
         limit, used = ((_CGROUP / name).read_text().strip() for name in ("memory.max", "memory.current"))
     except OSError:

@@ -1,4 +1,4 @@
-"""How much memory a method adds at its peak."""
+"""Measurement of the peak memory of a method."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ Frames = Callable[[], list[Frame]]
 Make = Callable[[], Callable[[Frame], object]]
 
 _STATUS, _FORGET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-# What methods import, at the latest when they are called: torch the second of these, with the first operator of ours.
+# Modules that methods import, at the latest when they run; the first custom operator imports torch._dynamo.
 _PRELOADED = ["__main__", "torch._dynamo", "numba", "pyoidn", "mcdenoise.benchmark.run"]
 _SECONDS = 300.0
 
 
 class Peaks:
-    """Peak memory of methods at sizes of images, each measured once.
+    """Peak memory by method and image size, each measured once.
 
     Args:
-        threads: of the methods.
+        threads: number of threads.
         device: ``"cpu"`` or ``"cuda"``.
     """
 
@@ -42,7 +42,7 @@ class Peaks:
         self._known: dict[tuple[str, tuple[int, int]], float | None] = {}
 
     def of(self, method: Method, size: tuple[int, int], frames: Frames) -> float | None:
-        """See :func:`peak_memory`; ``frames`` are of the size, and read only if it was not asked for before."""
+        """See :func:`peak_memory`; ``frames`` returns frames of this size, and is called on the first request only."""
         key = method.name, size
         if key not in self._known:
             make = functools.partial(make_method, method, threads=self._threads, device=self._device)
@@ -51,31 +51,31 @@ class Peaks:
 
 
 def peak_memory(make: Make, frames: Frames, *, threads: int, device: str, seconds: float = _SECONDS) -> float | None:
-    """Memory that making a method and denoising some frames adds at its peak: weights, history and all.
+    """Peak memory of constructing a method and denoising some frames: weights, history and temporary buffers.
 
-    On a CPU it is the peak of the resident set in a fresh process, less the resident set before: the frames are there
-    already, and so are the modules of torch, numba and Open Image Denoise. Pages that an allocator has freed and kept
-    count, as they do for everyone else on the machine.
-    On a GPU it is what torch had allocated there at the peak, less what it had before; a library that allocates by
-    itself is not seen.
+    On a CPU it is the peak resident set size of a fresh process minus its resident set size before, when the frames and
+    the modules of torch, numba and Open Image Denoise are already loaded. Memory that an allocator has freed but not
+    returned to the system counts.
+    On a GPU it is the peak of torch's allocated memory minus the memory allocated before; memory that other libraries
+    allocate is not included.
 
     Args:
-        make: makes the method, whose first calls may still warm up; another process must be able to call it: a function
-            of a module, or :func:`functools.partial` of one.
-        frames: reads or makes the frames, on the CPU; another process must be able to call it.
-        threads: of the method.
+        make: constructs the method, whose first calls may still warm up; it must be picklable, such as a function of a
+            module, or :func:`functools.partial` of one.
+        frames: reads or makes the frames, on the CPU; it must be picklable.
+        threads: number of threads of the method.
         device: ``"cpu"`` or ``"cuda"``.
-        seconds: for which another process may take; then it is ended.
+        seconds: time limit for the other process.
 
     Returns:
-        Mebibytes, or ``None`` where it cannot be measured: the system does not tell, or the method cannot be given to
-        another process, or fails there, or does not come to an end.
+        Mebibytes, or ``None`` if it cannot be measured: the system does not report it, or the method cannot be sent to
+        another process, fails there, or exceeds the time limit.
     """
     if device == "cuda":
         return _peak_on_gpu(make, frames)
     if not _FORGET_PEAK.exists():
         return None
-    # Started from a server that has imported everything, and nothing has run in: a fresh process in a moment.
+    # The fork server has imported all modules and run nothing, so that a fresh process starts quickly.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
     receiver, sender = context.Pipe(duplex=False)
@@ -83,7 +83,7 @@ def peak_memory(make: Make, frames: Frames, *, threads: int, device: str, second
     try:
         with deaf_children():
             process.start()
-    except Exception:  # whatever an object refuses with that only this process can have
+    except Exception:  # objects that cannot be pickled raise various exceptions
         return None
     sender.close()
     try:
@@ -96,15 +96,15 @@ def peak_memory(make: Make, frames: Frames, *, threads: int, device: str, second
 
 
 def _send_peak(sender: Connection, make: Make, frames: Frames, threads: int) -> None:
-    # Where it could not be made deaf from its first moment on.
+    # On systems where the process could not be started with SIGINT ignored.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    with suppress(Exception):  # whatever the method fails with: where it matters, it is found out by denoising
+    with suppress(Exception):  # the benchmark itself reports an exception of the method when it denoises
         sender.send(_peak_of_this_process(make, frames, threads))
 
 
 def _end_with_parent() -> None:
-    # A method that hangs would outlive a benchmark that was killed.
+    # Otherwise a method that hangs would outlive a benchmark that was killed.
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -123,7 +123,7 @@ def _peak_of_this_process(make: Make, frames: Frames, threads: int) -> float:
 
 
 def _status(name: str) -> int:
-    """Kibibytes."""
+    """A size in kibibytes from the status of this process."""
     lines = _STATUS.read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
 
@@ -136,8 +136,8 @@ def _peak_on_gpu(make: Make, frames: Frames) -> float | None:
         runner = make()
         for frame in shown:
             runner(frame)
-    except Exception:  # as above
+    except Exception:  # the benchmark itself reports it
         return None
     added = torch.cuda.max_memory_allocated() - before
-    # Nothing at all: it runs elsewhere.
+    # A method that allocated nothing runs on another device.
     return added / 2**20 if added else None

@@ -1,4 +1,4 @@
-"""The benchmark itself: every method on every scene, frame by frame, taking turns."""
+"""The benchmark: on every scene, the methods take turns frame by frame."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.results import IMAGES, STAGES, Cell, Method, Results, Scene, Spread
 
 _WHOLE, _COMPUTING = "whole", "computing"
-# Hands its input on: the time of looking at it is nobody's.
-_NOTHING = "noisy"
-# Images on the way that are those of a method of their own.
+# This method returns its input; its run time is not divided into stages.
+_IDENTITY = "noisy"
+# Intermediate images that are also results of a method of their own.
 _METHODS_TOO = ("noisy", "accumulated")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How to measure.
+    """Settings of a benchmark.
 
     Args:
-        rounds: how often each method denoises each frame, and an image of each size, without warming up; with 0, errors
-            are all that is measured.
-        busy: cores that other processes keep busy while times are measured.
-        beside: a command that runs meanwhile, again and again.
-        threads: of torch, of methods that do not ask torch, and of reading and writing EXRs.
+        rounds: number of timed repetitions per frame, and per image size, after warming up; with 0 only errors are
+            measured.
+        busy: number of cores that other processes keep busy while times are measured.
+        beside: a command that runs repeatedly while times are measured.
+        threads: number of threads of torch, of methods that do not use torch, and of reading and writing EXRs.
         device: ``"cpu"`` or ``"cuda"``.
-        sizes: widths and heights for the cost over pixels, see :func:`mcdenoise.benchmark.parse_sizes`.
-        pictures: of how many frames of each scene the images are kept, at most.
+        sizes: widths and heights for measuring run time over pixels, see :func:`mcdenoise.benchmark.parse_sizes`.
+        pictures: maximum number of frames per scene whose images are stored.
         metrics: names in :data:`mcdenoise.evaluate.METRICS`.
-        flip_every: FLIP is slow: compute it for the first of so many frames with a reference.
-        on_the_way: whether to compare the images on the way to a result, too, such as ``initial``.
-        memory: whether to measure what memory each method takes, in processes of their own.
+        flip_every: compute FLIP, which is slow, only for every n-th frame with a reference.
+        on_the_way: whether to score intermediate images too, such as ``initial``.
+        memory: whether to measure the peak memory of each method, in separate processes.
         command: the command line, to be stored with the results.
 
     Raises:
@@ -74,15 +74,15 @@ class Settings:
     command: str = ""
 
     def __post_init__(self) -> None:
-        for name, least in (("rounds", 0), ("busy", 0), ("threads", 1), ("pictures", 0), ("flip_every", 1)):
-            if getattr(self, name) < least:
+        for name, minimum in (("rounds", 0), ("busy", 0), ("threads", 1), ("pictures", 0), ("flip_every", 1)):
+            if getattr(self, name) < minimum:
                 option = name.replace("_", "-")
-                raise InputError(f"--{option}: expected at least {least}, found {getattr(self, name)}")
+                raise InputError(f"--{option}: expected at least {minimum}, found {getattr(self, name)}")
         check_device(self.device)
 
     @property
     def load(self) -> tuple[int, str]:
-        """What runs while times are measured, as :func:`mcdenoise.benchmark.machine.busy_machine` takes it."""
+        """The background load, as arguments of :func:`mcdenoise.benchmark.machine.busy_machine`."""
         return self.busy, self.beside
 
 
@@ -94,31 +94,31 @@ def run_benchmark(
     *,
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Results:
-    """Find out what each method costs on each scene, and what it leaves wrong.
+    """Measure the run time and the error of each method on each scene.
 
-    Of each scene, all methods denoise one frame after the other, taking turns on each: A B C, A B C. The first pass
-    over the frames warms up: it is not timed; images are compared with the references, and kept, there. Then every
-    round is a pass that is timed. As all see every frame in its order, all histories are right; the first frame of a
-    pass has none, and is not counted where there are others.
+    The methods take turns on each frame: A B C, A B C. The first pass over the frames warms up and is not timed; its
+    images are compared with the references, and some are stored. Every further round is a timed pass. Every method sees
+    all frames in order, so every history is correct; the first frame of a pass has no history and counts only in a
+    sequence of one frame.
 
-    The stages: ``read`` is reading all buffers of a frame and bringing them to the device; it is done once for all
-    methods. Then those of :class:`Timed`. ``write`` is bringing the image back and writing it as ``mcdenoise denoise``
+    The stages are ``read``, which reads all buffers of a frame and copies them to the device, once for all methods;
+    the stages of :class:`Timed`; and ``write``, which copies the image back and writes it as ``mcdenoise denoise``
     does, into the folder of the results.
 
     Args:
         sequences: frames with references.
-        methods: see :func:`choose_methods`; those that are missing are listed as such.
-        out: folder to make: ``results.json``, ``results.csv`` and ``images/SCENE/METHOD/N.exr``. It comes into being
-            when all is done.
-        settings: how to measure; sets the threads of torch.
-        on_step: called with the number of steps done, and that of all of them.
+        methods: see :func:`choose_methods`; missing methods are listed as such.
+        out: new folder for ``results.json``, ``results.csv`` and ``images/SCENE/METHOD/N.exr``. It appears once the
+            benchmark is complete.
+        settings: settings of the measurement; this sets torch's number of threads.
+        on_step: called with the number of finished steps and the number of all steps.
 
     Returns:
-        What is in ``results.json``. A method that fails on a scene, or is skipped there because the scene has not what
-        it needs, has a cell that says why; a scene whose files cannot be read fails for all methods.
+        The content of ``results.json``. A method that fails on a scene, or that is skipped there because the scene
+        lacks a buffer, has a cell with the reason; a scene whose files cannot be read fails for all methods.
 
     Raises:
-        InputError: a sequence has no references, there is something at ``out``, or it cannot be written to.
+        InputError: a sequence has no references, ``out`` exists, or it cannot be written to.
     """
     settings = settings or Settings()
     for sequence in sequences:
@@ -145,7 +145,7 @@ def run_benchmark(
             cells += own
         with busy_machine(*(settings.load if sizes else (0, ""))):
             costs, fits = measure_sizes(
-                [method for method in made.methods if method.model != _NOTHING],
+                [method for method in made.methods if method.model != _IDENTITY],
                 made.denoisers,
                 sizes,
                 rounds=settings.rounds,
@@ -176,7 +176,7 @@ def run_benchmark(
 
 
 class _Made:
-    """The methods that could be made, why the others could not, and what memory they take."""
+    """The constructed methods, the reasons why others could not be constructed, and their peak memory."""
 
     def __init__(self, methods: list[Method], settings: Settings) -> None:
         self.methods = [method for method in methods if not method.missing]
@@ -186,7 +186,7 @@ class _Made:
         for method in self.methods:
             try:
                 self.denoisers[method.name] = make_method(method, threads=settings.threads, device=settings.device)
-            except Exception as error:  # whatever a method fails with: the others go on
+            except Exception as error:  # a method may raise any exception; the other methods continue
                 self.failures[method.name] = one_line(error)
 
 
@@ -197,7 +197,7 @@ class _Read(NamedTuple):
 
 
 class _SceneRun:
-    """All methods on one scene."""
+    """Runs all methods on one scene."""
 
     def __init__(
         self,
@@ -227,14 +227,14 @@ class _SceneRun:
         )
 
     def measure(self, on_step: Callable[[], None]) -> tuple[Scene, list[Cell]]:
-        """The scene, and a cell for each method that is not missing."""
+        """Measure the scene: returns it, and a cell for each method that is not missing."""
         try:
             self._warm_up(on_step)
             with busy_machine(*self._settings.load):
                 for _ in range(self._settings.rounds):
                     self._round(on_step)
         except InputError as error:
-            # A frame cannot be read: nobody has seen the whole scene.
+            # A frame cannot be read, so no method has seen the whole scene.
             reason = one_line(error)
             self._failures, self._lacking = {method.name: reason for method in self._made.methods}, set()
             self._scene = replace(self._scene, pictures=[])
@@ -244,7 +244,7 @@ class _SceneRun:
         return self._scene, [self._cell(method) for method in self._made.methods]
 
     def _warm_up(self, on_step: Callable[[], None]) -> None:
-        """Every method on every frame: what its images are worth, and look like."""
+        """Run every method on every frame once; score its images and store some of them."""
         for number, frame, _ in self._frames(reference=True):
             kept = number in self._scene.pictures
             if kept and frame.reference is not None:
@@ -286,7 +286,7 @@ class _SceneRun:
                         _WHOLE: reading + computing + writing,
                         _COMPUTING: computing,
                         "read": reading,
-                        **({} if method.model == _NOTHING else timed.stages),
+                        **({} if method.model == _IDENTITY else timed.stages),
                         "write": writing,
                     }
                     for stage, milliseconds in taken.items():
@@ -295,7 +295,7 @@ class _SceneRun:
 
     def _frames(self, *, reference: bool) -> Iterator[_Read]:
         for timed in self._made.denoisers.values():
-            # A still has neither a history nor a frame that it would be one of.
+            # A still is a shot of one frame, which needs no history.
             timed.denoiser.reset(frames=1 if len(self._sequence) == 1 else None)
         for number in self._sequence.numbers:
             start = self._watch.mark()
@@ -316,7 +316,7 @@ class _SceneRun:
     def _noted(self, name: str) -> Iterator[None]:
         try:
             yield
-        except Exception as error:  # whatever a method fails with: the others go on
+        except Exception as error:  # a method may raise any exception; the other methods continue
             self._failures[name] = one_line(error)
             if isinstance(error, MissingBufferError):
                 self._lacking.add(name)
@@ -358,20 +358,20 @@ class _SceneRun:
 
 
 def _of(method: str, stage: str) -> str:
-    """What an image on the way is called."""
+    """Name of an intermediate image."""
     return f"{method}, {stage}"
 
 
-def kept_frames(numbers: list[int], most: int) -> list[int]:
-    """The last frames of the last run of successive numbers that is long enough, or else of the longest.
+def kept_frames(numbers: list[int], maximum: int) -> list[int]:
+    """The last frames of the last run of successive numbers that is long enough, or else of the longest run.
 
     Example:
         >>> kept_frames([0, 1, 2, 3, 5, 6, 7, 20], 3)
         [5, 6, 7]
     """
     runs = [[number for _, number in run] for _, run in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
-    longest = max(runs, key=lambda run: (min(len(run), most), run[-1]), default=[])
-    return longest[-most:] if most else []
+    longest = max(runs, key=lambda run: (min(len(run), maximum), run[-1]), default=[])
+    return longest[-maximum:] if maximum else []
 
 
 def _first_two_frames(root: Path, numbers: tuple[int, ...]) -> list[Frame]:

@@ -21,23 +21,24 @@ Size = tuple[int, int]
 SIZES = "320x180,640x360,960x540,1280x720,1920x1080"
 
 _LARGEST_SIDE = 16384
-# Smaller images are tried without asking whether there is memory for them.
+# Images of up to this many pixels are tried without an estimate of their memory.
 _SMALL = 1_000_000
-# Of the memory that is free; the histories of the other methods and all that is not foreseen have the rest.
-_USABLE_SHARE = 0.5
+# Fraction of the free memory that a method may use; the rest is for the histories of the other methods and for errors
+# of the estimate.
+_USABLE_FRACTION = 0.5
 
 
 def parse_sizes(text: str) -> list[Size]:
-    """Read a choice of sizes.
+    """Parse a list of sizes.
 
     Args:
         text: widths and heights in pixels, such as ``"320x180,1280x720"``, or ``"none"``.
 
     Returns:
-        Widths and heights, each once, from few to many pixels.
+        Distinct widths and heights, from few to many pixels.
 
     Raises:
-        InputError: the text is something else, or a side is longer than 16384 pixels.
+        InputError: the text is not of this form, or a side is longer than 16384 pixels.
 
     Example:
         >>> parse_sizes("1280x720,320x180")
@@ -55,9 +56,9 @@ def parse_sizes(text: str) -> list[Size]:
 
 
 def synthetic_frame(width: int, height: int) -> Frame:
-    """A wall in noisy light that slides by a third of a pixel, with every buffer that a method may want.
+    """A noisily lit wall that moves by a third of a pixel, with every buffer that a method can use.
 
-    The time depends on the number of pixels only; what matters is that the history of the wall is found again.
+    Run times depend on the number of pixels only, provided that reprojection finds the history, as it does here.
     """
     generator = torch.Generator().manual_seed(0)
     albedo = torch.rand(1, 3, height, width, generator=generator)
@@ -86,21 +87,22 @@ def measure_sizes(
 ) -> tuple[list[Cost], list[Fit]]:
     """Time every method on synthetic frames of every size, taking turns: A B C, A B C.
 
-    Two frames warm up, the second of them with a history, and are not counted. A method is not tried where it would
-    need more than half of the memory that is free, as foretold by what it takes at a half and at a quarter of the side.
+    The first two frames, of which the second has a history, warm up and are not timed. A method is skipped at a size
+    where it would need more than half of the free memory; the need is extrapolated from images of a half and a quarter
+    of the width and height.
 
     Args:
-        methods: what to time.
-        made: those that could be made, by name.
+        methods: methods to time.
+        made: the denoisers of the methods that could be constructed, by name.
         sizes: widths and heights, ascending.
-        rounds: frames of each.
-        threads: for measuring memory.
+        rounds: number of timed frames per method and size.
+        threads: number of threads, for measuring memory.
         device: ``"cpu"`` or ``"cuda"``.
         on_step: called ``rounds + 2`` times for each size.
 
     Returns:
-        Milliseconds in memory, without files, by size and method; a line through them for each method that was timed
-        at two sizes or more.
+        Milliseconds without reading and writing files, by size and method; and a fitted line for each method that was
+        timed at two sizes or more.
     """
     memory = _Memory(threads, device)
     methods = [method for method in methods if method.name in made]
@@ -121,7 +123,7 @@ def measure_sizes(
                     start = watch.mark()
                     made[name](frame)
                     taken = watch.between(start, watch.mark())
-                except Exception as error:  # whatever a method fails with: the others go on
+                except Exception as error:  # a method may raise any exception; the other methods continue
                     failures[name] = one_line(error)
                     continue
                 if turn >= 2:
@@ -136,7 +138,7 @@ def measure_sizes(
 
 
 def fit_line(method: str, costs: list[Cost]) -> Fit | None:
-    """The line through a method's medians with the least squares of relative deviations; ``None`` for less than two.
+    """Fit a line to a method's medians by least squares of relative deviations; ``None`` for fewer than two sizes.
 
     Example:
         >>> costs = [Cost("a", 1000, h, Spread(5 + 2 * h, 0, 0, 1)) for h in (1, 4, 9)]
@@ -152,30 +154,30 @@ def fit_line(method: str, costs: list[Cost]) -> Fit | None:
     if len({pixels for pixels, _ in points}) < 2:
         return None
     megapixels, milliseconds = np.array(points).T
-    # A plain fit would be that of the largest image alone.
+    # Without these weights the largest image would dominate the fit.
     per_megapixel, fixed = np.polyfit(megapixels, milliseconds, 1, w=1 / milliseconds)
     deviation = np.abs(fixed + per_megapixel * megapixels - milliseconds) / milliseconds
     return Fit(method, float(fixed), float(per_megapixel), float(deviation.max()))
 
 
 class _Memory:
-    """Foretells the memory a method takes."""
+    """Estimates the memory that a method needs."""
 
     def __init__(self, threads: int, device: str) -> None:
         self._device, self._peaks = device, Peaks(threads, device)
 
     def lack(self, method: Method, width: int, height: int) -> str:
-        """Why there is too little memory for an image, or ``""`` where there is enough, or nothing is known."""
+        """Why there is too little memory for an image; ``""`` if there is enough, or if it cannot be estimated."""
         if width * height <= _SMALL:
             return ""
-        smaller, small = ((max(width // share, 1), max(height // share, 1)) for share in (4, 2))
+        smaller, small = ((max(width // divisor, 1), max(height // divisor, 1)) for divisor in (4, 2))
         lower, upper = self._peak(method, smaller), self._peak(method, small)
         available = available_memory(self._device)
         if lower is None or upper is None or available is None:
             return ""
         pixels, known, less = width * height, small[0] * small[1], smaller[0] * smaller[1]
         needed = upper + max(upper - lower, 0.0) / (known - less) * (pixels - known)
-        usable = _USABLE_SHARE * available / 2**20
+        usable = _USABLE_FRACTION * available / 2**20
         return (
             ""
             if needed <= usable

@@ -1,4 +1,4 @@
-"""What the options of several commands have in common."""
+"""Types of options that several commands share."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from mcdenoise.errors import InputError
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Json = Path | None
-# Frames of a shot: folders, files, patterns.
+# Frames of a shot: folders, files or patterns.
 Inputs = tyro.conf.Positional[
     Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT [INPUT ...]", help_behavior_hint="(required)")]
 ]
 Layers = Annotated[tuple[str, ...], tyro.conf.arg(metavar="LAYER [LAYER ...]", help_behavior_hint="")]
 Map = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="BUFFER=LAYER")]]
-# On or off, and off without a word: that needs no second option which says so.
+# A flag without its negative option --no-FLAG.
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height of a ``--size``.
+    """Parse the width and height of ``--size``.
 
     Raises:
-        InputError: the text is something else.
+        InputError: the text is not of the form WIDTHxHEIGHT.
     """
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal()):

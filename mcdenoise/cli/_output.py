@@ -1,4 +1,4 @@
-"""What commands show, and where they show it."""
+"""Printed output of commands: progress bars, tables, warnings, JSON files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mcdenoise.errors import InputError, printable
 
 
 def progress_bar() -> Progress:
-    """A progress bar on stderr; silent when that is no terminal."""
+    """A progress bar on stderr, which is hidden if stderr is not a terminal."""
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
@@ -30,73 +30,73 @@ def progress_bar() -> Progress:
 
 
 def say(line: object) -> None:
-    """Print a line that has paths in it, or what else others have named: a terminal obeys nothing of it."""
+    """Print a line that contains paths or other names; terminal control sequences in it are escaped."""
     print(printable(str(line)), flush=True)
 
 
 def show(table: Table) -> None:
     """Print a table to stdout."""
-    # A pipe has no width: never fold what a script may read.
+    # A pipe has no width; do not wrap lines that a script may read.
     console = Console()
     Console(width=None if console.is_terminal else 200).print(table)
 
 
 def print_rows(rows: list[dict[str, str]]) -> None:
-    """Print rows with the same columns; nothing where there are none."""
+    """Print rows with the same columns as a table; prints nothing without rows."""
     if rows:
         table = Table(*rows[0])
         for row in rows:
-            # As they stand: a layer's name may hold brackets, which are orders to a table.
+            # Print names literally: brackets in the name of a layer would be markup to the table.
             table.add_row(*(Text(printable(each)) for each in row.values()))
         show(table)
 
 
 def print_times(milliseconds: dict[str, float]) -> None:
-    """Print the run time of each stage, and of all."""
+    """Print the run time of each stage, and their sum."""
     print(f"milliseconds a frame (median): {stages(milliseconds)}; together {sum(milliseconds.values()):.1f}")
 
 
 def stages(milliseconds: dict[str, float]) -> str:
-    """The run time of each stage in words."""
+    """The run time of each stage as text."""
     return ", ".join(f"{stage} {value:.1f}" for stage, value in milliseconds.items())
 
 
 def warn(warnings: Iterable[str]) -> None:
-    """Say on stderr what is probably wrong, a line each."""
+    """Print warnings to stderr, one per line."""
     for warning in warnings:
         print(f"warning: {printable(warning)}", file=sys.stderr)
 
 
 def check_json(path: Path | None, inputs: Iterable[Path], out: Path | None) -> None:
-    """See that the file of ``--json`` can be written before there is anything to be written.
+    """Check before the work of a command that the file of ``--json`` can be written.
 
     Args:
-        path: of ``--json``.
-        inputs: files and folders that the command reads, which it must not be one of.
-        out: folder that the command makes, in which it may be.
+        path: path of the file.
+        inputs: files and folders that the command reads; the file must not be one of them.
+        out: folder that the command creates; the file may be inside.
 
     Raises:
-        InputError: it cannot.
+        InputError: it cannot be written, or the command reads it.
     """
     if path is None:
         return
-    # Here because it brings the reader of images, which not every command needs.
+    # Imported here because it loads the reader of images, which not every command needs.
     from mcdenoise.data.files import check_writable
 
     real = os.path.realpath(path)
     for given in map(os.path.realpath, inputs):
         read = real.endswith("camera.json") or not real.endswith(".json")
         if real == given or (os.path.lexists(real) and read and real.startswith(f"{given}{os.sep}")):
-            raise InputError(f"--json: expected a file to write, found {path}, which is read; choose another path")
+            raise InputError(f"--json: expected a file to write, found {path}, which is an input; choose another path")
     made = out is not None and not os.path.lexists(out) and real.startswith(f"{os.path.realpath(out)}{os.sep}")
     if not made:
         check_writable(path)
 
 
 def write_json(path: Path | None, content: Any) -> None:
-    """Write what was printed to the file of ``--json``, if there is one."""
+    """Write the content of a printed table to the file of ``--json``, if it is given."""
     if path is not None:
-        # Here because it brings the reader of images, which not every command needs.
+        # Imported here because it loads the reader of images, which not every command needs.
         from mcdenoise.data.files import write_text
 
         write_text(path, json.dumps(content, indent=2) + "\n")

@@ -1,4 +1,4 @@
-"""How a shot is denoised, as options of several commands."""
+"""Options for reading, denoising and writing a shot, shared by several commands."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mcdenoise.shot import ShotSettings
 
 @dataclass(frozen=True)
 class ShotOptions(ShotSettings):
-    """As :class:`mcdenoise.shot.ShotSettings` says; here, how some of it is typed."""
+    """:class:`mcdenoise.shot.ShotSettings` as command-line options; overrides the parsing of some fields."""
 
     map: Map = ()
     color_without_albedo: Flag = False

@@ -1,4 +1,4 @@
-"""Standard output that cannot be written to does not end a command's work."""
+"""Standard output whose failure does not interrupt the work of a command."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from mcdenoise.errors import InputError
 
 
 class _Forgiving:
-    """A stream that takes what is written to it, whether or not it can be handed on; the first failure is kept.
+    """A stream that discards output after a failed write; the first failure is stored.
 
     Args:
-        stream: a file's, whose descriptor leads nowhere after a failure, so that no later write meets it again.
+        stream: the stream of a file, whose descriptor is redirected to the null device after a failure.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -40,27 +40,27 @@ class _Forgiving:
 
     def _failed(self, error: OSError) -> None:
         self.failure = self.failure or error
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, self._stream.fileno())
-        os.close(nowhere)
-        # What is in its buffer goes there.
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, self._stream.fileno())
+        os.close(null)
+        # Discard the content of its buffer too.
         with suppress(OSError):
             self._stream.flush()
 
 
 @contextmanager
 def forgiving_stdout() -> Iterator[None]:
-    """Let a command go on where nobody reads what it prints, such as ``| head``, and print what its encoding lacks.
+    """Let a command continue when the reader of its output ends (``| head``), and escape unencodable characters.
 
     Raises:
-        InputError: at the end, where it could not be written for another reason, such as a full disk.
+        InputError: at the end, if writing failed for another reason, such as a full disk.
     """
     stdout = sys.stdout
-    # Another stream is of whoever has put it there.
+    # Leave a stream alone with which other code has replaced stdout.
     if stdout is not sys.__stdout__ or stdout is None:
         yield
         return
-    # As Python's own stderr does: a name that ASCII lacks is shown by its number.
+    # Like Python's stderr, escape characters that the encoding lacks.
     stdout.reconfigure(errors="backslashreplace")
     sys.stdout = forgiving = _Forgiving(stdout)
     try:
@@ -70,4 +70,6 @@ def forgiving_stdout() -> Iterator[None]:
         sys.stdout = stdout
     if forgiving.failure is not None and not isinstance(forgiving.failure, BrokenPipeError):
         reason = forgiving.failure.strerror
-        raise InputError(f"standard output: cannot be written ({reason}); all else is done") from forgiving.failure
+        raise InputError(
+            f"standard output: cannot be written ({reason}); everything else is done"
+        ) from forgiving.failure

@@ -1,4 +1,4 @@
-"""`mcdenoise benchmark --suite`: renders what is missing, scores it, writes the tables."""
+"""`mcdenoise benchmark --suite`: renders missing frames, scores the methods, writes the tables."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def score_suite(
     rows = choose_rows(patterns)
     if out is None and not render:
         raise InputError("--out: expected a folder to write to with --no-render, found none; give one with -o")
-    # What is wrong with the methods is said before hours of rendering.
+    # Report errors in the choice of methods before hours of rendering.
     methods = choose_methods(f"{models or DEFAULT},{PEERS}", precisions=precisions, baselines=("noisy",))
     if out is not None:
         check_packages()

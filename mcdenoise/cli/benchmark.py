@@ -46,50 +46,52 @@ def benchmark(
     render: bool = True,
     json: Json = None,
 ) -> int:
-    """Measure error against run time: any methods and doing nothing, on the same frames, taking turns.
+    """Measure the error and the run time of methods, which take turns on the same frames.
 
-    Writes OUT/index.html, the report, with its plots, results.json, results.csv and images; OUT must not exist.
-    Exit status 1 if a method failed on a scene; one that needs a buffer which the scene has not is skipped there.
-    With --ops, measures the operators instead: time, error, and how near they come to a copy.
+    Writes the report OUT/index.html with its plots, results.json, results.csv and images; OUT must not exist. The exit
+    status is 1 if a method failed on a scene; a method is skipped on scenes that lack a buffer it needs. With --ops,
+    measures the operators instead: run time, error, and run time relative to a copy.
 
-    With --suite wild, renders frames that no training uses, by Mitsuba and by Blender's Cycles, to the folder of --data
-    where they are missing, and compares --models with OIDN's best setting of each: OUT/suite.md, suite.json and
-    close-ups. Without --out it only renders. Rendering everything takes hours; it can be stopped and goes on.
+    With --suite wild, renders the missing frames of a test suite that no training uses, in Mitsuba and in Blender's
+    Cycles, to the folder of --data, and compares --models with OIDN's best setting on each row: OUT/suite.md,
+    suite.json and close-ups. Without --out it only renders. Rendering everything takes hours; it can be interrupted,
+    and resumes.
 
     Args:
         sequences: folders of sequences with references.
-        out: folder to make; needed except with --ops.
-        models: names separated by commas, see `mcdenoise models`, with settings if need be, several at once such as
-            "oidn(quality=fast|high)"; weights files; file.py:factory; "pretrained" for all with shipped weights; "all"
-            for every name there is, saying which have no weights yet; or none. By default those with shipped weights,
-            filters, and other denoisers. Doing nothing and accumulation alone are always there.
-        precisions: precisions of the convolutions of models that learn: float32, bfloat16, and int8 where calibrated;
-            float32,bfloat16 by default, with --suite float32.
+        out: new folder for the results; required except with --ops.
+        models: methods separated by commas: names of `mcdenoise models`, with optional settings such as
+            "oidn(quality=fast|high)"; weights files; file.py:factory; "pretrained" for all models with shipped weights;
+            "all" for every model, where those without weights are listed as missing; or "none". By default the models
+            with shipped weights, filters, and other denoisers. The noisy input and accumulation alone are always
+            included.
+        precisions: precisions of the convolutions of trainable models: float32, bfloat16, and int8 for calibrated
+            weights; float32,bfloat16 by default, float32 with --suite.
         frames: frames of each sequence to denoise, such as 0-59,70; all by default.
-        rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.
-        threads: CPU threads of all methods; torch's choice by default.
-        busy: cores that other processes keep busy while times are measured, as a renderer beside a denoiser does.
-        beside: a command that runs while times are measured, such as a rendering; it begins again when it ends.
+        rounds: number of timed repetitions of each frame and of each size; 3 by default, 5 with --ops, 1 with --suite.
+        threads: number of CPU threads of all methods; torch's default if not given.
+        busy: number of cores that other processes keep busy while times are measured, as a renderer would.
+        beside: a command that runs repeatedly while times are measured, such as a rendering.
         device: cpu or cuda.
-        sizes: sizes of random images whose cost alone is measured, such as 1280x720,3840x2160, or none.
-        pictures: number of frames of each scene whose images are kept.
-        keep_all: measure each method that skips anything a second time, skipping nothing, to see what that saves.
+        sizes: sizes of synthetic images for measuring run time over pixels, such as 1280x720,3840x2160, or none.
+        pictures: number of frames of each scene whose images are stored.
+        keep_all: measure each method that skips work a second time without skipping, to see what skipping saves.
         ops: measure the operators.
         size: size of the images with --ops, WIDTHxHEIGHT.
         suite: render and score the suite of this name.
         data: folder of the suite's frames.
         rows: rows of the suite to score, such as "cycles-*,mitsuba-parlour-box-4"; all by default.
-        blender_python: a Python that has Blender's module bpy, to render the suite's rows of Cycles; by default that
-            of the environment variable BLENDER_PYTHON, or else this one.
-        render: --no-render scores the rows that are in the folder of --data and renders nothing.
-        json: write what is in results.json, or ops.json, to this file too.
+        blender_python: a Python with Blender's module bpy, for the suite's rows of Cycles; by default that of the
+            environment variable BLENDER_PYTHON, or else the Python that runs mcdenoise.
+        render: with --no-render, score the rows that exist in the folder of --data, and render nothing.
+        json: write the content of results.json, or ops.json, to this file too.
     """
     keep_heap()
     threads = torch.get_num_threads() if threads is None else threads
     check_threads(threads)
     if suite is not None:
         if ops or sequences:
-            raise InputError("--suite: expected neither folders of sequences nor --ops beside it, found one")
+            raise InputError("--suite: expected neither folders of sequences nor --ops with it, found one of them")
         if data is None:
             raise InputError("--data: expected the folder of the suite's frames, found none; give one")
         command = _command_line(
@@ -132,7 +134,7 @@ def benchmark(
                 on_step=lambda done, total: progress.update(task, completed=done, total=total),
             )
         print_rows(op_rows(costs))
-        print(f"a copy moves {costs.bandwidth:.1f} GB/s, read and written")
+        print(f"a copy moves {costs.bandwidth:.1f} GB/s, reading and writing")
         write_json(json, asdict(costs))
         return 0
     if out is None:
@@ -186,6 +188,6 @@ def benchmark(
 
 
 def _command_line(*arguments: object, **options: object) -> str:
-    """A command line with every choice in it, also those that were made by default."""
+    """A command line with all options, including those with their default values."""
     chosen = [f"--{name}={value}" for name, value in options.items() if value is not None]
     return shlex.join(["mcdenoise", *map(str, arguments), *chosen])

@@ -21,19 +21,19 @@ def calibrate(
     out: Out,
     frames: str | None = None,
 ) -> None:
-    """Calibrate weights for --precision int8: add the ranges of all tensors of its U-Nets on some frames.
+    """Calibrate weights for --precision int8: record the ranges of all tensors in the model's U-Nets on some frames.
 
-    What is brighter than anything in these frames is clamped inside of the network, not in the image: take frames of
-    the kind that will be denoised, such as some of those that the weights were trained on. The weights stay the same.
+    Values beyond these ranges are clamped inside the network, though not in the image. Use frames like those that will
+    be denoised, such as some of the training data. The weights themselves do not change.
 
     Args:
         weights: safetensors file of a model with a U-Net.
         sequences: folders of sequences; references are not needed.
-        out: file to write, which may be the same.
-        frames: which frames of each, such as 0-3; all by default.
+        out: file to write, which may be the input file.
+        frames: frames of each sequence to use, such as 0-3; all by default.
     """
     if not sequences:
-        raise InputError("sequences: expected some frames to calibrate on, found none")
+        raise InputError("sequences: expected frames for the calibration, found none")
     about = describe_weights(weights)
     architecture, settings = about.pop("architecture"), about.pop("settings")
     model = load_weights(weights)

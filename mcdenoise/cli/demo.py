@@ -16,13 +16,13 @@ from mcdenoise.models import DEFAULT
 
 
 def demo(out: Out = Path("demo"), model: str = DEFAULT, json: Json = None) -> None:
-    """Render 16 frames of a small scene at one sample a pixel, denoise them, print errors and times.
+    """Render 16 frames of a small scene at one sample per pixel, denoise them, and print errors and run times.
 
-    Ends with a report of error against run time: all models, filters, and what other denoisers are installed.
+    Then compare the error and the run time of all models, filters and installed denoisers in a report.
 
     Args:
-        out: folder to write to; what an earlier run rendered there is used again.
-        model: a name with settings, a weights file, or file.py:factory, as of `denoise`.
+        out: folder to write to; frames that an earlier run rendered there are reused.
+        model: a name with optional settings, a weights file, or file.py:factory, as for `mcdenoise denoise`.
         json: write the printed figures to this file too.
     """
     keep_heap()

@@ -21,7 +21,7 @@ from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.models import pretrained_models
 from mcdenoise.shot import ShotSettings
 
-# Loading numba takes 0.9 s. The shipped networks gain as much from it on a still of three million pixels.
+# Loading numba takes 0.9 s, which is what the shipped networks gain from it on a still of three million pixels.
 _SMALL_STILL = 1920 * 1080
 
 
@@ -31,14 +31,15 @@ def denoise(
     shot: tyro.conf.OmitArgPrefixes[ShotOptions],
     json: Json = None,
 ) -> None:
-    """Denoise the frames of a shot: writes the same files, clean, to OUT, and OUT/denoise.json.
+    """Denoise the frames of a shot; writes denoised copies of the files to OUT, and OUT/denoise.json.
 
     Args:
-        inputs: a folder; files; or a pattern such as 'shot_####.exr', 'shot_%04d.exr' or 'shot_*.exr'. Each may be an
-            EXR with layers, or one file a buffer; `mcdenoise inspect` shows what is taken from where.
-        out: folder to write to: files of the same names, with the radiance replaced and all else as it was
-            (of the BMFR layout: denoisedN.exr).
-        shot: how it is read, denoised and written.
+        inputs: a folder; files; or a pattern such as 'shot_####.exr', 'shot_%04d.exr' or 'shot_*.exr'. Each frame may
+            be an EXR with layers, or one file per buffer; `mcdenoise inspect` shows which layer each buffer is read
+            from.
+        out: folder to write to: files of the same names, with denoised radiance and all other layers unchanged
+            (for the BMFR layout: denoisedN.exr).
+        shot: options for reading, denoising and writing the shot.
         json: write the run times to this file too.
     """
     keep_heap()
@@ -48,7 +49,7 @@ def denoise(
     opened = shot.open(inputs)
     shown = None
     if shot.preview:
-        # It loads kornia, which denoising does without.
+        # Imported here because it loads kornia, which denoising does not need.
         from mcdenoise.preview import Preview
 
         shown = Preview(
@@ -107,7 +108,7 @@ def denoise(
 
 
 def _backend(opened: Sequence, shot: ShotSettings) -> AbstractContextManager[None]:
-    """The reference implementations where a process ends before compiled ones pay: for a small still."""
+    """Use the reference implementations for a small still, where compiled ones take longer to load than they save."""
     height, width = opened.size
     small = len(opened) == 1 and height * width <= _SMALL_STILL and shot.max_memory is None
     return ops.use("torch") if small and shot.spelling.name in pretrained_models() else nullcontext()

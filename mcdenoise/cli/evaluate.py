@@ -25,15 +25,17 @@ def evaluate(
     device: str = "cpu",
     json: Json = None,
 ) -> None:
-    """Compare a folder of denoised images, ours or not, or what a model makes, with the references of a sequence.
+    """Compare denoised images, from a folder or from a model, with the references of a sequence.
 
     Args:
         sequence: folder of a sequence with references.
-        images: folder of one EXR a frame, such as denoised12.exr or frame.0012.exr, scene-linear RGB.
-        model: compare this model instead: a name with settings, a weights file, or file.py:factory, as of `denoise`.
-        protocol: how a publication computed its numbers; they are printed beside the strict ones.
-        frames: frames to compare, such as 0-59,70; all that have a reference by default.
-        device: where the model runs: cpu or cuda.
+        images: folder with one EXR per frame, such as denoised12.exr or frame.0012.exr, scene-linear RGB, written by
+            any denoiser.
+        model: evaluate this model instead: a name with optional settings, a weights file, or file.py:factory, as for
+            `mcdenoise denoise`.
+        protocol: protocol of a publication, whose numbers are printed in addition to the strict ones.
+        frames: frames to compare, such as 0-59,70; by default all frames that have a reference.
+        device: device of the model: cpu or cuda.
         json: write the printed figures to this file too.
     """
     if (images is None) is (model is None):
@@ -62,7 +64,7 @@ def _print_evaluation(result: Evaluation) -> None:
         columns = []
         for metric in own.mean:
             columns.append((metric, own, "" if own is strict else name))
-            # Only these are the same quantity; a protocol's SMAPE may be one of displayed values.
+            # Only these are comparable; a protocol may compute other metrics, such as SMAPE, of displayed values.
             if own is not strict and metric in ("PSNR", "SSIM") and metric in strict.mean:
                 columns.append((metric, strict, "strict"))
         table = Table("frame", *(f"{metric} {of}".strip() for metric, _, of in columns))
@@ -83,7 +85,7 @@ def _print_evaluation(result: Evaluation) -> None:
         print(f"warping error (Lai et al. 2018): {ours:.4g}; of the references {theirs:.4g}")
     if result.reference_noise is not None:
         print(
-            f"perfect: estimate of what the truth would score, since the references' own SMAPE against it is about "
+            f"perfect: estimated score of the truth, given that the SMAPE of the references themselves is about "
             f"{result.reference_noise:.4g}"
         )
 

@@ -25,26 +25,26 @@ def export(
     frames: int = 5,
     json: Json = None,
 ) -> None:
-    """Export a model as one graph: a step with its state as inputs and outputs, for frames of any size.
+    """Export one step of a model as a graph, with its state as inputs and outputs, for frames of any size.
 
-    The inputs are the buffers by name and the tensors of the state as state.NAME, zeros before the first frame; the
-    outputs are image and next_state.NAME. Takes some minutes.
+    The inputs are the buffers by name and the tensors of the state as state.NAME, which are zeros for the first frame;
+    the outputs are image and next_state.NAME. An export takes some minutes.
 
     Args:
         model: name of a model, see `mcdenoise models`, or your own: path/to/file.py:factory or package.module:factory.
         out: file to write, .onnx or .pt2.
-        weights: safetensors file of your own weights for that model.
+        weights: safetensors file with your own weights for that model.
         buffers: names of the buffers that frames will have, such as color,albedo,normal,depth,motion; by default those
-            of --check, or else all that the model is better with.
-        format: onnx, or torch for torch.export.load; by default that of the file's ending.
-        check: folder of a sequence: run the ONNX graph by onnxruntime over its frames, and print the differences.
+            of the sequence --check, or else all that the model uses.
+        format: onnx, or torch for torch.export.load; by default from the file name's extension.
+        check: folder of a sequence: run the ONNX graph in onnxruntime on its frames, and print the differences.
         frames: number of frames to check.
         json: write the names of inputs and outputs, and the differences, to this file too.
     """
     made = create_model(model, pretrained=weights is None, weights=weights)
     sequence = None if check is None else open_sequence(check)
     if sequence is not None and (format == "torch" or out.suffix == ".pt2"):
-        raise InputError("--check: expected an ONNX file, which onnxruntime runs, found another format")
+        raise InputError("--check: expected an ONNX file, for onnxruntime, found another format")
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
     if buffers is not None:
@@ -63,6 +63,6 @@ def export(
     if sequence is not None:
         for number, difference in differences(exported, made, sequence, frames):
             found[number] = difference
-            print(f"frame {number}: largest difference to torch {difference:.1e}, relative")
+            print(f"frame {number}: maximum relative difference from torch {difference:.1e}")
     write_json(json, {"model": model, "inputs": exported.inputs, "outputs": exported.outputs, "differences": found})
     say(f"wrote {out}")

@@ -19,16 +19,16 @@ def gradcheck(
     order: Literal[1, 2] = 2,
     json: Json = None,
 ) -> int:
-    """Check first and second derivatives of operators against finite differences, in float64, number by number.
+    """Check first and second derivatives of operators against finite differences in float64, element by element.
 
-    A function of your own takes floating-point tensors. What it is tried on is a small tuple of tensors, or several by
-    name, that its file gives as `function.example_inputs`, or as `inputs()` for all functions in it; without either,
-    images of 6 by 5 pixels for all arguments.
+    A function of your own takes floating-point tensors. Its file defines the example inputs, a small tuple of tensors
+    or several tuples by name, as `function.example_inputs`, or as `inputs()` for all functions in the file; by default
+    every argument is an image of 6 by 5 pixels.
 
     Args:
         ops: names of operators, or functions of your own, path/to/file.py:function or package.module:function; all
             operators by default.
-        order: 1 for first derivatives alone, such as of a function that can be differentiated once.
+        order: 1 to check first derivatives only, for functions that can be differentiated once.
         json: write the results to this file too.
     """
     table = Table("op", "case", "inputs", "result", "seconds")
@@ -38,7 +38,7 @@ def gradcheck(
     for result in results:
         outcome = "ok" if result.passed else f"FAILED {result.message}"
         row = (result.op, result.case, ", ".join(result.inputs), outcome, f"{result.seconds:.2f}")
-        # What others wrote is no markup.
+        # Names and messages of other people's code are not markup.
         table.add_row(*map(escape, row))
     show(table)
     write_json(json, [asdict(result) for result in results])

@@ -14,24 +14,24 @@ from mcdenoise.cli._output import show, write_json
 from mcdenoise.models import overview
 
 _MEASURED = ("SMAPE", "ms a frame")
-# What tells motion: a model takes whichever of it there is.
+# Buffers from which motion is computed; a model uses those that a frame has.
 _MOTION = {"motion", "position", "previous_position", "view_projection"}
 
 
 def models(results: Path | None = None, json: Json = None) -> None:
-    """List the models by kind: their paper, what they need and use, weights, parameters, and operations per pixel.
+    """List the models by kind: paper, required and used buffers, weights, parameters, and operations per pixel.
 
-    A model uses `motion` if it takes motion, or positions with cameras, or whichever of them there is.
+    The column "uses" lists `motion` if a model uses motion buffers, or positions with cameras, whichever a frame has.
 
     Args:
-        results: folder of a finished `mcdenoise benchmark`, for columns of error and run time: means over its scenes
-            of those models that it measured as they are shipped.
+        results: folder of a finished `mcdenoise benchmark`, for columns of error and run time: means over its scenes,
+            for the models that it measured with their shipped weights and default settings.
         json: write the list to this file too.
     """
     measured = _measured(results) if results else {}
     entries = overview()
     columns = ("model", "paper", "needs", "uses", "weights", "parameters", "kMAC per pixel")
-    columns = (*columns, *(_MEASURED if results else ()), "what")
+    columns = (*columns, *(_MEASURED if results else ()), "description")
     for kind in dict.fromkeys(entry.kind for entry in entries):
         table = Table(*columns, title=kind, title_justify="left")
         for entry in (each for each in entries if each.kind == kind):
@@ -52,8 +52,8 @@ def models(results: Path | None = None, json: Json = None) -> None:
 
 
 def _measured(folder: Path) -> dict[str, tuple[str, str]]:
-    """SMAPE and milliseconds of each model, where every scene of a benchmark has both."""
-    # Here because it brings the readers of files, which take their time to load.
+    """Mean SMAPE and milliseconds of each model that has both on every scene of a benchmark."""
+    # Imported here because it loads the readers of files, which is slow.
     from mcdenoise.results import Results
 
     results, found = Results.read(folder), {}

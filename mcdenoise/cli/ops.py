@@ -12,13 +12,13 @@ from mcdenoise.cli._output import show, write_json
 
 
 def ops(json: Json = None) -> None:
-    """List the operators: what they do, what they are differentiable in, and their error in each precision.
+    """List the operators with a description, their differentiable arguments, and their error in each precision.
 
     Args:
         json: write the list to this file too.
     """
     entries = overview()
-    table = Table("op", "what", "differentiable in", "cases", "float32", "bfloat16", "float16")
+    table = Table("op", "description", "differentiable in", "cases", "float32", "bfloat16", "float16")
     for entry in entries:
         errors = (f"{entry.errors[name]:.0e}" for name in ("float32", "bfloat16", "float16"))
         table.add_row(entry.name, entry.summary, ", ".join(entry.differentiable), str(entry.cases), *errors)

@@ -21,19 +21,19 @@ def stability(
 ) -> int:
     """Check operators, models and the denoiser on ordinary, stiff and extreme inputs, and over thousands of frames.
 
-    Errors are in units of the dtype's epsilon times the condition number of the case; bounds come from analysis.
+    Errors are in units of the dtype's epsilon times the condition number of the case; bounds come from error analysis.
 
-    A function of your own takes floating-point tensors, and is compared with itself in float64. What it is tried on is
-    a small tuple of tensors, or several by name, that its file gives as `function.example_inputs`, or as `inputs()` for
-    all functions in it; without either, images of 6 by 5 pixels for all arguments.
+    A function of your own takes floating-point tensors, and is compared with itself in float64. Its file defines the
+    example inputs, a small tuple of tensors or several tuples by name, as `function.example_inputs`, or as `inputs()`
+    for all functions in the file; by default every argument is an image of 6 by 5 pixels.
 
     Args:
         ops: names of operators, or functions of your own, path/to/file.py:function or package.module:function; all
             operators by default.
-        models: names with settings if need be, weights files, or file.py:factory; all that can be had by default, none
-            where operators are named.
-        dtypes: precisions to try.
-        frames: length of the long runs.
+        models: names with optional settings, weights files, or file.py:factory; by default all available models, or
+            none if operators are named.
+        dtypes: precisions to check.
+        frames: number of frames of the long runs.
         json: write every check to this file too, and the errors of the long runs over time.
     """
     if frames < 1:
@@ -54,13 +54,13 @@ def stability(
 
 
 def _print_checks(checks: list[Check]) -> None:
-    """One row for each subject, dtype and backend: error and bound of what was nearest to its bound."""
+    """Print a row for each subject, dtype and backend: the error that is closest to its bound, and that bound."""
     if not checks:
         return
     rows: dict[tuple[str, str, str], list[Summary]] = {}
     for summary in summarize(checks):
         rows.setdefault((summary.subject, summary.dtype, summary.backend), []).append(summary)
-    table = Table("what", "dtype", "backend", "checks", "condition", "forward", "gradient", "holds", "result")
+    table = Table("subject", "dtype", "backend", "checks", "condition", "forward", "gradient", "holds", "result")
     for key, summaries in rows.items():
         found = {summary.what: summary for summary in summaries}
         errors = []
@@ -75,7 +75,7 @@ def _print_checks(checks: list[Check]) -> None:
         elif list(found) == ["runs"]:
             holds, result = "-", f"not run: {found['runs'].worst.message}"
         condition = max(summary.condition for summary in summaries)
-        # What others wrote is no markup.
+        # Names and messages of other people's code are not markup.
         row = (*key, str(sum(s.checks for s in summaries)), f"{condition:.1g}", *errors, holds, result)
         table.add_row(*map(escape, row))
     show(table)

@@ -1,4 +1,4 @@
-"""Images of a sequence, those of a folder or those that a method makes, against the sequence's references."""
+"""Comparison of images, from a folder or from a method, with the references of their sequence."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ STRICT: ProtocolName = "strict"
 WARPED, FLICKER = "wRMSE", "flicker"
 _METRICS = {**{name: METRICS[name] for name in USUAL}, "HDR-FLIP": Metric(flip_hdr)}
 _OURS = re.compile(r"denoised(\d+)")
-# The largest motion, in pixels, of a shot in which nothing moves.
+# Maximum motion, in pixels, of a shot that counts as static.
 _STILL = 0.05
 
 
@@ -49,10 +49,10 @@ class Table:
     """Values of one protocol.
 
     Args:
-        description: how the protocol gets its values.
-        frames: by frame number and metric; a temporal one stands at the later frame of its pair.
-        skipped: why a metric could not be computed, or not for every frame.
-        shots: metrics of whole shots, with the number of frames.
+        description: how the protocol computes its values.
+        frames: values by frame number and metric; a temporal metric is listed at the later frame of its pair.
+        skipped: reasons why a metric could not be computed, or not for every frame.
+        shots: metrics of whole shots, with their number of frames.
     """
 
     description: str
@@ -89,10 +89,11 @@ class Evaluation:
     Args:
         sequence: its name.
         images: the folder, or the name of the method.
-        tables: by protocol; ``"strict"`` is always there, with every metric.
-        warping_error: Lai's warping error of the images and of the references, mean over the pairs of frames.
-        reference_noise: the references' own SMAPE against the truth, where the renderer has noted it.
-        floor: what a perfect result would score against references with that noise, by metric.
+        tables: by protocol; ``"strict"`` is always included, with every metric.
+        warping_error: warping error (Lai et al. 2018) of the images and of the references, mean over the pairs of
+            frames.
+        reference_noise: estimated SMAPE of the references themselves, if the renderer has recorded it.
+        floor: score of a perfect result against references with that noise, by metric.
     """
 
     sequence: str
@@ -103,7 +104,7 @@ class Evaluation:
     floor: dict[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
-        """For a JSON file; ``null`` stands for the infinite PSNR of equal images."""
+        """The evaluation as JSON values; the infinite PSNR of equal images becomes ``null``."""
         tables = {
             name: {
                 "description": table.description,
@@ -130,17 +131,17 @@ def _finite(values: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def find_images(folder: Path, numbers: Collection[int]) -> dict[int, Path]:
-    """The EXR file of each frame, by the number in its name.
+    """Find the EXR file of each frame, by the number in its name.
 
-    Files ``denoisedN.exr`` are taken wherever there are any. Else all EXR files of the folder must be named alike up to
-    one number, such as ``frame.0012.exr`` or ``shot02_0012.exr``; a name may hold further numbers that never change.
+    If the folder has files ``denoisedN.exr``, only these are used. Otherwise the names of all its EXR files must differ
+    in one number only, such as ``frame.0012.exr`` or ``shot02_0012.exr``; other numbers in the names must be constant.
 
     Args:
-        folder: of the images.
-        numbers: frames that are needed.
+        folder: folder of the images.
+        numbers: required frames.
 
     Raises:
-        InputError: there is no such folder, the names do not tell the frames, or a frame is missing.
+        InputError: there is no such folder, the names do not give frame numbers, or a frame is missing.
     """
     if not os.path.isdir(folder):
         found = "a file" if os.path.isfile(folder) else "no such folder"
@@ -165,8 +166,8 @@ def find_images(folder: Path, numbers: Collection[int]) -> dict[int, Path]:
 
 
 def _numbered(folder: Path, stems: list[str]) -> list[tuple[int, str]]:
-    """Frame number and file stem, from the one number in which the stems differ."""
-    # Text and numbers alternate: the odd parts are the numbers.
+    """Frame number and file stem of each file, from the one number in which the stems differ."""
+    # Text and numbers alternate, with the numbers at odd indices.
     split = [re.split(r"(\d+)", stem) for stem in stems]
     alike = {tuple(parts[::2]) for parts in split}
     changing = [i for i in range(1, len(split[0]), 2) if len({parts[i] for parts in split if i < len(parts)}) > 1]
@@ -175,8 +176,8 @@ def _numbered(folder: Path, stems: list[str]) -> list[tuple[int, str]]:
     if len(alike) > 1 or len(changing) != 1:
         shown = ", ".join(f"{stem}.exr" for stem in (stems[0], stems[-1])[: len(stems)])
         raise InputError(
-            f"{folder}: expected names with one number that tells the frame, such as denoised12.exr or "
-            f"frame.0012.exr, found {shown}; leave one series of images in the folder"
+            f"{folder}: expected names that differ in one number, that of the frame, such as denoised12.exr or "
+            f"frame.0012.exr, found {shown}; keep only one series of images in the folder"
         )
     return [(int(parts[changing[0]]), stem) for parts, stem in zip(split, stems, strict=True)]
 
@@ -190,16 +191,16 @@ def evaluate_folder(
 ) -> Evaluation:
     """Compare the images of a folder with the references of a sequence.
 
-    Temporal metrics take pairs of frames with successive numbers and references; those along the motion need motion, or
-    positions with cameras; flicker needs shots in which nothing moves by more than 0.05 pixels.
+    Temporal metrics use pairs of successive frames with references. Metrics along the motion need motion buffers, or
+    positions with cameras; flicker needs shots without motion of more than 0.05 pixels.
 
     Args:
         sequence: frames with references.
-        folder: an EXR image of each, see :func:`find_images`: alone or among other layers, scene-linear, with the
-            primaries that its ``chromaticities`` state, or else Rec. 709. The references have those that the
-            color files state.
-        protocol: name in :data:`mcdenoise.metrics.PROTOCOLS`; its values come beside the strict ones.
-        on_frame: called with the number of each frame that is done.
+        folder: folder with an EXR image of each frame, see :func:`find_images`: alone or among other layers,
+            scene-linear, with the primaries of its header ``chromaticities``, or else of Rec. 709. The references have
+            the primaries that the headers of the color files state.
+        protocol: name in :data:`mcdenoise.metrics.PROTOCOLS`; its values are added to the strict ones.
+        on_frame: called with the number of each finished frame.
 
     Raises:
         InputError: the sequence has no references; an image is missing, damaged, of another size, has other channels,
@@ -221,14 +222,14 @@ def evaluate_method(
     protocol: ProtocolName = STRICT,
     on_frame: Callable[[int], None] = lambda number: None,
 ) -> Evaluation:
-    """Compare what a method makes of a sequence with its references, without writing it; see :func:`evaluate_folder`.
+    """Denoise a sequence and compare the images with its references, without writing them; see :func:`evaluate_folder`.
 
     Args:
-        sequence: frames with references; those without are denoised too, as a history needs them.
-        denoiser: is reset first.
-        name: what to call the method.
-        protocol: as there.
-        on_frame: as there, also for frames without a reference.
+        sequence: frames with references; frames without one are denoised too, because the history needs them.
+        denoiser: denoiser; it is reset first.
+        name: name of the method, for the table.
+        protocol: see :func:`evaluate_folder`.
+        on_frame: called with the number of each finished frame, including frames without a reference.
 
     Raises:
         InputError: the sequence has no references, a file is damaged, or a buffer that the method needs is missing.
@@ -255,22 +256,22 @@ def _evaluate(
     protocol: ProtocolName,
     on_frame: Callable[[int], None],
 ) -> Evaluation:
-    """Errors of images, each with its number, frame and reference."""
+    """Evaluate images, each with its number, frame and reference."""
     chosen = PROTOCOLS[protocol]
     strict = Table(PROTOCOLS[STRICT].description)
     tables: dict[str, Table] = {STRICT: strict}
     if protocol != STRICT:
         tables[protocol] = Table(chosen.description)
     pairs = _Pairs(strict)
-    past: tuple[int, Tensor, Tensor] | None = None
+    last: tuple[int, Tensor, Tensor] | None = None
     for number, image, frame, reference in images:
-        before = past[1:] if past is not None and past[0] == number - 1 else None
+        before = last[1:] if last is not None and last[0] == number - 1 else None
         strict.frames[number] = measure(_METRICS, image, reference, before, strict.skipped)
         pairs.add(number, frame, image, reference, before)
         if protocol != STRICT and number in sequence.numbers[chosen.skipped_frames :]:
             own, first = tables[protocol], number - 1 not in sequence.numbers[chosen.skipped_frames :]
             own.frames[number] = measure(chosen.metrics, image, reference, None if first else before, own.skipped)
-        past = number, image, reference
+        last = number, image, reference
         on_frame(number)
     pairs.finish()
     _explain(strict, [*_temporal(_METRICS), WARPED])
@@ -286,7 +287,7 @@ def _evaluate(
 
 
 class _Pairs:
-    """What needs the motion between frames: the warped errors, and flicker where there is none."""
+    """Metrics that depend on the motion between frames: the warped errors, and the flicker of static shots."""
 
     def __init__(self, table: Table) -> None:
         self._table = table
@@ -298,17 +299,17 @@ class _Pairs:
     def add(
         self, number: int, frame: Frame, image: Tensor, reference: Tensor, before: tuple[Tensor, Tensor] | None
     ) -> None:
-        """The next frame, and image and reference of its predecessor."""
-        past, self._frame = self._frame, frame
+        """Add the next frame; ``before`` is the image and the reference of the previous frame."""
+        last, self._frame = self._frame, frame
         motion = None
-        if before is not None and past is not None:
-            motion = motion_to_previous(frame, past.view_projection)
+        if before is not None and last is not None:
+            motion = motion_to_previous(frame, last.view_projection)
             if motion is None:
                 self._table.skipped[WARPED] = "the frames have no motion, and no positions with cameras"
-        if motion is None or before is None or past is None:
+        if motion is None or before is None or last is None:
             self._flicker = None
             return
-        surface, previous = surface_before(frame), Surface(past.position, past.normal, past.depth)
+        surface, previous = surface_before(frame), Surface(last.position, last.normal, last.depth)
         clip, truth = torch.stack([before[0], image], 1), torch.stack([before[1], reference], 1)
         try:
             value = float(warped_rmse_srgb(clip, truth, motion, surface, previous))
@@ -327,13 +328,13 @@ class _Pairs:
         self._flicker.add(image, reference)
 
     def finish(self) -> None:
-        """Put the flicker of all static shots into the table, each weighted by its frames."""
+        """Add the mean flicker of all static shots to the table, weighted by their numbers of frames."""
         frames = sum(shot.frames for shot in self._shots)
         if frames:
             mean = sum(shot.frames * float(shot.value()) for shot in self._shots) / frames
             self._table.shots[FLICKER] = mean, frames
         else:
-            self._table.skipped[FLICKER] = "no two successive frames with references between which nothing moves"
+            self._table.skipped[FLICKER] = "no two successive frames with references and without motion between them"
 
     @property
     def warping_error(self) -> tuple[float, float] | None:
@@ -344,7 +345,7 @@ class _Pairs:
 
 
 def _is_still(motion: Tensor) -> bool:
-    """Whether all motion that is known is next to nothing."""
+    """Whether all known motion is negligible."""
     length = torch.hypot(motion[:, 0], motion[:, 1])
     known = length[torch.isfinite(length)]
     return known.numel() > 0 and float(known.max()) < _STILL
@@ -355,7 +356,7 @@ def _temporal(metrics: Mapping[str, Metric]) -> list[str]:
 
 
 def _explain(table: Table, temporal: Iterable[str]) -> None:
-    """Say of temporal metrics why there are none, where nothing else has said so."""
+    """Add the reason for missing temporal metrics, unless there is one already."""
     counts = table.counts
     for name in temporal:
         if name not in counts:
@@ -372,14 +373,14 @@ def _check_header(path: Path, size: tuple[int, int]) -> None:
 
 
 def _read(sequence: Sequence, number: int, path: Path) -> tuple[Tensor, Frame, Tensor]:
-    """Image, frame and reference, both images with the primaries of Rec. 709."""
+    """Read image, frame and reference; both images are converted to the primaries of Rec. 709."""
     image, metadata = open_result(path).read()
     bad = ~torch.isfinite(image).all(1)[0]
     if bad.any():
         row, column = bad.nonzero()[0].tolist()
         raise InputError(
             f"{path}: expected finite pixels, found {int(bad.sum())} NaN or infinite ones of {bad.numel()}, first at "
-            f"row {row}, column {column}; no error is defined with them: repair them, or skip the frame"
+            f"row {row}, column {column}; errors are undefined for such pixels: repair them, or skip the frame"
         )
     try:
         frame, _ = sequence.frame(number).with_depth().validate()

@@ -1,4 +1,4 @@
-"""The metrics that methods are compared by, and those of one image."""
+"""The metrics by which methods are compared, and their values for one frame."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ METRICS: dict[str, Metric] = {
     "FLIP": Metric(flip_srgb),
     "tSMAPE": Metric(temporal_smape_linear, temporal=True),
     "tRMSE": Metric(temporal_rmse_srgb, temporal=True),
-    # For comparison with tables of others: not computed unless it is asked for.
+    # For comparison with published tables; it is computed only on request.
     "PSNR 2.2": Metric(psnr_gamma, higher_is_better=True),
 }
 USUAL = tuple(name for name in METRICS if name != "PSNR 2.2")
@@ -45,14 +45,14 @@ def measure(
     past: tuple[Tensor, Tensor] | None = None,
     skipped: dict[str, str] | None = None,
 ) -> dict[str, float]:
-    """Every metric of one frame that can be computed.
+    """Compute all metrics of one frame that can be computed.
 
     Args:
         metrics: by name.
         image: ``(1, 3, H, W)`` scene-linear radiance.
         reference: of the same shape.
-        past: image and reference of the frame before; without them there are no temporal metrics.
-        skipped: gets the reason for each metric that these images, or this installation, do not allow.
+        past: image and reference of the previous frame; without them temporal metrics are skipped.
+        skipped: receives the reason for each metric that these images, or this installation, do not allow.
     """
     values = {}
     for name, metric in metrics.items():
@@ -69,7 +69,7 @@ def measure(
 
 
 def check_references(sequence: Sequence) -> None:
-    """See that there is something to compare with.
+    """Check that a sequence has references.
 
     Raises:
         InputError: the sequence has no references.

@@ -1,1 +1,1 @@
-"""Denoising inside a renderer: one module for each, which imports the renderer on first use."""
+"""Integrations into renderers, one module each, which imports its renderer on first use."""

@@ -1,4 +1,4 @@
-"""Structural similarity in the forms that published numbers were computed with."""
+"""Structural similarity in the variants behind published numbers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch.nn.functional import avg_pool2d, conv2d
 from mcdenoise.metrics._check import UncomputableError
 
 _K1, _K2 = 0.01, 0.03
-# Of the five scales, from fine to coarse: Wang, Simoncelli and Bovik 2003, Sec. 3.2.
+# Exponents of the five scales, from fine to coarse: Wang, Simoncelli and Bovik 2003, Sec. 3.2.
 _SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
@@ -28,7 +28,7 @@ def uniform(size: int = 7) -> Tensor:
 def similarity(
     image: Tensor, reference: Tensor, window: Tensor, data_range: float, *, sample_covariance: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Structural similarity of every channel, over those pixels whose window lies within the image.
+    """Structural similarity of each channel, over the pixels whose window lies within the image.
 
     With local means, variances and covariance under the window: ``SSIM = mean(l cs)``,
     ``l = (2 ux uy + C1) / (ux^2 + uy^2 + C1)``, ``cs = (2 sxy + C2) / (sx^2 + sy^2 + C2)``, ``C = (K data_range)^2``.
@@ -37,8 +37,8 @@ def similarity(
         image: ``(B, C, H, W)``.
         reference: of the same shape.
         window: ``(size,)`` weights, applied in both directions.
-        data_range: of the values.
-        sample_covariance: divide by the number of pixels less one; for a window of equal weights.
+        data_range: range of the values.
+        sample_covariance: divide by the number of pixels minus one; only for a window of equal weights.
 
     Returns:
         ``(B, C)`` mean SSIM, and ``(B, C)`` mean cs.
@@ -66,21 +66,21 @@ def similarity(
 
 
 def multiscale_similarity(image: Tensor, reference: Tensor, data_range: float) -> Tensor:
-    """Similarity over five scales, each half as large as the one before: ``l_5 cs_5^w5 prod_(j<5) cs_j^wj``.
+    """Similarity over five scales, each half as large as the previous: ``l_5 cs_5^w5 prod_(j<5) cs_j^wj``.
 
-    Gaussian window of 11 with sigma 1.5; scales are 2x2 means (an odd side is padded with zeros); negative factors
-    count as 0: the conventions of ``pytorch_msssim.ms_ssim``.
+    It follows the conventions of ``pytorch_msssim.ms_ssim``: a Gaussian window of 11 pixels with sigma 1.5, scales by
+    2x2 means with odd sides padded by zeros, and negative factors replaced by 0.
 
     Args:
         image: ``(B, C, H, W)``.
         reference: of the same shape.
-        data_range: of the values.
+        data_range: range of the values.
 
     Returns:
         ``(B, C)`` in [0, 1].
 
     Raises:
-        UncomputableError: the images are not larger than 160 pixels, too small for five scales.
+        UncomputableError: a side is not larger than 160 pixels, which is too small for five scales.
 
     Source: Wang, Simoncelli and Bovik 2003.
     """

@@ -1,4 +1,4 @@
-"""Errors of what a display shows: clamped to [0, 1] on the sRGB curve, or (HDR-FLIP) at every exposure."""
+"""Errors of displayed values: clamped to [0, 1] with the sRGB curve, or (HDR-FLIP) over all exposures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcdenoise.metrics._check import UncomputableError, check_images
 
 _SSIM_WINDOW = 11
 _LARGEST = 65504.0
-# Of a reference darker than this HDR-FLIP finds no exposures, and ends the process.
+# For references darker than this, flip-evaluator finds no exposures and ends the process.
 _BLACK = 1e-5
 
 
@@ -31,7 +31,7 @@ def displayed(image: Tensor) -> Tensor:
 
 
 def display_codes(image: Tensor) -> Tensor:
-    """What :func:`displayed` gives as 8-bit codes: ``round(255 displayed)``.
+    """The values of :func:`displayed` as 8-bit codes: ``round(255 displayed)``.
 
     Args:
         image: ``(..., 3, H, W)`` scene-linear radiance, Rec. 709 primaries; no NaN.
@@ -49,7 +49,7 @@ def display_codes(image: Tensor) -> Tensor:
 def psnr_srgb(image: Tensor, reference: Tensor) -> Tensor:
     """Peak signal-to-noise ratio as displayed: clamped to [0, 1], sRGB curve, peak 1.
 
-    ``kornia.metrics.psnr`` on these values gives the same for one image; it averages a batch before the logarithm.
+    For one image ``kornia.metrics.psnr`` of the displayed values is equal; it averages a batch before the logarithm.
 
     Args:
         image: ``(..., 3, H, W)`` scene-linear radiance.
@@ -67,7 +67,7 @@ def psnr_srgb(image: Tensor, reference: Tensor) -> Tensor:
 
 
 def psnr_gamma(image: Tensor, reference: Tensor, *, gamma: float = 2.2) -> Tensor:
-    """Peak signal-to-noise ratio of values clamped to [0, 1] on a plain power curve, peak 1.
+    """Peak signal-to-noise ratio of values clamped to [0, 1] with a power curve, peak 1.
 
     Args:
         image: ``(..., 3, H, W)`` scene-linear radiance.
@@ -93,11 +93,11 @@ def psnr_gamma(image: Tensor, reference: Tensor, *, gamma: float = 2.2) -> Tenso
 def ssim_srgb(image: Tensor, reference: Tensor) -> Tensor:
     """Structural similarity as displayed: clamped to [0, 1], sRGB curve, data range 1.
 
-    Gaussian window of 11x11 pixels with sigma 1.5, K1 = 0.01, K2 = 0.03, weighted (not sample) covariance, each channel
-    by itself; the mean over channels and those pixels whose window lies within the image. It is
+    It uses a Gaussian window of 11x11 pixels with sigma 1.5, K1 = 0.01, K2 = 0.03 and weighted (not sample) covariance,
+    and is the mean over the channels and over the pixels whose window lies within the image. It is computed by
     ``kornia.metrics.ssim`` with ``padding="valid"``, and agrees with scikit-image's ``structural_similarity`` with
-    ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1``; published values with that
-    function's defaults (7x7 uniform window, and once a data range of 2) are higher.
+    ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1``. Published values with the defaults
+    of that function (7x7 uniform window, in old versions a data range of 2) are higher.
 
     Args:
         image: ``(..., 3, H, W)`` scene-linear radiance, H and W at least 11.
@@ -123,15 +123,16 @@ def ssim_srgb(image: Tensor, reference: Tensor) -> Tensor:
             f"SSIM's window: expected at least 11 x 11 pixels, found {image.shape[-2]} x {image.shape[-1]}"
         )
     shown, expected = (displayed(x).reshape(-1, *x.shape[-3:]) for x in (image, reference))
-    # Without kornia's epsilon, which the denominator does not need (it is at least K1^2 K2^2), equal images give 1.
+    # Drop kornia's epsilon, so that equal images give 1: the denominator is at least K1^2 K2^2 without it.
     similarity = ssim(shown, expected, _SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid")
     return similarity.mean((-3, -2, -1)).reshape(image.shape[:-3])
 
 
 def flip_srgb(image: Tensor, reference: Tensor) -> Tensor:
-    """Mean LDR-FLIP as displayed: clamped to [0, 1], sRGB curve, 67 pixels a degree; what a viewer sees on flipping.
+    """Mean LDR-FLIP as displayed: clamped to [0, 1], sRGB curve, 67 pixels per degree.
 
-    Computed by the authors' ``flip-evaluator``, on the CPU, about 1 microsecond a pixel; no gradient.
+    LDR-FLIP estimates the difference that a viewer sees when flipping between the two images. It is computed by the
+    authors' package ``flip-evaluator`` on the CPU, at about 1 microsecond per pixel, and has no gradient.
 
     Args:
         image: ``(..., 3, H, W)`` scene-linear radiance.
@@ -151,14 +152,14 @@ def flip_srgb(image: Tensor, reference: Tensor) -> Tensor:
 
 
 def flip_hdr(image: Tensor, reference: Tensor) -> Tensor:
-    """Mean HDR-FLIP: the worst LDR-FLIP of each pixel over the exposures that the reference's luminances call for.
+    """Mean HDR-FLIP: the maximum LDR-FLIP of each pixel over a range of exposures chosen from the reference.
 
-    Scene-linear radiance, not clamped; every exposure goes through the ACES curve of the metric's authors. 67 pixels a
-    degree. Computed by the authors' ``flip-evaluator`` with its defaults, on the CPU; as slow as so many LDR-FLIPs as
-    there are exposures (2 to about 15). No gradient.
+    It takes scene-linear radiance, applies each exposure and the ACES curve of the metric's authors, and assumes 67
+    pixels per degree. It is computed by the authors' package ``flip-evaluator`` with its defaults, on the CPU, at the
+    cost of one LDR-FLIP per exposure (2 to about 15), and has no gradient.
 
     Args:
-        image: ``(..., 3, H, W)`` scene-linear radiance; what is outside [0, 65504] is clamped.
+        image: ``(..., 3, H, W)`` scene-linear radiance; clamped to [0, 65504].
         reference: of the same shape.
 
     Returns:
@@ -177,12 +178,12 @@ def flip_hdr(image: Tensor, reference: Tensor) -> Tensor:
 
 
 def flip(image: Tensor, reference: Tensor, dynamic_range: Literal["LDR", "HDR"]) -> Tensor:
-    """Mean FLIP of images that are already in the metric's own domain.
+    """Mean FLIP of images that are already in the domain of the metric.
 
     Args:
         image: ``(..., 3, H, W)`` in [0, 1] on the sRGB curve for ``"LDR"``, else scene-linear and at least 0.
         reference: of the same shape.
-        dynamic_range: which of the two metrics.
+        dynamic_range: ``"LDR"`` for LDR-FLIP, ``"HDR"`` for HDR-FLIP.
 
     Returns:
         ``(...)`` in [0, 1], lower is better.
@@ -194,7 +195,7 @@ def flip(image: Tensor, reference: Tensor, dynamic_range: Literal["LDR", "HDR"])
         evaluator = importlib.import_module("flip_evaluator")
     except ImportError as error:
         raise UncomputableError(
-            "FLIP needs flip-evaluator, which is not installed; pip install 'mcdenoise[peers]', or leave FLIP out"
+            "FLIP needs flip-evaluator, which is not installed; pip install 'mcdenoise[peers]', or skip FLIP"
         ) from error
     tests, truths = (
         x.detach().reshape(-1, *x.shape[-3:]).permute(0, 2, 3, 1).float().cpu().contiguous().numpy()

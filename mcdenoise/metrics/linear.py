@@ -1,4 +1,4 @@
-"""Errors of scene-linear radiance: no tone curve, nothing clamped."""
+"""Errors of scene-linear radiance, without a tone curve or clamping."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def smape_linear(image: Tensor, reference: Tensor, *, epsilon: float = 1e-2) -> 
     Args:
         image: ``(..., C, H, W)`` scene-linear radiance.
         reference: of the same shape.
-        epsilon: in the unit of the radiance.
+        epsilon: small constant in the unit of the radiance.
 
     Returns:
         ``(...)`` in [0, 1], lower is better.
@@ -21,7 +21,7 @@ def smape_linear(image: Tensor, reference: Tensor, *, epsilon: float = 1e-2) -> 
     Raises:
         ValueError: the shapes differ.
 
-    Source: the paper's Eq. 9.
+    Source: Eq. 9 of the paper, doi:10.1007/s00371-023-02951-6.
 
     Example:
         >>> import torch
@@ -38,7 +38,7 @@ def relmse_linear(image: Tensor, reference: Tensor, *, epsilon: float = 1e-2) ->
     Args:
         image: ``(..., C, H, W)`` scene-linear radiance.
         reference: of the same shape.
-        epsilon: in the unit of the radiance squared.
+        epsilon: small constant in the unit of the squared radiance.
 
     Returns:
         ``(...)``, lower is better.
@@ -54,7 +54,7 @@ def relmse_linear(image: Tensor, reference: Tensor, *, epsilon: float = 1e-2) ->
 
 
 def rmse_linear(image: Tensor, reference: Tensor) -> Tensor:
-    """Root mean squared error of scene-linear radiance: ``sqrt(mean((x - y)^2))``. A few bright pixels can decide it.
+    """Root mean squared error of scene-linear radiance: ``sqrt(mean((x - y)^2))``. A few bright pixels may dominate it.
 
     Args:
         image: ``(..., C, H, W)`` scene-linear radiance.

@@ -1,4 +1,4 @@
-"""What a metric is to those who compute and compare many of them."""
+"""Description of a metric, for code that computes and compares several."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Metric:
-    """How to compare an image with its reference.
+    """A metric that compares an image with its reference.
 
     Args:
-        function: of image and reference, ``(1, 3, H, W)``, or of two clips, ``(1, 2, 3, H, W)``.
-        higher_is_better: whether it is a similarity; else it is an error.
+        function: takes image and reference, ``(1, 3, H, W)``, or two clips, ``(1, 2, 3, H, W)``.
+        higher_is_better: whether it is a similarity instead of an error.
         temporal: whether it takes pairs of successive frames.
     """
 
@@ -23,5 +23,5 @@ class Metric:
     temporal: bool = False
 
     def better(self, value: float, other: float) -> bool:
-        """Whether the first value is better than the other; equal ones are not."""
+        """Whether the first value is strictly better than the other."""
         return value > other if self.higher_is_better else value < other

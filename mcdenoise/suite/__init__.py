@@ -1,4 +1,4 @@
-"""A suite of frames that nothing was trained on, as renderers write them: what it has, its rendering, its tables."""
+"""A test suite of rendered frames that no model was trained on: its list of rows, its rendering, and its tables."""
 
 from mcdenoise.suite.close_ups import write_close_ups
 from mcdenoise.suite.rendering import Stage, open_row, render_suite, rows_there

@@ -1,14 +1,14 @@
-"""Scenes of the suite for Blender's Cycles, written as Blender writes: multilayer EXR files with every pass.
+"""Scenes of the suite for Blender's Cycles, rendered to multilayer EXR files with every pass.
 
     python blender_scenes.py job.json
 
-This script stands alone. It imports Blender's Python module ``bpy``, which is under the GPL (``pip install
-bpy==4.5.15``, Python 3.11; no display is needed), and nothing else beyond the standard library. The job names the
-scene, its settings and the images that are wanted, see :func:`main`; :mod:`mcdenoise.suite.rendering` writes it.
+This script is self-contained: apart from the standard library it imports only Blender's Python module ``bpy``, which is
+under the GPL (``pip install bpy==4.5.15``, Python 3.11; it needs no display). The job file names the scene, its
+settings and the images to render, see :func:`main`; :mod:`mcdenoise.suite.rendering` writes it.
 
-``gallery``: lacquered planks, a brick wall, brushed steel, glass, a mirror, a lamp, a page of marks, thin rods, a head
-that moves. ``garden``: outdoors under the sun and an HDR sky, with grass, a fence, lacquer and a glass ball.
-``attic``: matt things only, in a room that light enters by a window.
+``gallery`` has lacquered planks, a brick wall, brushed steel, glass, a mirror, a lamp, a page of marks, thin rods, and
+a head that moves. ``garden`` is outdoors under the sun and an HDR sky, with grass, a fence, lacquer and a glass ball.
+``attic`` is a room of diffuse objects only, lit through a window.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 bpy: Any
 try:
     bpy = importlib.import_module("bpy")
-except ImportError:  # mcdenoise's own Python need not have it.
+except ImportError:  # The Python that runs mcdenoise does not need bpy.
     bpy = None
 
 PASSES: tuple[str, ...] = ("z", "position", "normal", "vector", "emit", "environment")
@@ -35,8 +35,9 @@ Color = tuple[float, float, float]
 def main() -> None:
     """Read the job and render it.
 
-    It has ``scene``, ``size``, ``frames``, ``filter`` (``"default"`` or ``"centre"``), ``lens``, ``blur``, ``threads``,
-    and ``images``: a list of ``frame``, ``samples``, ``seed``, ``passes`` and ``out``. A file gets its name when whole.
+    Its keys are ``scene``, ``size``, ``frames``, ``filter`` (``"default"`` or ``"centre"``), ``lens``, ``blur``,
+    ``threads``, and ``images``: a list of objects with ``frame``, ``samples``, ``seed``, ``passes`` and ``out``. A file
+    gets its final name once it is complete.
     """
     with open(sys.argv[1], encoding="utf-8") as file:
         job = json.load(file)
@@ -58,7 +59,7 @@ def main() -> None:
 
 
 def set_up(scene: Any, job: dict[str, Any]) -> None:
-    """Everything that is not the scene."""
+    """Apply the render settings and the output format."""
     scene.render.engine = "CYCLES"
     scene.frame_start, scene.frame_end = 0, job["frames"] - 1
     scene.render.resolution_x, scene.render.resolution_y = job["size"]
@@ -70,7 +71,7 @@ def set_up(scene: Any, job: dict[str, Any]) -> None:
     cycles = scene.cycles
     cycles.device = "CPU"
     cycles.use_adaptive_sampling = cycles.use_denoising = False
-    # Cycles takes a box filter as one pixel wide whatever the width says, so the narrow one is the default kind.
+    # In Cycles the width does not apply to a box filter, so the narrow filter is a Blackman-Harris filter too.
     cycles.pixel_filter_type = "BLACKMAN_HARRIS"
     cycles.filter_width = 0.01 if job["filter"] == "centre" else 1.5
     settings = scene.render.image_settings
@@ -82,7 +83,7 @@ def set_up(scene: Any, job: dict[str, Any]) -> None:
 
 
 def gallery(frames: int) -> None:
-    """What shines, indoors and under a little sky."""
+    """An interior of glossy objects with a little sky light."""
     sky(24, 160, 0.05)
     plane("Floor", (0, 0, 0), (0, 0, 0), (12, 12), planks())
     plane("Wall", (0, 3.2, 1.5), (math.pi / 2, 0, 0), (9, 3), bricks())
@@ -107,7 +108,7 @@ def gallery(frames: int) -> None:
 
 
 def garden(frames: int) -> None:
-    """Outdoors: a bright sun, sharp shadows, thin things."""
+    """An outdoor scene with a bright sun, sharp shadows and thin objects."""
     sky(34, 130, 0.09)
     rng = random.Random(5)
     plane("Ground", (0, 0, 0), (0, 0, 0), (40, 40), soil())
@@ -140,7 +141,7 @@ def garden(frames: int) -> None:
 
 
 def attic(frames: int) -> None:
-    """A closed room of matt things; most of it sees the window's light after several bounces."""
+    """A closed room of diffuse objects; light from the window reaches most of it after several bounces."""
     sky(30, 60, 0.16)
     plaster = matt("Plaster", (0.72, 0.68, 0.6))
     plane("Floor", (0, 0, 0), (0, 0, 0), (6, 6), boards())
@@ -176,7 +177,7 @@ def attic(frames: int) -> None:
 
 
 def camera(frames: int, lens: float, place: Any, target: Color) -> None:
-    """A camera on a path that looks at one place."""
+    """Add a camera that moves along a path and looks at one point."""
     data = bpy.data.cameras.new("Camera")
     thing = bpy.data.objects.new("Camera", data)
     scene = bpy.context.scene
@@ -193,7 +194,7 @@ def camera(frames: int, lens: float, place: Any, target: Color) -> None:
 
 
 def path(thing: Any, frames: int, place: Any) -> None:
-    """Keyframes; for the Vector pass from one before the first frame to one after the last."""
+    """Animate the location, from one frame before the first to one after the last, which the Vector pass needs."""
     bpy.context.preferences.edit.keyframe_new_interpolation_type = "LINEAR"
     for step in range(-1, frames + 1):
         thing.location = place(step)
@@ -203,7 +204,7 @@ def path(thing: Any, frames: int, place: Any) -> None:
 def plane(
     name: str, where: Color, turned: Color, size: tuple[float, float], material: Any, height: float | None = None
 ) -> None:
-    """A rectangle, or with a height a box."""
+    """Add a rectangle, or a box if a height is given."""
     make = bpy.ops.mesh.primitive_plane_add if height is None else bpy.ops.mesh.primitive_cube_add
     make(size=1, location=where, rotation=turned)
     bpy.context.object.scale = (*size, 1 if height is None else height)
@@ -211,19 +212,19 @@ def plane(
 
 
 def ball(name: str, where: Color, radius: float, material: Any) -> None:
-    """A sphere."""
+    """Add a sphere."""
     bpy.ops.mesh.primitive_uv_sphere_add(radius=radius, location=where, segments=64, ring_count=32)
     finish(name, material)
 
 
 def cylinder(name: str, where: Color, radius: float, height: float, material: Any) -> None:
-    """An upright cylinder."""
+    """Add an upright cylinder."""
     bpy.ops.mesh.primitive_cylinder_add(radius=radius, depth=height, location=where, vertices=48)
     finish(name, material, smooth=False)
 
 
 def finish(name: str, material: Any, smooth: bool = True) -> Any:
-    """Name the object just made and give it its material."""
+    """Name the active object and assign its material."""
     thing = bpy.context.object
     thing.name = name
     thing.data.materials.append(material)
@@ -232,7 +233,7 @@ def finish(name: str, material: Any, smooth: bool = True) -> Any:
 
 
 def surface(name: str, **inputs: Any) -> tuple[Any, Any, Any]:
-    """A material of one Principled BSDF, its tree, and the node."""
+    """A material of one Principled BSDF, its node tree, and the BSDF's node."""
     material = bpy.data.materials.new(name)
     material.use_nodes = True
     shader = material.node_tree.nodes["Principled BSDF"]
@@ -242,12 +243,12 @@ def surface(name: str, **inputs: Any) -> tuple[Any, Any, Any]:
 
 
 def matt(name: str, color: Color) -> Any:
-    """No gloss at all."""
+    """A diffuse material without any specular reflection."""
     return surface(name, Base_Color=(*color, 1), Roughness=1.0, Specular_IOR_Level=0.0)[0]
 
 
 def metal(name: str, value: float, roughness: float, color: Color = (1.0, 1.0, 1.02)) -> Any:
-    """A mirror, or a rough one."""
+    """A metal, from a perfect mirror to a rough one."""
     shade = tuple(value * channel for channel in color)
     return surface(name, Base_Color=(*shade, 1), Metallic=1.0, Roughness=roughness)[0]
 
@@ -263,7 +264,7 @@ def coat(name: str, color: Color) -> Any:
 
 
 def lamp(strength: float, color: Color) -> Any:
-    """What gives light."""
+    """An emissive material."""
     material, _, shader = surface("Lamp")
     shader.inputs["Emission Color"].default_value = (*color, 1)
     shader.inputs["Emission Strength"].default_value = strength
@@ -271,7 +272,7 @@ def lamp(strength: float, color: Color) -> Any:
 
 
 def patterned(name: str, kind: str, low: Color, high: Color, output: str, scale: float, **inputs: Any) -> Any:
-    """A surface whose color goes from one to another along a texture over its own coordinates."""
+    """A material whose color is interpolated between two colors by a procedural texture in object coordinates."""
     material, tree, shader = surface(name, **inputs)
     node = tree.nodes.new(kind)
     node.inputs["Scale"].default_value = scale
@@ -285,7 +286,7 @@ def patterned(name: str, kind: str, low: Color, high: Color, output: str, scale:
 
 
 def planks() -> Any:
-    """Dark wood of strong grain under lacquer."""
+    """Lacquered dark wood with a strong grain."""
     material, node, _ = patterned(
         "Planks", "ShaderNodeTexWave", (0.02, 0.01, 0.006), (0.2, 0.1, 0.05), "Fac", 9.0, Roughness=0.5, Coat_Weight=1.0
     )
@@ -295,7 +296,7 @@ def planks() -> Any:
 
 
 def boards() -> Any:
-    """Matt wood."""
+    """Diffuse wood."""
     material, node, _ = patterned(
         "Boards", "ShaderNodeTexWave", (0.2, 0.12, 0.07), (0.5, 0.34, 0.2), "Fac", 14.0, Roughness=1.0
     )
@@ -315,12 +316,12 @@ def marks() -> Any:
 
 
 def soil() -> Any:
-    """Earth in many shades."""
+    """Soil of many shades."""
     return patterned("Soil", "ShaderNodeTexNoise", (0.05, 0.03, 0.02), (0.4, 0.3, 0.2), "Fac", 60.0, Roughness=1.0)[0]
 
 
 def checks() -> Any:
-    """A board of squares."""
+    """A checkerboard."""
     return patterned("Checks", "ShaderNodeTexChecker", (0.06, 0.07, 0.1), (0.75, 0.7, 0.6), "Fac", 8.0)[0]
 
 
@@ -345,7 +346,7 @@ def sky(elevation: float, rotation: float, strength: float) -> None:
     world.use_nodes = True
     tree = world.node_tree
     node = tree.nodes.new("ShaderNodeTexSky")
-    # Nishita's sky has gone by another name since Blender 5.0.
+    # Blender 5.0 renamed Nishita's sky model.
     node.sky_type = "NISHITA" if bpy.app.version < (5, 0) else "SINGLE_SCATTERING"
     node.sun_elevation, node.sun_rotation = math.radians(elevation), math.radians(rotation)
     node.sun_size, node.sun_intensity = math.radians(1.5), 0.5

@@ -1,4 +1,4 @@
-"""Rendering the suite into a folder, which can be stopped at any time and goes on where it was."""
+"""Rendering of the suite into a folder; it can be interrupted at any time, and resumes."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from mcdenoise.scenes.render.halves import ReferenceHalves
 from mcdenoise.suite.rows import SHOTS, Row, Shot
 
 _SCRIPT = Path(__file__).with_name("blender_scenes.py")
-# References are rendered in so many equal parts, whose halves tell the noise that is left.
+# Each reference is the mean of this many renderings; the difference of its two halves estimates its noise.
 _PARTS = 8
-# All references get a quarter of their samples before any gets more: then the suite can be used.
+# All references get a quarter of their samples before any gets the rest, so that the suite can be used early.
 _FRACTIONS = (0.25, 1.0)
 _SEED, _REFERENCE_SEED = 77, 1_000_000
 _LENS, _FOCUS = 0.03, 3.4
 
 
 class Stage(NamedTuple):
-    """How far the rendering is.
+    """Progress of the rendering.
 
     Args:
-        shot: what is rendered next.
-        fraction: of the samples of its references.
-        done: shots that are finished, counted once for each fraction.
-        total: all of them.
+        shot: the shot that is rendered next.
+        fraction: fraction of its reference samples that is rendered.
+        done: number of finished steps; each shot is one step per fraction.
+        total: number of all steps.
     """
 
     shot: str
@@ -57,22 +57,22 @@ def render_suite(
     threads: int = 0,
     on_stage: Callable[[Stage], None] = lambda stage: None,
 ) -> None:
-    """Render what is missing; files have their names only when whole.
+    """Render the missing files of shots; a file gets its final name once it is complete.
 
     Args:
-        shots: in this order. Their references get a quarter of their samples first, and then all.
+        shots: shots in the order of rendering. All references get a quarter of their samples first, and then the rest.
         data: the folder; a shot's files go to ``data/NAME``.
-        blender_python: an interpreter that can import ``bpy``, for the shots of Cycles; by default as
-            :class:`mcdenoise.scenes.cycles.Blender` has it.
-        threads: of Cycles; all processors by default.
+        blender_python: a Python interpreter that can import ``bpy``, for the shots of Cycles; by default as in
+            :class:`mcdenoise.scenes.cycles.Blender`.
+        threads: number of threads for Cycles; 0 uses all processors.
         on_stage: called before each step.
 
     Raises:
-        InputError: a renderer is missing or failed, or the folder cannot be written or holds something else.
+        InputError: a renderer is missing or failed, or the folder cannot be written or holds other files.
     """
     shots = list(shots)
     if any(shot.renderer == "cycles" and not _is_whole(shot, data) for shot in shots):
-        # Before the hours that Mitsuba takes.
+        # Find Blender before the hours that Mitsuba takes.
         with Blender(blender_python) as blender:
             blender_python = blender.python
     try:
@@ -89,15 +89,15 @@ def render_suite(
 
 
 def rows_there(rows: Iterable[Row], data: Path) -> list[Row]:
-    """Those of the rows that can be opened: their frames and references are there, however noisy these still are."""
+    """The rows whose frames and references exist; the references may be unfinished."""
     return [row for row in rows if _is_there(row.shot, data)]
 
 
 def open_row(row: Row, data: Path) -> Sequence:
-    """The frames of a row, under its name.
+    """Open the frames of a row, under its name.
 
     Raises:
-        InputError: they are not there, or damaged.
+        InputError: the files are missing or damaged.
     """
     return replace(open_sequence(data / row.shot.name, row.frames), name=row.name)
 
@@ -114,7 +114,7 @@ def _is_there(shot: Shot, data: Path) -> bool:
 
 
 def _is_whole(shot: Shot, data: Path) -> bool:
-    """Whether nothing of a shot of Cycles is missing."""
+    """Whether a shot of Cycles is completely rendered."""
     parts = _parts_of(shot, data)
     return _is_there(shot, data) and all(_part(parts, k, n).is_file() for k in range(_PARTS) for n in shot.references)
 
@@ -149,7 +149,7 @@ def _mitsuba_scene(shot: Shot) -> tuple[dict[str, Any], list[Camera], dict[str, 
 
 
 def _take_references(shot: Shot, data: Path) -> None:
-    """Take the references of the first shot of the same picture: then they need not be rendered twice."""
+    """Copy the references of the first shot with the same picture, instead of rendering them again."""
     first = next((other for other in SHOTS if other.picture == shot.picture), shot)
     if first == shot:
         return
@@ -201,16 +201,16 @@ def _run_blender(shot: Shot, images: list[dict[str, Any]], python: Path, threads
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "job.json"
         path.write_text(json.dumps(job))
-        # -P: the modules beside the script are none of Blender's.
+        # With -P, Python does not import the modules beside the script.
         command = [str(python), "-P", str(_SCRIPT), str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode or not all(Path(image["out"]).is_file() for image in images):
-        said = [line for line in done.stderr.splitlines() if line.strip()] or ["it ended without a word"]
-        raise InputError(f"{shot.name}: Blender could not render it: {said[-1].strip()}")
+        messages = [line for line in done.stderr.splitlines() if line.strip()] or ["it ended without a message"]
+        raise InputError(f"{shot.name}: Blender could not render it: {messages[-1].strip()}")
 
 
 def _write_reference(path: Path, parts: list[Path], samples: int) -> float:
-    """The mean of the parts, and the estimate of its noise."""
+    """Write the mean of the parts, and return the estimate of its noise."""
     halves: ReferenceHalves | None = None
     for part in parts:
         pixels, channels, _ = read_exr(part)
@@ -220,13 +220,13 @@ def _write_reference(path: Path, parts: list[Path], samples: int) -> float:
             size = color.shape[:2]
             halves = ReferenceHalves.start(np.zeros((size[0] * size[1], 3)), 0, 0)
         halves.add(color.reshape(-1, 3), samples)
-    assert halves is not None, "there are two parts at least"
+    assert halves is not None, "there are at least two parts"
     write_exr(path, halves.mean().astype(np.float32).reshape(*size, 3), ["R", "G", "B"])
     return halves.noise() or 0.0
 
 
 def _parts_of(shot: Shot, data: Path) -> Path:
-    """Where the parts of its references lie: shots of the same picture have them in common."""
+    """Folder with the parts of the references, which shots with the same picture share."""
     first = next((other for other in SHOTS if other.picture == shot.picture), shot)
     return data / ".parts" / first.name
 

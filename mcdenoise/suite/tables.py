@@ -1,4 +1,4 @@
-"""The suite's tables: each model against OIDN's best setting of each row, and error over samples."""
+"""The suite's tables: each model against OIDN's best setting on each row, and error over samples."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from mcdenoise.suite.rows import Row
 
 SMAPE, PSNR, TEMPORAL = "SMAPE", "PSNR 2.2", "tRMSE"
 SHOWN = (SMAPE, PSNR, TEMPORAL)
-# With noisy features the library's high quality is its balanced network.
+# With noisy features, OIDN uses the same network for high and balanced quality.
 PEERS = (
     "oidn(quality=fast|balanced, auxiliary=clean|noisy, source=raw|accumulated),"
     "oidn(quality=high, auxiliary=clean, source=raw|accumulated)"
 )
 _PEER = "oidn"
-# Where a reference has this part of an error itself, the row cannot tell much.
+# If the reference's own noise is more than this fraction of an error, the row is marked as inconclusive.
 _NOISY = 0.5
 
 
 @dataclass(frozen=True)
 class Best:
-    """A value of the peer, and the setting that has it.
+    """The best value of the peer in one metric.
 
     Args:
         value: of the metric.
-        setting: the method's name.
-        milliseconds: of that setting, where it was timed.
+        setting: name of the method that reaches it.
+        milliseconds: run time of that method; ``None`` if it was not timed.
     """
 
     value: float
@@ -42,15 +42,15 @@ class Line:
     """One model on one row.
 
     Args:
-        row: its name.
-        model: the method's name.
-        samples: a pixel.
-        values: of the model, by metric: SMAPE, PSNR of values clamped to [0, 1] on a power curve of 1/2.2, and the root
-            mean squared error of differences between frames where there are several.
-        best: of the peer, by metric, each of the setting that is best in it on this row; empty without the peer.
-        noisy: of the input.
-        milliseconds: a frame, where it was timed.
-        reference_noise: SMAPE that the references themselves are estimated to have.
+        row: name of the row.
+        model: name of the method.
+        samples: samples per pixel.
+        values: the model's values by metric: SMAPE; PSNR of values clamped to [0, 1] on a power curve of 1/2.2; and for
+            sequences the root mean squared error of differences between frames.
+        best: the peer's best value by metric, over its settings on this row; empty without the peer.
+        noisy: values of the input, by metric.
+        milliseconds: run time per frame; ``None`` if it was not timed.
+        reference_noise: estimated SMAPE of the references themselves.
     """
 
     row: str
@@ -68,12 +68,12 @@ class Line:
 
 
 def suite_lines(results: Results, rows: Iterable[Row]) -> list[Line]:
-    """Each model on each row of the table, model by model; where a model failed, it has no line."""
+    """The lines of the table, model by model; a model has no line for a row on which it failed."""
     return _lines(results, [row for row in rows if not row.shot.curve])
 
 
 def error_lines(results: Results, rows: Iterable[Row]) -> list[Line]:
-    """As :func:`suite_lines`, of the points of the curves of error over samples."""
+    """As :func:`suite_lines`, for the curves of error over samples."""
     return _lines(results, [row for row in rows if row.shot.curve])
 
 
@@ -114,13 +114,13 @@ def _shown(cell: Cell) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class MethodMean:
-    """What a method costs and leaves wrong, in the mean of rows.
+    """Mean error and mean run time of a method over rows.
 
     Args:
         method: its name.
-        error: geometric mean of its SMAPE over that of the noisy input.
-        milliseconds: geometric mean of its times a frame.
-        beaten_by: a method that is neither slower nor worse; empty for those on the Pareto front.
+        error: geometric mean of its SMAPE relative to that of the noisy input.
+        milliseconds: geometric mean of its run times per frame.
+        beaten_by: a method that is neither slower nor worse; empty for methods on the Pareto front.
     """
 
     method: str
@@ -130,9 +130,9 @@ class MethodMean:
 
 
 def error_against_time(results: Results, rows: Iterable[Row]) -> tuple[list[MethodMean], int]:
-    """Each method in the mean of the rows of the table, fastest first, and how many rows these are.
+    """Mean error and run time of each method over the rows of the table, fastest first, and the number of these rows.
 
-    A method without any result is skipped; a row counts where all others have an error and a time.
+    Methods without any result are skipped. Only rows on which all other methods have an error and a run time count.
     """
     names = [
         method.name
@@ -157,7 +157,7 @@ def error_against_time(results: Results, rows: Iterable[Row]) -> tuple[list[Meth
 
 
 def _point(results: Results, row: Row, method: str) -> tuple[float, float] | None:
-    """Error over that of the noisy input, and milliseconds."""
+    """Error relative to that of the noisy input, and milliseconds."""
     noisy, cell = _cell(results, row, "noisy"), _cell(results, row, method)
     if noisy is None or cell is None or cell.computing is None:
         return None
@@ -181,17 +181,20 @@ def _best(results: Results, row: Row, peers: list[Method]) -> dict[str, Best]:
 
 
 def markdown(lines: list[Line], curves: list[Line], means: Sequence[MethodMean] = (), counted: int = 0) -> str:
-    """The tables as text: error against time, one for each model with its wins and losses, and error over samples.
+    """The tables in Markdown: error against time, one table per model with its wins and losses, error over samples.
 
     Args:
         lines: see :func:`suite_lines`.
         curves: see :func:`error_lines`.
         means: see :func:`error_against_time`.
-        counted: rows that these are means of.
+        counted: number of rows behind ``means``.
     """
     parts = []
     if means:
-        about = f"SMAPE over that of the noisy input, and milliseconds a frame: geometric means of {counted} rows."
+        about = (
+            f"SMAPE relative to that of the noisy input, and milliseconds per frame: geometric means over {counted} "
+            "rows."
+        )
         parts += ["## Error against time", "", about, "", *_means_table(means), ""]
     for model in dict.fromkeys(line.model for line in lines):
         own = [line for line in lines if line.model == model]
@@ -202,7 +205,7 @@ def markdown(lines: list[Line], curves: list[Line], means: Sequence[MethodMean] 
 
 
 def sample_curves(curves: list[Line]) -> dict[str, dict[str, list[tuple[int, float]]]]:
-    """SMAPE over samples by scene (a row's name without its samples), and by model, ``input`` and ``OIDN, best``."""
+    """SMAPE over samples, by scene (a row's name without its samples) and by model, ``input`` or ``OIDN, best``."""
     found: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for line in curves:
         own = found.setdefault(line.row.rpartition("-")[0], {})
@@ -216,27 +219,26 @@ def sample_curves(curves: list[Line]) -> dict[str, dict[str, list[tuple[int, flo
 
 
 def verdict(lines: list[Line]) -> list[str]:
-    """One model against the peer in a few lines: rows ahead and behind, and the mean ratio of SMAPE."""
+    """Summary of one model against the peer: the rows where it is ahead and behind, and the mean ratio of SMAPE."""
     judged = [line for line in lines if line.best]
     if not judged:
-        return ["OIDN was not there to compare with; pip install 'mcdenoise[peers]'"]
-    said = []
+        return ["OIDN is not installed, so there is no comparison with it; pip install 'mcdenoise[peers]'"]
+    summary = []
     for metric in SHOWN:
         both = [line for line in judged if metric in line.values and metric in line.best]
         behind = [line.row for line in both if not line.ahead(metric)]
         if both:
             text = f"{metric}: ahead of OIDN's best setting in {len(both) - len(behind)} of {len(both)} rows"
-            said.append(text + (f"; behind in {'; '.join(behind)}" if behind else ""))
+            summary.append(text + (f"; behind in {'; '.join(behind)}" if behind else ""))
     ratios = [line.values[SMAPE] / line.best[SMAPE].value for line in judged]
-    said.append(
-        f"SMAPE over that of OIDN's best setting, geometric mean of {len(ratios)} rows: {geometric_mean(ratios):.3f}"
-    )
+    mean = geometric_mean(ratios)
+    summary.append(f"SMAPE relative to OIDN's best setting, geometric mean over {len(ratios)} rows: {mean:.3f}")
     unclear = [
         line.row for line in judged if line.reference_noise and line.reference_noise > _NOISY * line.best[SMAPE].value
     ]
     if unclear:
-        said.append(f"references with more than half of the error themselves: {'; '.join(unclear)}")
-    return said
+        summary.append(f"rows whose reference noise is more than half of the error: {'; '.join(unclear)}")
+    return summary
 
 
 def _table(lines: list[Line]) -> list[str]:

@@ -1,4 +1,4 @@
-"""A folder of images against references: which files, which values, and what is refused."""
+"""Evaluation of a folder of images: finding files, values, and rejected input."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def touched(folder: Path, *names: str) -> Path:
 
 @pytest.fixture
 def images(small_sequence: Path, tmp_path: Path) -> Path:
-    """The noisy colors as if they were a result."""
+    """A folder with the noisy colors as its images."""
     out = tmp_path / "out"
     out.mkdir()
     for number in range(4):
@@ -48,7 +48,7 @@ def changed(path: Path, change: Callable[[np.ndarray[Any, Any]], object]) -> Non
     write_exr(path, pixels, channels, half=False)
 
 
-# Which files
+# Finding files
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def changed(path: Path, change: Callable[[np.ndarray[Any, Any]], object]) -> Non
         ("frame.0008.exr", "frame.0009.exr", "frame.0010.exr"),
         ("8.exr", "9.exr", "10.exr", "notes.txt"),
         ("shot02_v3.0008.beauty.exr", "shot02_v3.0009.beauty.exr", "shot02_v3.0010.beauty.exr"),
-        # Ours, with something else beside it.
+        # Files of mcdenoise, beside other files.
         ("denoised8.exr", "denoised9.exr", "denoised10.exr", "mask.exr", "albedo9.exr", ".denoised9.5.tmp.exr"),
     ],
 )
@@ -76,16 +76,16 @@ def test_a_single_frame_is_found(tmp_path: Path) -> None:
     ("names", "message"),
     [
         ((), "expected denoised EXR images, found none"),
-        (("a1.exr", "b2.exr"), r"names with one number that tells the frame.*found a1.exr, b2.exr"),
-        (("a1_1.exr", "a2_2.exr"), "names with one number that tells the frame"),
-        (("v1_f2.exr",), r"found v1_f2.exr; leave one series"),
-        (("mask.exr",), "names with one number that tells the frame"),
+        (("a1.exr", "b2.exr"), r"names that differ in one number, that of the frame.*found a1.exr, b2.exr"),
+        (("a1_1.exr", "a2_2.exr"), "names that differ in one number, that of the frame"),
+        (("v1_f2.exr",), r"found v1_f2.exr; keep only one series"),
+        (("mask.exr",), "names that differ in one number, that of the frame"),
         (("f1.exr", "f01.exr", "f2.exr"), r"one file a frame, found f01.exr and f1.exr"),
         (("f1.exr", "f3.exr"), r"found none of frame 2 \(it has frames 1 to 3\); .* --frames"),
         (tuple(f"denoised{i}.exr" for i in range(100, 103)), r"found none of frame 1, 2 \(it has frames 100 to 102\)"),
     ],
 )
-def test_names_that_do_not_tell_the_frames(tmp_path: Path, names: tuple[str, ...], message: str) -> None:
+def test_names_without_a_frame_number_are_rejected(tmp_path: Path, names: tuple[str, ...], message: str) -> None:
     with pytest.raises(InputError, match=message):
         find_images(touched(tmp_path / "out", *names), [1, 2])
 
@@ -113,13 +113,13 @@ def test_every_value_is_that_of_its_function(small_sequence: Path, images: Path)
     clip, truth = (torch.stack([getattr(frame, name) for frame in frames], 1) for name in ("color", "reference"))
     warping = []
     for number, frame in enumerate(frames):
-        past = None if number == 0 else (clip[:, number - 1], truth[:, number - 1])
+        previous = None if number == 0 else (clip[:, number - 1], truth[:, number - 1])
         found = dict(table.frames[number])
         assert 0 < found.pop("HDR-FLIP") < 1
         warped = found.pop("wRMSE", None)
         assert frame.reference is not None
         usual = {name: METRICS[name] for name in USUAL}
-        assert found == pytest.approx(measure(usual, frame.color, frame.reference, past), rel=1e-6)
+        assert found == pytest.approx(measure(usual, frame.color, frame.reference, previous), rel=1e-6)
         if number == 0:
             assert warped is None
             continue
@@ -139,9 +139,9 @@ def test_every_value_is_that_of_its_function(small_sequence: Path, images: Path)
     assert table.counts["SMAPE"] == 4
     assert table.counts["tRMSE"] == table.counts["wRMSE"] == 3
     assert result.warping_error == pytest.approx(np.mean(warping, 0).tolist(), rel=1e-6)
-    # The floor and the sky change less than the noise does.
+    # The floor and the sky change less than the noise.
     assert np.mean(warping, 0)[0] > 5 * np.mean(warping, 0)[1]
-    assert "nothing moves" in table.skipped["flicker"]
+    assert "without motion" in table.skipped["flicker"]
     assert (result.reference_noise, result.floor) == (None, {})
 
 
@@ -160,7 +160,7 @@ def test_references_are_perfect(small_sequence: Path, images: Path) -> None:
 
 
 @pytest.mark.parametrize("protocol", ["meng2020", "fan2021"])
-def test_a_protocol_stands_beside_strict(small_sequence: Path, images: Path, protocol: ProtocolName) -> None:
+def test_a_protocol_is_listed_beside_strict(small_sequence: Path, images: Path, protocol: ProtocolName) -> None:
     sequence = open_sequence(small_sequence)
     tables = evaluate_folder(sequence, images, protocol=protocol).tables
     assert list(tables) == ["strict", protocol]
@@ -169,11 +169,11 @@ def test_a_protocol_stands_beside_strict(small_sequence: Path, images: Path, pro
     expected = measure(PROTOCOLS[protocol].metrics, frame.color, frame.reference)
     assert tables[protocol].frames[2] == pytest.approx(expected, rel=1e-6)
     assert list(tables[protocol].frames) == [0, 1, 2, 3]
-    # Of the same images, the data range of 2 makes it higher.
+    # For the same images, the data range of 2 makes the SSIM higher.
     assert tables[protocol].mean["SSIM"] > tables["strict"].mean["SSIM"]
 
 
-def test_noisebase_leaves_out_the_first_frames(small_sequence: Path, images: Path) -> None:
+def test_noisebase_skips_the_first_frames(small_sequence: Path, images: Path) -> None:
     pytest.importorskip("flip_evaluator")
     tables = evaluate_folder(open_sequence(small_sequence), images, protocol="noisebase").tables
     assert tables["noisebase"].frames == {}
@@ -183,7 +183,7 @@ def test_noisebase_leaves_out_the_first_frames(small_sequence: Path, images: Pat
 
 
 def long_sequence(folder: Path, frames: int) -> tuple[Path, Path]:
-    """A static shot whose noisy colors are also its result: sequence and images."""
+    """A static shot whose noisy colors are also its denoised images: the folders of both."""
     generator = torch.Generator().manual_seed(0)
     root, out = folder / "static", folder / "still"
     out.mkdir()
@@ -208,17 +208,17 @@ def test_flicker_of_a_static_shot(small_sequence: Path, tmp_path: Path) -> None:
     assert strict.mean["flicker"] == pytest.approx(float(flicker_srgb(clip, truth)), rel=1e-5)
     assert strict.mean["flicker"] > 0.05
     assert strict.counts["flicker"] == 19
-    # Nothing moves, so nothing is warped.
+    # Without motion, warping changes nothing.
     assert strict.mean["wRMSE"] == pytest.approx(strict.mean["tRMSE"], rel=1e-4)
-    # 16 frames less; the first of the rest has no predecessor any more.
+    # 16 frames are skipped; the first of the rest has no previous frame.
     assert list(noisebase.frames) == [16, 17, 18]
     assert {name: noisebase.counts[name] for name in ("PSNR", "tPSNR")} == {"PSNR": 3, "tPSNR": 2}
     assert "160 x 160" in noisebase.skipped["MS-SSIM"]
 
 
-def test_two_shots_flicker_apart(small_sequence: Path, tmp_path: Path) -> None:
+def test_the_flicker_of_two_shots_is_computed_separately(small_sequence: Path, tmp_path: Path) -> None:
     root, images = long_sequence(tmp_path, 7)
-    # Everything is somewhere else from frame 4 on.
+    # From frame 4 on, everything has moved.
     changed(root / "inputs" / "motion4.exr", lambda pixels: pixels.fill(3.0))
     for number in (4, 5, 6):
         changed(images / f"frame.{number:04d}.exr", lambda pixels: pixels.fill(0.5))
@@ -232,7 +232,7 @@ def test_two_shots_flicker_apart(small_sequence: Path, tmp_path: Path) -> None:
     assert strict.counts["flicker"] == 7
 
 
-def test_frames_apart_are_no_pair(small_sequence: Path, images: Path) -> None:
+def test_frames_that_are_not_successive_are_no_pair(small_sequence: Path, images: Path) -> None:
     (small_sequence / "inputs" / "reference1.exr").unlink()
     table = evaluate_folder(open_sequence(small_sequence), images).tables["strict"]
     assert list(table.frames) == [0, 2, 3]
@@ -267,7 +267,7 @@ def test_alpha_is_ignored(small_sequence: Path, images: Path) -> None:
 
 
 def test_primaries_of_the_images_are_converted(small_sequence: Path, images: Path, colour: Any) -> None:
-    """The references in ACEScg are as good as the references."""
+    """References converted to ACEScg score like the references themselves."""
     spaces = colour.RGB_COLOURSPACES
     matrix = colour.matrix_RGB_to_RGB(spaces["sRGB"], spaces["ACEScg"], chromatic_adaptation_transform="Bradford")
     primaries = (*spaces["ACEScg"].primaries.flatten().tolist(), *spaces["ACEScg"].whitepoint.tolist())
@@ -292,10 +292,10 @@ def test_the_truth_scores_the_noise_of_the_references(small_sequence: Path, imag
         return noise_floor(sequence)
 
     one, two = noted(0.01), noted(0.02)
-    # By construction; 5760 values scatter by 1 %.
+    # This holds by construction; 5760 values estimate it to 1 %.
     assert one["SMAPE"] == pytest.approx(0.01, rel=0.04)
     assert two["SMAPE"] == pytest.approx(0.02, rel=0.04)
-    # The change from frame to frame has the noise of both frames; below white it doubles with it.
+    # The change from frame to frame has the noise of both frames, and is proportional to it below white.
     assert two["tRMSE"] == pytest.approx(2 * one["tRMSE"], rel=0.1)
     references = torch.cat([sequence.frame(number).reference for number in range(4)])
     deviation = 0.01 * math.sqrt(math.pi / 2) * (2 * references + 0.01)
@@ -309,17 +309,17 @@ def test_the_truth_scores_the_noise_of_the_references(small_sequence: Path, imag
     assert result.floor["tRMSE"] == 0
 
 
-# What is refused
+# Rejected input
 
 
-def test_nothing_to_compare_with(small_sequence: Path, images: Path) -> None:
+def test_a_sequence_without_references_is_rejected(small_sequence: Path, images: Path) -> None:
     for path in (small_sequence / "inputs").glob("reference*.exr"):
         path.unlink()
     with pytest.raises(InputError, match="expected references to compare with, found none"):
         evaluate_folder(open_sequence(small_sequence), images)
 
 
-def test_pixels_that_are_no_numbers_are_counted(small_sequence: Path, images: Path) -> None:
+def test_pixels_that_are_not_finite_are_counted(small_sequence: Path, images: Path) -> None:
     def spoil(pixels: np.ndarray[Any, Any]) -> None:
         pixels[5, 7, 1] = np.nan
         pixels[6, 2] = np.inf
@@ -348,7 +348,7 @@ def test_images_of_another_kind(
 
 @pytest.mark.parametrize("noisy", [False, True])
 def test_images_among_other_layers(small_sequence: Path, images: Path, noisy: bool) -> None:
-    """What a denoiser makes of a renderer's file is compared as if it stood alone; the noisy image beside it is not."""
+    """A denoised image among other layers is compared as if it were alone; the noisy image beside it is ignored."""
     alone = evaluate_folder(open_sequence(small_sequence), images).tables["strict"].mean
     layers = ["Combined", "Depth", *(["Noisy Image"] if noisy else [])]
     for path in images.glob("denoised*.exr"):

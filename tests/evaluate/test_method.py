@@ -1,4 +1,4 @@
-"""What a method makes of a sequence against references, without files."""
+"""Evaluation of a method on a sequence, without files."""
 
 from __future__ import annotations
 
@@ -73,12 +73,12 @@ def test_a_method_sees_frames_without_a_reference_too(small_sequence: Path) -> N
     assert result.tables["strict"].counts["SMAPE"] == 3
 
 
-def test_frames_that_are_no_neighbours_are_no_pair(small_sequence: Path) -> None:
+def test_frames_that_are_not_successive_are_no_pair(small_sequence: Path) -> None:
     result = evaluate_method(open_sequence(small_sequence, "0,2-3"), Denoiser(same), "nothing")
     assert (result.tables["strict"].counts["SMAPE"], result.tables["strict"].counts["tRMSE"]) == (3, 1)
 
 
-def test_without_references_there_is_nothing_to_compare(small_sequence: Path) -> None:
+def test_a_sequence_without_references_is_rejected(small_sequence: Path) -> None:
     for path in (small_sequence / "inputs").glob("reference*.exr"):
         path.unlink()
     with pytest.raises(InputError, match="expected references"):

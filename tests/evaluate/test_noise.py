@@ -1,4 +1,4 @@
-"""How noisy references are."""
+"""Noise of references."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def noted(write: Callable[[str], object], noise: object) -> None:
     write(json.dumps({"color_includes_albedo": True, "reference_noise": noise}))
 
 
-def test_the_noise_of_the_references_is_the_renderers(small_sequence: Path) -> None:
+def test_the_noise_of_the_references_is_read_from_the_renderers_file(small_sequence: Path) -> None:
     described = small_sequence / "inputs" / "camera.json"
     assert reference_noise(open_sequence(small_sequence)) is None
     # A reference without an estimate is skipped.

@@ -1,4 +1,4 @@
-"""Metrics and the training loss: known answers, and the paper's equations written out."""
+"""Metrics and the training loss: known answers, and the equations of the paper written out."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ def clip(*values: float) -> Tensor:
 
 
 def test_smape_written_out() -> None:
-    # |1 - 3| / (1 + 3 + 0.01), and a black pixel that is right.
+    # |1 - 3| / (1 + 3 + 0.01), and a black pixel without an error.
     assert smape_linear(image(1, 0), image(3, 0)).item() == pytest.approx((2 / 4.01 + 0) / 2)
     # In the dark the epsilon decides: 0.01 against 0 is half an error, not a whole one.
     assert smape_linear(image(0.01), image(0)).item() == pytest.approx(0.5)
 
 
 def test_temporal_smape_written_out() -> None:
-    # Differences 1, 2 against 1, 0: the first is right, the second |2 - 0| / (2 + 0 + 0.01).
+    # Differences 1, 2 against 1, 0: the first has no error, the second |2 - 0| / (2 + 0 + 0.01).
     error = temporal_smape_linear(clip(0, 1, 3), clip(5, 6, 6))
     assert error.item() == pytest.approx((0 + 2 / 2.01) / 2)
-    # Differences are absolute: up is as far as down.
+    # Differences are absolute, so the direction does not matter.
     assert temporal_smape_linear(clip(0, 1), clip(1, 0)).item() == 0
 
 
@@ -64,12 +64,12 @@ def test_relmse_written_out() -> None:
 
 
 def test_rmse_written_out() -> None:
-    # One of two pixels is 2 off in every channel: sqrt((4 + 0) / 2).
+    # One of two pixels has an error of 2 in every channel: sqrt((4 + 0) / 2).
     assert rmse_linear(image(1.0, 5.0), image(3.0, 5.0)).item() == pytest.approx(math.sqrt(2))
 
 
 def test_psnr_written_out() -> None:
-    # 0.0031308 and less is 12.92 times as much on a display; an error of 0.01292 is -20 log10(0.01292) dB.
+    # The sRGB curve multiplies values up to 0.0031308 by 12.92; an error of 0.01292 is -20 log10(0.01292) dB.
     assert psnr_srgb(image(0.001), image(0.002)).item() == pytest.approx(-20 * math.log10(0.01292), abs=1e-3)
     assert psnr_srgb(image(5.0), image(1.0)).item() == math.inf
 
@@ -90,7 +90,7 @@ def noisy_pair(height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 def test_ssim_of_flat_images_written_out() -> None:
-    # Without structure only the means count: (2 a b + K1^2) / (a^2 + b^2 + K1^2).
+    # For flat images only the means count: (2 a b + K1^2) / (a^2 + b^2 + K1^2).
     first, second = torch.full((1, 3, 11, 12), 0.2), torch.full((1, 3, 11, 12), 0.4)
     a, b = (float(displayed(x).flatten()[0]) for x in (first, second))
     assert ssim_srgb(first, second).item() == pytest.approx((2 * a * b + 1e-4) / (a * a + b * b + 1e-4), abs=1e-4)
@@ -130,14 +130,14 @@ def test_flip_is_that_of_its_authors() -> None:
     flip = pytest.importorskip("flip_evaluator")
     image, reference = noisy_pair(20, 24)
     test, truth = (displayed(x)[0].permute(1, 2, 0).contiguous().numpy() for x in (image, reference))
-    # The error map without its colors, averaged here.
+    # The mean of the error map without the color map.
     errors = flip.evaluate(truth, test, "LDR", applyMagma=False)[0]
     assert 0.05 < errors.mean() < 0.9
     assert flip_srgb(image, reference).item() == pytest.approx(float(errors.mean()), rel=1e-4)
 
 
 def test_flip_of_flat_images_written_out() -> None:
-    # Black and white are as far apart as colors can be, up to the compression of the largest distances.
+    # Black and white have the maximum color distance, up to the compression of large distances.
     black, white = torch.zeros(1, 3, 16, 16), torch.ones(1, 3, 16, 16)
     assert flip_srgb(black, white).item() > 0.9
     assert flip_srgb(9 * white, white).item() == 0
@@ -153,7 +153,7 @@ def test_hdr_flip_is_that_of_its_authors() -> None:
     assert flip_hdr(image, reference).item() == pytest.approx(float(errors.mean()), rel=1e-4)
 
 
-def test_hdr_flip_sees_what_a_display_clamps() -> None:
+def test_hdr_flip_sees_errors_that_a_display_clamps() -> None:
     pytest.importorskip("flip_evaluator")
     # Half the image is twenty times as bright as white.
     reference = torch.full((1, 3, 16, 16), 0.5)
@@ -161,7 +161,7 @@ def test_hdr_flip_sees_what_a_display_clamps() -> None:
     dimmer = reference.clamp_max(10)
     assert flip_srgb(dimmer, reference).item() == 0
     assert flip_hdr(dimmer, reference).item() > 0.05
-    # Exposures are chosen by the reference alone, so what is wrong beyond all of them is finite too.
+    # Exposures depend on the reference alone, so errors beyond all of them are finite too.
     assert 0 < flip_hdr(torch.full_like(reference, 1e9), reference).item() <= 1
 
 
@@ -172,7 +172,7 @@ def test_hdr_flip_of_darkness() -> None:
     black[1] = 0
     with pytest.raises(UncomputableError, match="found a black one"):
         flip_hdr(images, black)
-    # A candle in a cellar is enough, and a flat reference has one exposure.
+    # One bright pixel suffices, and a flat reference has one exposure.
     black[1, 2, 3, 4] = 2e-5
     assert flip_hdr(images, black).isfinite().all()
     assert flip_hdr(images, torch.full_like(images, 0.5)).isfinite().all()
@@ -185,19 +185,19 @@ def test_flip_without_its_package_says_what_to_install(monkeypatch: pytest.Monke
 
 
 def test_temporal_rmse_written_out() -> None:
-    # All of it below the bend of the curve, where a display shows 12.92 times as much. Errors 0, 1, 3 (in 1/1000):
-    # their changes are 1 and 2.
+    # All values are on the linear part of the sRGB curve, which multiplies by 12.92. The errors 0, 1, 3 (in 1/1000)
+    # change by 1 and 2.
     error = temporal_rmse_srgb(clip(0, 0.001, 0.003), clip(0, 0, 0))
     assert error.item() == pytest.approx(12.92e-3 * (1 + 2) / 2, rel=1e-4)
-    # The wrong direction is an error, unlike in temporal_smape_linear.
+    # A change in the wrong direction is an error, unlike in temporal_smape_linear.
     assert temporal_rmse_srgb(clip(0, 0.001), clip(0.001, 0)).item() == pytest.approx(12.92e-3 * 2, rel=1e-4)
-    # The root is taken of the whole frame: one pixel of two changes by 0.002.
+    # The root is taken of the mean over the frame, in which one of two pixels changes by 0.002.
     two = torch.zeros(1, 2, 3, 1, 2)
     two[:, 1, :, :, 0] = 0.002
     assert temporal_rmse_srgb(two, torch.zeros_like(two)).item() == pytest.approx(
         12.92 * 0.002 / math.sqrt(2), rel=1e-4
     )
-    # Beyond white nothing changes on a display, and a steady error does not flicker.
+    # Changes above white are not displayed, and a constant error does not flicker.
     assert temporal_rmse_srgb(clip(2, 7), clip(1, 1)).item() == 0
 
 
@@ -211,20 +211,20 @@ def test_temporal_metrics_batch_and_have_a_gradient() -> None:
     assert gradcheck(lambda x: temporal_rmse_srgb(x, references), (clips.requires_grad_(),))
 
 
-def test_a_display_clamps_and_bends() -> None:
+def test_displayed_values_are_clamped_and_on_the_srgb_curve() -> None:
     shown = displayed(image(-1.0, 0.0, 0.5, 1.0, 9.0))[0, 0, 0]
     torch.testing.assert_close(shown, torch.tensor([0.0, 0.0, 1.055 * 0.5 ** (1 / 2.4) - 0.055, 1.0, 1.0]))
 
 
-def test_a_display_is_that_of_colour_science(colour: Any) -> None:
+def test_displayed_values_agree_with_colour_science(colour: Any) -> None:
     values = torch.linspace(0, 1, 1001, dtype=torch.float64).expand(3, 1, 1001)
     expected = colour.cctf_encoding(values[0, 0].numpy(), "sRGB")
-    # Measured: 2e-8, where the straight part meets the curve.
+    # Measured: 2e-8, where the linear part meets the power curve.
     torch.testing.assert_close(displayed(values)[0, 0], torch.from_numpy(expected), atol=1e-7, rtol=0)
 
 
 @pytest.mark.parametrize("metric", IMAGE_METRICS)
-def test_whatever_stands_before_the_image_is_a_batch(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
+def test_leading_axes_are_batch_axes(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
     torch.manual_seed(0)
     images, references = torch.rand(2, 4, 3, 12, 13) * 1.5, torch.rand(2, 4, 3, 12, 13) * 1.5
     together = metric(images, references)
@@ -245,7 +245,7 @@ def test_no_error_is_zero(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
 def test_integers_and_complex_numbers_are_refused(
     metric: Callable[[Tensor, Tensor], Tensor], dtype: torch.dtype
 ) -> None:
-    """Differences of unsigned integers wrap around."""
+    """Differences of unsigned integers would overflow."""
     image = torch.rand(1, 2, 3, 12, 12)
     with pytest.raises(TypeError, match=f"image: expected a floating-point dtype, found {dtype}"):
         metric(image.to(dtype), image)

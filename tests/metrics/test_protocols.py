@@ -1,4 +1,4 @@
-"""Published protocols: against the packages they were computed with, and their steps written out in numpy."""
+"""Published protocols, compared with the packages behind them and with their steps written out in numpy."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def legacy_gamma(image: Array) -> Array:
 
 
 def eight_bits(shown: Array) -> Array:
-    """As a PNG keeps it."""
+    """Values as stored in an 8-bit PNG."""
     return np.clip(shown * 255.0 + 0.5, 0, 255).astype(np.uint8) / 255.0
 
 
@@ -57,7 +57,7 @@ def test_every_name_is_a_protocol() -> None:
     assert all({"PSNR", "SSIM"} <= set(protocol.metrics) for protocol in PROTOCOLS.values())
 
 
-def test_strict_is_what_the_functions_give() -> None:
+def test_strict_agrees_with_the_functions() -> None:
     image, reference = pair(31, 40)
     assert values("strict", image, reference) == {
         "PSNR": float(psnr_srgb(image, reference)),
@@ -73,11 +73,11 @@ def test_psnr_and_ssim_of_old_are_those_of_scikit_image(protocol: ProtocolName) 
     test, truth = (rounded(legacy_gamma(x)) for x in arrays(image, reference))
     found = values(protocol, image, reference)
     assert found["PSNR"] == pytest.approx(metrics.peak_signal_noise_ratio(truth, test, data_range=1), rel=1e-12)
-    # The defaults of that function, with the range that it took for floats before it had to be given.
+    # The defaults of that function, with the data range that old versions assumed for floats.
     expected = metrics.structural_similarity(truth, test, channel_axis=2, data_range=2)
     assert 0.1 < expected < 0.9
     assert found["SSIM"] == pytest.approx(expected, rel=1e-9)
-    # The half of that range would give less.
+    # Half of that range would give lower values.
     assert found["SSIM"] > metrics.structural_similarity(truth, test, channel_axis=2, data_range=1) + 0.02
 
 
@@ -92,7 +92,7 @@ def test_meng2020_written_out() -> None:
 
 
 def test_eight_bits_are_rounded_or_truncated() -> None:
-    # 0.5^(1/0.454545) shows as 0.5, which is 127.5 of 255.
+    # 0.5^(1/0.454545) is displayed as 0.5, which is 127.5 of 255.
     gray = torch.full((1, 3, 1, 1), 0.5 ** (1 / 0.454545))
 
     def level(name: ProtocolName, image: Tensor) -> float:
@@ -106,7 +106,7 @@ def test_eight_bits_are_rounded_or_truncated() -> None:
     assert level("noisebase", gray) == pytest.approx(math.floor(exact))
 
 
-def test_gamma_clamps_after_it_bends() -> None:
+def test_gamma_clamps_after_the_power() -> None:
     shown = gamma_displayed(torch.tensor([-1.0, 0.0, 0.25, 1.0, 9.0]))
     torch.testing.assert_close(shown, torch.tensor([0.0, 0.0, 0.25**0.454545, 1.0, 1.0]))
 
@@ -121,7 +121,7 @@ def written_out_aces(image: Array) -> Array:
 
 def test_noisebase_is_that_of_pytorch_msssim() -> None:
     other = pytest.importorskip("pytorch_msssim")
-    # An odd side at three of the five scales.
+    # Three of the five scales have an odd side.
     image, reference = pair(171, 190)
     tests, truths = (np.floor(written_out_aces(x) * 255) / 255 for x in arrays(image, reference))
     luminances = [torch.from_numpy(x**2.2 @ [0.2126, 0.7152, 0.0722])[None, None] for x in (tests, truths)]
@@ -164,7 +164,7 @@ def test_noisebase_compares_1024_of_1080_rows() -> None:
 
 
 def test_the_aces_fit_is_made_of_the_color_spaces_of_colour_science(colour: Any) -> None:
-    """Linear sRGB to AP1 with the saturation of the reference rendering transform, and back with the output's."""
+    """The matrices contain the conversions to AP1 and back, and the saturations of the ACES transforms."""
     srgb, ap1 = colour.RGB_COLOURSPACES["sRGB"], colour.RGB_COLOURSPACES["ACEScg"]
     luminance = ap1.matrix_RGB_to_XYZ[1]
 

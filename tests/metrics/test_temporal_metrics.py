@@ -1,4 +1,4 @@
-"""Errors along the motion, and of what does not move."""
+"""Errors along the motion, and the flicker of static shots."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ def clips(*, frames: int = 2) -> tuple[Tensor, Tensor]:
 
 
 def moving(pattern: Tensor, by: int) -> Tensor:
-    """``(1, 2, 3, H, W)``: a pattern, and the same moved to the right."""
+    """``(1, 2, 3, H, W)``: a pattern, and the pattern moved to the right."""
     return torch.stack([pattern, pattern.roll(by, -1)], 1)
 
 
 def motion(by: float, height: int, width: int) -> Tensor:
-    """Of what has moved to the right."""
+    """Motion of a pattern that has moved to the right."""
     return torch.tensor([-by, 0.0], dtype=torch.float64).reshape(1, 2, 1, 1).expand(1, 2, height, width)
 
 
-def test_without_motion_it_is_the_error_of_frame_differences() -> None:
+def test_without_motion_the_warped_error_is_that_of_frame_differences() -> None:
     clip, reference = clips()
     still = torch.zeros(2, 2, 5, 6, dtype=torch.float64)
     torch.testing.assert_close(warped_rmse_srgb(clip, reference, still), temporal_rmse_srgb(clip, reference))
@@ -45,7 +45,7 @@ def test_without_motion_it_is_the_error_of_frame_differences() -> None:
     torch.testing.assert_close(warping_error_srgb(clip, still), expected)
 
 
-def test_an_error_that_moves_with_its_surface_is_none() -> None:
+def test_an_error_that_moves_with_its_surface_does_not_count() -> None:
     torch.manual_seed(0)
     reference, error = torch.rand(1, 3, 4, 9, dtype=torch.float64) / 2, torch.rand(1, 3, 4, 9, dtype=torch.float64) / 2
     clip, truth = moving(reference + error, 2), moving(reference, 2)
@@ -55,20 +55,20 @@ def test_an_error_that_moves_with_its_surface_is_none() -> None:
     assert temporal_rmse_srgb(clip, truth).item() > 0.1
 
 
-def test_what_really_changes_is_right() -> None:
+def test_true_changes_are_no_error() -> None:
     """A surface that gets brighter: Lai's error of the truth is not 0, the error against the reference is."""
     truth = moving(torch.full((1, 3, 4, 9), 0.001, dtype=torch.float64), 1)
     truth[:, 1] *= 2
     along = motion(1, 4, 9)
     assert warping_error_srgb(truth, along).item() == pytest.approx(3 * 0.01292**2, rel=1e-4)
     assert warped_rmse_srgb(truth, truth, along).item() == 0
-    # It stays dark instead: wrong by the whole change.
+    # An image that stays dark is wrong by the whole change.
     dark = truth[:, :1].expand_as(truth)
     assert warped_rmse_srgb(dark, truth, along).item() == pytest.approx(0.01292, rel=1e-4)
 
 
-def test_pixels_without_a_past_do_not_count() -> None:
-    """Four columns; the last one comes from half outside, and the first shows another surface."""
+def test_pixels_without_a_history_do_not_count() -> None:
+    """Of four columns, the last comes from half outside the image, and the first shows another surface."""
     clip = torch.zeros(1, 2, 3, 1, 4, dtype=torch.float64)
     clip[:, 1, :, :, 0] = 1.0
     clip[:, 1, :, :, 3] = 0.001
@@ -86,11 +86,11 @@ def test_pixels_without_a_past_do_not_count() -> None:
     assert found.item() == pytest.approx(math.sqrt(expected / 3), rel=1e-4)
 
 
-def test_nothing_seen_before_has_no_warped_error() -> None:
+def test_without_any_history_there_is_no_warped_error() -> None:
     clip = torch.rand(1, 2, 3, 4, 5)
     away = torch.full((1, 2, 4, 5), torch.inf)
     for call in (lambda: warping_error_srgb(clip, away), lambda: warped_rmse_srgb(clip, clip, away)):
-        with pytest.raises(UncomputableError, match="seen in the frame before, found none"):
+        with pytest.raises(UncomputableError, match="expected pixels with a history, found none"):
             call()
 
 
@@ -118,7 +118,7 @@ def test_flicker_written_out() -> None:
     still = torch.full_like(clip, 0.5)
     deviation = 0.01292 * math.sqrt(2 / 3)
     assert flicker_srgb(clip, still).item() == pytest.approx(deviation, rel=1e-4)
-    # A result that does not follow what really changes flickers less than it should; a steady error does not flicker.
+    # A result that does not follow true changes flickers less than it should; a constant error does not flicker.
     assert flicker_srgb(still, clip).item() == pytest.approx(-deviation, rel=1e-4)
     assert flicker_srgb(clip + 0.0001, clip).item() == pytest.approx(0, abs=1e-7)
 

@@ -1,4 +1,4 @@
-"""The suite: its rows, its rendering at tiny sizes, and its tables; what needs a renderer is skipped without it."""
+"""The suite: its rows, its rendering at tiny sizes, and its tables. Tests that need a renderer are skipped without."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ TINY: dict[str, Any] = {"frames": 2, "size": (16, 9), "reference_samples": 8}
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """A `mcdenoise benchmark`: exit status, output and messages."""
+    """Run `mcdenoise benchmark`: exit status, output and messages."""
 
     def call(*arguments: Any) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as stop:
@@ -54,7 +54,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
 # Rows
 
 
-def test_names_tell_rows_apart_and_each_sequence_is_a_still_too() -> None:
+def test_row_names_are_unique_and_each_sequence_is_also_a_still() -> None:
     rows = choose_rows()
     assert len({row.name for row in rows}) == len(rows)
     assert len({shot.name for shot in SHOTS}) == len(SHOTS)
@@ -114,16 +114,16 @@ def test_the_parlour_is_the_same_each_time_and_its_pillar_moves() -> None:
 
 @pytest.fixture
 def two_shots(monkeypatch: pytest.MonkeyPatch) -> list[Shot]:
-    """The same picture with one and with two samples."""
+    """Two shots of the same picture, with one and with two samples per pixel."""
     shots = [Shot(f"tiny-{n}", "mitsuba", "parlour", n, "box", **TINY) for n in (1, 2)]
     monkeypatch.setattr(rendering, "SHOTS", tuple(shots))
     return shots
 
 
 @pytest.mark.slow
-def test_rendering_goes_on_where_it_was_and_shares_references(tmp_path: Path, two_shots: list[Shot]) -> None:
+def test_rendering_resumes_and_shares_references(tmp_path: Path, two_shots: list[Shot]) -> None:
     mitsuba = pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    # So small an image is rendered sooner than a kernel is compiled.
+    # Rendering so small an image takes less time than compiling a kernel.
     mitsuba.set_variant("scalar_rgb")
     stages = []
     render_suite(two_shots, tmp_path, on_stage=stages.append)
@@ -162,7 +162,7 @@ def test_cycles_needs_a_blender(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere: expected a Python that has Blender's module bpy"):
         render_suite([shot], tmp_path / "data", blender_python=tmp_path / "nowhere")
     assert not (tmp_path / "data").exists()
-    # It has the module, and cannot render.
+    # This Python has the module, but cannot render.
     broken = tmp_path / "broken.sh"
     broken.write_text(
         "#!/bin/sh\ncase $2 in *blender.py) echo '{\"ok\": \"4.5\"}'; cat;; *) echo 'no light' >&2; exit 1;; esac\n"
@@ -186,7 +186,7 @@ def test_cycles_writes_what_the_reader_understands(tmp_path: Path, scene: str) -
     assert float(sequence.reference(1).mean()) == pytest.approx(float(sequence.frame(1).color.mean()), rel=0.5)
 
 
-def test_a_reference_is_the_mean_of_its_parts_and_knows_its_noise(tmp_path: Path) -> None:
+def test_a_reference_is_the_mean_of_its_parts_with_an_estimate_of_its_noise(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     parts = []
     for part in range(8):
@@ -196,7 +196,7 @@ def test_a_reference_is_the_mean_of_its_parts_and_knows_its_noise(tmp_path: Path
     noise = rendering._write_reference(tmp_path / "reference.exr", parts, 4)
     mean = np.mean([read_exr(path)[0] for path in parts], axis=0)
     np.testing.assert_allclose(read_exr(tmp_path / "reference.exr")[0], mean, rtol=1e-3)
-    # Of a Gaussian of this deviation: E|x| = sigma sqrt(2 / pi), over 2 + 0.01; 6000 values tell it to 1 %.
+    # A Gaussian has E|x| = sigma sqrt(2 / pi), here divided by 2 + 0.01; 6000 values estimate it to 1 %.
     assert noise == pytest.approx(0.1 / 8**0.5 * (2 / np.pi) ** 0.5 / 2.01, rel=0.05)
 
 
@@ -224,7 +224,7 @@ def _results(ours: list[float], fast: list[float], high: list[float]) -> tuple[R
     return Results("", "2026-10-21T12:00:00+00:00", machine, 1, scenes, methods, cells), rows
 
 
-def test_each_row_is_against_the_best_setting_of_that_row() -> None:
+def test_each_row_is_compared_with_the_best_setting_on_that_row() -> None:
     results, rows = _results([0.1, 0.2], fast=[0.2, 0.15], high=[0.3, 0.1])
     first, second = suite_lines(results, rows)
     assert (first.row, first.model, first.samples, first.reference_noise) == ("a", "ours", 4, 0.01)
@@ -235,15 +235,15 @@ def test_each_row_is_against_the_best_setting_of_that_row() -> None:
     assert first.ahead(PSNR)
     assert not second.ahead(SMAPE)
     assert TEMPORAL not in first.best
-    said = verdict([first, second])
-    assert said[0] == "SMAPE: ahead of OIDN's best setting in 1 of 2 rows; behind in b"
-    # The mean of 1/2 and 2 is 1: neither is favoured.
-    assert said[2] == "SMAPE over that of OIDN's best setting, geometric mean of 2 rows: 1.000"
+    summary = verdict([first, second])
+    assert summary[0] == "SMAPE: ahead of OIDN's best setting in 1 of 2 rows; behind in b"
+    # The geometric mean of 1/2 and 2 is 1, which favours neither.
+    assert summary[2] == "SMAPE relative to OIDN's best setting, geometric mean over 2 rows: 1.000"
     text = markdown([first, second], [])
     assert "| a | 0.1000 | 0.2000 | 0.500 | 90.00 | 80.00 |  |  | 7 | 7 | (quality=fast) | 0.0100 |" in text
 
 
-def test_error_against_time_is_of_rows_that_all_have_and_names_who_is_beaten() -> None:
+def test_error_against_time_uses_common_rows_and_names_the_faster_method() -> None:
     results, rows = _results([0.1, 0.2, 0.05], [0.2, 0.2, 0.1], [0.1, 0.4, 0.1])
     times = {"noisy": 1.0, "ours": 10.0, "oidn(quality=fast)": 5.0, "oidn(quality=high)": 40.0}
     results.cells[:] = [
@@ -258,27 +258,29 @@ def test_error_against_time_is_of_rows_that_all_have_and_names_who_is_beaten() -
         ("ours", pytest.approx(10), ""),
         ("oidn(quality=high)", pytest.approx(40), "ours"),
     ]
-    # Of the noisy input's 0.5: 0.2 and 0.4.
+    # Relative to the noisy input's 0.5, the errors are 0.2 and 0.4.
     assert means[1].error == pytest.approx((0.2 * 0.4) ** 0.5)
     assert "| oidn(quality=high) | 0.4000 | 40 | no: ours |" in markdown([], [], means, counted)
     assert error_against_time(results, []) == ([], 0)
 
 
-def test_a_reference_with_much_of_the_error_is_named() -> None:
+def test_rows_with_noisy_references_are_named() -> None:
     results, rows = _results([0.015], fast=[0.018], high=[0.02])
-    assert verdict(suite_lines(results, rows))[-1] == "references with more than half of the error themselves: a"
+    assert verdict(suite_lines(results, rows))[-1] == "rows whose reference noise is more than half of the error: a"
 
 
-def test_without_the_peer_nothing_is_claimed() -> None:
+def test_without_the_peer_there_is_no_comparison() -> None:
     results, rows = _results([0.1], fast=[0.2], high=[0.3])
     results = dataclasses.replace(results, methods=results.methods[:2], cells=results.cells[:2])
     (line,) = suite_lines(results, rows)
     assert line.best == {}
-    assert verdict([line]) == ["OIDN was not there to compare with; pip install 'mcdenoise[peers]'"]
+    assert verdict([line]) == [
+        "OIDN is not installed, so there is no comparison with it; pip install 'mcdenoise[peers]'"
+    ]
     assert "| a | 0.1000 |" in markdown([line], [])
 
 
-def test_points_of_a_curve_are_no_rows() -> None:
+def test_points_of_a_curve_are_not_rows_of_the_table() -> None:
     results, rows = _results([0.2, 0.1], fast=[0.3, 0.2], high=[0.4, 0.3])
     names = {"a": "scene-samples-1", "b": "scene-samples-2"}
     rows = [
@@ -297,7 +299,7 @@ def test_points_of_a_curve_are_no_rows() -> None:
     assert "| scene-samples-2 | 0.5000 | 0.1000 | 0.2000 |" in markdown([], lines)
 
 
-def test_close_ups_stand_side_by_side(tmp_path: Path) -> None:
+def test_close_ups_are_drawn_side_by_side(tmp_path: Path) -> None:
     results, rows = _results([0.1], fast=[0.2], high=[0.3])
     truth = np.full((18, 32, 3), 0.25, np.float32)
     for folder, image in (("noisy", truth * 2), ("ours", truth), ("reference", truth)):
