@@ -118,7 +118,7 @@ def _compare(out: Path, model: str, on_step: Callable[[int, int], None]) -> tupl
     settings = Settings(
         rounds=1,
         threads=threads,
-        pictures=len(REFERENCE_FRAMES),
+        pictures=FRAMES,
         on_the_way=True,
         command=f"mcdenoise demo -o {shlex.quote(str(out))} --model {shlex.quote(model)}",
     )

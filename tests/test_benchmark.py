@@ -830,18 +830,23 @@ def test_too_large_an_image_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize(
-    ("numbers", "most", "expected"),
+    ("numbers", "scored", "most", "expected"),
     [
-        ([8, 9, 10, 11], 3, [9, 10, 11]),
-        ([0, 1, 2, 5, 6], 3, [0, 1, 2]),
-        ([0, 1, 5, 6], 3, [5, 6]),
-        ([0, 1, 2, 7, 8, 9, 10, 20], 2, [9, 10]),
-        ([4], 4, [4]),
-        ([4, 5], 0, []),
+        ([8, 9, 10, 11], [8, 9, 10, 11], 3, [9, 10, 11]),
+        ([8, 9, 10, 11], [10], 3, [8, 9, 10]),
+        ([0, 1, 2, 5, 6], [0, 1, 2, 5, 6], 3, [0, 1, 2]),
+        ([0, 1, 2, 5, 6], [0, 6], 3, [5, 6]),
+        ([0, 1, 5, 6], [0, 1, 5, 6], 3, [5, 6]),
+        ([0, 1, 2, 7, 8, 9, 10, 20], [1, 10, 20], 2, [9, 10]),
+        ([4], [4], 4, [4]),
+        ([4, 5], [], 4, []),
+        ([4, 5], [4, 5], 0, []),
     ],
 )
-def test_pictures_are_of_successive_frames(numbers: list[int], most: int, expected: list[int]) -> None:
-    assert kept_frames(numbers, most) == expected
+def test_pictures_are_of_successive_frames_up_to_one_with_a_reference(
+    numbers: list[int], scored: list[int], most: int, expected: list[int]
+) -> None:
+    assert kept_frames(numbers, scored, most) == expected
 
 
 # Operators

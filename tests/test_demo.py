@@ -42,7 +42,7 @@ def test_demo_renders_denoises_and_shows(small_demo, tmp_path, monkeypatch):
     }
     assert result.page == tmp_path / "report" / "index.html"
     found = Results.read(tmp_path / "report")
-    assert (found.scenes[0].scored, found.scenes[0].pictures, found.failed) == ([1, 2], [1, 2], False)
+    assert (found.scenes[0].scored, found.scenes[0].pictures, found.failed) == ([1, 2], [0, 1, 2], False)
     assert "demo" in found.command
     # The errors are those of the files that were written, up to their half precision.
     written = evaluate_folder(open_sequence(tmp_path / "sequence"), result.denoised).tables["strict"]

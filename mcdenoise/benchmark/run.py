@@ -222,7 +222,7 @@ class _SceneRun:
             height,
             sequence.numbers,
             sequence.reference_numbers,
-            kept_frames(sequence.reference_numbers, settings.pictures),
+            kept_frames(sequence.numbers, sequence.reference_numbers, settings.pictures),
             reference_noise(sequence),
         )
 
@@ -362,16 +362,16 @@ def _of(method: str, stage: str) -> str:
     return f"{method}, {stage}"
 
 
-def kept_frames(numbers: list[int], maximum: int) -> list[int]:
-    """The last frames of the last run of successive numbers that is long enough, or else of the longest run.
+def kept_frames(numbers: list[int], scored: list[int], maximum: int) -> list[int]:
+    """Successive frames that end at one with a reference: as many as there are, and of those the last.
 
     Example:
-        >>> kept_frames([0, 1, 2, 3, 5, 6, 7, 20], 3)
+        >>> kept_frames([0, 1, 2, 3, 5, 6, 7, 8, 20], [2, 7], 3)
         [5, 6, 7]
     """
     runs = [[number for _, number in run] for _, run in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
-    longest = max(runs, key=lambda run: (min(len(run), maximum), run[-1]), default=[])
-    return longest[-maximum:] if maximum else []
+    ends = [run[: run.index(number) + 1] for run in runs for number in run if number in scored]
+    return max(ends, key=lambda run: (min(len(run), maximum), run[-1]), default=[])[-maximum:] if maximum else []
 
 
 def _first_two_frames(root: Path, numbers: tuple[int, ...]) -> list[Frame]:

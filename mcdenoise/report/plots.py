@@ -13,7 +13,7 @@ from typing import Any, Literal
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
+from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator, NullLocator
 
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
@@ -277,18 +277,18 @@ def ticks(low: float, high: float) -> list[float]:
     """Round numbers for a logarithmic axis: as few as are enough.
 
     Example:
-        >>> ticks(0.04, 0.5), ticks(3, 2000)
-        ([0.05, 0.1, 0.2, 0.5], [10.0, 100.0, 1000.0])
+        >>> ticks(0.04, 0.5), ticks(3, 2000), ticks(0.064, 0.11)
+        ([0.05, 0.1, 0.2, 0.5], [10.0, 100.0, 1000.0], [0.07, 0.08, 0.09, 0.1, 0.11])
     """
     decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
-    steps: list[list[float]] = [[1], [1, 3], [1, 2, 5], [1, 1.5, 2, 3, 4, 5, 7], [1 + step / 10 for step in range(90)]]
-    found: list[float] = []
-    for parts in steps:
+    for parts in ([1], [1, 3], [1, 2, 5]):
         found = [float(f"{part}e{decade}") for decade in decades for part in parts]
         found = [value for value in found if low <= value <= high]
         if len(found) >= 3:
-            break
-    return found[:: max(1, len(found) // 7)]
+            return found[:: max(1, len(found) // 7)]
+    # Less than a decade and a half: equal steps, which look nearly equal there.
+    values = MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(low, high)
+    return [float(f"{value:.6g}") for value in values if low <= value <= high]
 
 
 def _figure(layout: Layout) -> tuple[Figure, Axes]:

@@ -18,7 +18,7 @@ from mcdenoise.evaluate import METRICS
 from mcdenoise.report.gallery import REFERENCE, Gallery, picture_pixels, read_gallery
 from mcdenoise.report.pictures import BRIGHTEST, data_uris, decode
 from mcdenoise.report.views import Range, Row, View, metrics, pareto_front, points, views
-from mcdenoise.results import STAGES, Results
+from mcdenoise.results import STAGES, Kind, Results
 
 FILE = "index.html"
 PLOTS = "plots"
@@ -35,7 +35,7 @@ _UNKNOWN = "\N{EN DASH}"
 def write_report(folder: Path) -> Path:
     """Write ``index.html``, and ``plots/*.svg`` and ``plots/*.png``, from a finished benchmark.
 
-    The page is one file that needs no network and no server: plots, tables that sort, an image comparer, close-ups and
+    The page is one file that needs no network and no server: an image comparer, close-ups, plots, tables that sort, and
     temporal profiles. Its pictures are 8-bit previews, and are made coarser or smaller where they would be more than 20
     megabytes; every figure is of the full data.
 
@@ -71,6 +71,9 @@ def write_report(folder: Path) -> Path:
         "reference": REFERENCE,
         "heat": {"end": _HEAT_END, "gradient": ", ".join(_css_rgb(color) for color in _heat_colors()[::15])},
         "brightest": f"{BRIGHTEST:g}",
+        "close_ups": any(gallery.close_ups for gallery in galleries),
+        "profiles": any(gallery.profiles for gallery in galleries),
+        "featured": _featured(results, shown, names),
     } | _comparer(results, galleries, shown, names)
     path = folder / FILE
     write_text(path, render_page("report.html.jinja", content))
@@ -183,7 +186,7 @@ def _write_plots(folder: Path, results: Results, shown: list[View], names: list[
         ) from error
     colors = plots.model_colors(results.methods)
     errors: list[dict[str, Any]] = []
-    stages: list[dict[str, str]] = []
+    stages: list[dict[str, Any]] = []
 
     def both(name: str, description: str, wide: Any, narrow: Any) -> dict[str, str]:
         made = {
@@ -202,8 +205,11 @@ def _write_plots(folder: Path, results: Results, shown: list[View], names: list[
                 wide, narrow = (plots.error_over_time(view, metric, colors, layout) for layout in ("wide", "narrow"))
                 made = both(f"{metric.lower()}-{suffix}", described, wide, narrow)
                 errors.append({"view": place, "metric": metric, "front": _front(view, metric), **made})
+            if not any(row.stages for row in view.rows):
+                continue
             described = f"Milliseconds of each stage, {view.name}; the table below has the figures"
-            stages.append(both(f"stages-{suffix}", described, plots.stage_bars(view), plots.stage_bars(view, "narrow")))
+            made = both(f"stages-{suffix}", described, plots.stage_bars(view), plots.stage_bars(view, "narrow"))
+            stages.append({"view": place, **made})
         described = "Milliseconds a frame over megapixels; the table below has the figures"
         wide, narrow = (plots.cost_over_pixels(results, colors, layout) for layout in ("wide", "narrow"))
         cost = both("cost", described, wide, narrow) if results.costs else {}
@@ -256,6 +262,8 @@ def _comparer(results: Results, galleries: list[Gallery], shown: list[View], nam
             "width": gallery.scene.width // gallery.factor,
             "height": gallery.scene.height // gallery.factor,
             "frames": gallery.scene.pictures,
+            # The frame of the close-ups, which has a reference, or else the last one.
+            "start": gallery.scene.pictures.index(max(gallery.codes.get(REFERENCE) or gallery.scene.pictures)),
             "pictures": {
                 name: dict(zip(map(str, own), islice(files, len(own)), strict=True))
                 for name, own in gallery.codes.items()
@@ -279,14 +287,23 @@ def _comparer(results: Results, galleries: list[Gallery], shown: list[View], nam
 
 
 def _first_pair(results: Results, shown: list[View], names: list[str]) -> list[str]:
-    """The first method, and that of those that learn (or else of the others) which the first metric likes best."""
+    """What the comparer begins with: Open Image Denoise at its best (or else the best filter), and the best network."""
     if not results.methods:
         return []
-    rows = [row for row in shown[0].rows if names and names[0] in row.errors and row.method.kind != "baseline"]
-    rows = [row for row in rows if row.method.kind == "trainable"] or rows
+    rows = [row for row in shown[0].rows if names and names[0] in row.errors]
     sign = -1 if names and METRICS[names[0]].higher_is_better else 1
-    best = min(rows, key=lambda row: sign * row.errors[names[0]].value, default=None)
-    return [results.methods[0].name, best.method.name if best else REFERENCE]
+
+    def best(kind: Kind, otherwise: str) -> str:
+        own = [row for row in rows if row.method.kind == kind]
+        own = [row for row in own if row.method.model == "oidn"] or own
+        return min(own, key=lambda row: sign * row.errors[names[0]].value).method.name if own else otherwise
+
+    return [best("fixed", results.methods[0].name), best("trainable", REFERENCE)]
+
+
+def _featured(results: Results, shown: list[View], names: list[str]) -> set[str]:
+    """What is shown at once in close-ups and profiles: the first method, the first pair, and the reference."""
+    return {*(method.name for method in results.methods[:1]), *_first_pair(results, shown, names), REFERENCE}
 
 
 def _metric(name: str) -> dict[str, Any]:

@@ -32,12 +32,15 @@ def browser() -> Iterator[Any]:
         chromium.close()
 
 
-def open_page(browser: Any, page: Path, complaints: list[str], **options: Any) -> Any:
+def open_page(browser: Any, page: Path, complaints: list[str], layout: str = "seam", **options: Any) -> Any:
     tab = browser.new_page(**{"viewport": {"width": 1200, "height": 900}, **options})
     tab.on("console", lambda message: complaints.append(f"{message.type}: {message.text}"))
     tab.on("pageerror", lambda error: complaints.append(str(error)))
     tab.on("request", lambda request: request.url.startswith(("file:", "data:")) or complaints.append(request.url))
     tab.goto(page.as_uri())
+    ready(tab)
+    tab.check(f"input[value={layout}]", force=True)
+    tab.fill("#frame", "0")
     ready(tab)
     return tab
 
@@ -89,6 +92,52 @@ def test_both_sides_show_their_picture(tab: Any):
         assert np.abs(at(canvas, x, 0.4) - shown(ours, x, 0.4)).max() <= 2
 
 
+def test_three_pictures_stand_side_by_side(browser: Any, page: Path):
+    complaints: list[str] = []
+    tab = open_page(browser, page, complaints, "beside", viewport={"width": 1400, "height": 900})
+    choose(tab, "noisy", "ours")
+    canvas = pixels(tab)
+    for pane, image in enumerate((picture(1, 1.0, FRAMES[0]), picture(2, 0.1, FRAMES[0]), picture(0, 0.0, FRAMES[0]))):
+        assert np.abs(at(canvas, (pane + 0.31) / 3, 0.4) - shown(image, 0.31, 0.4)).max() <= 2
+    assert tab.is_hidden("#seam")
+    # A pixel is read out in whichever pane the pointer is.
+    box = tab.locator("#stage").bounding_box()
+    across = (box["width"] - 8) / 3
+    for pane in range(3):
+        x, y = pane * (across + 4) + (WIDTH // 2 + 0.5) / WIDTH * across, (HEIGHT // 2 + 0.5) / HEIGHT * box["height"]
+        tab.mouse.move(box["x"] + x, box["y"] + y)
+        assert tab.text_content("#pixel") == f"{WIDTH // 2}, {HEIGHT // 2}"
+    tab.set_viewport_size({"width": 500, "height": 900})
+    tab.wait_for_function("document.querySelector('#stage').clientHeight > 500")
+    tab.close()
+    assert not complaints
+
+
+def test_all_frames_play_until_paused(tab: Any):
+    seen = "new Promise(done => { const own = new Set(); const timer = setInterval(() => { own.add("
+    seen += "document.querySelector('#frame').value); if (own.size === 3) { clearInterval(timer); done(3); } }, 20); })"
+    tab.click("#play")
+    assert tab.get_attribute("#play", "aria-label") == "Pause"
+    assert tab.evaluate(seen) == 3
+    tab.click("#play")
+    tab.wait_for_timeout(200)
+    frame = tab.input_value("#frame")
+    tab.wait_for_timeout(300)
+    assert tab.input_value("#frame") == frame
+
+
+def test_no_column_is_cut_on_a_narrow_screen(browser: Any, page: Path):
+    complaints: list[str] = []
+    tab = open_page(browser, page, complaints, viewport={"width": 500, "height": 900})
+    cut = "[...document.querySelectorAll('.scroll')].filter(one => one.scrollWidth > one.clientWidth).length"
+    assert tab.evaluate(cut) == 0
+    # Every figure stands below the name of its column.
+    cell = "getComputedStyle(document.querySelector('#figures td.number'), '::before').content"
+    assert tab.evaluate(cell) == '"SMAPE"'
+    tab.close()
+    assert not complaints
+
+
 def test_the_slider_moves_the_seam(tab: Any):
     choose(tab, "noisy", "reference")
     tab.locator("#stage").scroll_into_view_if_needed()
@@ -117,6 +166,7 @@ def test_the_seam_by_keyboard(tab: Any):
     assert tab.get_attribute("#seam", "aria-valuenow") == "42"
     tab.keyboard.press("Home")
     assert tab.get_attribute("#seam", "aria-valuenow") == "0"
+    choose(tab, "noisy", "ours")
     assert "noisy left, ours right" in tab.get_attribute("#seam", "aria-valuetext")
 
 

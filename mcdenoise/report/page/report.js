@@ -44,6 +44,9 @@ function sortTable(table, heading) {
 }
 
 for (const table of document.querySelectorAll("table.sortable")) {
+  // Where there is little room, each row is a card, and each figure has the name of its column above it.
+  const names = [...table.tHead.rows[0].cells].map((cell) => cell.textContent.trim());
+  for (const row of table.tBodies[0].rows) [...row.cells].forEach((cell, column) => (cell.dataset.label = names[column]));
   for (const heading of table.tHead.rows[0].cells) {
     heading.querySelector("button").addEventListener("click", () => sortTable(table, heading));
   }
@@ -86,16 +89,20 @@ function startComparer() {
   const canvas = stage.querySelector("canvas");
   const context = canvas.getContext("2d");
   const REFERENCE = "reference";
-  const KEPT = 32;
+  const SIDES = ["left", "right", "reference"];
   const LARGEST_PIXEL = 48;
+  const STACKED_BELOW = 640;
+  const GAP = 4;
+  const FRAME_MILLISECONDS = 100;
 
-  // center is in pixels of the picture; zoom 1 fits it into the stage.
-  const state = { scene: 0, frame: 0, left: "", right: "", exposure: 0, tone: "srgb", show: "picture", seam: 0.5, zoom: 1 };
-  state.center = { x: 0, y: 0 };
+  // center is in pixels of the picture; zoom 1 fits it into its pane.
+  const state = { scene: 0, frame: null, left: "", right: "", exposure: 0, tone: "srgb", show: "picture" };
+  Object.assign(state, { layout: "beside", seam: 0.5, zoom: 1, center: { x: 0, y: 0 } });
   const sides = { left: null, right: null, reference: null };
   const decoded = new Map();
   let cursor = null;
   let request = 0;
+  let playing = null;
 
   const scene = () => data.scenes[state.scene];
   const frameNumber = () => scene().frames[state.frame];
@@ -115,7 +122,8 @@ function startComparer() {
       drawing.drawImage(image, 0, 0);
       const codes = drawing.getImageData(0, 0, surface.width, surface.height).data;
       decoded.set(key, { name, codes, surface, look: "" });
-      if (decoded.size > KEPT) decoded.delete(decoded.keys().next().value);
+      const kept = Math.max(32, SIDES.length * scene().frames.length);
+      if (decoded.size > kept) decoded.delete(decoded.keys().next().value);
     }
     return decoded.get(key);
   }
@@ -151,15 +159,46 @@ function startComparer() {
     side.look = look;
   }
 
-  const fitScale = () => Math.min(stage.clientWidth / scene().width, stage.clientHeight / scene().height);
+  const stacked = () => stage.parentElement.clientWidth < STACKED_BELOW;
+
+  /** Where each picture is painted: side by side or one below the other, or two of them at one place under a seam. */
+  function panes() {
+    const [width, height] = [stage.clientWidth, stage.clientHeight];
+    if (state.layout === "seam") {
+      const split = state.seam * width;
+      const whole = { x: 0, y: 0, width, height };
+      return [
+        { ...whole, name: "left", start: 0, end: split },
+        { ...whole, name: "right", start: split, end: width },
+      ];
+    }
+    const across = (width - 2 * GAP) / 3;
+    const down = (height - 2 * GAP) / 3;
+    return SIDES.map((name, index) => {
+      const pane = stacked()
+        ? { name, x: 0, y: index * (down + GAP), width, height: Math.max(down, 0) }
+        : { name, x: index * (across + GAP), y: 0, width: Math.max(across, 0), height };
+      return { ...pane, start: pane.x, end: pane.x + pane.width };
+    });
+  }
+
+  /** A place on the stage as one in its pane. */
+  function inPane({ x, y }) {
+    const all = panes();
+    const pane = all.find((one) => x < one.x + one.width + GAP && y < one.y + one.height + GAP) ?? all.at(-1);
+    return { x: x - pane.x, y: y - pane.y };
+  }
+
+  const fitScale = () => Math.min(panes()[0].width / scene().width, panes()[0].height / scene().height);
   const scale = () => fitScale() * state.zoom;
 
   function keepInside() {
     const most = Math.max(LARGEST_PIXEL / fitScale(), 1);
     state.zoom = clamp(state.zoom, 1, most);
+    const { width, height } = panes()[0];
     for (const [axis, size, room] of [
-      ["x", scene().width, stage.clientWidth],
-      ["y", scene().height, stage.clientHeight],
+      ["x", scene().width, width],
+      ["y", scene().height, height],
     ]) {
       const half = Math.min(room / scale() / 2, size / 2);
       state.center[axis] = clamp(state.center[axis], half, size - half);
@@ -176,18 +215,17 @@ function startComparer() {
     context.clearRect(0, 0, width, height);
     const perPixel = scale() * ratio;
     context.imageSmoothingEnabled = perPixel < 1;
-    const split = Math.round(state.seam * width);
-    for (const [side, start, end] of [
-      [sides.left, 0, split],
-      [sides.right, split, width],
-    ]) {
+    for (const pane of panes()) {
+      const side = sides[pane.name];
       develop(side);
       if (side === null) continue;
+      const [start, end] = [Math.round(pane.start * ratio), Math.round(pane.end * ratio)];
+      const [x, y] = [(pane.x + pane.width / 2) * ratio, (pane.y + pane.height / 2) * ratio];
       context.save();
       context.beginPath();
-      context.rect(start, 0, end - start, height);
+      context.rect(start, pane.y * ratio, end - start, pane.height * ratio);
       context.clip();
-      context.translate(width / 2 - state.center.x * perPixel, height / 2 - state.center.y * perPixel);
+      context.translate(x - state.center.x * perPixel, y - state.center.y * perPixel);
       context.drawImage(side.surface, 0, 0, scene().width * perPixel, scene().height * perPixel);
       context.restore();
     }
@@ -202,8 +240,15 @@ function startComparer() {
     stage.dataset.scale = scale().toFixed(3);
     stage.style.touchAction = state.zoom > 1 ? "none" : "pan-y";
     stage.classList.toggle("zoomed", state.zoom > 1);
-    stage.querySelector(".tag.left").textContent = sides.left ? state.left : `${state.left}: not kept`;
-    stage.querySelector(".tag.right").textContent = sides.right ? state.right : `${state.right}: not kept`;
+    for (const pane of panes()) {
+      const tag = stage.querySelector(`.tag.${pane.name}`);
+      const name = state[pane.name] ?? REFERENCE;
+      tag.textContent = sides[pane.name] ? name : `${name}: none of this frame`;
+      const atEnd = state.layout === "seam" && pane.name === "right";
+      tag.style.left = atEnd ? "auto" : `${pane.x + 8}px`;
+      tag.style.top = `${pane.y + 8}px`;
+      tag.style.maxWidth = `${(state.layout === "seam" ? 0.47 : 0.9) * pane.width}px`;
+    }
     element("legend").hidden = state.show !== "error";
     element("frame-name").textContent = `${frameNumber()} (${state.frame + 1} of ${scene().frames.length})`;
     element("exposure-name").textContent = `${state.exposure < 0 ? "−" : "+"}${Math.abs(state.exposure)} EV`;
@@ -238,7 +283,10 @@ function startComparer() {
     delete stage.dataset.ready;
     for (const id of ["frame", "exposure", "tone", "left", "right"]) element(id).value = state[id];
     element("scene").value = state.scene;
-    for (const input of document.querySelectorAll("input[name=show]")) input.checked = input.value === state.show;
+    for (const name of ["show", "layout"]) {
+      for (const input of document.querySelectorAll(`input[name=${name}]`)) input.checked = input.value === state[name];
+    }
+    layOut();
     const [left, right, reference] = await Promise.all([state.left, state.right, REFERENCE].map(picture));
     if (own !== request) return;
     Object.assign(sides, { left, right, reference });
@@ -251,7 +299,15 @@ function startComparer() {
 
   function change(changes) {
     Object.assign(state, changes);
-    update();
+    return update();
+  }
+
+  function layOut() {
+    const [across, down] = state.layout === "seam" ? [1, 1] : stacked() ? [1, 3] : [3, 1];
+    const ratio = (across * scene().width) / (down * scene().height);
+    stage.style.aspectRatio = String(ratio);
+    stage.style.setProperty("--ratio", ratio);
+    stage.dataset.layout = state.layout;
   }
 
   function openScene(index, changes = {}) {
@@ -263,19 +319,19 @@ function startComparer() {
     const wanted = { left: state.left || data.first[0], right: state.right || data.first[1], ...changes };
     for (const side of ["left", "right"]) if (!names.includes(wanted[side])) wanted[side] = names.at(side === "left" ? 0 : -1);
     element("frame").max = scene().frames.length - 1;
-    stage.style.aspectRatio = `${scene().width} / ${scene().height}`;
-    stage.style.setProperty("--ratio", scene().width / scene().height);
-    const frame = clamp(wanted.frame ?? state.frame, 0, scene().frames.length - 1);
+    const frame = clamp(wanted.frame ?? state.frame ?? scene().start, 0, scene().frames.length - 1);
     const center = { x: scene().width / 2, y: scene().height / 2 };
     change({ zoom: 1, center, ...wanted, frame });
   }
 
   /* Zoom and pan: what is under the pointer stays under it. */
 
-  function toPicture({ x, y }) {
+  function toPicture(onTheStage) {
+    const place = inPane(onTheStage);
+    const pane = panes()[0];
     return {
-      x: state.center.x + (x - stage.clientWidth / 2) / scale(),
-      y: state.center.y + (y - stage.clientHeight / 2) / scale(),
+      x: state.center.x + (place.x - pane.width / 2) / scale(),
+      y: state.center.y + (place.y - pane.height / 2) / scale(),
     };
   }
 
@@ -284,7 +340,7 @@ function startComparer() {
     return { x: event.clientX - box.left - stage.clientLeft, y: event.clientY - box.top - stage.clientTop };
   }
 
-  function zoomBy(factor, at = { x: stage.clientWidth / 2, y: stage.clientHeight / 2 }) {
+  function zoomBy(factor, at = { x: panes()[0].width / 2, y: panes()[0].height / 2 }) {
     if (fitScale() === 0) return;
     const fixed = toPicture(at);
     const most = Math.max(LARGEST_PIXEL / fitScale(), 1);
@@ -321,7 +377,7 @@ function startComparer() {
     stage.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, onStage(event));
     if (pointers.size > 1) return;
-    dragsSeam = event.target === seam || state.zoom === 1;
+    dragsSeam = state.layout === "seam" && (event.target === seam || state.zoom === 1);
     (event.target === seam ? seam : stage).focus({ preventScroll: true });
     event.preventDefault();
     if (dragsSeam) moveSeam(onStage(event).x / stage.clientWidth);
@@ -354,6 +410,16 @@ function startComparer() {
   /* Controls and keys. */
 
   const step = (by) => change({ frame: clamp(state.frame + by, 0, scene().frames.length - 1) });
+  const play = async () => {
+    const own = playing ? null : {};
+    playing = own;
+    element("play").textContent = own ? "❚❚" : "▶";
+    element("play").ariaLabel = own ? "Pause" : "Play";
+    while (own && playing === own) {
+      await change({ frame: (state.frame + 1) % scene().frames.length });
+      await new Promise((done) => setTimeout(done, FRAME_MILLISECONDS));
+    }
+  };
   const expose = (by) => change({ exposure: clamp(state.exposure + by, -8, 8) });
   const swap = () => change({ left: state.right, right: state.left });
   const nextTone = () => {
@@ -372,10 +438,11 @@ function startComparer() {
   for (const id of ["frame", "exposure"]) {
     element(id).addEventListener("input", (event) => change({ [id]: Number(event.target.value) }));
   }
-  for (const input of document.querySelectorAll("input[name=show]")) {
-    input.addEventListener("change", () => change({ show: input.value }));
+  for (const input of document.querySelectorAll("input[name=show], input[name=layout]")) {
+    input.addEventListener("change", () => change({ [input.name]: input.value }));
   }
   element("swap").addEventListener("click", swap);
+  element("play").addEventListener("click", play);
   element("earlier").addEventListener("click", () => step(-1));
   element("later").addEventListener("click", () => step(1));
   element("in").addEventListener("click", () => zoomBy(1.5));
@@ -392,7 +459,9 @@ function startComparer() {
     "[": () => expose(-0.5),
     "]": () => expose(0.5),
     "\\": () => change({ exposure: 0 }),
+    " ": play,
     e: () => change({ show: state.show === "error" ? "picture" : "error" }),
+    s: () => change({ layout: state.layout === "seam" ? "beside" : "seam" }),
     t: nextTone,
     x: swap,
   };
@@ -403,7 +472,7 @@ function startComparer() {
     const far = event.shiftKey ? 5 : 1;
     if (event.target === stage && state.zoom > 1) {
       panBy((-across * far * 40) / scale(), (-down * far * 40) / scale());
-    } else if (across !== 0) {
+    } else if (across !== 0 && state.layout === "seam") {
       moveSeam(state.seam + across * far * 0.02);
     } else {
       return false;
@@ -445,6 +514,9 @@ function startComparer() {
     });
   }
 
-  new ResizeObserver(paint).observe(stage);
+  new ResizeObserver(() => {
+    layOut();
+    paint();
+  }).observe(stage);
   openScene(0);
 }
