@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 
@@ -11,8 +10,9 @@ import tyro
 from mcdenoise.cli._options import Out
 from mcdenoise.cli._output import print_rows, progress_bar, say, warn
 from mcdenoise.cli._shot import ShotOptions
+from mcdenoise.engines import Engine, LocalEngine, RayEngine, processors
 from mcdenoise.errors import InputError
-from mcdenoise.film import Engine, Film, LocalEngine, RayEngine, ShotResult, read_film, run_film, write_page
+from mcdenoise.film import Film, ShotResult, read_film, run_film, write_page
 
 
 def film(
@@ -48,7 +48,6 @@ def film(
     if ray is not None and workers is not None:
         raise InputError("--workers, --ray: expected one of them, found both")
     shots = read_film(manifest, shot)
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     engine: Engine
     threads = None
     if ray is not None:
@@ -57,8 +56,8 @@ def film(
         engine, threads = RayEngine(ray, cpus=cpus, gpus=float(gpus)), cpus
     else:
         workers = 1 if workers is None else workers
-        engine = LocalEngine(workers)
-        threads = max(1, count // workers) if workers > 1 else None
+        engine = LocalEngine(workers, preload="mcdenoise.film.work")
+        threads = max(1, processors() // workers) if workers > 1 else None
     plan = Film(shots, out, piece, joint, threads)
     began = time.perf_counter()
     with progress_bar() as progress:

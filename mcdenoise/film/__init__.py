@@ -6,16 +6,12 @@ disks themselves, and keep a record of each finished frame beside the result (`r
 """
 
 from mcdenoise.film.driver import Film, FilmResult, ShotResult, run_film
-from mcdenoise.film.engines import Engine, LocalEngine, RayEngine
 from mcdenoise.film.manifest import Shot, read_film
 from mcdenoise.film.page import write_page
 
 __all__ = [
-    "Engine",
     "Film",
     "FilmResult",
-    "LocalEngine",
-    "RayEngine",
     "Shot",
     "ShotResult",
     "read_film",

@@ -10,21 +10,20 @@ from collections import deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from mcdenoise.data.files import held, sweep, write_text
+from mcdenoise.engines import MOST_LOSSES, Done, Engine, describe_error
 from mcdenoise.errors import InputError
 from mcdenoise.film import work
-from mcdenoise.film.engines import Done, Engine
 from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import Piece, cut
 from mcdenoise.film.record import Tail, read_journal
 from mcdenoise.film.work import RECORDS, Closed, Found, Made, Order
 from mcdenoise.folder import make_folder
 
-# How often a task may be lost in a row without a single frame made, before nobody tries it any more.
-_PATIENCE = 5
 _SECONDS_BETWEEN_LOOKS = 0.2
 # Seconds between looks at all journals: a thousand of them cost no more than some hundred questions a second.
 _SECONDS_BETWEEN_COUNTS, _SECONDS_A_JOURNAL = 0.5, 0.002
@@ -199,7 +198,7 @@ class _Run:
         created = datetime.now(UTC).isoformat(timespec="seconds")
         try:
             while self.queue or self.running:
-                room = self.engine.room() if self.queue else 0
+                room = self.engine.free_slots() if self.queue else 0
                 while self.queue and room > 0:
                     self._submit(self.queue.popleft())
                     room -= 1
@@ -292,7 +291,7 @@ class _Run:
         """The process is no more; what it has finished is on the disk."""
         done = _finished(task)
         task.lost = 1 if done else task.lost + 1
-        if task.lost >= _PATIENCE:
+        if task.lost >= MOST_LOSSES:
             self._failed(task, InputError(f"{why}, {task.lost} times in a row"))
         elif task.piece is None:
             self.queue.appendleft(_Task(task.kind, task.result, lost=task.lost))
@@ -301,7 +300,7 @@ class _Run:
             self._piece_ended(task.result)
 
     def _failed(self, task: _Task, error: BaseException) -> None:
-        result, reason = task.result, _reason(error)
+        result, reason = task.result, describe_error(error)
         if task.piece is not None:
             result.failed.update(dict.fromkeys(set(task.piece.wanted) - _finished(task), reason))
             self._piece_ended(result)
@@ -331,15 +330,10 @@ def _finished(task: _Task) -> set[int]:
     return {record.number for record in read_journal(task.journal)} if task.journal is not None else set()
 
 
-def _reason(error: BaseException) -> str:
-    text = " ".join(str(error).split())
-    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"[:500]
-
-
 def _as_json(film: Film, result: FilmResult, created: str) -> dict[str, Any]:
     return {
         "created": created,
-        "version": film.order(film.shots[0]).version if film.shots else "",
+        "version": version("mcdenoise"),
         "complete": result.complete,
         "seconds": round(result.seconds, 3),
         "frames_made": result.made,

@@ -54,14 +54,12 @@ class Order:
         out: absolute folder of the film.
         joint: how far a frame may differ from that of the uncut shot, see :func:`mcdenoise.models.frames_remembered`.
         threads: of torch; ``None`` for its own choice.
-        version: of this package where the film is planned.
     """
 
     shot: Shot
     out: Path
     joint: float
     threads: int | None = None
-    version: str = field(default_factory=lambda: version("mcdenoise"))
 
     @property
     def folder(self) -> Path:
@@ -332,11 +330,6 @@ class _Writer:
 @functools.lru_cache(1)
 def _opened(order: Order) -> _Opened:
     """A shot, ready to be denoised; the last one is kept, of which a process may make several pieces."""
-    if order.version != version("mcdenoise"):
-        raise InputError(
-            f"mcdenoise: expected version {order.version}, as where the film is planned, found {version('mcdenoise')}; "
-            "install the same everywhere"
-        )
     keep_heap()
     if order.shot.settings.max_memory is not None:
         return_heap()

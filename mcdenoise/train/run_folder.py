@@ -100,6 +100,13 @@ class RunFolder:
             file.write(content.getbuffer())
             file.write(_sealed(content.getbuffer()))
 
+    def checkpointed(self) -> int:
+        """When the checkpoint was written, in nanoseconds since 1970; 0 without one."""
+        try:
+            return self._checkpoint.stat().st_mtime_ns
+        except OSError:
+            return 0
+
     def load(self, *parts: Any) -> tuple[int, Provenance]:
         """Restore what :meth:`save` saved; zero steps without a checkpoint.
 

@@ -16,7 +16,8 @@ import pytest
 from shots import pixels, same, write_manifest, write_shot
 
 from mcdenoise.cli import main
-from mcdenoise.film import Film, LocalEngine, read_film, run_film
+from mcdenoise.engines import LocalEngine
+from mcdenoise.film import Film, read_film, run_film
 from mcdenoise.film.record import read_records
 
 # Of a machine that others use, too.
