@@ -24,6 +24,15 @@ class MissingBufferError(InputError):
     """A frame lacks a buffer that a method cannot do without."""
 
 
+def is_unicode(text: str) -> bool:
+    """Whether the text has an encoding in UTF-8; the name of a file that is none has not."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def printable(text: str) -> str:
     r"""The text without what a terminal would obey and without line breaks: such characters are spelled out.
 

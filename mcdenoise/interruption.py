@@ -58,6 +58,35 @@ def deaf_children() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+def prepare_worker() -> None:
+    """In a worker process, first of all: SIGINT is for the driver, SIGTERM and SIGHUP end it, as does the driver's end.
+
+    Before it ends it removes the files that it is writing. What it was told to ignore it ignores.
+    """
+    # Not every system can start a process with signals blocked.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _end_worker)
+    threading.Thread(target=_end_with_driver, daemon=True).start()
+
+
+def _end_worker(number: int, frame: FrameType | None) -> None:
+    remove_unfinished()
+    os._exit(128 + number)
+
+
+def _end_with_driver() -> None:
+    # Here because few processes need it. A worker whose driver was killed would wait for its next task for ever.
+    import multiprocessing
+
+    driver = multiprocessing.parent_process()
+    if driver is not None:
+        driver.join()
+        remove_unfinished()
+        os._exit(1)
+
+
 class Interruption:
     """What a command does at SIGINT, SIGTERM and SIGHUP: one line on stderr, and status 128 and the signal's number.
 

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import sys
-import threading
 from collections.abc import Callable, Hashable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from types import FrameType
 from typing import Any
 
 from mcdenoise.engines.engine import Done
 from mcdenoise.errors import InputError
-from mcdenoise.interruption import deaf_children, remove_unfinished
+from mcdenoise.interruption import deaf_children, prepare_worker
 
 # In this time an interrupted worker removes the file that it is writing.
 _SECONDS_TO_END = 0.3
@@ -95,30 +92,8 @@ class LocalEngine:
         self._running = {}
 
     def _pool(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, self._context, _begin)
+        return ProcessPoolExecutor(1, self._context, prepare_worker)
 
     def _renew(self, slot: int) -> None:
         self._pools[slot].shutdown(wait=False)
         self._pools[slot] = self._pool()
-
-
-def _begin() -> None:
-    """Prepare a worker: SIGINT is the driver's, SIGTERM ends it, and it ends with the driver."""
-    # Not every system can start a process with signals blocked.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _end)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end(number: int, frame: FrameType | None) -> None:
-    remove_unfinished()
-    os._exit(128 + number)
-
-
-def _end_with_parent() -> None:
-    # A worker whose driver was killed would wait for its next task for ever.
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        remove_unfinished()
-        os._exit(1)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from mcdenoise.data.sequences import parse_frames
-from mcdenoise.errors import InputError, printable
+from mcdenoise.errors import InputError, is_unicode, printable
 from mcdenoise.methods import WEIGHTS
 from mcdenoise.reading import read_text
 from mcdenoise.shot import ShotSettings
@@ -110,11 +110,11 @@ def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
 
 
 def _shot(name: str, inputs: tuple[Path, ...], settings: ShotSettings, where: str) -> Shot:
-    plain = name.strip() and not name.startswith(".") and not {"/", "\\", "\0"} & set(name)
+    plain = name.strip() and not name.startswith(".") and not {"/", "\\", "\0"} & set(name) and is_unicode(name)
     if not plain or name.casefold() in _TAKEN or len(os.fsencode(name)) > _LONGEST_NAME:
         raise InputError(
-            f"{where}: expected a name that a folder can have, without slashes or a dot before it, not one of "
-            f"{', '.join(sorted(_TAKEN))}, found {printable(repr(name[:80]))}; choose another"
+            f"{where}: expected a name that a folder can have, in UTF-8, without slashes or a dot before it, not "
+            f"one of {', '.join(sorted(_TAKEN))}, found {printable(repr(name[:80]))}; choose another"
         )
     return Shot(name, tuple(Path(os.path.abspath(path)) for path in inputs), settings)
 

@@ -34,7 +34,7 @@ class FrameRecord:
     Args:
         number: of the frame.
         key: of what it was made.
-        result: the file that was written.
+        result: the file that was written, by its path in the folder of the shot.
         inputs: of each file that it was made of the stamp, and the digest of its bytes.
         report: what happened to it.
         alike: whether it looks like the frame before and finds no history in it.

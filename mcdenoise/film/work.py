@@ -71,6 +71,17 @@ class Order:
         """Where it is written down what is finished."""
         return self.out / RECORDS / self.shot.name
 
+    def result(self, record: FrameRecord) -> Path:
+        """The file of a finished frame, wherever the film has been moved to."""
+        return self.folder / record.result[0]
+
+    def has(self, record: FrameRecord) -> bool:
+        """Whether that file is there, as it was written."""
+        try:
+            return stamp(self.result(record))[1:] == record.result[1:]
+        except OSError:
+            return False
+
 
 @dataclass(frozen=True)
 class Found:
@@ -186,7 +197,7 @@ def look(order: Order) -> Found:
     done = {
         number
         for number in opened.sequence.numbers
-        if number in records and _is_there(records[number]) and records[number].key == keys.key(number)
+        if number in records and order.has(records[number]) and records[number].key == keys.key(number)
     }
     return Found(
         opened.shot,
@@ -247,10 +258,10 @@ def close(order: Order) -> Closed:
     """
     opened = _opened(order)
     found = read_records(order.records)
-    records = [found[n] for n in opened.sequence.numbers if n in found and _is_there(found[n])]
+    records = [found[n] for n in opened.sequence.numbers if n in found and order.has(found[n])]
     report = new_report(opened.sequence, _name(opened.shot))
     report.frames = {each.number: each.report for each in records}
-    report.files = {each.number: Path(each.result[0]) for each in records}
+    report.files = {each.number: order.result(each) for each in records}
     report.alike = [each.number for each in records if each.alike]
     for folder in (order.folder, order.records):
         sweep(folder, youngest=0)
@@ -309,10 +320,11 @@ class _Writer:
         report = self.report.frames.pop(number)
         if number not in self.left:
             return
+        path = self.report.files.pop(number)
         record = FrameRecord(
             number,
             self.keys.key(number),
-            stamp(self.report.files.pop(number)),
+            (path.relative_to(self.order.folder).as_posix(), *stamp(path)[1:]),
             self.keys.inputs(number),
             report,
             number in self.report.alike,
@@ -399,14 +411,6 @@ def _name(shot: Shot) -> str:
     return str(spelling.weights or spelling.name)
 
 
-def _is_there(record: FrameRecord) -> bool:
-    """Whether the result is what was written."""
-    try:
-        return stamp(Path(record.result[0])) == record.result
-    except OSError:
-        return False
-
-
 def _small(image: Tensor) -> Tensor:
     """What is compared to see whether a frame sticks out."""
     height, width = image.shape[-2:]
@@ -433,7 +437,7 @@ def _joints(order: Order, records: Collection[FrameRecord]) -> dict[int, float]:
         if not path.is_file():
             continue
         try:
-            shown = open_result(Path(record.result[0])).read()[0]
+            shown = open_result(order.result(record)).read()[0]
             other = torch.from_numpy(np.ascontiguousarray(read_exr(path)[0][..., :3])).permute(2, 0, 1)[None]
         except InputError:
             continue
@@ -475,7 +479,7 @@ def _pictures(order: Order, records: list[FrameRecord], described: list[dict[str
         if record.number not in wanted:
             continue
         try:
-            image, metadata = open_result(Path(record.result[0])).read()
+            image, metadata = open_result(order.result(record)).read()
         except InputError:
             continue
         height, width = image.shape[-2:]

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -16,7 +13,7 @@ from multiprocessing.synchronize import Event
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError
-from mcdenoise.interruption import deaf_children
+from mcdenoise.interruption import deaf_children, prepare_worker
 from mcdenoise.scenes.render.folder import ReferenceState
 from mcdenoise.scenes.render.frames import FrameJob, render_frame
 from mcdenoise.scenes.render.tracer import Scene, Tracer
@@ -73,18 +70,8 @@ _process: _Process | None = None
 
 def _start_process(source: TracerSource, job: FrameJob, paths: Synchronized[int], stop: Event) -> None:
     global _process
-    # Where it could not be made deaf from its first moment on.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    prepare_worker()
     _process = _Process(source, job, paths, stop)
-
-
-def _end_with_parent() -> None:
-    # A pool whose owner was killed would wait for its next frame for ever, with all the memory it has.
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _render_frame_in_process(number: int) -> ReferenceState | None:
