@@ -27,7 +27,7 @@ from mcdenoise.train import Recipe, Run, RunFolder, train
 
 @dataclass(frozen=True)
 class _Job:
-    """A run of the sweep, as a worker is told it."""
+    """A run of the sweep."""
 
     run: Run
     out: Path
