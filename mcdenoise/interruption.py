@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, suppress
 from pathlib import Path
 from types import FrameType
 
@@ -18,6 +18,24 @@ _WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up"}
 _GRACE = 1.25
 # Files and folders that are being written, and are to go where that does not come to its end.
 _unfinished: set[Path] = set()
+
+
+class _Starts:
+    """Whether a process is being started, and whether a signal came meanwhile; another thread may get it."""
+
+    active = False
+    interrupted = False
+
+
+_starts = _Starts()
+
+
+def start_resource_tracker() -> None:
+    """Start the process that removes what pools of an ended process leave, without a stderr to tell it on."""
+    from multiprocessing import resource_tracker
+
+    with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
+        resource_tracker.ensure_running()
 
 
 @contextmanager
@@ -45,17 +63,21 @@ def deaf_children() -> Iterator[None]:
     """Processes that are started within this do not hear Ctrl+C, from their first moment on.
 
     A terminal sends it to all processes of a command. The first one tells the others what to do; what they would print,
-    while they import modules, is of no use.
+    while they import modules, is of no use. A signal that this process gets meanwhile interrupts it at the end of the
+    block: a process that is half started would print why it cannot start.
     """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    masks = hasattr(signal, "pthread_sigmask")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
+    _starts.active, _starts.interrupted = True, False
     try:
         yield
     finally:
-        # One that has come meanwhile is delivered now.
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        _starts.active = False
+        if masks:
+            # A signal that came meanwhile is delivered now.
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if _starts.interrupted:
+            raise KeyboardInterrupt
 
 
 def prepare_worker() -> None:
@@ -77,7 +99,7 @@ def _end_worker(number: int, frame: FrameType | None) -> None:
 
 
 def _end_with_driver() -> None:
-    # Here because few processes need it. A worker whose driver was killed would wait for its next task for ever.
+    # Imported here, as few processes need it. A worker whose driver was killed would wait for its next task for ever.
     import multiprocessing
 
     driver = multiprocessing.parent_process()
@@ -150,6 +172,9 @@ class Interruption:
         # What is imported has nothing to tidy up, and is the least prepared for exceptions.
         if again or not self.listening or _is_importing(frame):
             self._end(number)
+        if _starts.active:
+            _starts.interrupted = True
+            return
         raise KeyboardInterrupt
 
     def _ignore(self) -> None:

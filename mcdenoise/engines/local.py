@@ -12,7 +12,7 @@ from typing import Any
 
 from mcdenoise.engines.engine import Done
 from mcdenoise.errors import InputError
-from mcdenoise.interruption import deaf_children, prepare_worker
+from mcdenoise.interruption import deaf_children, prepare_worker, start_resource_tracker
 
 # In this time an interrupted worker removes the file that it is writing.
 _SECONDS_TO_END = 0.3
@@ -44,6 +44,7 @@ class LocalEngine:
         self._context = multiprocessing.get_context("forkserver" if forks else "spawn")
         if forks:
             self._context.set_forkserver_preload([preload])
+        start_resource_tracker()
         self._before = set(multiprocessing.active_children())
         self._pools = [self._pool() for _ in range(workers)]
         self._running: dict[Future[Any], int] = {}

@@ -52,14 +52,17 @@ class FrameRecord:
     at: float = field(default_factory=time.time)
 
     def line(self) -> str:
-        """The record as one line of JSON."""
-        return json.dumps(asdict(self))
+        """The record as one line of JSON, with a checksum of all else at its end."""
+        content = asdict(self)
+        return json.dumps({**content, "seal": digest_text(json.dumps(content))})
 
     @classmethod
     def of(cls, line: str) -> FrameRecord | None:
-        """The record of a line; ``None`` if the line is none, such as one that was cut off."""
+        """The record of a line; ``None`` if the line is no record, or was damaged or cut off."""
         try:
             found: dict[str, Any] = json.loads(line)
+            if found.pop("seal") != digest_text(json.dumps(found)):
+                return None
             report = found["report"]
             report["stages"] = {name: Stage(**stage) for name, stage in report["stages"].items()}
             inputs = tuple((_stamp(stamp), str(digest)) for stamp, digest in found["inputs"])

@@ -13,7 +13,7 @@ from multiprocessing.synchronize import Event
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError
-from mcdenoise.interruption import deaf_children, prepare_worker
+from mcdenoise.interruption import deaf_children, prepare_worker, start_resource_tracker
 from mcdenoise.scenes.render.folder import ReferenceState
 from mcdenoise.scenes.render.frames import FrameJob, render_frame
 from mcdenoise.scenes.render.tracer import Scene, Tracer
@@ -113,6 +113,7 @@ def render_in_processes(
     """
     # A fresh interpreter each: Mitsuba's threads and what it holds on a GPU do not survive a fork.
     context = multiprocessing.get_context("spawn")
+    start_resource_tracker()
     paths, stop = context.Value("q", 0), context.Event()
     seen = 0
     start = (source, job, paths, stop)
