@@ -18,7 +18,8 @@ import torch
 
 from mcdenoise.data.files import write_text
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
-from mcdenoise.film import Film, RayEngine, read_film, run_film
+from mcdenoise.engines import RayEngine
+from mcdenoise.film import Film, read_film, run_film
 from mcdenoise.frame import Frame
 from mcdenoise.shot import ShotSettings
 

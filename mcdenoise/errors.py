@@ -24,6 +24,15 @@ class MissingBufferError(InputError):
     """A frame lacks a buffer that a method needs."""
 
 
+def is_unicode(text: str) -> bool:
+    """Whether the text has an encoding in UTF-8; the name of a file that is none has not."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def printable(text: str) -> str:
     r"""Escape control characters, which a terminal would obey, and line breaks.
 

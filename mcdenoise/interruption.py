@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, suppress
 from pathlib import Path
 from types import FrameType
 
@@ -18,6 +18,24 @@ _WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up"}
 _GRACE = 1.25
 # Incomplete files and folders, to be removed if the process ends early.
 _unfinished: set[Path] = set()
+
+
+class _Starts:
+    """Whether a process is being started, and whether a signal came meanwhile; another thread may get it."""
+
+    active = False
+    interrupted = False
+
+
+_starts = _Starts()
+
+
+def start_resource_tracker() -> None:
+    """Start the process that removes what pools of an ended process leave, without a stderr to tell it on."""
+    from multiprocessing import resource_tracker
+
+    with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
+        resource_tracker.ensure_running()
 
 
 @contextmanager
@@ -45,17 +63,50 @@ def deaf_children() -> Iterator[None]:
     """Start child processes inside this block that ignore Ctrl+C from the beginning.
 
     A terminal sends Ctrl+C to all processes of a command. The main process tells its children what to do; tracebacks
-    from children that are still importing modules would not help.
+    from children that are still importing modules would not help. A signal that this process receives inside the block
+    interrupts it at the end of the block, because a half-started process would print why it cannot start.
     """
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    masks = hasattr(signal, "pthread_sigmask")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
+    _starts.active, _starts.interrupted = True, False
     try:
         yield
     finally:
-        # A signal that arrived in the meantime is delivered now.
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        _starts.active = False
+        if masks:
+            # A signal that came meanwhile is delivered now.
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if _starts.interrupted:
+            raise KeyboardInterrupt
+
+
+def prepare_worker() -> None:
+    """In a worker process, first of all: SIGINT is for the driver, SIGTERM and SIGHUP end it, as does the driver's end.
+
+    Before it ends it removes the files that it is writing. What it was told to ignore it ignores.
+    """
+    # Not every system can start a process with signals blocked.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _end_worker)
+    threading.Thread(target=_end_with_driver, daemon=True).start()
+
+
+def _end_worker(number: int, frame: FrameType | None) -> None:
+    remove_unfinished()
+    os._exit(128 + number)
+
+
+def _end_with_driver() -> None:
+    # Imported here, as few processes need it. A worker whose driver was killed would wait for its next task for ever.
+    import multiprocessing
+
+    driver = multiprocessing.parent_process()
+    if driver is not None:
+        driver.join()
+        remove_unfinished()
+        os._exit(1)
 
 
 class Interruption:
@@ -121,6 +172,9 @@ class Interruption:
         # An import has nothing to clean up, and modules rarely handle exceptions while they are imported.
         if again or not self.listening or _is_importing(frame):
             self._end(number)
+        if _starts.active:
+            _starts.interrupted = True
+            return
         raise KeyboardInterrupt
 
     def _ignore(self) -> None:

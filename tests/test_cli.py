@@ -30,7 +30,7 @@ from mcdenoise.shot import ShotSettings
 from mcdenoise.train import TrainConfig
 
 RGB = ["R", "G", "B"]
-POSITIONAL = {"folder", "inputs", "sequence", "sequences", "scene", "images", "ops", "manifest"}
+POSITIONAL = {"folder", "inputs", "sequence", "sequences", "scene", "images", "ops", "manifest", "recipes"}
 
 
 @pytest.fixture(autouse=True)

@@ -38,6 +38,8 @@ ALLOWED: dict[str, set[str]] = {
     # What a signal ends, and what is to be tidied up then.
     "interruption": set(),
     "threads": set(),
+    # Tasks run in other processes, whatever they do.
+    "engines": {"errors", "interruption"},
     # What is kept is written as all files are; nothing of them is read.
     "user_cache": {"data", "errors"},
     "own": {"errors"},
@@ -49,7 +51,7 @@ ALLOWED: dict[str, set[str]] = {
     "models": SIGNAL | {"nn", "own", "user_cache"},
     # Leaves: what is read and rendered knows the frame, and no method.
     "data": SIGNAL | {"interruption"},
-    "scenes": SIGNAL | {"data", "interruption"},
+    "scenes": SIGNAL | {"data", "engines", "interruption"},
     "denoiser": SIGNAL | {"models"},
     "methods": SIGNAL | {"models", "denoiser"},
     # For scripts of a renderer: nothing of the package imports them.
@@ -62,8 +64,8 @@ ALLOWED: dict[str, set[str]] = {
     "report": LIBRARY | {"evaluate", "results"},
     "benchmark": LIBRARY | {"check", "commit", "evaluate", "interruption", "methods", "results"},
     **dict.fromkeys(TOOLS - REPORTS - {"film"}, LIBRARY | REPORTS | {"commit", "results", "user_cache"}),
-    "film": LIBRARY | {"commit", "folder", "heap", "interruption", "methods", "preview", "report", "shot"},
-    "cli": LIBRARY | TOOLS | {"heap", "interruption", "results", "shot", "threads"},
+    "film": LIBRARY | {"commit", "engines", "folder", "heap", "interruption", "methods", "preview", "report", "shot"},
+    "cli": LIBRARY | TOOLS | {"engines", "heap", "interruption", "results", "shot", "threads"},
     "__main__": {"cli"},
     # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.
     "": LIBRARY,
@@ -76,7 +78,7 @@ FAST_FORMS = ("mcdenoise.ops._numba", "mcdenoise.ops._triton")
 CIRCULAR: set[str] = set()
 # `from mcdenoise import Denoiser` leaves these alone: optional, slow to load, or of use to the command line only.
 LAZY = {"OpenImageIO", "PIL", "av", "colour", "jinja2", "matplotlib", "numba", "triton", "tyro"}
-LAZY |= {"drjit", "mitsuba", "pyoidn", "flip_evaluator", "lightning", "lightning_fabric", "tensorboard"}
+LAZY |= {"drjit", "mitsuba", "pyoidn", "ray", "flip_evaluator", "lightning", "lightning_fabric", "tensorboard"}
 SECONDS = 0.5
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 
@@ -11,8 +10,9 @@ import tyro
 from mcdenoise.cli._options import Out
 from mcdenoise.cli._output import print_rows, progress_bar, say, warn
 from mcdenoise.cli._shot import ShotOptions
+from mcdenoise.engines import Engine, LocalEngine, RayEngine, processors
 from mcdenoise.errors import InputError
-from mcdenoise.film import Engine, Film, LocalEngine, RayEngine, ShotResult, read_film, run_film, write_page
+from mcdenoise.film import Film, ShotResult, read_film, run_film, write_page
 
 
 def film(
@@ -24,22 +24,24 @@ def film(
     piece: int = 200,
     joint: float = 1e-2,
 ) -> int | None:
-    """Denoise the shots of a film, by any number of processes: writes to OUT/NAME/ what denoise does.
+    """Denoise the shots of a film, by any number of processes or machines: OUT/NAME/ is what denoise writes of a shot.
 
-    The same command again makes what is not finished: frames of other files, settings, weights or versions, too. What
-    fails is told in the end with the reason, and the status is 1; everything else is done.
+    The same command again resumes the film: it denoises the frames that are not finished, or whose files, settings,
+    weights or version have changed. What failed is listed at the end with the reason, and the status is 1.
 
     Args:
         manifest: TOML file with a table [[shot]] for each shot: name, input (a folder, a file, a pattern or a list of
             these), and any option of `mcdenoise denoise`; [every] has options of all. Or a pattern of folders, in
             quotes, such as 'renders/*/beauty', each of which is a shot.
         out: folder to write to: a folder for each shot, film.json, and the page film.html.
-        shot: how each is read, denoised and written, where the manifest does not say otherwise.
+        shot: how shots are read, denoised and written; the manifest overrides it.
         workers: processes of this machine; 1 by default.
-        ray: address of a Ray cluster to take instead, such as auto, 10.0.0.1:6379, or local for one on this machine.
-        piece: the most frames that one process makes of a shot; longer ones are cut into pieces that overlap by as many
-            frames as the history needs; 0 cuts none.
-        joint: how far a frame behind a cut may differ from that of the whole shot, as a fraction; decides the overlap.
+        ray: address of a Ray cluster that denoises instead, such as auto, 10.0.0.1:6379, or local for one on this
+            machine; all machines see the same folders.
+        piece: largest number of frames that one process denoises of a shot; longer shots are cut into pieces that
+            overlap by as many frames as the history needs; 0 cuts none.
+        joint: largest difference of a frame after a joint from that of the uncut shot, as a fraction; it decides the
+            overlap.
     """
     if piece < 0:
         raise InputError(f"--piece: expected at least 0 frames, found {piece}")
@@ -48,7 +50,6 @@ def film(
     if ray is not None and workers is not None:
         raise InputError("--workers, --ray: expected one of them, found both")
     shots = read_film(manifest, shot)
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     engine: Engine
     threads = None
     if ray is not None:
@@ -57,22 +58,22 @@ def film(
         engine, threads = RayEngine(ray, cpus=cpus, gpus=float(gpus)), cpus
     else:
         workers = 1 if workers is None else workers
-        engine = LocalEngine(workers)
-        threads = max(1, count // workers) if workers > 1 else None
+        engine = LocalEngine(workers, preload="mcdenoise.film.work")
+        threads = max(1, processors() // workers) if workers > 1 else None
     plan = Film(shots, out, piece, joint, threads)
     began = time.perf_counter()
     with progress_bar() as progress:
-        task = progress.add_task(f"look at {len(shots)} shots", total=None)
+        task = progress.add_task(f"scan {len(shots)} shots", total=None)
 
         def show(made: int, total: int | None) -> None:
             rate = made / (time.perf_counter() - began)
             if total is not None:
                 progress.update(task, description=f"{made}/{total} frames, {rate:.2f}/s", completed=made, total=total)
 
-        result = run_film(plan, engine, on_progress=show, on_shot=_say)
+        result = run_film(plan, engine, on_progress=show, on_shot=_print_shot)
     for each in result.shots:
-        if each.closed is not None:
-            warn(f"{each.shot.name}: {warning}" for warning in each.closed.warnings)
+        if each.summary is not None:
+            warn(f"{each.shot.name}: {warning}" for warning in each.summary.warnings)
     print_rows(
         [
             {"shot": each.shot.name, "frames": frames, "failed": why}
@@ -95,8 +96,8 @@ def film(
     return None if result.complete else 1
 
 
-def _say(result: ShotResult) -> None:
-    """One line a shot, when it is closed."""
+def _print_shot(result: ShotResult) -> None:
+    """Print one line for a shot that is summarized or has failed."""
     frames = len(result.found.numbers) if result.found is not None else 0
     kept = len(result.found.done) if result.found is not None else 0
     rate = f", {result.rate:.2f}/s" if result.made else ""

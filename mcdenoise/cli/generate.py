@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import tyro
-from rich.progress import TaskID
 
 from mcdenoise.cli._options import Flag, Out
-from mcdenoise.cli._output import progress_bar, say
+from mcdenoise.cli._output import print_rows, progress_bar, say
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
+from mcdenoise.engines import RayEngine, Task, run_tasks
 from mcdenoise.errors import InputError
-from mcdenoise.scenes.cycles import Blender, render_cycles
-from mcdenoise.scenes.random.takes import CLEANER, Sampling, random_takes
-from mcdenoise.scenes.render import render_sequence
+from mcdenoise.scenes.cycles import Blender
+from mcdenoise.scenes.generation import Generation, render_seed
+from mcdenoise.scenes.random.takes import Sampling
+from mcdenoise.scenes.render import choose_variant
 
 _FOR_TRAINING = RenderOptions(realisations=3, reference_spp=64, size="160x160")
 _WILD_STILLS = 0.5
@@ -38,10 +42,12 @@ def generate(
     blender_python: Path | None = None,
     parts: Flag = False,
     threads: int = 0,
-) -> None:
+) -> int | None:
     """Render random rooms, courts and still lifes to sequences to train on: OUT/random0000, OUT/random0001, ...
 
-    The same seed is the same scene and noise anywhere. The same command again resumes a run that was stopped.
+    The same seed is the same scene and noise anywhere. The same command again resumes a run that was stopped. With
+    --ray, each seed is a task: the task of a lost worker is retried, and seeds that failed are listed at the end, with
+    status 1.
 
     Args:
         out: folder of the sequences; finished frames in it are kept.
@@ -63,7 +69,8 @@ def generate(
         blender_python: a Python that has Blender's module bpy; by default that of the environment variable
             BLENDER_PYTHON, or else this one.
         parts: with Cycles, also write diffuse and specular light, which add up to each noisy color.
-        threads: threads of Cycles; all processors by default.
+        threads: threads of Cycles; all processors by default. With --ray, the processors that a task takes; 1 by
+            default.
     """
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
@@ -75,56 +82,62 @@ def generate(
         raise InputError("--parts: expected together with --renderer cycles: Mitsuba's path integrator has no parts")
     if rendering.keep_samples and renderer == "cycles":
         raise InputError("--keep-samples: expected together with --renderer mitsuba: Cycles writes no single samples")
+    if rendering.ray is not None and rendering.workers > 1:
+        raise InputError("--workers, --ray: expected one of them, found both")
     chosen, arguments = parse_frames(seeds, name="--seeds"), rendering.arguments()
+    cycles = renderer == "cycles"
+    plan = Generation(
+        out=Path(os.path.abspath(out)),
+        rendering=arguments,
+        frames=frames,
+        zoom=zoom,
+        noise_seed=noise_seed,
+        wild=wild,
+        sampling=sampling or ("mixed" if wild else "centre"),
+        stills=(_WILD_STILLS if wild else 0) if stills is None else stills,
+        cycles=cycles,
+        cycles_spp=cycles_spp,
+        blender_python=blender_python,
+        parts=parts,
+        threads=threads,
+    )
+    if rendering.ray is not None:
+        return _on_ray(plan, chosen, rendering.ray, out)
     with ExitStack() as stack:
-        blender = stack.enter_context(Blender(blender_python)) if renderer == "cycles" else None
+        blender = stack.enter_context(Blender(blender_python)) if cycles else None
         progress = stack.enter_context(progress_bar())
-        whole = progress.add_task("scenes", total=len(chosen))
+        scenes = progress.add_task("scenes", total=len(chosen))
+
+        def begin(name: str) -> Callable[[int, int], None]:
+            task = progress.add_task(name, total=None)
+
+            def show(done: int, total: int) -> None:
+                progress.update(task, completed=done, total=total, visible=done < total)
+
+            return show
+
         for seed in chosen:
-            takes = random_takes(
-                seed,
-                frames,
-                zoom,
-                sampling=sampling or ("mixed" if wild else "centre"),
-                spp=None if wild else rendering.spp,
-                stills=(_WILD_STILLS if wild else 0) if stills is None else stills,
-                shiny=wild,
-                width=max(arguments["size"][0], 1),
-            )
-            for take in takes:
-                task = progress.add_task(take.name, total=None)
-
-                def show(done: int, total: int, task: TaskID = task) -> None:
-                    progress.update(task, completed=done, total=total)
-
-                folder, noise = out / take.name, seed if noise_seed is None else noise_seed
-                if blender is not None:
-                    written = render_cycles(
-                        take.made,
-                        folder,
-                        blender,
-                        size=arguments["size"],
-                        seed=noise,
-                        view=take.view,
-                        samples=cycles_spp,
-                        realisations=rendering.realisations,
-                        reference_samples=rendering.reference_spp,
-                        parts=parts,
-                        threads=threads,
-                        progress=show,
-                    )
-                else:
-                    reference_spp = max(arguments["reference_spp"], CLEANER * take.spp if wild else 0)
-                    written = render_sequence(
-                        take.made.scene,
-                        take.made.cameras,
-                        folder,
-                        seed=noise,
-                        moves=take.made.moves,
-                        film=take.film,
-                        progress=show,
-                        **{**arguments, "spp": take.spp, "reference_spp": reference_spp},
-                    )
-                progress.remove_task(task)
+            for written in plan.render(seed, blender, begin):
                 say(written)
-            progress.advance(whole)
+            progress.advance(scenes)
+    return None
+
+
+def _on_ray(plan: Generation, seeds: list[int], address: str, out: Path) -> int | None:
+    """Render the seeds on a Ray cluster, a task each."""
+    threads = plan.threads or 1
+    # Of one kind, whatever each machine would choose: it is part of what a sequence is identified by.
+    variant = "" if plan.cycles else choose_variant(plan.rendering["variant"])
+    plan = replace(plan, threads=threads, rendering={**plan.rendering, "variant": variant or None})
+    engine = RayEngine(address, cpus=threads, gpus=float(variant.startswith("cuda")))
+    with progress_bar() as progress:
+        scenes = progress.add_task("scenes", total=len(seeds))
+
+        def done(task: Task, written: list[Path]) -> None:
+            progress.advance(scenes)
+            for each in written:
+                say(out / each.relative_to(plan.out))
+
+        failed = run_tasks(engine, [Task(f"seed {seed}", render_seed, (plan, seed)) for seed in seeds], done)
+    print_rows([{"scene": name, "failed": reason} for name, reason in failed.items()])
+    return 1 if failed else None

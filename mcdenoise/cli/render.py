@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,9 @@ import tyro
 from mcdenoise.cli._options import Flag, Out, parse_size
 from mcdenoise.cli._output import progress_bar, say
 from mcdenoise.data.sequences import parse_frames
+from mcdenoise.engines import RayEngine
 from mcdenoise.errors import InputError
-from mcdenoise.scenes.render import load_shot, render_sequence
+from mcdenoise.scenes.render import choose_variant, load_shot, render_sequence
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,8 @@ class RenderOptions:
         reference_frames: frames that get a reference, such as 8-11; all by default.
         size: WIDTHxHEIGHT in pixels.
         workers: processes that render frames side by side; of use with scalar_rgb.
+        ray: address of a Ray cluster that renders instead, such as auto, 10.0.0.1:6379, or local for one on this
+            machine; all machines see the same folders.
         variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
         keep_samples: also write the single samples of the noisy colors, for methods such as sbmc and layered.
     """
@@ -38,6 +42,7 @@ class RenderOptions:
     reference_frames: str | None = None
     size: str = "640x360"
     workers: int = 1
+    ray: str | None = None
     variant: str | None = None
     keep_samples: Flag = False
 
@@ -87,13 +92,22 @@ def render(
     if every < 1:
         raise InputError(f"--every: expected at least 1, found {every}")
     arguments = rendering.arguments()
+    if rendering.ray is not None and rendering.workers > 1:
+        raise InputError("--workers, --ray: expected one of them, found both")
     shot = load_shot(camera_path)
+    engine = None
+    if rendering.ray is not None:
+        # Workers have other working folders.
+        scene, out = Path(os.path.abspath(scene)), Path(os.path.abspath(out))
+        arguments["variant"] = choose_variant(rendering.variant)
+        engine = RayEngine(rendering.ray, gpus=float(arguments["variant"].startswith("cuda")))
     with progress_bar() as progress:
         task = progress.add_task("render", total=None)
         written = render_sequence(
             scene,
             shot.cameras[::every],
             out,
+            engine=engine,
             frames=frames,
             moves={name: path[::every] for name, path in shot.moves.items()},
             seed=seed,

@@ -13,7 +13,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from mcdenoise.data.files import atomic_path
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, is_unicode
 
 Image: TypeAlias = NDArray[np.float32]
 Mask: TypeAlias = NDArray[np.bool_]
@@ -180,10 +180,8 @@ def check_name(path: Path) -> None:
     Raises:
         InputError: the name is not valid UTF-8.
     """
-    try:
-        str(path).encode()
-    except UnicodeEncodeError as error:
-        raise InputError(f"{path}: expected a name in UTF-8, found other bytes; rename the file") from error
+    if not is_unicode(str(path)):
+        raise InputError(f"{path}: expected a name in UTF-8, found other bytes; rename the file")
 
 
 def is_hollow(path: Path, spec: oiio.ImageSpec, promised: int) -> bool:

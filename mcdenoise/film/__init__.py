@@ -1,21 +1,18 @@
-"""Films: many shots, denoised by many processes, and nothing lost.
+"""Films: many shots, denoised by many processes or machines, with nothing lost.
 
-A film is planned, made and closed by tasks that any process on any machine can do (`work`): they read and write the
-disks themselves, and keep a record of each finished frame beside the result (`record`). One process hands them out
-(`driver`), through an engine (`engines`), and may be killed at any time: what is finished is found again.
+Each shot is scanned, denoised and summarized by tasks (`work`), which any worker on any machine can run: workers read
+and write the disks themselves, and record each finished frame beside its result (`record`). The driver (`driver`)
+schedules the tasks on an engine (:mod:`mcdenoise.engines`). Driver and workers may be killed at any time: the next run
+finds the finished frames again.
 """
 
 from mcdenoise.film.driver import Film, FilmResult, ShotResult, run_film
-from mcdenoise.film.engines import Engine, LocalEngine, RayEngine
 from mcdenoise.film.manifest import Shot, read_film
 from mcdenoise.film.page import write_page
 
 __all__ = [
-    "Engine",
     "Film",
     "FilmResult",
-    "LocalEngine",
-    "RayEngine",
     "Shot",
     "ShotResult",
     "read_film",

@@ -1,4 +1,4 @@
-"""Hands out the tasks of a film, and knows how far it is: all that it knows besides is on the disk."""
+"""The driver: schedules the tasks of a film, counts finished frames, and retries tasks whose workers are lost."""
 
 from __future__ import annotations
 
@@ -10,37 +10,36 @@ from collections import deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from mcdenoise.data.files import held, sweep, write_text
+from mcdenoise.engines import MOST_LOSSES, Done, Engine, describe_error
 from mcdenoise.errors import InputError
 from mcdenoise.film import work
-from mcdenoise.film.engines import Done, Engine
 from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import Piece, cut
 from mcdenoise.film.record import Tail, read_journal
-from mcdenoise.film.work import RECORDS, Closed, Found, Made, Order
+from mcdenoise.film.work import RECORDS, Found, Made, Order, Summary
 from mcdenoise.folder import make_folder
 
-# How often a task may be lost in a row without a single frame made, before nobody tries it any more.
-_PATIENCE = 5
-_SECONDS_BETWEEN_LOOKS = 0.2
-# Seconds between looks at all journals: a thousand of them cost no more than some hundred questions a second.
+_SECONDS_BETWEEN_POLLS = 0.2
+# Seconds between reading all journals: a thousand of them cost no more than some hundred reads a second.
 _SECONDS_BETWEEN_COUNTS, _SECONDS_A_JOURNAL = 0.5, 0.002
 FILE = "film.json"
 
 
 @dataclass(frozen=True)
 class Film:
-    """What is to be made.
+    """A film to be denoised.
 
     Args:
-        shots: in the order in which they are begun.
-        out: folder; each shot has one in it.
-        piece: the most frames that one process makes of a shot; 0 for no limit.
-        joint: how far a frame may differ from that of the uncut shot, as a fraction.
-        threads: of torch in each process.
+        shots: in the order in which they are started.
+        out: output folder; each shot gets a folder of its name in it.
+        piece: largest number of frames in a piece; 0 does not cut shots.
+        joint: largest difference of a frame from that of the uncut shot, as a fraction.
+        threads: of torch in each worker; ``None`` for its own choice.
     """
 
     shots: Sequence[Shot]
@@ -50,26 +49,26 @@ class Film:
     threads: int | None = None
 
     def order(self, shot: Shot) -> Order:
-        """What every task of a shot is told."""
+        """The order that every task of a shot gets."""
         return Order(shot, Path(os.path.abspath(self.out)), self.joint, self.threads)
 
 
 @dataclass
 class ShotResult:
-    """How far a shot is.
+    """The state of a shot.
 
     Args:
-        shot: which.
-        found: when it has been looked at.
-        made: frames that were made in this run.
-        failed: why, by number of the frame.
-        reason: why the shot as a whole could not be made.
-        closed: when all is made that can be.
-        traces: of failures that are no fault of the input.
-        begun: seconds, of the first piece.
-        ended: seconds, of the last.
-        pieces: in which the shot was cut.
-        waiting: pieces that are not made yet.
+        shot: the shot.
+        found: what the scan found; ``None`` before it.
+        made: number of frames that were denoised in this run.
+        failed: for each failed frame, by number, the reason.
+        reason: why the whole shot failed; empty if it did not.
+        summary: of the finished frames; ``None`` before the last task of the shot.
+        traces: tracebacks of failures that the input did not cause.
+        begun: time at which the first piece was started, seconds.
+        ended: time at which the last piece ended, seconds.
+        pieces: number of pieces into which the shot was cut.
+        waiting: number of pieces that have not ended.
     """
 
     shot: Shot
@@ -77,7 +76,7 @@ class ShotResult:
     made: int = 0
     failed: dict[int, str] = field(default_factory=dict)
     reason: str = ""
-    closed: Closed | None = None
+    summary: Summary | None = None
     traces: list[str] = field(default_factory=list)
     begun: float = 0.0
     ended: float = 0.0
@@ -86,8 +85,8 @@ class ShotResult:
 
     @property
     def complete(self) -> bool:
-        """Whether every frame is there."""
-        return self.closed is not None and not self.failed and not self.reason
+        """Whether every frame is finished."""
+        return self.summary is not None and not self.failed and not self.reason
 
     @property
     def rate(self) -> float:
@@ -95,7 +94,7 @@ class ShotResult:
         return self.made / max(self.ended - self.begun, 1e-3) if self.made else 0.0
 
     def failures(self) -> list[tuple[str, str]]:
-        """Frames, and why they are not there; neighbours with one reason are one row."""
+        """The failed frames and the reasons; neighbours with the same reason are one row."""
         rows: list[tuple[list[int], str]] = []
         for number, why in sorted(self.failed.items()):
             if rows and rows[-1][1] == why:
@@ -108,12 +107,12 @@ class ShotResult:
 
 @dataclass
 class FilmResult:
-    """How a film has ended.
+    """How a film ended.
 
     Args:
         shots: in the order of the film.
-        seconds: that it took.
-        trouble: why ``film.json`` could not be written.
+        seconds: run time.
+        trouble: why ``film.json`` could not be written; empty if it was.
     """
 
     shots: list[ShotResult]
@@ -122,18 +121,18 @@ class FilmResult:
 
     @property
     def complete(self) -> bool:
-        """Whether every frame of every shot is there."""
+        """Whether every frame of every shot is finished."""
         return not self.trouble and all(each.complete for each in self.shots)
 
     @property
     def made(self) -> int:
-        """Frames that were made in this run."""
+        """Number of frames that were denoised in this run."""
         return sum(each.made for each in self.shots)
 
 
 @dataclass
 class _Task:
-    """One task, with what is needed to do it again."""
+    """One task, with what its retry needs."""
 
     kind: str
     result: ShotResult
@@ -150,20 +149,20 @@ def run_film(
     on_progress: Callable[[int, int | None], None] = lambda made, total: None,
     on_shot: Callable[[ShotResult], None] = lambda result: None,
 ) -> FilmResult:
-    """Make a film: look at every shot, make what is missing, and close each shot.
+    """Denoise a film: scan every shot, denoise the frames that are not finished, and summarize each shot.
 
-    What fails, fails alone: it is in the result, and the rest goes on. The same call again goes on where this one
-    ended, however that was. Writes ``OUT/film.json`` when it ends, in whatever way.
+    A frame, a piece or a shot that fails is named in the result, and all others go on. The same call again resumes the
+    film, however the last one ended. ``OUT/film.json`` is written at the end, also after an error or an interruption.
 
     Args:
-        film: what is to be made.
-        engine: who makes it; is closed in the end.
-        on_progress: called with how many frames were made, and how many there are to be made as far as that is known:
-            ``None`` while shots are looked at.
-        on_shot: called with each shot that is closed or given up.
+        film: the film.
+        engine: runs the tasks, and is closed at the end.
+        on_progress: called with the number of frames that were denoised, and of those that this run has to denoise;
+            the latter is ``None`` until all shots are scanned.
+        on_shot: called with each shot that is summarized, or has failed.
 
     Raises:
-        InputError: the folder cannot be written to, or another process makes a film in it.
+        InputError: the folder cannot be written to, or another process writes a film to it.
     """
     try:
         make_folder(film.out / RECORDS)
@@ -188,22 +187,20 @@ class _Run:
     ) -> None:
         self.film, self.engine, self.on_progress, self.on_shot = film, engine, on_progress, on_shot
         self.result = FilmResult([ShotResult(shot) for shot in film.shots])
-        # Looks first: then what is wrong is known at once, and how long all takes.
-        self.queue = deque(_Task("look", each) for each in self.result.shots)
+        # All shots are scanned first, so that wrong input is reported early and the time left is known.
+        self.queue = deque(_Task("scan", each) for each in self.result.shots)
         self.running: dict[Hashable, _Task] = {}
-        self.looking = len(film.shots)
+        self.unscanned = len(film.shots)
         self.began = self.counted = time.monotonic()
-        self.said: tuple[int, int | None] = (-1, None)
+        self.reported: tuple[int, int | None] = (-1, None)
 
     def run(self) -> FilmResult:
         created = datetime.now(UTC).isoformat(timespec="seconds")
         try:
             while self.queue or self.running:
-                room = self.engine.room() if self.queue else 0
-                while self.queue and room > 0:
+                for _ in range(min(len(self.queue), self.engine.free_slots()) if self.queue else 0):
                     self._submit(self.queue.popleft())
-                    room -= 1
-                for handle, done in self.engine.finished(_SECONDS_BETWEEN_LOOKS).items():
+                for handle, done in self.engine.finished(_SECONDS_BETWEEN_POLLS).items():
                     self._ended(self.running.pop(handle), done)
                 self._count()
         finally:
@@ -216,7 +213,7 @@ class _Run:
         return self.result
 
     def sweep(self) -> None:
-        """Remove what processes left over that were ended while they wrote: there are none any more."""
+        """Remove the half-written files of workers that were killed; no worker is alive any more."""
         for each in self.result.shots:
             if each.begun:
                 order = self.film.order(each.shot)
@@ -227,12 +224,12 @@ class _Run:
         result = task.result
         shot = result.found.shot if result.found is not None else result.shot
         order = self.film.order(shot)
-        if task.kind == "look":
-            handle = self.engine.submit(work.look, order)
-        elif task.kind == "close":
-            handle = self.engine.submit(work.close, order)
+        if task.kind == "scan":
+            handle = self.engine.submit(work.scan, order)
+        elif task.kind == "summarize":
+            handle = self.engine.submit(work.summarize, order)
         else:
-            # A name that no other has: who is thought to be dead may write still.
+            # A new name for each attempt, because a lost worker may still be alive and write to the old one.
             task.journal = order.records / f"{secrets.token_hex(8)}.jsonl"
             task.tail = Tail(task.journal)
             result.begun = result.begun or time.monotonic()
@@ -247,21 +244,21 @@ class _Run:
             self._lost(task, done.lost)
         elif done.error is not None:
             self._failed(task, done.error)
-        elif task.kind == "look":
-            self._looked(task.result, done.answer)
+        elif task.kind == "scan":
+            self._scanned(task.result, done.answer)
         elif task.kind == "make":
             self._made(task, done.answer)
         else:
-            task.result.closed = done.answer
+            task.result.summary = done.answer
             self.on_shot(task.result)
 
-    def _looked(self, result: ShotResult, found: Found) -> None:
-        self.looking -= 1
+    def _scanned(self, result: ShotResult, found: Found) -> None:
+        self.unscanned -= 1
         result.found = found
         result.failed.update(found.unreadable)
         self._cut(result, set(found.numbers) - found.done)
         if not result.waiting:
-            self._close(result)
+            self._summarize(result)
 
     def _cut(self, result: ShotResult, missing: set[int], lost: int = 0) -> None:
         if result.found is None:
@@ -270,7 +267,7 @@ class _Run:
         tasks = [_Task("make", result, piece, lost=lost) for piece in pieces]
         result.pieces = result.pieces or len(pieces)
         result.waiting += len(pieces)
-        # What was lost comes first: its shot is nearest to its end.
+        # Retries come first, because their shots are nearest to their ends.
         self.queue.extendleft(reversed(tasks)) if lost else self.queue.extend(tasks)
 
     def _made(self, task: _Task, made: Made) -> None:
@@ -283,16 +280,16 @@ class _Run:
         result.waiting -= 1
         result.ended = time.monotonic()
         if not result.waiting:
-            self._close(result)
+            self._summarize(result)
 
-    def _close(self, result: ShotResult) -> None:
-        self.queue.appendleft(_Task("close", result))
+    def _summarize(self, result: ShotResult) -> None:
+        self.queue.appendleft(_Task("summarize", result))
 
     def _lost(self, task: _Task, why: str) -> None:
-        """The process is no more; what it has finished is on the disk."""
+        """Retry a task whose worker is lost; the frames that it has finished are on the disk."""
         done = _finished(task)
         task.lost = 1 if done else task.lost + 1
-        if task.lost >= _PATIENCE:
+        if task.lost >= MOST_LOSSES:
             self._failed(task, InputError(f"{why}, {task.lost} times in a row"))
         elif task.piece is None:
             self.queue.appendleft(_Task(task.kind, task.result, lost=task.lost))
@@ -301,18 +298,18 @@ class _Run:
             self._piece_ended(task.result)
 
     def _failed(self, task: _Task, error: BaseException) -> None:
-        result, reason = task.result, _reason(error)
+        result, reason = task.result, describe_error(error)
         if task.piece is not None:
             result.failed.update(dict.fromkeys(set(task.piece.wanted) - _finished(task), reason))
             self._piece_ended(result)
             return
-        if task.kind == "look":
-            self.looking -= 1
+        if task.kind == "scan":
+            self.unscanned -= 1
         result.reason = reason
         self.on_shot(result)
 
     def _count(self) -> None:
-        """Count what is finished, now and then."""
+        """Report the number of finished frames, if some time has passed since the last report."""
         pause = max(_SECONDS_BETWEEN_COUNTS, _SECONDS_A_JOURNAL * len(self.running))
         if time.monotonic() - self.counted >= pause:
             self.counted = time.monotonic()
@@ -321,25 +318,20 @@ class _Run:
                     task.result.made += task.tail.new()
         known = [each for each in self.result.shots if each.found is not None]
         total = sum(len(each.found.numbers) - len(each.found.done) for each in known if each.found is not None)
-        told = (self.result.made, None if self.looking else total)
-        if told != self.said:
-            self.said = told
-            self.on_progress(*told)
+        progress = (self.result.made, None if self.unscanned else total)
+        if progress != self.reported:
+            self.reported = progress
+            self.on_progress(*progress)
 
 
 def _finished(task: _Task) -> set[int]:
     return {record.number for record in read_journal(task.journal)} if task.journal is not None else set()
 
 
-def _reason(error: BaseException) -> str:
-    text = " ".join(str(error).split())
-    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"[:500]
-
-
 def _as_json(film: Film, result: FilmResult, created: str) -> dict[str, Any]:
     return {
         "created": created,
-        "version": film.order(film.shots[0]).version if film.shots else "",
+        "version": version("mcdenoise"),
         "complete": result.complete,
         "seconds": round(result.seconds, 3),
         "frames_made": result.made,
@@ -366,16 +358,16 @@ def _shot_as_json(result: ShotResult) -> dict[str, Any]:
     if result.found is not None:
         found = {"frames": list(result.found.numbers), "found_finished": len(result.found.done)}
         about |= {**found, "overlap": result.found.overlap, "chosen": result.found.choice}
-    if result.closed is not None:
-        about |= _closed_as_json(result.closed)
+    if result.summary is not None:
+        about |= _summary_as_json(result.summary)
     return about
 
 
-def _closed_as_json(closed: Closed) -> Mapping[str, Any]:
+def _summary_as_json(summary: Summary) -> Mapping[str, Any]:
     return {
-        "milliseconds": closed.milliseconds,
-        "joints": {str(number): difference for number, difference in closed.joints.items()},
-        "worst": [row["number"] for row in sorted(closed.frames, key=lambda row: -row["score"])[:3]],
-        "resets": {str(row["number"]): row["reset"] for row in closed.frames if row["reset"]},
-        "warnings": list(closed.warnings),
+        "milliseconds": summary.milliseconds,
+        "joints": {str(number): difference for number, difference in summary.joints.items()},
+        "worst": [row["number"] for row in sorted(summary.frames, key=lambda row: -row["score"])[:3]],
+        "resets": {str(row["number"]): row["reset"] for row in summary.frames if row["reset"]},
+        "warnings": list(summary.warnings),
     }

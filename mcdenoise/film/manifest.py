@@ -1,4 +1,4 @@
-"""Which shots a film has, and how each is denoised: a TOML file, or a pattern of folders."""
+"""The manifest of a film: its shots and how each is denoised, as a TOML file or a pattern of folders."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from mcdenoise.data.sequences import parse_frames
-from mcdenoise.errors import InputError, printable
+from mcdenoise.errors import InputError, is_unicode, printable
 from mcdenoise.methods import WEIGHTS
 from mcdenoise.reading import read_text
 from mcdenoise.shot import ShotSettings
 
-# What stands in the folder of a film beside its shots.
+# Folder of the thumbnails, beside the shots.
 PICTURES = "film_pictures"
 _TAKEN = {"film.json", "film.html", PICTURES}
 _OWN = ("name", "input")
@@ -31,8 +31,8 @@ class Shot:
 
     Args:
         name: of its folder in the output.
-        inputs: absolute folders, files or patterns.
-        settings: how it is denoised; paths in it are absolute.
+        inputs: folders, files or patterns, as absolute paths.
+        settings: how it is denoised, with absolute paths.
     """
 
     name: str
@@ -41,23 +41,23 @@ class Shot:
 
 
 def read_film(manifest: Path, settings: ShotSettings | None = None) -> list[Shot]:
-    """Read which shots a film has.
+    """Read the shots of a film.
 
     Args:
         manifest: a TOML file with a table ``[[shot]]`` for each shot, which has ``name``, ``input`` (a folder, a file,
             a pattern, or a list of these, beside the manifest where they are not absolute), and any setting of
             :class:`mcdenoise.shot.ShotSettings`; a table ``[every]`` has settings of all shots. Or a pattern of folders
-            such as ``renders/*/beauty``: each is a shot, named by what the pattern leaves open.
-        settings: of all shots, where the manifest does not say otherwise.
+            such as ``renders/*/beauty``: each folder is a shot, and is named by the parts that match wildcards.
+        settings: of all shots; the manifest overrides them.
 
     Raises:
-        InputError: the manifest cannot be read, says nothing, or says what nobody understands.
+        InputError: the manifest cannot be read, has no shots, or has an unknown key or a wrong value.
     """
     settings = _absolute(settings or ShotSettings(), Path.cwd())
     shots = _of_file(manifest, settings) if manifest.suffix == ".toml" else _of_pattern(manifest, settings)
     names: dict[str, Shot] = {}
     for shot in shots:
-        # Some file systems have one folder for both.
+        # Some file systems do not tell upper case from lower case.
         other = names.setdefault(shot.name.casefold(), shot)
         if other is not shot:
             raise InputError(
@@ -74,8 +74,8 @@ def _of_pattern(pattern: Path, settings: ShotSettings) -> list[Shot]:
             "check the path, and put the pattern into quotes"
         )
     parts = pattern.parts
-    open_parts = [place for place, part in enumerate(parts) if glob.has_magic(part)] or [len(parts) - 1]
-    return [_shot("_".join(path.parts[p] for p in open_parts), (path,), settings, str(pattern)) for path in found]
+    wildcards = [place for place, part in enumerate(parts) if glob.has_magic(part)] or [len(parts) - 1]
+    return [_shot("_".join(path.parts[p] for p in wildcards), (path,), settings, str(pattern)) for path in found]
 
 
 def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
@@ -110,11 +110,11 @@ def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
 
 
 def _shot(name: str, inputs: tuple[Path, ...], settings: ShotSettings, where: str) -> Shot:
-    plain = name.strip() and not name.startswith(".") and not {"/", "\\", "\0"} & set(name)
+    plain = name.strip() and not name.startswith(".") and not {"/", "\\", "\0"} & set(name) and is_unicode(name)
     if not plain or name.casefold() in _TAKEN or len(os.fsencode(name)) > _LONGEST_NAME:
         raise InputError(
-            f"{where}: expected a name that a folder can have, without slashes or a dot before it, not one of "
-            f"{', '.join(sorted(_TAKEN))}, found {printable(repr(name[:80]))}; choose another"
+            f"{where}: expected a name that a folder can have, in UTF-8, without slashes or a dot before it, not "
+            f"one of {', '.join(sorted(_TAKEN))}, found {printable(repr(name[:80]))}; choose another"
         )
     return Shot(name, tuple(Path(os.path.abspath(path)) for path in inputs), settings)
 
@@ -129,11 +129,11 @@ def _inputs(given: Any, where: str, base: Path) -> tuple[Path, ...]:
 
 
 def _settings(table: Mapping[str, Any], settings: ShotSettings, where: str, base: Path) -> ShotSettings:
-    """The settings with those of a table."""
+    """The settings, overridden by those of a table."""
     kinds = get_type_hints(ShotSettings)
     changed = {}
     for key, value in table.items():
-        # As on the command line, or as in Python.
+        # Both spellings are accepted, that of the command line and that of Python.
         name = key.replace("-", "_")
         if name not in kinds:
             near = difflib.get_close_matches(name, [*kinds, *_OWN], 1)
@@ -151,8 +151,8 @@ def _settings(table: Mapping[str, Any], settings: ShotSettings, where: str, base
 
 
 def _typed(kind: Any, value: Any, where: str) -> Any:
-    """A value of TOML as the type of a setting."""
-    # None is said by saying nothing.
+    """Convert a value of TOML to the type of a setting."""
+    # TOML has no null: a setting that is None is not in the table.
     kinds = [each for each in (get_args(kind) if get_origin(kind) not in (tuple, Literal) else [kind]) or [kind]]
     kind = next(each for each in kinds if each is not type(None))
     if get_origin(kind) is Literal and value in get_args(kind):
@@ -165,7 +165,7 @@ def _typed(kind: Any, value: Any, where: str) -> Any:
     if get_origin(kind) is Literal:
         expected = f"one of {', '.join(get_args(kind))}"
         raise InputError(f"{where}: expected {expected}, found {_found(value)}; choose one")
-    # True and False are whole numbers to Python.
+    # In Python, True and False are integers.
     fits = isinstance(value, bool) is (kind is bool) and isinstance(
         value, (int, float) if kind is float else str if kind is Path else kind
     )
@@ -175,7 +175,7 @@ def _typed(kind: Any, value: Any, where: str) -> Any:
 
 
 def _absolute(settings: ShotSettings, base: Path, chosen: Collection[str] | None = None) -> ShotSettings:
-    """With paths that mean the same to a process that works elsewhere."""
+    """The settings with absolute paths, because workers may have other working folders."""
     kinds = get_type_hints(ShotSettings)
     changed: dict[str, Any] = {}
     for each in fields(settings):

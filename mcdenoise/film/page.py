@@ -1,4 +1,4 @@
-"""The page that a supervisor scrolls through: all shots of a film, and what to look at in each."""
+"""The report page of a film: all shots, with the frames that a supervisor should check in each."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from mcdenoise.report import render_page
 
 FILE = "film.html"
 _WORST = 3
-# Of a curve, in units of its own.
+# Size of a curve in the units of its SVG.
 _WIDTH, _HEIGHT = 600, 40
 
 
 def write_page(film: Film, result: FilmResult) -> Path:
-    """Write ``OUT/film.html``: of each shot what failed, the frames that stick out, a strip, resets and warnings.
+    """Write ``OUT/film.html``: for each shot failures, the frames with the largest change, a strip, resets, warnings.
 
-    Shots that are not complete come first, then those with the frames that stick out most. Pictures lie beside the page
-    and are loaded as it is scrolled.
+    Shots that are not complete come first, then the others by their largest change. The thumbnails are files beside the
+    page, and are loaded as it is scrolled.
 
     Args:
-        film: what was to be made.
-        result: what became of it.
+        film: the film.
+        result: how it ended.
 
     Returns:
         The path of the page.
@@ -52,8 +52,8 @@ def write_page(film: Film, result: FilmResult) -> Path:
 
 
 def _shown(result: ShotResult) -> dict[str, Any]:
-    rows: Sequence[Mapping[str, Any]] = () if result.closed is None else result.closed.frames
-    pictures: Mapping[int, str] = {} if result.closed is None else result.closed.pictures
+    rows: Sequence[Mapping[str, Any]] = () if result.summary is None else result.summary.frames
+    pictures: Mapping[int, str] = {} if result.summary is None else result.summary.pictures
     worst = sorted(rows, key=lambda row: -row["score"])[:_WORST]
     shown = {row["number"] for row in worst}
     return {
@@ -65,14 +65,14 @@ def _shown(result: ShotResult) -> dict[str, Any]:
         "made": result.made,
         "rate": result.rate,
         "failures": result.failures(),
-        "warnings": () if result.closed is None else result.closed.warnings,
-        "joints": {} if result.closed is None else result.closed.joints,
+        "warnings": () if result.summary is None else result.summary.warnings,
+        "joints": {} if result.summary is None else result.summary.joints,
         "resets": [(row["number"], row["reset"]) for row in rows if row["reset"]],
         "replaced": sum(row["replaced_pixels"] for row in rows),
         "worst": [{**row, "picture": quote(pictures[row["number"]])} for row in worst if row["number"] in pictures],
         "strip": [(number, quote(path)) for number, path in sorted(pictures.items()) if number not in shown],
         "curves": [
-            ("sticks out of its neighbours by", _curve([row["score"] for row in rows])),
+            ("change from both neighbours", _curve([row["score"] for row in rows])),
             ("pixels with a history", _curve([row["history"] or 0.0 for row in rows], top=1.0)),
             ("milliseconds", _curve([row["milliseconds"] for row in rows])),
         ]
@@ -82,7 +82,7 @@ def _shown(result: ShotResult) -> dict[str, Any]:
 
 
 def _curve(values: Sequence[float], top: float = 0.0) -> dict[str, Any]:
-    """Points of a line, as SVG has them, and the largest value."""
+    """The points of an SVG polyline, and the largest value."""
     top = top or max(values) or 1.0
     step = _WIDTH / (len(values) - 1)
     points = " ".join(f"{step * i:.1f},{_HEIGHT * (1 - min(v / top, 1)):.1f}" for i, v in enumerate(values))

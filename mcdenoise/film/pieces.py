@@ -1,4 +1,4 @@
-"""A shot in pieces: which frames one process makes, and how many it looks at before, for their history."""
+"""Pieces of a shot: the frames that one worker writes, and the frames before them that give them their history."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Piece:
-    """Frames that one process goes through, one after the other.
+    """Frames that one worker denoises, one after the other.
 
     Args:
-        numbers: of all of them, ascending.
-        wanted: of those that are written; the others give them their history.
+        numbers: of all frames of the piece, ascending.
+        wanted: of the frames that are written; the others only give them their history.
     """
 
     numbers: tuple[int, ...]
@@ -20,27 +20,27 @@ class Piece:
 
     @property
     def joint(self) -> int | None:
-        """The frame before the first that is written, which another piece makes; ``None`` where a shot begins."""
+        """The frame before the first one that is written, which another piece writes; ``None`` where a shot begins."""
         place = self.numbers.index(self.wanted[0])
         return self.numbers[place - 1] if place else None
 
 
 def cut(numbers: Sequence[int], missing: Collection[int], length: int, overlap: int | None) -> list[Piece]:
-    """Cut a shot into pieces of equal length, and take of each what is missing.
+    """Cut a shot into pieces of equal length, and take the missing frames of each.
 
-    Where the pieces lie depends on the shot alone, and not on what is missing or who makes them. Each begins
-    ``overlap`` frames before the first frame that it writes. One that was begun goes on where it ended, with as many
-    frames before that; or from its own beginning, with the very same result, where that is no more than twice as far.
+    The boundaries depend on the shot alone, not on the missing frames or the workers. A piece begins ``overlap`` frames
+    before the first frame that it writes. An interrupted piece resumes ``overlap`` frames before its first missing
+    frame; or at its own first frame, with exactly the same result, where that is at most twice as far.
 
     Args:
         numbers: of all frames of the shot, ascending.
-        missing: those to be written.
-        length: the most frames of a piece; 0 for shots that are not cut.
-        overlap: see :func:`mcdenoise.models.frames_remembered`; of a method that remembers nobody knows what, ``None``,
-            shots are not cut, and every frame is made after all frames before it.
+        missing: numbers of the frames to be written.
+        length: largest number of frames in a piece; 0 does not cut the shot.
+        overlap: see :func:`mcdenoise.models.frames_remembered`; ``None`` for a method whose history has no known
+            length: the shot is not cut, and every frame is computed after all frames before it.
 
     Returns:
-        The pieces in order; none where nothing is missing.
+        The pieces in order; none where no frame is missing.
 
     Example:
         >>> for piece in cut(range(12), range(3, 12), length=6, overlap=2):
@@ -59,11 +59,11 @@ def cut(numbers: Sequence[int], missing: Collection[int], length: int, overlap: 
             if numbers[place] not in missing:
                 continue
             start = begin if overlap is None or place - begin <= 2 * overlap else place - overlap
-            # To go on costs no more than to begin anew.
+            # One longer piece costs no more than another overlap.
             if own and start <= own[-1].stop:
                 start = own.pop().start
             own.append(range(start, place + 1))
         for places in own:
-            gone = tuple(numbers[place] for place in places)
-            pieces.append(Piece(gone, tuple(n for n in gone if n in missing and numbers[first] <= n)))
+            computed = tuple(numbers[place] for place in places)
+            pieces.append(Piece(computed, tuple(n for n in computed if n in missing and numbers[first] <= n)))
     return pieces

@@ -1,8 +1,8 @@
-"""What is written down of each finished frame, so that it is known again: by what it was made of, not by its name.
+"""Records of finished frames, by which the next run knows that they need not be denoised again.
 
-A frame is known by its key, a digest of the bytes of its files and of those of the frames that it remembers, of the
-settings, the weights and the version. Beside it stand size and time of each file, as version control systems have them:
-where these are the same, the bytes are not read again, and a look costs one question to the file system.
+A record has the key of its frame: a digest of the bytes of the frame's files and of the frames in its history, of the
+settings, the weights and the version. It also has size and modification time of each file, as the index of a version
+control system has: a file with the same size and time is not read again, so that a scan costs one stat call a file.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ _BLOCK, _REMEMBERED = 1 << 20, 256
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """A frame that is finished.
+    """The record of a finished frame.
 
     Args:
         number: of the frame.
-        key: of what it was made.
-        result: the file that was written.
-        inputs: of each file that it was made of the stamp, and the digest of its bytes.
-        report: what happened to it.
-        alike: whether it looks like the frame before and finds no history in it.
-        change: how far it differs from the result before, in [0, 1]; ``None`` where there was none.
-        at: seconds since 1970.
+        key: digest of all that decides its result.
+        result: the file that was written, by its path in the folder of the shot.
+        inputs: stamp and digest of each input file.
+        report: of the denoiser.
+        alike: whether the frame resembles the frame before, and yet finds no history in it.
+        change: difference from the result before, in [0, 1]; ``None`` where there was none.
+        at: time of the record, seconds since 1970.
     """
 
     number: int
@@ -52,14 +52,17 @@ class FrameRecord:
     at: float = field(default_factory=time.time)
 
     def line(self) -> str:
-        """As JSON, in one line."""
-        return json.dumps(asdict(self))
+        """The record as one line of JSON, with a checksum of all else at its end."""
+        content = asdict(self)
+        return json.dumps({**content, "seal": digest_text(json.dumps(content))})
 
     @classmethod
     def of(cls, line: str) -> FrameRecord | None:
-        """What a line says; ``None`` of one that is something else, such as one that was cut off."""
+        """The record of a line; ``None`` if the line is no record, or was damaged or cut off."""
         try:
             found: dict[str, Any] = json.loads(line)
+            if found.pop("seal") != digest_text(json.dumps(found)):
+                return None
             report = found["report"]
             report["stages"] = {name: Stage(**stage) for name, stage in report["stages"].items()}
             inputs = tuple((_stamp(stamp), str(digest)) for stamp, digest in found["inputs"])
@@ -78,29 +81,28 @@ def stamp(path: Path) -> Stamp:
     """The stamp of a file.
 
     Raises:
-        OSError: it is not there.
+        OSError: there is no such file.
     """
     status = os.stat(path)
     return str(path), status.st_size, status.st_mtime_ns
 
 
 class Digests:
-    """Digests of files, each computed once for a stamp.
+    """Digests of files, cached by their stamps.
 
-    What is computed is remembered of the last files only, of which some are part of many frames; what was written down,
-    as long as this lives.
+    The cache holds the digests of all records that it was given, and of the last 256 files that it has read.
     """
 
     def __init__(self) -> None:
-        self._written: dict[Stamp, str] = {}
+        self._recorded: dict[Stamp, str] = {}
         self._computed: dict[Stamp, str] = {}
 
     def of(self, path: Path) -> tuple[Stamp, str]:
-        """Stamp and digest; of a file that cannot be read the digest is empty."""
+        """Stamp and digest of a file; the digest of a file that cannot be read is empty."""
         try:
             found = stamp(path)
-            digest = self._written.get(found) or self._computed.pop(found, "") or digest_of(path)
-            # Last in the order of the dictionary, of which the first go.
+            digest = self._recorded.get(found) or self._computed.pop(found, "") or digest_of(path)
+            # The newest entry is the last one of the dictionary, and the first one is dropped.
             self._computed[found] = digest
             if len(self._computed) > _REMEMBERED:
                 del self._computed[next(iter(self._computed))]
@@ -109,16 +111,16 @@ class Digests:
             return (str(path), -1, -1), ""
 
     def learn(self, records: Iterable[FrameRecord]) -> None:
-        """Believe what was written down."""
+        """Take the digests of records."""
         for record in records:
-            self._written.update(record.inputs)
+            self._recorded.update(record.inputs)
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a file's bytes.
+    """SHA-256 of the bytes of a file.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     digest = hashlib.sha256()
     with path.open("rb") as file:
@@ -133,12 +135,12 @@ def digest_text(*parts: str) -> str:
 
 
 class Journal:
-    """What one process has finished, a line a frame.
+    """The records of one attempt at a piece, a line a frame.
 
-    No two processes write to one, not even one that is thought to be dead and its successor.
+    Each attempt has a journal of its own: a worker that is taken for lost may still write to its own.
 
     Args:
-        path: of the file; its folder is made.
+        path: of the file; its folder is created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -146,7 +148,7 @@ class Journal:
 
     @contextmanager
     def open(self) -> Iterator[Journal]:
-        """Within this, lines are written.
+        """Open the journal for the duration of a ``with`` block.
 
         Raises:
             InputError: the file cannot be written.
@@ -163,15 +165,15 @@ class Journal:
             os.close(self._handle)
 
     def add(self, record: FrameRecord) -> None:
-        """Write down a finished frame.
+        """Add the record of a finished frame.
 
         Raises:
-            InputError: it cannot be written.
+            InputError: the file cannot be written.
         """
         self._write(record.line())
 
     def _write(self, line: str) -> None:
-        # The line before may have been cut off by a full disk.
+        # A full disk may have cut off the line before.
         content = f"\n{line}\n".encode()
         try:
             if os.write(self._handle, content) < len(content):
@@ -194,7 +196,7 @@ def read_records(folder: Path) -> dict[int, FrameRecord]:
 
 
 def read_journal(path: Path) -> Iterator[FrameRecord]:
-    """The records of one journal; none where it cannot be read."""
+    """The records of one journal; none if it cannot be read."""
     with suppress(OSError), path.open(encoding="utf-8", errors="replace") as file:
         for line in file:
             if (record := FrameRecord.of(line)) is not None:
@@ -202,10 +204,10 @@ def read_journal(path: Path) -> Iterator[FrameRecord]:
 
 
 class Tail:
-    """Counts what is written to a journal while somebody else writes it.
+    """Counts the records of a journal while a worker writes it.
 
     Args:
-        path: of the journal, which need not be there yet.
+        path: of the journal, which need not exist yet.
     """
 
     def __init__(self, path: Path) -> None:
@@ -213,14 +215,14 @@ class Tail:
         self._offset = 0
 
     def new(self) -> int:
-        """How many frames were finished since the last call."""
+        """The number of frames that were finished since the last call."""
         try:
             with self.path.open("rb") as file:
                 file.seek(self._offset)
                 content = file.read()
         except OSError:
             return 0
-        # What is being written is counted next time.
+        # A line that is still being written is counted by the next call.
         whole = content.rfind(b"\n") + 1
         self._offset += whole
         return sum(line.startswith(b'{"number"') for line in content[:whole].split(b"\n"))

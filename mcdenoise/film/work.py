@@ -1,7 +1,7 @@
-"""What a process does for a film: it looks at a shot, makes a piece of it, and closes it when all is made.
+"""The tasks of a film: scan a shot, denoise a piece of it, and summarize it when all pieces have ended.
 
-Each task is a function of what it is told and of the disk, so that any process on any machine can do it, again if need
-be. It is told little and answers little: frames are read and written here, and go nowhere else.
+A task depends on its arguments and on the disk alone, so that any worker can run it, and retry it. Arguments and
+answers are small: workers read and write the frames themselves.
 """
 
 from __future__ import annotations
@@ -37,53 +37,63 @@ from mcdenoise.metrics import smape_linear
 from mcdenoise.models import find_weights, frames_remembered
 from mcdenoise.preview import Preview
 
-# Where records are kept, beside the shots.
+# Folder of the records, beside the shots.
 RECORDS = ".film"
-# Settings that change no pixel.
+# Settings that change no pixel of a result.
 _SILENT = {"frames", "threads", "preview", "preview_fps", "preview_exposure", "results", "max_memory"}
-# Largest side of what is compared to see whether a frame sticks out, and of a thumbnail; how many of these a shot has.
+# Largest side of the images whose change is measured, and of a thumbnail; thumbnails in the strip, and of the worst.
 _SMALL, _THUMBNAIL, _STRIP, _WORST = 64, 320, 6, 3
 
 
 @dataclass(frozen=True)
 class Order:
-    """What every task is told.
+    """The arguments that all tasks of a shot have in common.
 
     Args:
-        shot: which.
-        out: absolute folder of the film.
-        joint: how far a frame may differ from that of the uncut shot, see :func:`mcdenoise.models.frames_remembered`.
+        shot: the shot.
+        out: folder of the film, as an absolute path.
+        joint: largest difference of a frame from that of the uncut shot, see
+            :func:`mcdenoise.models.frames_remembered`.
         threads: of torch; ``None`` for its own choice.
-        version: of this package where the film is planned.
     """
 
     shot: Shot
     out: Path
     joint: float
     threads: int | None = None
-    version: str = field(default_factory=lambda: version("mcdenoise"))
 
     @property
     def folder(self) -> Path:
-        """Where the frames are written."""
+        """The folder to which the frames are written."""
         return self.out / self.shot.name
 
     @property
     def records(self) -> Path:
-        """Where it is written down what is finished."""
+        """The folder of the journals."""
         return self.out / RECORDS / self.shot.name
+
+    def result(self, record: FrameRecord) -> Path:
+        """The file of a finished frame, also after the film's folder was moved."""
+        return self.folder / record.result[0]
+
+    def has(self, record: FrameRecord) -> bool:
+        """Whether that file is still as it was written."""
+        try:
+            return stamp(self.result(record))[1:] == record.result[1:]
+        except OSError:
+            return False
 
 
 @dataclass(frozen=True)
 class Found:
-    """What :func:`look` has found.
+    """What :func:`scan` found.
 
     Args:
-        shot: with the model that was chosen, if a measurement chooses it.
+        shot: the shot, with the model that was chosen, if a measurement chooses it.
         numbers: of all frames.
-        done: those that are finished.
-        unreadable: why, of frames that cannot be opened, by number.
-        overlap: frames that the history needs, see :func:`mcdenoise.models.frames_remembered`.
+        done: numbers of the finished frames.
+        unreadable: for each frame that cannot be opened, by number, the reason.
+        overlap: number of frames that the history needs, see :func:`mcdenoise.models.frames_remembered`.
         choice: the model that was chosen, in words.
         warnings: of the reader.
     """
@@ -99,11 +109,11 @@ class Found:
 
 @dataclass(frozen=True)
 class Made:
-    """What :func:`make` did not make.
+    """What failed in :func:`make`.
 
     Args:
-        failed: why, by number of the frame.
-        trace: where it went wrong, if it was no fault of the input.
+        failed: for each failed frame, by number, the reason.
+        trace: traceback of a failure that the input did not cause.
     """
 
     failed: Mapping[int, str] = field(default_factory=dict)
@@ -111,16 +121,16 @@ class Made:
 
 
 @dataclass(frozen=True)
-class Closed:
-    """What there is to say of a shot.
+class Summary:
+    """The summary of a shot.
 
     Args:
-        milliseconds: median of each stage.
-        frames: of each frame the number, and ``change``, ``history``, ``reset``, ``replaced_pixels``, ``score``.
-        joints: by the number of the frame before it, how far the two results of that frame differ: the one that stands,
-            and the one with no more history than the pieces share.
-        pictures: of the numbers of some frames, the thumbnails, beside the page.
-        warnings: what is probably wrong.
+        milliseconds: median run time of each stage.
+        frames: for each frame ``number``, ``change``, ``history``, ``reset``, ``replaced_pixels`` and ``score``.
+        joints: for each joint, by the number of the frame before it, the SMAPE between the two results of that frame:
+            with the whole history, and with that of the overlap alone.
+        pictures: paths of the thumbnails, by number of the frame, relative to the page.
+        warnings: what is probably wrong, a line each.
     """
 
     milliseconds: Mapping[str, float]
@@ -132,7 +142,7 @@ class Closed:
 
 @dataclass(frozen=True)
 class _Opened:
-    """A shot that is ready to be denoised."""
+    """A shot with its frames opened, and its denoiser."""
 
     shot: Shot
     sequence: Sequence
@@ -143,14 +153,14 @@ class _Opened:
     settings: str
 
     def window(self, number: int) -> list[int]:
-        """The frame, and those before it that it remembers."""
+        """The frame, and the frames in its history."""
         place = self.sequence.numbers.index(number)
         first = 0 if self.overlap is None else max(0, place - self.overlap)
         return self.sequence.numbers[first : place + 1]
 
 
 class _Keys:
-    """What frames are made of; frames are asked for in ascending order, and each file is looked at once.
+    """Keys of frames. Frames are asked for in ascending order, so that each file is read at most once.
 
     Args:
         opened: the shot.
@@ -162,24 +172,24 @@ class _Keys:
         self._inputs: dict[int, tuple[tuple[Stamp, str], ...]] = {}
 
     def inputs(self, number: int) -> tuple[tuple[Stamp, str], ...]:
-        """The files of a frame, with digests."""
+        """Stamps and digests of the files of a frame."""
         if number not in self._inputs:
             self._inputs[number] = tuple(self.digests.of(path) for path in self.opened.sequence.files(number))
         return self._inputs[number]
 
     def key(self, number: int) -> str:
-        """Of a frame: what it is made of, and what it remembers."""
+        """The key of a frame: a digest of all that decides its result."""
         window = self.opened.window(number)
         key = digest_text(self.opened.settings, *(digest for each in window for _, digest in self.inputs(each)))
         self._inputs = {each: found for each, found in self._inputs.items() if each >= window[0]}
         return key
 
 
-def look(order: Order) -> Found:
-    """See which frames a shot has, and which of them are finished.
+def scan(order: Order) -> Found:
+    """A task: find the frames of a shot, and which of them are finished.
 
     Raises:
-        InputError: the shot cannot be opened, or not be denoised in this way.
+        InputError: the shot cannot be opened, or cannot be denoised with these settings.
     """
     opened = _opened(order)
     records, digests = read_records(order.records), Digests()
@@ -188,7 +198,7 @@ def look(order: Order) -> Found:
     done = {
         number
         for number in opened.sequence.numbers
-        if number in records and _is_there(records[number]) and records[number].key == keys.key(number)
+        if number in records and order.has(records[number]) and records[number].key == keys.key(number)
     }
     return Found(
         opened.shot,
@@ -202,24 +212,24 @@ def look(order: Order) -> Found:
 
 
 def make(order: Order, piece: Piece, journal: Path) -> Made:
-    """Make the frames of a piece, and write down each as it is finished.
+    """A task: denoise the frames of a piece, and record each as it is finished.
 
     Args:
-        order: what every task is told.
-        piece: which frames.
-        journal: where; nobody else may write to it, and nobody may have.
+        order: of the shot.
+        piece: the frames.
+        journal: path of a new journal for this attempt.
 
     Returns:
-        Which frames failed. A damaged frame fails alone, and the history begins anew behind it; where results cannot be
-        written, all fail that are left.
+        The frames that failed. A damaged frame fails alone, and the history begins anew after it; where a result cannot
+        be written, all frames that are left fail.
 
     Raises:
-        InputError: as :func:`look`.
+        InputError: as :func:`scan`.
     """
     opened = _opened(order)
     make_folder(order.folder)
     check_apart(opened.sequence, order.folder)
-    # It stands for a complete result.
+    # That file says that the shot is complete.
     remove(order.folder / "denoise.json")
     numbers, left = list(piece.numbers), set(piece.wanted)
     failed: dict[int, str] = {}
@@ -235,24 +245,24 @@ def make(order: Order, piece: Piece, journal: Path) -> Made:
                     left -= {number for number in left if number <= error.number}
     except InputError as error:
         failed |= dict.fromkeys(left, str(error))
-    except Exception as error:  # a model of somebody's own, or memory
+    except Exception as error:  # of a user's model, or for lack of memory
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         return Made(failed | dict.fromkeys(left, reason[:500]), traceback.format_exc())
     return Made(failed)
 
 
-def close(order: Order) -> Closed:
-    """Sum up what was made of a shot: its ``denoise.json`` if it is complete, its thumbnails and preview.
+def summarize(order: Order) -> Summary:
+    """A task: write ``denoise.json`` of a complete shot, its thumbnails and its preview, and measure its joints.
 
     Raises:
-        InputError: as :func:`look`, or something cannot be written.
+        InputError: as :func:`scan`, or something cannot be written.
     """
     opened = _opened(order)
     found = read_records(order.records)
-    records = [found[n] for n in opened.sequence.numbers if n in found and _is_there(found[n])]
+    records = [found[n] for n in opened.sequence.numbers if n in found and order.has(found[n])]
     report = new_report(opened.sequence, _name(opened.shot))
     report.frames = {each.number: each.report for each in records}
-    report.files = {each.number: Path(each.result[0]) for each in records}
+    report.files = {each.number: order.result(each) for each in records}
     report.alike = [each.number for each in records if each.alike]
     for folder in (order.folder, order.records):
         sweep(folder, youngest=0)
@@ -270,7 +280,7 @@ def close(order: Order) -> Closed:
                 f"joint: the result of frame {number} differs by {difference:.2g} from that with a shorter history, "
                 f"more than {order.joint:g}; make --piece longer, or 0 to cut nothing"
             )
-    return Closed(
+    return Summary(
         report.milliseconds if records else {},
         tuple(described),
         joints,
@@ -280,7 +290,7 @@ def close(order: Order) -> Closed:
 
 
 class _Writer:
-    """Makes frames, and writes down each as it is finished."""
+    """Denoises frames, and records each as it is finished."""
 
     def __init__(self, order: Order, opened: _Opened, journal: Journal, joint: int | None, left: set[int]) -> None:
         self.order, self.opened, self.journal, self.joint, self.left = order, opened, journal, joint, left
@@ -289,7 +299,7 @@ class _Writer:
         self.small: Tensor | None = None
 
     def write(self, numbers: list[int]) -> None:
-        """Go through frames, of which those that are left are written."""
+        """Denoise frames, and write those of them that are not finished."""
         settings, sequence = self.opened.shot.settings, self.opened.sequence
         write_frames(
             sequence.part(numbers),
@@ -304,17 +314,18 @@ class _Writer:
         )
 
     def finished(self, number: int, image: Tensor) -> None:
-        """In the thread that writes: the file of a frame is there."""
+        """Record a frame; called in the thread that has written its file."""
         before, self.small = self.small, _small(image)
         if number == self.joint:
             self._keep_joint(number, image)
         report = self.report.frames.pop(number)
         if number not in self.left:
             return
+        path = self.report.files.pop(number)
         record = FrameRecord(
             number,
             self.keys.key(number),
-            stamp(self.report.files.pop(number)),
+            (path.relative_to(self.order.folder).as_posix(), *stamp(path)[1:]),
             self.keys.inputs(number),
             report,
             number in self.report.alike,
@@ -324,19 +335,14 @@ class _Writer:
         self.left.discard(number)
 
     def _keep_joint(self, number: int, image: Tensor) -> None:
-        """For :func:`close`, when the other piece has made this frame too."""
+        """Keep the result before the joint, for :func:`summarize` to compare with that of the other piece."""
         pixels = image[0].permute(1, 2, 0).float().cpu().numpy()
         write_exr(_joint_path(self.order, number), pixels, ["R", "G", "B"], half=False)
 
 
 @functools.lru_cache(1)
 def _opened(order: Order) -> _Opened:
-    """A shot, ready to be denoised; the last one is kept, of which a process may make several pieces."""
-    if order.version != version("mcdenoise"):
-        raise InputError(
-            f"mcdenoise: expected version {order.version}, as where the film is planned, found {version('mcdenoise')}; "
-            "install the same everywhere"
-        )
+    """Open a shot; the last one is cached, because a worker may denoise several pieces of it."""
     keep_heap()
     if order.shot.settings.max_memory is not None:
         return_heap()
@@ -349,11 +355,11 @@ def _opened(order: Order) -> _Opened:
     denoiser.reset(frames=len(sequence))
     streams = len(sequence) > 1 and denoiser.has_history(sequence.buffers)
     overlap = frames_remembered(denoiser.model, order.joint) if streams else 0
-    told = {key: str(value) for key, value in asdict(settings).items() if key not in _SILENT}
-    # References change no result.
+    listed = {key: str(value) for key, value in asdict(settings).items() if key not in _SILENT}
+    # References do not change a result.
     rows = [str(row) for row in sequence.table if row.buffer != "reference"]
     described = digest_text(
-        version("mcdenoise"), source_commit(), repr(sorted(told.items())), *_weights(settings), *rows, str(overlap)
+        version("mcdenoise"), source_commit(), repr(sorted(listed.items())), *_weights(settings), *rows, str(overlap)
     )
     shot = replace(order.shot, settings=settings)
     return _Opened(shot, sequence, denoiser, overlap, unreadable, choice, described)
@@ -366,7 +372,7 @@ def _denoiser(settings: Any) -> Denoiser:
 
 
 def _open_what_opens(shot: Shot) -> tuple[Sequence, dict[int, str]]:
-    """The frames that can be opened, and why others cannot: one damaged file costs a film one frame."""
+    """Open all frames that can be opened, with the reasons of the others: a damaged file costs a film one frame."""
     settings = shot.settings
     try:
         return settings.open(shot.inputs), {}
@@ -388,7 +394,7 @@ def _open_what_opens(shot: Shot) -> tuple[Sequence, dict[int, str]]:
 
 
 def _weights(settings: Any) -> list[str]:
-    """Digests of the files that the model is made of."""
+    """Digests of the model's files: its weights, or its source if it is the user's."""
     spelling = settings.spelling
     paths = [spelling.weights] if spelling.weights else []
     if ".py:" in spelling.model:
@@ -406,16 +412,8 @@ def _name(shot: Shot) -> str:
     return str(spelling.weights or spelling.name)
 
 
-def _is_there(record: FrameRecord) -> bool:
-    """Whether the result is what was written."""
-    try:
-        return stamp(Path(record.result[0])) == record.result
-    except OSError:
-        return False
-
-
 def _small(image: Tensor) -> Tensor:
-    """What is compared to see whether a frame sticks out."""
+    """A small image whose change from frame to frame is measured."""
     height, width = image.shape[-2:]
     scale = _SMALL / max(height, width, _SMALL)
     size = (max(1, round(height * scale)), max(1, round(width * scale)))
@@ -433,14 +431,14 @@ def _joint_path(order: Order, number: int) -> Path:
 
 
 def _joints(order: Order, records: Collection[FrameRecord]) -> dict[int, float]:
-    """How far the two results of the frame before each piece differ."""
+    """The SMAPE between the two results of the frame before each joint."""
     found = {}
     for record in records:
         path = _joint_path(order, record.number)
         if not path.is_file():
             continue
         try:
-            shown = open_result(Path(record.result[0])).read()[0]
+            shown = open_result(order.result(record)).read()[0]
             other = torch.from_numpy(np.ascontiguousarray(read_exr(path)[0][..., :3])).permute(2, 0, 1)[None]
         except InputError:
             continue
@@ -450,7 +448,7 @@ def _joints(order: Order, records: Collection[FrameRecord]) -> dict[int, float]:
 
 
 def _described(records: Collection[FrameRecord]) -> list[dict[str, Any]]:
-    """What the page says of each frame; ``score`` is how far it sticks out of both its neighbours."""
+    """Rows of the page, a frame each; ``score`` is the smaller one of its changes from both neighbours."""
     rows: list[dict[str, Any]] = []
     changes = {each.number: each.change for each in records}
     for each in records:
@@ -470,7 +468,7 @@ def _described(records: Collection[FrameRecord]) -> list[dict[str, Any]]:
 
 
 def _pictures(order: Order, records: list[FrameRecord], described: list[dict[str, Any]]) -> dict[int, str]:
-    """Thumbnails of the frames that stick out most, and of some of all."""
+    """Write thumbnails of the frames with the highest scores, and of some frames across the shot."""
     if not records:
         return {}
     worst = sorted(described, key=lambda row: (-row["score"], row["number"]))[:_WORST]
@@ -482,7 +480,7 @@ def _pictures(order: Order, records: list[FrameRecord], described: list[dict[str
         if record.number not in wanted:
             continue
         try:
-            image, metadata = open_result(Path(record.result[0])).read()
+            image, metadata = open_result(order.result(record)).read()
         except InputError:
             continue
         height, width = image.shape[-2:]
@@ -494,7 +492,7 @@ def _pictures(order: Order, records: list[FrameRecord], described: list[dict[str
 
 
 def _preview(order: Order, opened: _Opened, files: Mapping[int, Path]) -> None:
-    """As `mcdenoise denoise --preview`, of the files: frames may have been made in any order."""
+    """Write the preview of `mcdenoise denoise --preview` from the files, whose frames were denoised in any order."""
     settings = opened.shot.settings
     shown = Preview(
         order.folder,

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from mcdenoise.data.files import atomic_path, held, write_text
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, is_unicode
 from mcdenoise.reading import read_bytes, read_text
 
 _SEAL = 32  # bytes of a SHA-256
@@ -45,13 +45,9 @@ class RunFolder:
         Raises:
             InputError: an earlier run wrote other contents, or the folder's name is not valid UTF-8.
         """
-        try:
-            str(self.out).encode()
-        except UnicodeEncodeError as error:
-            # TensorBoard could not write its events there.
-            raise InputError(
-                f"{self.out}: expected a folder whose name is UTF-8; choose another one for the run"
-            ) from error
+        # TensorBoard cannot write its events to another.
+        if not is_unicode(str(self.out)):
+            raise InputError(f"{self.out}: expected a folder whose name is UTF-8; choose another one for the run")
         for name, content in identity.items():
             path = self.out / f"{name}.json"
             if os.path.lexists(path) and (not path.is_file() or path.read_bytes() != _json(content).encode()):
@@ -100,6 +96,13 @@ class RunFolder:
         with atomic_path(self._checkpoint) as temporary, temporary.open("wb") as file:
             file.write(content.getbuffer())
             file.write(_sealed(content.getbuffer()))
+
+    def checkpointed(self) -> int:
+        """When the checkpoint was written, in nanoseconds since 1970; 0 without one."""
+        try:
+            return self._checkpoint.stat().st_mtime_ns
+        except OSError:
+            return 0
 
     def load(self, *parts: Any) -> tuple[int, Provenance]:
         """Restore the state from the checkpoint; return zero steps if there is none.

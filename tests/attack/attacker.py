@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from mutations import DAMAGES, PLACES
 from server import HUNG, Ended, Process, Server
-from table import COMMANDS, GENERATION, KINDS, RENDERING, SHOWN, Command
+from table import COMMANDS, FILM, GENERATION, KINDS, RENDERING, SHOWN, Command
 from world import build
 
 from mcdenoise.data.exr import read_exr
@@ -25,9 +25,12 @@ from mcdenoise.errors import InputError
 
 # What commands write; all else in a case's folder has to stay as it was.
 _WRITTEN = re.compile(
-    r"(out|run|rendered|generated|compared|\.cache|\.config|\.triton)(/.*)?|results/(index\.html|plots(/.*)?)|model\.pt2|out\.safetensors|\.output.*"
+    r"(out|filmed|run|rendered|generated|compared|\.cache|\.config|\.triton)(/.*)?|results/(index\.html|plots(/.*)?)|model\.pt2|out\.safetensors|\.output.*"
 )
-_CHANGING = re.compile(r"run/(events\..*|cache/.*)|results/plots/.*|\.(cache|config|triton)(/.*)?", re.DOTALL)
+_CHANGING = re.compile(
+    r"run/(events\..*|cache/.*)|filmed/(\.film/.*|film_pictures/.*)|results/plots/.*|\.(cache|config|triton)(/.*)?",
+    re.DOTALL,
+)
 _LEFTOVER = re.compile(r"\.mcdenoise-|\.tmp|\.copy\.exr|/building")
 
 
@@ -46,7 +49,7 @@ class Attacker:
         self._expected: dict[str, tuple[object, set[str]]] = {}
         self._number = 0
         build(self.world)
-        made = [SHOWN, RENDERING, GENERATION] if is_installed("mitsuba") else [SHOWN]
+        made = [SHOWN, FILM, *([RENDERING, GENERATION] if is_installed("mitsuba") else [])]
         for each in made:
             done = self.run(each.split(), self.world)
             assert done.status == 0, done
@@ -159,7 +162,7 @@ class Attacker:
             return f"unexpected: {sorted(strange)}"
         if problem := self.touched(folder, command.needs, besides):
             return problem
-        if problem := unreadable(folder / "out", besides):
+        if problem := unreadable(folder / command.out, besides):
             return problem
         if ended.status == 0:
             try:
@@ -203,7 +206,7 @@ def unreadable(out: Path, besides: str = "") -> str:
     if not out.is_dir():
         return ""
     for path in sorted(out.glob("[!.]*.exr")):
-        if f"out/{path.name}" == besides:
+        if besides.endswith(f"{out.name}/{path.name}"):
             continue
         try:
             image = read_exr(path)[0]

@@ -43,6 +43,7 @@ class Command:
         statuses: that it may end with.
         requires: a module without which it can do nothing.
         seconds: after so many it counts as hung.
+        out: folder of the images that it writes.
     """
 
     arguments: str
@@ -52,6 +53,7 @@ class Command:
     statuses: tuple[int, ...] = (0, 2)
     requires: str = ""
     seconds: float = SECONDS
+    out: str = "out"
 
     @property
     def command(self) -> list[str]:
@@ -64,6 +66,12 @@ def images(folder: Path, _: str) -> object:
     pixels = {path.name: digest(read_exr(path)[0]) for path in sorted(out.glob("*.exr"))}
     report = json.loads((out / "denoise.json").read_text())
     return pixels, sorted(each["file"] for each in report["frames"].values())
+
+
+def filmed(folder: Path, _: str) -> object:
+    """Pixels of all shots, and whether they are complete."""
+    about = json.loads((folder / "filmed/film.json").read_text())
+    return about["complete"], {each["name"]: exr_files(folder / "filmed" / each["name"]) for each in about["shots"]}
 
 
 def printed(_: Path, out: str) -> object:
@@ -134,6 +142,7 @@ RENDERING = (
 GENERATION = (
     "generate -o generated --seeds 0 --frames 2 --size 16x12 --realisations 1 --reference-spp 4 --variant scalar_rgb"
 )
+FILM = "film film.toml -o filmed"
 COMPARISON = "benchmark shot -o compared --models joint_bilateral --rounds 1 --sizes none --pictures 1 --threads 1"
 COMMANDS = {
     "denoise": Command(SHOWN, ("shot",), images),
@@ -146,6 +155,9 @@ COMMANDS = {
     ),
     "denoise network": Command(NETWORK, ("shot", "weights.safetensors"), images),
     "denoise again": Command(SHOWN, ("shot", "out"), images),
+    # It says of each shot what failed in it, and ends with 1.
+    "film": Command(FILM, ("film.toml", "shot"), filmed, statuses=(0, 1, 2), out="filmed/wall"),
+    "film again": Command(FILM, ("film.toml", "shot", "filmed"), filmed, statuses=(0, 1, 2), out="filmed/wall"),
     "inspect": Command("inspect shot", ("shot",), printed),
     "inspect layers": Command("inspect layers", ("layers",), printed),
     "evaluate": Command("evaluate shot out", ("shot", "out"), printed),
@@ -363,7 +375,9 @@ KINDS = {
         },
     ),
     "color of the second frame": Kind(
-        "shot/inputs/color1.exr", pixels, {"denoise": 60, "denoise network": 40, "reader sequence": 60}
+        "shot/inputs/color1.exr",
+        pixels,
+        {"denoise": 60, "denoise network": 40, "reader sequence": 60, "film": 20, "film again": 20},
     ),
     "albedo": Kind("shot/inputs/albedo1.exr", pixels, {"denoise": 80, "denoise network": 40, "train": 6}),
     "normal": Kind("shot/inputs/shading_normal0.exr", pixels, {"denoise": 80, "reader sequence": 60}),
@@ -387,11 +401,14 @@ KINDS = {
     "png": Kind("still.png", partial(pixels, suffix=".png"), {"reader png": 80}),
     "zip": Kind("frame0.zip", entries, {"denoise zip": 100, "reader zip": 100}),
     "recipe": Kind("recipe.toml", toml, {"reader recipe": 200}),
-    "film": Kind("film.toml", toml, {"reader film": 200}),
+    "film": Kind("film.toml", toml, {"reader film": 200, "film": 20}),
     "camera path": Kind("path.json", json.loads, {"reader camera_path": 200}),
     "results.json": Kind("results/results.json", json.loads, {"reader results": 160, "models": 10, "report": 10}),
     "earlier denoise.json": Kind("out/denoise.json", exactly, {"denoise again": 100}),
     "earlier image": Kind("out/denoised1.exr", exactly, {"denoise again": 60}),
+    "journal of a film": Kind("filmed/.film/wall/*.jsonl", exactly, {"film again": 30}),
+    "earlier image of a film": Kind("filmed/wall/denoised0.exr", exactly, {"film again": 20}),
+    "earlier film.json": Kind("filmed/film.json", exactly, {"film again": 12}),
     "checkpoint": Kind("run/checkpoint.pt", exactly, {"train": 40}),
     "log": Kind("run/log.jsonl", anything, {"train": 40, "reader run": 160}),
     "config of a run": Kind("run/config.json", exactly, {"train": 40}),

@@ -47,6 +47,8 @@ OPTIONS = {"-o", "--json"}
 GIVEN = {
     "shot": ["denoise", "inspect", "evaluate", "train", "reader sequence"],
     "layers": ["denoise layers", "inspect layers"],
+    "filmed": ["film"],
+    "film.toml": ["film"],
     "out": ["denoise", "denoise layers", "denoise network", "evaluate"],
     "weights.safetensors": ["denoise network", "reader weights"],
     "results": ["reader results"],
@@ -68,7 +70,7 @@ def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> 
     failed, command = [], COMMANDS[name]
     attacker.expected(name)
     # The ending tells what a picture, or a zip, is.
-    suffix = Path(part).suffix if part.startswith(("still", "frame")) else ""
+    suffix = Path(part).suffix if part.startswith(("still", "frame", "film.")) else ""
     for given in (each + suffix for each in NAMES if len(os.fsencode(each + suffix)) <= 255):
         folder = attacker.fresh(command.needs)
         if (folder / part).exists():
@@ -84,7 +86,7 @@ def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> 
         # Where it is expected to be found.
         if os.path.lexists(folder / given) and not os.path.lexists(folder / part):
             (folder / given).rename(folder / part)
-        if suffix and ended.status == 0:
+        if suffix and ended.status == 0 and name != "film":
             (written,) = (path for path in (folder / "out").iterdir() if path.name != "denoise.json")
             written.rename(written.with_name(Path(part).stem + written.suffix))
         # What is printed, or the report of the written file, has the name in it.

@@ -88,12 +88,13 @@ def test_something_stands_there(attacker: Attacker, command: str) -> None:
 
 @pytest.mark.attack
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("name", ["denoise", "denoise layers", "denoise again", "train"])
+@pytest.mark.parametrize("name", ["denoise", "denoise layers", "denoise again", "film", "train"])
 def test_no_room(attacker: Attacker, name: str) -> None:
     """Files that may not grow beyond some bytes: nothing partial is left, and a run with room is complete."""
     failed, command, g = [], COMMANDS[name], np.random.default_rng(0)
     attacker.expected(name)
-    limits = g.integers(1, 400_000 if name == "train" else 2500, 6 if name == "train" else 30)
+    slow = name in ("train", "film")
+    limits = g.integers(1, 400_000 if name == "train" else 2500, 6 if slow else 30)
     for limit in map(int, limits):
         folder = attacker.fresh(command.needs)
         # What it prints is not what is tried here, and has no room either.
@@ -108,30 +109,31 @@ def test_no_room(attacker: Attacker, name: str) -> None:
 
 @pytest.mark.attack
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount")
-@pytest.mark.parametrize("name", ["denoise", "denoise layers"])
+@pytest.mark.parametrize("name", ["denoise", "denoise layers", "film"])
 def test_a_small_disk(attacker: Attacker, name: str) -> None:
     failed, command = [], COMMANDS[name]
     for options in ("ro", *(f"size={kilobytes}k" for kilobytes in (4, 8, 12, 16, 24, 32))):
         folder = attacker.fresh(command.needs)
-        (folder / "out").mkdir()
-        mount = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder / "out")]
+        out = folder / command.out.split("/")[0]
+        out.mkdir()
+        mount = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(out)]
         if subprocess.run(mount, capture_output=True, check=False).returncode:
             pytest.skip("may not mount")
         try:
             ended = attacker.run(command.command, folder)
             problem = attacker.judge(name, folder, ended, same=True)
         finally:
-            subprocess.run(["umount", str(folder / "out")], check=True)
+            subprocess.run(["umount", str(out)], check=True)
         failed += attacker.count("outputs", problem, f"{name}, {options}", folder)
     assert not failed, "\n".join(failed)
 
 
 @pytest.mark.attack
 @pytest.mark.skipif(os.geteuid() != 0, reason="takes the rights of another user")
-@pytest.mark.parametrize("name", ["denoise", "denoise again", "denoise layers", "train", "report", "inspect"])
+@pytest.mark.parametrize("name", ["denoise", "denoise again", "denoise layers", "film", "train", "report", "inspect"])
 def test_somebody_elses_folder(attacker: Attacker, name: str) -> None:
     failed, command = [], COMMANDS[name]
-    for place in ("out", "run", "results", "shot/inputs", "layers", "."):
+    for place in ("out", "filmed", "run", "results", "shot/inputs", "layers", "."):
         for mode in (0o700, 0o755, 0o1777):
             folder = attacker.fresh(command.needs)
             folder.chmod(0o777)

@@ -52,6 +52,7 @@ tolerance = 0.1
 FILM = """\
 [every]
 threads = 1
+model = "joint_bilateral"
 
 [[shot]]
 name = "wall"
@@ -87,9 +88,7 @@ def build(folder: Path) -> None:
     weights = save_weights(create_model(MODEL, pretrained=True), MODEL, {}, {"licence": "Apache-2.0"})
     (folder / "weights.safetensors").write_bytes(weights)
     (folder / "recipe.toml").write_text(RECIPE)
-    (folder / "film.toml").write_text(
-        '[every]\nthreads = 1\n\n[[shot]]\nname = "wall"\ninput = "shot"\nalpha_min = 0.2\n'
-    )
+    (folder / "film.toml").write_text(FILM)
     # Its folder is the scene's name.
     (folder / "scene").mkdir()
     (folder / "scene/scene.xml").write_text(SCENE)

@@ -16,7 +16,8 @@ import pytest
 from shots import pixels, same, write_manifest, write_shot
 
 from mcdenoise.cli import main
-from mcdenoise.film import Film, LocalEngine, read_film, run_film
+from mcdenoise.engines import LocalEngine
+from mcdenoise.film import Film, read_film, run_film
 from mcdenoise.film.record import read_records
 
 # Of a machine that others use, too.
@@ -158,21 +159,3 @@ def test_a_killed_driver_takes_its_workers_along_and_the_next_goes_on(
     after = read_records(out / ".film/s00")
     assert {number: after[number].at for number in kept} == kept
     assert len(pixels(out / "s00")) == 90
-
-
-@pytest.mark.parametrize(
-    ("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")], ids=["SIGINT", "SIGTERM"]
-)
-def test_a_signal_ends_it_with_one_line(tmp_path: Path, number: signal.Signals, word: str) -> None:
-    manifest = write_manifest(tmp_path / "film.toml", make_shots(tmp_path, 1, 60), model="accumulated")
-    out = tmp_path / "out"
-    process = start(manifest, out, "--workers", "2")
-    wait_for_frames(out, 2, process)
-    process.send_signal(number)
-    message = process.communicate(timeout=SECONDS)[1]
-    assert process.returncode == 128 + number
-    assert message == f"mcdenoise film: {word}; finished files are kept\n"
-    assert not json.loads((out / "film.json").read_text())["complete"]
-    assert pixels(out / "s00")
-    # Nothing half-written is left.
-    assert not [path for path in (out / "s00").iterdir() if path.name.startswith(".")]

@@ -13,7 +13,7 @@ from mcdenoise.film import work
 from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import cut
 from mcdenoise.film.record import FrameRecord, Journal, read_records
-from mcdenoise.film.work import Order, look, make
+from mcdenoise.film.work import Order, make, scan
 from mcdenoise.shot import ShotSettings
 
 FRAMES, DIFFERENT = 10_000, 50
@@ -47,7 +47,7 @@ def test_memory_is_flat_over_ten_thousand_frames(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(Journal, "add", watched)
     order = Order(Shot("long", (inputs,), ShotSettings("guided")), tmp_path / "out", 0.01, 1)
-    found = look(order)
+    found = scan(order)
     assert len(found.numbers) == FRAMES
     (piece,) = cut(found.numbers, found.numbers, 0, found.overlap)
     assert not make(order, piece, order.records / "all.jsonl").failed

@@ -17,7 +17,7 @@ from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import cut
-from mcdenoise.film.work import Order, close, look, make
+from mcdenoise.film.work import Order, make, scan, summarize
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import Recurrent, create_model, frames_remembered, list_models
 from mcdenoise.shot import ShotSettings
@@ -130,12 +130,12 @@ def test_a_shot_in_pieces_is_the_whole_one_up_to_the_joint(
     images = {}
     for name, length in (("whole", 0), ("cut", 20)):
         order = Order(shot, tmp_path / name, joint, 1)
-        found = look(order)
+        found = scan(order)
         pieces = cut(found.numbers, found.numbers, length, found.overlap)
         assert len(pieces) == (2 if length else 1)
         for place, piece in enumerate(pieces):
             assert not make(order, piece, order.records / f"{place}.jsonl").failed
-        closed = close(order)
+        closed = summarize(order)
         images[name] = pixels(order.folder)
     errors = {
         int(file.removeprefix("denoised").removesuffix(".exr")): float(
@@ -159,9 +159,9 @@ def test_a_shot_in_pieces_is_the_whole_one_up_to_the_joint(
 
 def test_a_joint_that_shows_is_told(long_shot: Path, tmp_path: Path) -> None:
     order = Order(Shot("long", (long_shot,), ShotSettings("accumulated")), tmp_path, 0.3, 1)
-    found = look(order)
+    found = scan(order)
     for place, piece in enumerate(cut(found.numbers, found.numbers, 20, 1)):
         make(order, piece, order.records / f"{place}.jsonl")
     strict = Order(order.shot, tmp_path, 1e-3, 1)
-    (warning,) = [each for each in close(strict).warnings if each.startswith("joint")]
+    (warning,) = [each for each in summarize(strict).warnings if each.startswith("joint")]
     assert "frame 19 differs" in warning

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 from shots import pixels, same, write_manifest, write_shot
 
+from mcdenoise.engines import LocalEngine, RayEngine
 from mcdenoise.errors import InputError
-from mcdenoise.film import Film, LocalEngine, RayEngine, read_film, run_film
+from mcdenoise.film import Film, read_film, run_film
 
 ray = pytest.importorskip("ray", reason="films on a cluster need Ray: pip install 'mcdenoise[ray]'")
 # Of Ray's own; none is of this package.

@@ -16,9 +16,9 @@ from shots import pixels, same, write_manifest, write_shot
 from mcdenoise.cli import main
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.files import held
+from mcdenoise.engines import Done, RayEngine
 from mcdenoise.errors import InputError
-from mcdenoise.film import Film, FilmResult, RayEngine, read_film, run_film, work, write_page
-from mcdenoise.film.engines import Done
+from mcdenoise.film import Film, FilmResult, read_film, run_film, work, write_page
 from mcdenoise.film.record import FrameRecord, read_records
 from mcdenoise.shot import ShotSettings
 
@@ -33,7 +33,7 @@ class Inline:
         self.tasks: list[str] = []
         self.lose = lose
 
-    def room(self) -> int:
+    def free_slots(self) -> int:
         return 1
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Hashable:
@@ -224,7 +224,7 @@ def test_a_damaged_frame_fails_alone(shots: dict[str, Path], tmp_path: Path, dam
 def test_the_table_of_what_failed_and_status_1(
     shots: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mcdenoise.cli.film.LocalEngine", lambda workers: Inline())
+    monkeypatch.setattr("mcdenoise.cli.film.LocalEngine", lambda workers, preload: Inline())
     (shots["s1"] / "inputs/color2.exr").write_bytes(b"")
     manifest = write_manifest(tmp_path / "film.toml", {**shots, "gone": tmp_path / "nowhere"}, model=MODEL)
     with pytest.raises(SystemExit) as stop:
@@ -281,12 +281,6 @@ def test_two_films_in_one_folder(shots: dict[str, Path], tmp_path: Path) -> None
     ):
         run(shots, tmp_path / "out")
     assert [path.name for path in (tmp_path / "out").iterdir()] == [".film"]
-
-
-def test_another_version_is_refused(shots: dict[str, Path], tmp_path: Path) -> None:
-    (shot, *_) = read_film(shots["s0"], ShotSettings(MODEL))
-    with pytest.raises(InputError, match=r"expected version 9\.9, as where the film is planned, found"):
-        work.look(work.Order(shot, tmp_path, 0.01, 1, version="9.9"))
 
 
 def test_names_of_any_kind(tmp_path: Path) -> None:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -16,7 +13,7 @@ from multiprocessing.synchronize import Event
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError
-from mcdenoise.interruption import deaf_children
+from mcdenoise.interruption import deaf_children, prepare_worker, start_resource_tracker
 from mcdenoise.scenes.render.folder import ReferenceState
 from mcdenoise.scenes.render.frames import FrameJob, render_frame
 from mcdenoise.scenes.render.tracer import Scene, Tracer
@@ -73,18 +70,8 @@ _process: _Process | None = None
 
 def _start_process(source: TracerSource, job: FrameJob, paths: Synchronized[int], stop: Event) -> None:
     global _process
-    # Ignore Ctrl+C, in case the process was not started ignoring it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    prepare_worker()
     _process = _Process(source, job, paths, stop)
-
-
-def _end_with_parent() -> None:
-    # A worker whose parent was killed would wait forever for its next frame and keep its memory.
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _render_frame_in_process(number: int) -> ReferenceState | None:
@@ -126,6 +113,7 @@ def render_in_processes(
     """
     # Spawn new interpreters, because Mitsuba's threads and GPU state do not survive a fork.
     context = multiprocessing.get_context("spawn")
+    start_resource_tracker()
     paths, stop = context.Value("q", 0), context.Event()
     seen = 0
     start = (source, job, paths, stop)

@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, view_projection
+from mcdenoise.engines import Engine
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.render.film import Film
-from mcdenoise.scenes.render.folder import SequenceFolder
+from mcdenoise.scenes.render.folder import ReferenceState, SequenceFolder
 from mcdenoise.scenes.render.frames import FrameJob, render_frame
 from mcdenoise.scenes.render.processes import TracerSource, render_in_processes
+from mcdenoise.scenes.render.remote import render_on_engine
 from mcdenoise.scenes.render.tracer import (
     RR_DEPTH,
     STRATIFIED_PATHS,
@@ -51,6 +53,7 @@ def render_sequence(
     variant: str | None = None,
     film: Film | None = None,
     keep_samples: bool = False,
+    engine: Engine | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Render a sequence in the BMFR layout.
@@ -88,6 +91,8 @@ def render_sequence(
             rounding from run to run. By default all samples are at the pixel centre.
         keep_samples: also write the single paths of each noisy colour, as layers of ``samplesN.exr``; on a film with
             the features of each path.
+        engine: renders the frames instead of processes of this machine, such as a
+            :class:`mcdenoise.engines.RayEngine`; it is closed at the end. Progress then advances frame by frame.
         progress: called with the finished and the total number of paths per pixel, summed over all frames. A reference
             that reaches the noise level early counts as complete.
 
@@ -113,7 +118,7 @@ def render_sequence(
         workers=(workers, 1),
     )
     source = TracerSource(scene, choose_variant(variant), max_depth, checked_moves)
-    if workers > 1:
+    if workers > 1 or engine is not None:
         source.check_portable()
     tracer = source.tracer()
     reach = tracer.reach(cameras)
@@ -180,7 +185,16 @@ def render_sequence(
 
     advance(job.paths_there())
     missing = [number for number in range(count) if not job.is_finished(number)]
-    if workers == 1:
+    if engine is not None:
+        paths_per_frame = (total - done) // max(len(missing), 1)
+
+        def finish(number: int, state: ReferenceState | None) -> None:
+            advance(paths_per_frame)
+            if state is not None:
+                folder.note_reference(number, state)
+
+        render_on_engine(source, job, missing, engine, finish)
+    elif workers == 1:
         for number in missing:
             state = render_frame(job, tracer, number, advance)
             if state is not None:

@@ -1,0 +1,27 @@
+"""Functions that workers call: they leave marks in a folder, and may kill their own process."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+
+def mark(folder: Path, name: str) -> str:
+    """Write a file and return its name."""
+    (folder / name).write_text(str(os.getpid()))
+    return name
+
+
+def die_at_first(folder: Path, name: str, times: int = 1) -> str:
+    """Kill this process so many times before the task succeeds."""
+    tries = sorted(folder.glob(f"{name}.try*"))
+    if len(tries) < times:
+        mark(folder, f"{name}.try{len(tries)}")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return mark(folder, name)
+
+
+def fail(message: str) -> None:
+    """Raise an error that no input causes."""
+    raise RuntimeError(message)

@@ -1,0 +1,107 @@
+"""Rendering and training on a Ray cluster of two nodes, one of which is lost: as on one machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mcdenoise.cli import main
+from mcdenoise.data.exr import read_exr
+from mcdenoise.models import describe_weights
+
+ray = pytest.importorskip("ray", reason="clusters need Ray: pip install 'mcdenoise[ray]'")
+pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
+pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
+# Ray's own warnings; none is of this package.
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default"), pytest.mark.timeout(1200)]
+RECIPES = Path(__file__).parents[2] / "recipes"
+SMALL = ["--size", "24x16", "--variant", "scalar_rgb"]
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Two nodes of one slot; the head runs no tasks."""
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    nodes = [made.add_node(num_cpus=1) for _ in range(2)]
+    yield made, nodes
+    ray.shutdown()
+    made.shutdown()
+
+
+def run(*arguments: object) -> object:
+    with pytest.raises(SystemExit) as stop:
+        main([*map(str, arguments)])
+    return stop.value.code
+
+
+def lose(cluster: Any, out: Path, pattern: str) -> threading.Thread:
+    """Remove a node as soon as there is something of that name."""
+
+    def wait() -> None:
+        while not list(out.glob(pattern)):
+            time.sleep(0.02)
+        cluster[0].remove_node(cluster[1][0], allow_graceful=False)
+
+    thread = threading.Thread(target=wait, daemon=True)
+    thread.start()
+    return thread
+
+
+def same(one: Path, other: Path) -> bool:
+    """Whether two folders hold the same images, bit by bit."""
+    images = [{path.relative_to(each): read_exr(path)[0] for path in each.rglob("*.exr")} for each in (one, other)]
+    equal = all(np.array_equal(image, images[1].get(path)) for path, image in images[0].items())
+    return bool(images[0]) and images[0].keys() == images[1].keys() and equal
+
+
+def test_generate(cluster: Any, tmp_path: Path) -> None:
+    options = ["--seeds", "0-3", "--frames", "3", "--reference-spp", "64", "--realisations", "1", *SMALL]
+    assert not run("generate", "-o", tmp_path / "quiet", *options)
+    lost = lose(cluster, tmp_path / "out", "*/inputs/color0.exr")
+    assert not run("generate", "-o", tmp_path / "out", *options, "--ray", cluster[0].address)
+    lost.join(60)
+    assert not lost.is_alive()
+    assert same(tmp_path / "quiet", tmp_path / "out")
+
+
+def test_render(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Paths are relative to the folder that the driver works in.
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.xml").write_text(
+        '<scene version="3.0.0"><integrator type="path"/><shape type="sphere"/><emitter type="constant"/></scene>'
+    )
+    cameras = [{"position": [0, 0.1 * k, 5], "look_at": [0, 0, 0]} for k in range(6)]
+    (tmp_path / "path.json").write_text(json.dumps({"fov": 40, "frames": cameras}))
+    options = ["scene.xml", "--camera-path", "path.json", "--reference-spp", "64", *SMALL]
+    assert not run("render", *options, "-o", "quiet")
+    lost = lose(cluster, tmp_path / "out", "inputs/color0.exr")
+    assert not run("render", *options, "-o", "out", "--ray", cluster[0].address)
+    lost.join(60)
+    assert same(tmp_path / "quiet", tmp_path / "out")
+    both = [json.loads((tmp_path / name / "inputs/camera.json").read_text()) for name in ("quiet", "out")]
+    assert both[0] == both[1]
+
+
+def test_sweep(cluster: Any, tmp_path: Path) -> None:
+    recipe, options = RECIPES / "tiny.toml", ["--seeds", "1-3", "--checkpoint-every", "4"]
+    assert not run("sweep", recipe, "-o", tmp_path / "quiet", *options, "--threads", "1")
+    lost = lose(cluster, tmp_path / "out", "tiny-*/checkpoint.pt")
+    assert not run("sweep", recipe, "-o", tmp_path / "out", *options, "--ray", cluster[0].address)
+    lost.join(60)
+    for name in ("tiny-1", "tiny-2", "tiny-3"):
+        weights = [tmp_path / each / name / "cascaded_v2_micro.safetensors" for each in ("quiet", "out")]
+        one, other = (describe_weights(path)["sha256"] for path in weights)
+        assert one == other, name
+    assert not os.path.lexists(tmp_path / "out/tiny-1/data")
