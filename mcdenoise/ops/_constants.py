@@ -1,4 +1,4 @@
-"""Numbers that an op and its fast forms share; compiled kernels have them built in."""
+"""Numbers that the reference of an op and its fast backends share; compiled kernels have them built in."""
 
 from __future__ import annotations
 
@@ -33,6 +33,10 @@ EVEN, BRIGHTER, LIGHT_WINDOW = 0.03, 1.2, 9
 BLOCK, DARK = 8, 1e-3
 # The least number that a depth counts as, and how many near depths away the scene ends.
 SHORTEST, FARTHEST = 1e-30, 1e4
+
+# Of the depth, as much as half-float depths are known to: the epsilon of SVGF's Eq. 3, which the paper leaves open. The
+# others keep quotients and their derivatives finite, where `exp` of them is zero in any precision.
+DEPTH_EPSILON, LEAST_DEPTH, HIGHEST_QUOTIENT = 1e-3, 1e-30, 1e4
 
 # Weight of a pixel in its own mean, at least: where it is like none of its neighbours it stays as it is, and nothing is
 # divided by 0. Differences of features beyond the other count as that, so that no square overflows.

@@ -1,21 +1,19 @@
-"""Edge-stopping functions of what a pixel sees: how much of a tap belongs to the same surface."""
+"""Averages over windows that stop at edges: a tap counts as far as it belongs to the same surface as the pixel."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._window import pad, shifted
+from mcdenoise.ops._constants import DEPTH_EPSILON, HIGHEST_QUOTIENT, LEAST_DEPTH
+from mcdenoise.ops._op import op
+from mcdenoise.ops._window import offsets, pad, shifted
 
 SIGMA_Z, SIGMA_N = 1.0, 128.0
-# The paper's epsilon, which it leaves open: of the depth, as much as half-float depths are known to.
-DEPTH_EPSILON = 1e-3
-# What keeps quotients and their derivatives finite, where `exp` of them is zero in any precision.
-_LEAST_DEPTH, _HIGHEST = 1e-30, 1e4
 
 
 def layouts(normal: Tensor | None, depth: Tensor | None) -> dict[str, tuple[Tensor, str]]:
@@ -33,40 +31,82 @@ def check_sigmas(sigma_z: float, sigma_n: float, sigma_l: float = 1.0) -> None:
         raise ValueError(f"sigma_n: expected at least 1, found {sigma_n}")
 
 
-def edge_stopping(
-    normal: Tensor | None, depth: Tensor | None, dtype: torch.dtype, radius: int, sigma_z: float, sigma_n: float
-) -> Callable[[int, int], Tensor | float]:
-    """The function of an offset ``(dy, dx)`` that gives ``w_z w_n``, see :func:`mcdenoise.ops.atrous`.
+def edge_average(
+    image: Tensor,
+    noise: Tensor,
+    normal: Tensor | None,
+    depth: Tensor | None,
+    bright: Tensor | None = None,
+    deviation: Tensor | None = None,
+    *,
+    kernel: Sequence[float],
+    step: int,
+    sigma_z: float,
+    sigma_n: float,
+) -> tuple[Tensor, Tensor]:
+    """The mean of an image over a window, with the weights of :func:`mcdenoise.ops.atrous`, and its variance.
 
     Args:
-        normal: ``(B, 3, H, W)`` or ``None``.
-        depth: ``(B, 1, H, W)`` or ``None``.
-        dtype: to compute in.
-        radius: of the farthest tap in pixels.
+        image: ``(B, C, H, W)``, at least float32, whose dtype is that of the sums and of both results.
+        noise: ``(B, N, H, W)`` variances; none, of no channels, where they are not asked for.
+        normal: ``(B, 3, H, W)``; without it ``w_n = 1``.
+        depth: ``(B, 1, H, W)``; without it ``w_z = 1``.
+        bright: ``(B, 1, H, W)`` luminance; without it ``w_l = 1``.
+        deviation: ``(B, 1, H, W)`` by how much luminance may differ, above 0.
+        kernel: weights of the taps along one axis, an odd number of them.
+        step: pixels between taps.
         sigma_z: tolerance of depths.
         sigma_n: exponent of the cosine.
 
     Returns:
-        ``(B, 1, H, W)`` for each offset, whatever lies outside of the image; 1 without normals and depths.
+        ``sum a image / sum a`` and ``sum a^2 noise / (sum a)^2`` over the taps inside the image, with the products
+        ``a`` of the kernel and of the edge-stopping weights.
     """
+    normal, depth = (None if each is None else each.to(image.dtype) for each in (normal, depth))
+    return average(image, noise, normal, depth, bright, deviation, list(kernel), step, sigma_z, sigma_n)
+
+
+@op("numba", differentiable=True)
+def average(
+    image: Tensor,
+    noise: Tensor,
+    normal: Tensor | None,
+    depth: Tensor | None,
+    bright: Tensor | None,
+    deviation: Tensor | None,
+    kernel: Sequence[float],
+    step: int,
+    sigma_z: float,
+    sigma_n: float,
+) -> tuple[Tensor, Tensor]:
+    """See :func:`edge_average`; all images have one dtype."""
+    height, width = image.shape[-2:]
+    radius = len(kernel) // 2 * step
     factors: list[Callable[[int, int], Tensor]] = []
     if depth is not None:
-        factors.append(_of_depth(depth.to(dtype), radius, sigma_z))
+        factors.append(_of_depth(depth, radius, sigma_z))
     if normal is not None:
-        factors.append(_of_normal(normal.to(dtype), radius, sigma_n))
-
-    def weight(dy: int, dx: int) -> Tensor | float:
-        product: Tensor | float = 1.0
+        factors.append(_of_normal(normal, radius, sigma_n))
+    if bright is not None and deviation is not None:
+        factors.append(_of_luminance(bright, deviation, radius))
+    channels = [image.shape[1], noise.shape[1], 1]
+    padded = pad(torch.cat([image, noise, torch.ones_like(image[:, :1])], 1), radius, "zeros")
+    total, image_sum, noise_sum = torch.zeros_like(image[:, :1]), torch.zeros_like(image), torch.zeros_like(noise)
+    for tap, dy, dx in offsets(len(kernel)):
+        row, column = divmod(tap, len(kernel))
+        seen, variance, inside = shifted(padded, radius, dy * step, dx * step, height, width).split(channels, 1)
+        weight = kernel[row] * kernel[column] * inside
         for factor in factors:
-            product = product * factor(dy, dx)
-        return product
-
-    return weight
+            weight = weight * factor(dy * step, dx * step)
+        total = total + weight
+        image_sum = image_sum + weight * seen
+        noise_sum = noise_sum + weight.square() * variance
+    return image_sum / total, noise_sum / total.square()
 
 
 def bounded_quotient(difference: Tensor, tolerance: Tensor) -> Tensor:
     """``difference / tolerance`` of two that are not negative, no more than 1e4."""
-    return difference / torch.maximum(tolerance, difference.detach() / _HIGHEST)
+    return difference / torch.maximum(tolerance, difference.detach() / HIGHEST_QUOTIENT)
 
 
 def _of_normal(normal: Tensor, radius: int, sigma: float) -> Callable[[int, int], Tensor]:
@@ -80,12 +120,23 @@ def _of_normal(normal: Tensor, radius: int, sigma: float) -> Callable[[int, int]
     return weight
 
 
+def _of_luminance(bright: Tensor, deviation: Tensor, radius: int) -> Callable[[int, int], Tensor]:
+    height, width = bright.shape[-2:]
+    padded = pad(bright, radius, "zeros")
+
+    def weight(dy: int, dx: int) -> Tensor:
+        difference = (shifted(padded, radius, dy, dx, height, width) - bright).abs()
+        return torch.exp(-bounded_quotient(difference, deviation))  # Eq. 5
+
+    return weight
+
+
 def _of_depth(depth: Tensor, radius: int, sigma: float) -> Callable[[int, int], Tensor]:
     height, width = depth.shape[-2:]
     hit = torch.isfinite(depth)
     z = torch.where(hit, depth, 0)
     slope_x, slope_y = _slope(z, hit, -1), _slope(z, hit, -2)
-    least = DEPTH_EPSILON * z + _LEAST_DEPTH
+    least = DEPTH_EPSILON * z + LEAST_DEPTH
     padded, padded_hit = pad(z, radius, "zeros"), F.pad(hit, (radius,) * 4)
 
     def weight(dy: int, dx: int) -> Tensor:

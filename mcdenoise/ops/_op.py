@@ -74,6 +74,18 @@ def op(
     return decorate
 
 
+def made_of(
+    inner: Callable[..., Any],
+) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
+    """Say that a function spends its time in an op, so that it has the backends of that."""
+
+    def decorate(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+        function.backends = backends_of(inner)  # type: ignore[attr-defined]
+        return function
+
+    return decorate
+
+
 def plain(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """The plain form of an op."""
     form: Callable[_Arguments, _Result] = getattr(function, "plain", function)
@@ -151,10 +163,18 @@ def _differentiate(operator: Operator, gradients: Callable[..., Any], plain: Cal
         if not torch.is_grad_enabled():
             return tuple(gradients(needed, *gradient, *arguments(tensors)))
         function = functools.partial(first, arguments=arguments)
-        wanted = _plain_gradients(function, tensors, pytree.tree_leaves(needed), gradient)
-        return tuple(pytree.tree_unflatten(wanted, ctx.structure))
+        # Of a list of numbers torch says once that it needs none, and expects none.
+        counts = [child.num_leaves for child in ctx.structure.children()]
+        of_leaves = [own for need, count in zip(needed, counts, strict=True) for own in _spread(need, count)]
+        wanted = pytree.tree_unflatten(_plain_gradients(function, tensors, of_leaves, gradient), ctx.structure)
+        return tuple(own if need is not False else None for own, need in zip(wanted, needed, strict=True))
 
     operator.register_autograd(backward, setup_context=setup_context)
+
+
+def _spread(need: bool | Sequence[bool], count: int) -> Sequence[bool]:
+    """Of each leaf of an argument."""
+    return [need] * count if isinstance(need, bool) else need
 
 
 def _plain_gradients(

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.ops._check import check_shapes
-from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, bounded_quotient, check_sigmas, edge_stopping, layouts
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, check_sigmas, edge_average, layouts
 from mcdenoise.ops._numbers import numbers_like
-from mcdenoise.ops._window import accumulator_dtype, offsets, pad, shifted
+from mcdenoise.ops._op import made_of, op
+from mcdenoise.ops._window import accumulator_dtype
 from mcdenoise.ops.moments import luminance
 
 SIGMA_L = 4.0
@@ -18,6 +19,7 @@ _KERNEL, _GAUSSIAN = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16), (1 / 4, 1 / 2, 1 / 4
 _LEAST_DEVIATION = 1e-10
 
 
+@made_of(average)
 def atrous(
     light: Tensor,
     variance: Tensor,
@@ -82,24 +84,16 @@ def atrous(
     if light.numel() == 0:
         return light, variance
     dtype = accumulator_dtype(light.dtype)
-    height, width = sizes["H"], sizes["W"]
     image, noise = light.to(dtype), variance.to(dtype)
-    bright = luminance(image[:, :3])
-    deviation = sigma_l * torch.sqrt(_blurred(noise) + _LEAST_DEVIATION**2)
-    radius = 2 * step
-    edge_weight = edge_stopping(normal, depth, dtype, radius, sigma_z, sigma_n)
-    padded = pad(torch.cat([image, noise, bright, torch.ones_like(bright)], 1), radius, "zeros")
-    total, light_sum, variance_sum = torch.zeros_like(bright), torch.zeros_like(image), torch.zeros_like(noise)
-    for _, dy, dx in offsets(5):
-        dy, dx, h = dy * step, dx * step, _KERNEL[dy + 2] * _KERNEL[dx + 2]
-        tap = shifted(padded, radius, dy, dx, height, width)
-        tap_light, tap_variance, tap_bright, inside = tap.split([sizes["C"], 1, 1, 1], 1)
-        weight = h * inside * edge_weight(dy, dx)
-        weight = weight * torch.exp(-bounded_quotient((tap_bright - bright).abs(), deviation))  # Eq. 5
-        total = total + weight
-        light_sum = light_sum + weight * tap_light
-        variance_sum = variance_sum + weight.square() * tap_variance
-    return (light_sum / total).to(light.dtype), (variance_sum / total.square()).to(variance.dtype)
+    deviation = sigma_l * torch.sqrt(blurred(noise) + _LEAST_DEVIATION**2)
+    filtered, remaining = edge_average(
+        *(image, noise, normal, depth, luminance(image[:, :3]), deviation),
+        kernel=_KERNEL,
+        step=step,
+        sigma_z=sigma_z,
+        sigma_n=sigma_n,
+    )
+    return filtered.to(light.dtype), remaining.to(variance.dtype)
 
 
 class Atrous(nn.Module):
@@ -128,7 +122,8 @@ class Atrous(nn.Module):
         return atrous(light, variance, normal, depth, step=self.step, **sigmas)
 
 
-def _blurred(variance: Tensor) -> Tensor:
+@op("numba", differentiable=True)
+def blurred(variance: Tensor) -> Tensor:
     """``g`` of Eq. 5; the border is repeated."""
     # All of kornia comes with it, which takes as long to import as a single frame to denoise.
     from kornia.filters import filter2d_separable

@@ -7,9 +7,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
-from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, bounded_quotient, check_sigmas, edge_stopping, layouts
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, bounded_quotient, check_sigmas, edge_average, layouts
 from mcdenoise.ops._module import module_of
-from mcdenoise.ops._window import accumulator_dtype, corner, offsets, pad, shifted, up_to_multiple
+from mcdenoise.ops._op import made_of
+from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
 
 STRATUM, LEVELS = 3, 5
 # Standard errors up to which a change is taken for noise.
@@ -18,6 +19,7 @@ THRESHOLD = 2.0
 _BLACK = 1e-15
 
 
+@made_of(average)
 def temporal_gradient(
     current: Tensor,
     previous: Tensor,
@@ -144,7 +146,9 @@ def sums_of_strata(
     noise = F.avg_pool2d(up_to_multiple(noise, stratum), stratum) / stratum**2
     normal, depth = (None if image is None else _middle(image, stratum) for image in (normal, depth))
     for level in range(levels):
-        change, noise = _smoothed(change, noise, normal, depth, 1 << level, sigma_z, sigma_n)
+        change, noise = edge_average(
+            *(change, noise, normal, depth), kernel=(1.0, 1.0, 1.0), step=1 << level, sigma_z=sigma_z, sigma_n=sigma_n
+        )
     difference, size = change.split(1, 1)
     return difference, torch.where(size > _BLACK * (largest / unit), size, 0), noise
 
@@ -159,27 +163,3 @@ def _middle(image: Tensor, stratum: int) -> Tensor:
         place = torch.arange(stratum // 2, size + stratum // 2, stratum, device=image.device)
         image = image.index_select(dim, place.clamp_max(size - 1))
     return image
-
-
-def _smoothed(
-    change: Tensor,
-    noise: Tensor,
-    normal: Tensor | None,
-    depth: Tensor | None,
-    step: int,
-    sigma_z: float,
-    sigma_n: float,
-) -> tuple[Tensor, Tensor]:
-    """One level of the transform: the means over 3x3 taps ``step`` strata apart, and the variance of a mean."""
-    height, width = change.shape[-2:]
-    edge_weight = edge_stopping(normal, depth, change.dtype, step, sigma_z, sigma_n)
-    padded = pad(torch.cat([change, noise, torch.ones_like(noise)], 1), step, "zeros")
-    total, change_sum, noise_sum = torch.zeros_like(noise), torch.zeros_like(change), torch.zeros_like(noise)
-    for _, dy, dx in offsets(3):
-        tap = shifted(padded, step, dy * step, dx * step, height, width)
-        tap_change, tap_noise, inside = tap.split([2, 1, 1], 1)
-        weight = inside * edge_weight(dy * step, dx * step)
-        total = total + weight
-        change_sum = change_sum + weight * tap_change
-        noise_sum = noise_sum + weight.square() * tap_noise
-    return change_sum / total, noise_sum / total.square()

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.ops._check import check_shapes
-from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, check_sigmas, edge_stopping, layouts
-from mcdenoise.ops._window import accumulator_dtype, offsets, pad, shifted
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, check_sigmas, edge_average, layouts
+from mcdenoise.ops._op import made_of
+from mcdenoise.ops._window import accumulator_dtype
 
 # Of linear RGB with the primaries of Rec. 709.
 LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -43,6 +44,7 @@ def luminance_moments(light: Tensor) -> Tensor:
     return torch.cat([bright, bright.square()], 1)
 
 
+@made_of(average)
 def moments_variance(
     moments: Tensor,
     normal: Tensor | None = None,
@@ -87,19 +89,19 @@ def moments_variance(
         >>> bool(abs(moments_variance(samples, kernel_size=31)[0, 0, 16, 16] - 1) < 0.25)
         True
     """
-    sizes = check_shapes(moments=(moments, "B 2 H W"), **layouts(normal, depth))
+    check_shapes(moments=(moments, "B 2 H W"), **layouts(normal, depth))
     _check_settings(kernel_size, sigma_z, sigma_n)
     mean, scale = moments.to(accumulator_dtype(moments.dtype)), 1.0
     if kernel_size > 1 and moments.numel():
-        radius, height, width = kernel_size // 2, sizes["H"], sizes["W"]
-        edge_weight = edge_stopping(normal, depth, mean.dtype, radius, sigma_z, sigma_n)
         # A power of two, which rounds nothing, so that no sum of representable moments overflows.
         scale = 2.0 ** -(kernel_size**2).bit_length()
-        padded = pad(torch.cat([mean * scale, torch.ones_like(mean[:, :1])], 1), radius, "zeros")
-        total = torch.zeros_like(padded[..., :height, :width])
-        for _, dy, dx in offsets(kernel_size):
-            total = total + shifted(padded, radius, dy, dx, height, width) * edge_weight(dy, dx)
-        mean = total[:, :2] / total[:, 2:]
+        mean, _ = edge_average(
+            *(mean * scale, mean[:, :0], normal, depth),
+            kernel=[1.0] * kernel_size,
+            step=1,
+            sigma_z=sigma_z,
+            sigma_n=sigma_n,
+        )
     first, second = mean.split(1, 1)
     difference = second - first.square() / scale
     return (torch.where(difference > 0, difference, 0) / scale).to(moments.dtype)

@@ -53,11 +53,29 @@ def _importance(draw: Draw, channels: int) -> Inputs:
     return {"image": draw(channels), "importance": 20 * draw(1)}
 
 
+def _atrous(draw: Draw, channels: int) -> Inputs:
+    return {"light": draw(channels + 2), "variance": 0.1 * draw(1) + 0.01, "normal": draw(3), "depth": 1 + draw(1)}
+
+
+def _moments(draw: Draw, channels: int) -> Inputs:
+    mean = draw(1)
+    return {"moments": torch.cat([mean, mean.square() + draw(1)], 1), "normal": draw(3), "depth": 1 + draw(1)}
+
+
+def _changes(draw: Draw, channels: int) -> Inputs:
+    before = draw(1)
+    named = {"current": 2 * before + draw(1), "previous": before, "weight": 0.1 + draw(1), "variance": 0.01 * draw(1)}
+    return {**named, "normal": draw(3), "depth": 1 + draw(1)}
+
+
 ZOO: dict[str, tuple[Callable[[Draw, int], Inputs], dict[str, Any]]] = {
     "affinity_filter": (_affinity, {"kernel_size": 5, "dilation": 2}),
     "grid_splat": (_splat, {"cell": 4, "bins": 5}),
     "grid_slice": (_slice, {"cell": 4}),
     "importance_filter": (_importance, {"kernel_size": 5}),
+    "atrous": (_atrous, {"step": 2, "sigma_n": 2.0}),
+    "moments_variance": (_moments, {"kernel_size": 5, "sigma_n": 2.0}),
+    "temporal_gradient": (_changes, {"stratum": 2, "levels": 2, "sigma_n": 2.0}),
 }
 FAST = [op for op in OPS if op.name in ZOO]
 # Of the others the derivatives are those of the plain form.
