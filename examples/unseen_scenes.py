@@ -104,7 +104,7 @@ def main() -> None:
         print(f"\n{table(means, options.markdown)}")
     floors = {sequence.name: noise_floor(sequence) for sequence in sequences}
     notes = [
-        f"{scene.name}: the SMAPE of the references themselves is about {scene.reference_noise:.4g}; the truth "
+        f"{scene.name}: the references' own SMAPE against the truth is about {scene.reference_noise:.4g}; the truth "
         f"would score about {', '.join(f'{metric} {floor:.4g}' for metric, floor in floors[scene.name].items())}."
         for scene in results.scenes
         if scene.reference_noise
