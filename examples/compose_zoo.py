@@ -1,11 +1,12 @@
-"""Put the head of one method on the backbone of another, train it for a minute, and see what it does.
+"""Put the head of one method on the backbone of another, train it for a minute, and measure its error.
 
     python examples/compose_zoo.py path/to/sequence
 
-The U-Net is that of `mrkp`, the maps of importance are those of `wskp`: six a pixel, for windows of 3 to 13 pixels, and
-how to blend what they give. Trains on all but the last frames of the sequence, and prints the error on these before and
-after, beside the noisy and the accumulated image. In every command the method is `examples/compose_zoo.py:method`:
-`mcdenoise train SEQUENCES -o RUN --model examples/compose_zoo.py:method` trains it for longer.
+The U-Net is that of `mrkp`, and the importance maps are those of `wskp`: six per pixel, for windows of 3 to 13 pixels,
+with weights that blend the six filtered images. The script trains on all but the last frames of the sequence, and
+prints the errors on these before and after, beside those of the noisy and the accumulated image. Every command accepts
+the method as `examples/compose_zoo.py:method`; for example, `mcdenoise train SEQUENCES -o RUN --model
+examples/compose_zoo.py:method` trains it for longer.
 """
 
 import argparse
@@ -29,7 +30,7 @@ HELD_OUT = 4  # frames at the end that are not trained on
 
 
 class Composed(nn.Module):
-    """Importance maps, and the weights that blend what they give, from one convolution on the U-Net's features."""
+    """Predicts importance maps, and weights for blending their results, by one convolution on the U-Net's features."""
 
     needs = Needs(frozenset({"albedo", "normal", "depth"}))
 
@@ -39,7 +40,7 @@ class Composed(nn.Module):
         self.head = nn.Conv2d(self.backbone.out_channels, 2 * len(SIDES), 3, padding=1)
 
     def forward(self, frame: Frame, state: None = None) -> tuple[Output, None]:
-        """The image, filtered with windows of every side, and blended."""
+        """Filter the image with windows of every size, and blend the results."""
         seen = torch.log1p(frame.color), frame.albedo, frame.normal, normalize_depth(frame.depth)
         maps, blend = self.head(self.backbone(torch.cat(seen, 1))[0]).float().chunk(2, 1)
         light, weights = with_carried(frame), torch.softmax(blend, 1).split(1, 1)
@@ -48,7 +49,7 @@ class Composed(nn.Module):
 
 
 def method(width: int = 16):
-    """Demodulated, accumulated, and of typical brightness, as any method may be."""
+    """The network in wrappers for demodulation, accumulation and exposure."""
     return Demodulated(Accumulated(Exposed(Composed(width))))
 
 
@@ -67,8 +68,8 @@ def report(name: str, denoiser: Denoiser, sequence) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", type=Path, help="folder with references")
-    parser.add_argument("--steps", type=int, default=150, help="of training")
-    parser.add_argument("--crop", type=int, default=96, help="side of what is trained on, in pixels")
+    parser.add_argument("--steps", type=int, default=150, help="training steps")
+    parser.add_argument("--crop", type=int, default=96, help="side of the training crops, in pixels")
     arguments = parser.parse_args()
     shot, name = open_sequence(arguments.sequence), f"{__file__}:method"
     for baseline in ("noisy", "accumulated", name):

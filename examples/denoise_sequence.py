@@ -1,11 +1,11 @@
-"""Denoise a shot frame by frame, as a renderer would: the shortest use of `Denoiser`.
+"""Denoise a shot frame by frame, as in a renderer: the shortest use of `Denoiser`.
 
     python examples/denoise_sequence.py path/to/sequence out
     python examples/denoise_sequence.py path/to/sequence out --weights runs/mine/cascaded_v2.safetensors
 
-Writes out/denoised0.exr, out/denoised1.exr, ... (scene-linear), and out/last.png: the last frame before and after, as a
-display shows it. A denoiser remembers: give it the frames in order, one `Denoiser` for each shot. With frames from
-somewhere else than a folder, build `mcdenoise.frame.Frame(color=..., albedo=..., ...)` and pass that.
+The script writes out/denoised0.exr, out/denoised1.exr, ... (scene-linear), and out/last.png: the last frame before and
+after, as displayed. A denoiser has a state: pass it the frames in order, and use one `Denoiser` for each shot. If the
+frames do not come from a folder, construct `mcdenoise.frame.Frame(color=..., albedo=..., ...)` yourself.
 """
 
 import argparse
@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("sequence", type=Path, help="folder of a renderer's frames")
     parser.add_argument("out", type=Path, help="folder to write to")
     parser.add_argument("--model", default=DEFAULT, help="a name that `mcdenoise models` lists, or file.py:factory")
-    parser.add_argument("--weights", type=Path, help="weights of your own training; by default the shipped ones")
+    parser.add_argument("--weights", type=Path, help="weights that you trained; by default the shipped ones")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     options = parser.parse_args()
 

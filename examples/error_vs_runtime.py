@@ -1,10 +1,11 @@
-"""Draw error over run time: every model with weights, filters, and what other denoisers are installed, on your scenes.
+"""Plot error over run time on your scenes, for models with weights, filters, and other installed denoisers.
 
     python examples/error_vs_runtime.py path/to/scene path/to/another -o figure.svg
     python examples/error_vs_runtime.py path/to/scene -o figure.png --metric PSNR --frames 0-11 --threads 2
 
-The mean over the scenes, each at its own size; bars are quartiles, the dashed line is the Pareto front. All methods
-take turns on every frame (see `mcdenoise benchmark`, which writes a whole report). Prints the figures that it draws.
+Points are means over the scenes, each at its own size; bars are quartiles, and the dashed line is the Pareto front. All
+methods take turns on every frame (see `mcdenoise benchmark`, which writes a complete report). The script prints the
+plotted values.
 """
 
 import argparse
@@ -26,10 +27,10 @@ def parse() -> argparse.Namespace:
     parser.add_argument("sequences", type=Path, nargs="+", metavar="SEQUENCE", help="folder of frames with references")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="figure to write: .svg or .png")
     parser.add_argument("--metric", choices=METRICS, default="SMAPE")
-    parser.add_argument("--models", metavar="NAMES", help="as of `mcdenoise benchmark`; all by default")
-    parser.add_argument("--frames", metavar="NUMBERS", help="which frames to use, such as 0-15")
-    parser.add_argument("--rounds", type=int, default=3, help="how often each method denoises each frame")
-    parser.add_argument("--threads", type=int, metavar="N", help="of all methods")
+    parser.add_argument("--models", metavar="NAMES", help="as for `mcdenoise benchmark`; all by default")
+    parser.add_argument("--frames", metavar="NUMBERS", help="frames to use, such as 0-15")
+    parser.add_argument("--rounds", type=int, default=3, help="number of times that each method denoises each frame")
+    parser.add_argument("--threads", type=int, metavar="N", help="number of threads of all methods")
     return parser.parse_args()
 
 

@@ -1,10 +1,10 @@
-"""Operators inside kornia's containers, and kornia's augmentation for frames with features.
+"""Use operators inside kornia's containers, and kornia's augmentations on frames with features.
 
     python examples/kornia_containers.py
 
-Every operator with one image has a Module twin, which goes into ``ImageSequential`` beside kornia's own filters and
-augmentations. Augmenting a frame is augmenting all of its buffers alike: they are stacked along the channels, moved by
-one call, and taken apart. Flips of the image change no world-space normal, but they turn the motion around.
+Every operator that takes one image has a Module twin, which can be used in ``ImageSequential`` beside kornia's own
+filters and augmentations. To augment a frame, its buffers are stacked along the channels, augmented by one call, and
+split again. Flipping the image does not change world-space normals, but it negates the motion in x.
 """
 
 import torch
@@ -20,20 +20,20 @@ BUFFERS = {"color": 3, "albedo": 3, "normal": 3, "depth": 1, "motion": 2}
 
 
 def preview(size: int = 64) -> ImageSequential:
-    """A quick look at noisy radiance: one operator of this package, one filter and one augmentation of kornia's."""
+    """A simple preview of noisy radiance: one operator of this package, one filter and one augmentation of kornia."""
     return ImageSequential(ClampFireflies(limit=4.0), MedianBlur((3, 3)), RandomCrop((size, size)))
 
 
 def augment(frame: Frame, flip: RandomHorizontalFlip) -> Frame:
-    """Flip all buffers of a frame alike.
+    """Flip all buffers of a frame together.
 
     Args:
-        frame: with all of ``BUFFERS``.
-        flip: drawn once for each image of the batch.
+        frame: a frame with all ``BUFFERS``.
+        flip: the augmentation; each image of the batch is flipped or not.
     """
     stacked = torch.cat([getattr(frame, name) for name in BUFFERS], 1)
     moved = dict(zip(BUFFERS, ImageSequential(flip)(stacked).split(list(BUFFERS.values()), 1), strict=True))
-    # What was drawn stays with the augmentation: true for the images that were flipped.
+    # The augmentation stores its random decisions: true for the images that were flipped.
     flipped = flip._params["batch_prob"].bool().reshape(-1, 1, 1, 1)
     x, y = moved["motion"].split(1, 1)
     moved["motion"] = torch.cat([torch.where(flipped, -x, x), y], 1)
@@ -41,7 +41,7 @@ def augment(frame: Frame, flip: RandomHorizontalFlip) -> Frame:
 
 
 def smooth(light: Tensor, steps: tuple[int, ...] = (1, 2, 4)) -> Tensor:
-    """Filters with two images in and out are chained by hand: light and its variance."""
+    """Chain filters that take and return two images, here light and its variance, in a loop."""
     variance = light.var((1, 2, 3), keepdim=True).expand_as(light[:, :1])
     for step in steps:
         light, variance = Atrous(step=step)(light, variance)

@@ -1,12 +1,12 @@
-"""What a pixel costs in frames of any size, whole process, within a limit of memory.
+"""Measure the cost per pixel of whole processes in frames of any size, within a memory limit.
 
     python examples/large_frames.py
     python examples/large_frames.py --sizes 1280x720,3840x2160 --model cascaded_v2_tiny --max-memory 2 --json costs.json
 
-Writes a synthetic sequence of each size (color, albedo, normal, depth and position, without cameras: single frames),
-denoises it with `mcdenoise denoise --max-memory`, which chooses the tiles, and prints of each size the tiles, the
-nanoseconds a pixel of the network and of all stages but reading and writing, by the median of the frames after the
-first, and the peak of the process's memory. 7680x4320 takes minutes and a gigabyte of disk.
+The script writes a synthetic sequence of each size (color, albedo, normal, depth and position, without cameras, so that
+frames have no history) and denoises it with `mcdenoise denoise --max-memory`, which chooses the tiles. For each size it
+prints the tiles, the nanoseconds per pixel of the network and of all stages except reading and writing, as medians over
+the frames after the first, and the peak memory of the process. 7680x4320 takes minutes and a gigabyte of disk.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from mcdenoise.models import DEFAULT
 
 
 def measure(width: int, height: int, options: argparse.Namespace, folder: Path) -> dict[str, object]:
-    """What it costs to denoise frames of a size, in a process of its own."""
+    """Measure the cost of denoising frames of a size in a separate process."""
     frame = synthetic_frame(width, height).replace(motion=None)
     for number in range(options.frames):
         write_bmfr_frame(folder / "wall" / "inputs", number, frame)
@@ -64,14 +64,14 @@ def main() -> None:
     parser.add_argument("--model", default=DEFAULT)
     parser.add_argument("--precision", default="bfloat16", choices=["float32", "bfloat16"])
     parser.add_argument("--max-memory", type=float, default=4.0, metavar="GB")
-    parser.add_argument("--frames", type=int, default=2, help="of each size; the first warms up")
+    parser.add_argument("--frames", type=int, default=2, help="frames of each size; the first warms up")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure to this file too")
     options = parser.parse_args()
 
-    for name, lowest in (("threads", 1), ("frames", 2)):
-        if getattr(options, name) < lowest:
-            raise InputError(f"--{name}: expected at least {lowest}, found {getattr(options, name)}")
+    for name, minimum in (("threads", 1), ("frames", 2)):
+        if getattr(options, name) < minimum:
+            raise InputError(f"--{name}: expected at least {minimum}, found {getattr(options, name)}")
     torch.set_num_threads(options.threads)
     machine = describe_machine("cpu")
     print(f"{options.model}, {options.precision}, within {options.max_memory:g} GB, {options.frames} frames")

@@ -1,13 +1,14 @@
-"""Error of denoised layers of light, and what they cost, on a shot that Blender rendered with its light passes.
+"""Measure the error and the run time of denoised light layers, on a shot that Blender rendered with its light passes.
 
     python examples/blender/render.py -o shot --frames 8 --samples 1 --filter none
     python examples/blender/render.py -o shot --name reference --frames 8 --samples 256 --filter none --seed 1001
     python examples/layers.py shot [METHOD...]
 
-Each method denoises the shot three times: the color alone, the color with its layers, and every layer by itself. Errors
-are squared differences from the reference over ``reference color^2 + 0.01``, times 1000, and SMAPE; of the layers, the
-sum of the former and the mean of the latter. Times are medians over the frames after the first, without files. The last
-column is how far the sum of the layers is from the color, on average, relative to its mean.
+Each method denoises the shot three times: the color alone, the color with its layers, and every layer separately.
+Errors are squared differences from the reference over ``reference color^2 + 0.01``, times 1000, and SMAPE; for the
+layers, the sum of the former and the mean of the latter. Times are medians over the frames after the first, without
+reading and writing files. The last column is the mean difference of the sum of the layers from the color, relative to
+the mean of the color.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ Images = dict[str, Tensor]
 
 
 def load(files: Path) -> list[Frame]:
-    """The frames of a shot with all their layers of light."""
+    """The frames of a shot with all their light layers."""
     sequence = open_sequence(files, lights=["all"])
     return [sequence.frame(number) for number in sequence.numbers]
 
 
 def denoised(frames: list[Frame], denoise: Callable[[Frame], Images]) -> tuple[list[Images], float]:
-    """Images by name of each frame, and milliseconds for one."""
+    """The images of each frame by name, and the median milliseconds per frame."""
     images, times = [], []
     for frame in frames:
         start = time.perf_counter()
@@ -46,7 +47,7 @@ def denoised(frames: list[Frame], denoise: Callable[[Frame], Images]) -> tuple[l
 
 
 def report(name: str, images: list[Images], milliseconds: float, references: list[Frame]) -> None:
-    """One row: time, errors of the color and of the layers, and how the layers add up."""
+    """Print one row: time, errors of the color and of the layers, and the error of the sum of the layers."""
     names = ["color", *references[0].layers]
     errors, smapes, apart = [], [], []
     for found, reference in zip(images, references, strict=True):

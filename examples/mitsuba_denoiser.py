@@ -1,14 +1,14 @@
-"""Denoise in a Mitsuba 3 script, in the line where `mi.OptixDenoiser` stood, and optimise through the denoiser.
+"""Replace `mi.OptixDenoiser` in a Mitsuba 3 script, and optimize a scene through the denoiser.
 
     python examples/mitsuba_denoiser.py -o mitsuba_denoiser
 
-`still` renders a Cornell box at a few samples a pixel, with the albedo and the normals of the `aov` integrator, and
-denoises the bitmap. `optimise` finds the color of the walls from a picture of them: each step renders one sample a
-pixel anew, and the gradient of the loss goes back through the denoiser into Mitsuba. It needs a variant that
-differentiates, `llvm_ad_rgb` (with an LLVM library that is new enough for the processor) or `cuda_ad_rgb`, and says so
-where none runs.
+`still` renders a Cornell box at a few samples per pixel, with the albedo and the normals of the `aov` integrator, and
+denoises the bitmap. `optimise` finds the color of the walls from an image of them: each step renders a new image at one
+sample per pixel, and the gradient of the loss propagates back through the denoiser into Mitsuba. It needs a
+differentiable variant, `llvm_ad_rgb` (with an LLVM library that is new enough for the processor) or `cuda_ad_rgb`, and
+is skipped with a message if neither works.
 
-Measured at 96x96: at 4 samples a pixel, SMAPE falls from 0.314 to 0.148; in llvm_ad_rgb, after 60 steps, the largest
+Measured at 96x96: at 4 samples per pixel, SMAPE falls from 0.314 to 0.148; in llvm_ad_rgb, after 60 steps, the maximum
 error of the walls' reflectance has fallen from 0.586 to 0.007.
 """
 
@@ -27,9 +27,9 @@ START = (0.3, 0.3, 0.3)
 
 def cornell_box(size: int) -> dict:
     box = mi.cornell_box()
-    # Denoisers want pixels that share no samples.
+    # A box filter, because denoisers expect independent noise in each pixel.
     box["sensor"]["film"] |= {"width": size, "height": size, "rfilter": {"type": "box"}}
-    # Image and features in one pass.
+    # Render image and features in one pass.
     box["integrator"] = {
         "type": "aov",
         "aovs": "albedo:albedo,normals:sh_normal",
@@ -39,7 +39,7 @@ def cornell_box(size: int) -> dict:
 
 
 def still(out: Path, size: int, samples: int) -> tuple[float, float]:
-    """The error of the noisy and of the denoised image, which are written beside each other."""
+    """Write the noisy and the denoised image, and return their errors."""
     scene = mi.load_dict(cornell_box(size))
     film = scene.sensors()[0].film()
     mi.render(scene, spp=samples, seed=1)
@@ -64,7 +64,7 @@ def error(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def optimise(size: int, steps: int) -> list[float]:
-    """The largest error of the walls' reflectance before and after each step."""
+    """Maximum error of the walls' reflectance before the first and after each step."""
     import drjit as dr
 
     scene = mi.load_dict(cornell_box(size))
@@ -85,7 +85,7 @@ def optimise(size: int, steps: int) -> list[float]:
         dr.backward(loss)
         optimiser.step()
         optimiser[WALLS] = dr.clip(optimiser[WALLS], 0.01, 0.99)
-        # Adam does not settle by itself.
+        # Decay the learning rate; with a constant one, Adam would not converge on noisy gradients.
         optimiser.set_learning_rate(0.05 * (1 - (step + 1) / steps))
         parameters.update(optimiser)
         errors.append(float(dr.max(dr.abs(true - optimiser[WALLS]))[0]))
@@ -95,16 +95,16 @@ def optimise(size: int, steps: int) -> list[float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("-o", "--out", type=Path, default=Path("mitsuba_denoiser"))
-    parser.add_argument("--variant", default="scalar_rgb", help="of Mitsuba, for the still")
+    parser.add_argument("--variant", default="scalar_rgb", help="Mitsuba variant for the still")
     parser.add_argument("--size", type=int, default=96)
-    parser.add_argument("--samples", type=int, default=4, help="a pixel, of the still")
-    parser.add_argument("--steps", type=int, default=60, help="of the optimisation")
+    parser.add_argument("--samples", type=int, default=4, help="samples per pixel of the still")
+    parser.add_argument("--steps", type=int, default=60, help="steps of the optimization")
     options = parser.parse_args()
 
     mi.set_variant(options.variant)
     import drjit as dr
 
-    # On a single core, loading a scene waits for a second thread.
+    # Loading a scene blocks on a single core unless there is a second thread.
     dr.set_thread_count(max(2, dr.thread_count()))
     noisy, denoised = still(options.out, options.size, options.samples)
     print(f"still: error {noisy:.3f} noisy, {denoised:.3f} denoised; wrote {options.out}/denoised.exr")
@@ -112,7 +112,7 @@ def main() -> None:
     variant = first_working(("cuda_ad_rgb", "llvm_ad_rgb"))
     if variant is None:
         print(
-            "optimise: skipped, as no variant of Mitsuba that differentiates runs here (no GPU, no LLVM or an old one)"
+            "optimise: skipped, as no differentiable variant of Mitsuba works here (no GPU, and no LLVM or an old one)"
         )
         return
     mi.set_variant(variant)

@@ -1,14 +1,13 @@
-"""Time methods side by side on one frame, without accumulation: what the image filter alone costs.
+"""Measure the run time of methods on one frame without accumulation, that is of their image filters alone.
 
     python examples/run_time.py
     python examples/run_time.py --models cascaded_v2 "oidn(quality=fast)" mine.py:make --size 1920x1080 --rounds 9
 
-Every round runs each of them once, one after the other, so that whatever else the machine does hits all alike; the
-first round warms up and is not counted. Prints the median and the quartiles, and the ratio to the first of them, Open
-Image Denoise's fastest network by default. The input is noise, which costs as much as any picture: the time depends on
-the number of pixels only. The time of Open Image Denoise includes copies to its layout and back, 10 to 20 ms at
-1280x720 on one core. As in the commands of the package, freed memory is kept (mcdenoise/heap.py); --no-heap leaves that
-to the system.
+Every round runs each method once, one after the other, so that other work of the machine affects all of them equally;
+the first round warms up and does not count. The script prints the median and the quartiles, and the ratio to the first
+method, by default Open Image Denoise's fastest network. The input is random, because the time depends only on the
+number of pixels. The time of Open Image Denoise includes copies to its layout and back, 10 to 20 ms at 1280x720 on one
+core. As in the commands of the package, the process keeps freed memory (mcdenoise/heap.py), unless --no-heap is given.
 """
 
 import argparse
@@ -48,10 +47,10 @@ OIDN = (
 
 
 def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], object]]:
-    """Calls of a method on this frame; of one that learns, in every precision that it can have here."""
+    """Calls of a method on this frame; for trainable models, one in every precision available here."""
     spelling = parse_method(spelt)
     settings = {"threads": threads, **spelling.settings} if spelling.takes("threads") else spelling.settings
-    # Fresh weights take as long as others, but are not calibrated.
+    # Random weights take the same time as trained ones, but have no calibration.
     pretrained = spelling.weights is None and spelling.model in pretrained_models()
     model = create_model(spelling.model, pretrained=pretrained, weights=spelling.weights, **settings)
     if isinstance(model, torch.nn.Module):
@@ -73,7 +72,7 @@ def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], o
 
 
 def interleaved(calls: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
-    """Milliseconds of each call in every round but the first."""
+    """Milliseconds of each call in every round except the first."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds + 1):
         for name, call in calls.items():
@@ -89,13 +88,13 @@ def main() -> None:
     parser.add_argument("--size", default="1280x720", metavar="WxH")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--no-heap", action="store_true", help="give freed memory back to the system at once")
+    parser.add_argument("--no-heap", action="store_true", help="return freed memory to the system at once")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every time to this file too")
     options = parser.parse_args()
 
-    for name, lowest in (("threads", 1), ("rounds", 2)):
-        if getattr(options, name) < lowest:
-            raise InputError(f"--{name}: expected at least {lowest}, found {getattr(options, name)}")
+    for name, minimum in (("threads", 1), ("rounds", 2)):
+        if getattr(options, name) < minimum:
+            raise InputError(f"--{name}: expected at least {minimum}, found {getattr(options, name)}")
     match = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", options.size)
     if not match:
         raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{options.size}'")
@@ -106,7 +105,7 @@ def main() -> None:
     torch.manual_seed(0)
     normal = torch.nn.functional.normalize(torch.randn(1, 3, height, width))
     color, albedo, depth = (torch.rand(1, channels, height, width) for channels in (3, 3, 1))
-    # As the accumulation hands it on.
+    # The history lengths that the accumulation would pass on for a first frame.
     length = torch.ones(1, 1, height, width)
     frame = Frame(color=color, albedo=albedo, normal=normal, depth=depth, current=color, length=length)
     calls: dict[str, Callable[[], object]] = {}

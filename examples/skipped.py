@@ -1,13 +1,13 @@
-"""What a scene does not need is skipped: how much time that saves, and what it does to the error.
+"""Measure how much time skipping saves, and how it changes the error.
 
     python examples/skipped.py path/to/scene path/to/another --model cascaded_v2_tiny
     python examples/skipped.py path/to/scene --markdown --tolerance 0.01
 
-Five shots are made of each scene: the flythrough as it is; the same without albedo; the same with a sky over its upper
-half; a static shot of its last frame that has a reference, with new noise in every frame (one sample a pixel); and an
-editor's viewport, twice as long, that shows one image of that frame (64 samples a pixel) again and again, until a
-corner of it is changed and rendered anew (one sample a pixel). Each frame is denoised twice, taking turns: as it
-is, and with nothing skipped. The last column is the change of SMAPE.
+The script makes five shots of each scene: the original flythrough; the flythrough without albedo; the flythrough with a
+sky in its upper half; a static shot of the last frame that has a reference, with new noise in every frame (one sample
+per pixel); and a viewport in an editor, twice as long, that repeats one image of that frame (64 samples per pixel)
+until a corner of it is changed and rendered again (one sample per pixel). Each frame is denoised twice, taking turns:
+with and without skipping. The last column is the change of SMAPE.
 """
 
 import argparse
@@ -28,17 +28,17 @@ COLUMNS = ("scene", "shot", "skipped", "ms, all kept", "ms", "saved", "SMAPE, al
 
 
 def flythrough(sequence: Sequence, frames: int) -> Iterator[Frame]:
-    """The first frames as they are."""
+    """The first frames, unchanged."""
     yield from (sequence.frame(number) for number in sequence.numbers[:frames])
 
 
 def without_albedo(sequence: Sequence, frames: int) -> Iterator[Frame]:
-    """The same, from a renderer that writes no albedo."""
+    """The flythrough as from a renderer that writes no albedo."""
     yield from (frame.replace(albedo=None) for frame in flythrough(sequence, frames))
 
 
 def half_sky(sequence: Sequence, frames: int) -> Iterator[Frame]:
-    """The same, as if nothing had been hit in the upper half."""
+    """The flythrough with a sky in its upper half."""
     for frame in flythrough(sequence, frames):
         height, width = frame.size
         above = torch.arange(height)[:, None].expand(1, 1, height, width) < height // 2
@@ -49,26 +49,26 @@ def half_sky(sequence: Sequence, frames: int) -> Iterator[Frame]:
 
 
 def noisy(reference: Tensor, spp: int) -> Tensor:
-    """With noise as of so many samples a pixel."""
+    """Add noise like that of this number of samples per pixel."""
     rate = torch.full_like(reference[:, :1], float(spp))
     return reference * torch.distributions.Gamma(rate, rate).sample()
 
 
 def at_rest(sequence: Sequence) -> Frame:
-    """The last frame with a reference, seen by a camera that does not move."""
+    """The last frame with a reference, without motion."""
     frame = sequence.frame(sequence.reference_numbers[-1])
     return frame.replace(motion=torch.zeros_like(frame.color[:, :2]))
 
 
 def static_shot(sequence: Sequence, frames: int) -> Iterator[Frame]:
-    """A camera at rest, one sample a pixel."""
+    """A static shot at one sample per pixel."""
     frame = at_rest(sequence)
     for _ in range(frames):
         yield frame.replace(color=noisy(frame.reference, 1))
 
 
 def viewport_edit(sequence: Sequence, frames: int) -> Iterator[Frame]:
-    """An image that stays, until a corner of it is made darker in the last third of the shot."""
+    """A repeated image, of which one corner becomes darker in the last third of the shot."""
     frame = at_rest(sequence)
     frame = frame.replace(color=noisy(frame.reference, 64))
     height, width = frame.size
@@ -93,7 +93,7 @@ SHOTS: dict[str, Callable[[Sequence, int], Iterator[Frame]]] = {
 
 
 def measure(name: str, shot: str, frames: Iterator[Frame], denoisers: tuple[Denoiser, Denoiser]) -> list[str]:
-    """A row of the table; the first frame warms up and is not timed."""
+    """Measure a row of the table; the first frame warms up and is not timed."""
     times: tuple[list[float], list[float]] = ([], [])
     errors: tuple[list[float], list[float]] = ([], [])
     planned: list[list[Stage]] = []
@@ -120,7 +120,7 @@ def main() -> None:
     parser.add_argument("--model", default=DEFAULT)
     parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32")
     parser.add_argument("--tolerance", type=float, default=TOLERANCE)
-    parser.add_argument("--frames", type=int, default=12, metavar="N", help="of each shot")
+    parser.add_argument("--frames", type=int, default=12, metavar="N", help="frames of each shot")
     parser.add_argument("--threads", type=int, metavar="N")
     parser.add_argument("--markdown", action="store_true", help="print a table in Markdown")
     options = parser.parse_args()

@@ -1,13 +1,13 @@
-"""Time whole processes side by side: one frame from EXR to EXR, with this package and with Open Image Denoise.
+"""Measure whole processes that denoise one frame from EXR to EXR, with this package and with Open Image Denoise.
 
     python examples/start_up.py
     python examples/start_up.py --size 640x360 --rounds 9 --model cascaded_v2_tiny --precisions auto,int8
 
-Every round starts each process once, one after the other, so that whatever else the machine does hits all alike; the
-first round, in which files come from the disk and kernels are compiled, is not counted. Prints the median and the
-quartiles in seconds, and how far behind the first. The peer is what a script of one's own would be: it reads color,
-albedo and normal with OpenImageIO, runs `pyoidn`, and writes the result. `pyoidn` itself imports torch where that is
-installed, as it is beside this package; the second row keeps torch from it, and the last one is torch alone.
+Every round starts each process once, one after the other, so that other work of the machine affects all of them
+equally; the first round, in which files are read from the disk and kernels are compiled, does not count. The script
+prints the median and the quartiles in seconds, and the difference from the first process. The peer is a short script
+that reads color, albedo and normal with OpenImageIO, runs `pyoidn`, and writes the result. `pyoidn` imports torch if it
+is installed, as it is with this package; in the second row it cannot, and the last row is the import of torch alone.
 """
 
 import argparse
@@ -66,7 +66,7 @@ device.release()
 
 
 def seconds(command: list[str]) -> float:
-    """That a process takes; it must succeed."""
+    """Run time of a process, which must succeed."""
     start = time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -77,17 +77,19 @@ def seconds(command: list[str]) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--model", default="cascaded_v2_tiny")
-    parser.add_argument("--precisions", default="auto,float32", help="of mcdenoise, separated by commas")
-    parser.add_argument("--quality", default="balanced", choices=["fast", "balanced", "high"], help="of the peer")
+    parser.add_argument("--precisions", default="auto,float32", help="precisions of mcdenoise, separated by commas")
+    parser.add_argument(
+        "--quality", default="balanced", choices=["fast", "balanced", "high"], help="quality of the peer"
+    )
     parser.add_argument("--size", default="1280x720", metavar="WxH")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every time to this file too")
     options = parser.parse_args()
 
-    for name, lowest in (("threads", 1), ("rounds", 2)):
-        if getattr(options, name) < lowest:
-            raise InputError(f"--{name}: expected at least {lowest}, found {getattr(options, name)}")
+    for name, minimum in (("threads", 1), ("rounds", 2)):
+        if getattr(options, name) < minimum:
+            raise InputError(f"--{name}: expected at least {minimum}, found {getattr(options, name)}")
     match = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", options.size)
     if not match:
         raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{options.size}'")

@@ -1,13 +1,14 @@
-"""Time training steps with the fast forms of the operators and with the plain ones, on the same clips, taking turns.
+"""Measure training steps with the fast backends of the operators and with the reference implementations.
 
     python examples/training_speed.py
     python examples/training_speed.py SEQUENCE... --model cascaded_v2_small --rounds 10 --json times.json
 
-A step is that of `mcdenoise train`: its clips are drawn, the network runs forward and backward, the optimiser and the
-averaged weights follow. Without a sequence the clips are noise. Every round makes one step in each way and precision,
-one after the other, so that whatever else the machine does hits all alike; two rounds warm up and are not counted.
-Prints medians, quartiles and steps a second, and how many times as fast the fast forms are. As in the command, freed
-memory is kept (mcdenoise/heap.py).
+A step is that of `mcdenoise train`: it draws clips, runs the network forward and backward, and updates the weights and
+their moving average. Without a sequence the clips are random. Every round makes one step in each precision with the
+fast backends ("fast") and with the reference ("plain") on the same clips, one after the other, so that other work of
+the machine affects all of them equally; two rounds warm up and do not count. The script prints medians, quartiles,
+steps per second, and the speedup of the fast backends. As in the command, the process keeps freed memory
+(mcdenoise/heap.py).
 """
 
 import argparse
@@ -44,7 +45,7 @@ WARM_UP = 2
 
 
 def noise(config: TrainConfig) -> ClipSampler:
-    """Clips of a shot without a picture: every buffer is noise in its range."""
+    """Clips of a random shot: every buffer is uniform noise in its range."""
     generator = np.random.default_rng(config.seed)
 
     def uniform(channels: int) -> NDArray[np.float32]:
@@ -56,7 +57,7 @@ def noise(config: TrainConfig) -> ClipSampler:
 
 
 def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:
-    """Clips of sequences, decoded into a folder that goes with this process."""
+    """Clips of sequences, which are decoded into a temporary folder."""
     if not sequences:
         return noise(config)
     front, rest = split(create_model(config.model))
@@ -64,15 +65,15 @@ def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:
         return DataFolders.open(config, front, rest.needs, sequences, []).load(Path(cache)).sampler
 
 
-def steps(config: TrainConfig, sampler: ClipSampler, plain: bool) -> Callable[[int], None]:
-    """Makes the step of a number; all start from the same weights."""
+def steps(config: TrainConfig, sampler: ClipSampler, reference: bool) -> Callable[[int], None]:
+    """A function that makes the training step of a number; all start from the same weights."""
     torch.manual_seed(config.seed)
     fabric = open_fabric("cpu", config.precision, config.batch)
     losses = {"image": 1.0, "initial": 1.0}
     trainer = Trainer(config, create_model(config.model).train(), fabric, losses, has_state=False)
 
     def step(number: int) -> None:
-        with ops.use("torch", strict=False) if plain else nullcontext():
+        with ops.use("torch", strict=False) if reference else nullcontext():
             trainer.step(number, sampler.draw(trainer.seeds(number)))
 
     return step
@@ -90,12 +91,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every time to this file too")
     options = parser.parse_args()
 
-    for name, lowest in (("threads", 1), ("rounds", 2)):
-        if getattr(options, name) < lowest:
-            raise InputError(f"--{name}: expected at least {lowest}, found {getattr(options, name)}")
+    for name, minimum in (("threads", 1), ("rounds", 2)):
+        if getattr(options, name) < minimum:
+            raise InputError(f"--{name}: expected at least {minimum}, found {getattr(options, name)}")
     fix_threads(options.threads)
     keep_heap()
-    ways: dict[tuple[FloatPrecision, str], Callable[[int], None]] = {}
+    runs: dict[tuple[FloatPrecision, str], Callable[[int], None]] = {}
     for precision in get_args(FloatPrecision):
         config = TrainConfig(
             model=options.model,
@@ -110,29 +111,29 @@ def main() -> None:
         )
         check_config(config, 1)
         sampler = clips(config, options.sequences)
-        for form in ("fast", "plain"):
-            ways[precision, form] = steps(config, sampler, form == "plain")
+        for backend in ("fast", "plain"):
+            runs[precision, backend] = steps(config, sampler, backend == "plain")
 
-    times: dict[tuple[FloatPrecision, str], list[float]] = {way: [] for way in ways}
+    times: dict[tuple[FloatPrecision, str], list[float]] = {run: [] for run in runs}
     for number in range(WARM_UP + options.rounds):
-        for way, step in ways.items():
+        for run, step in runs.items():
             start = time.perf_counter()
             step(number)
             if number >= WARM_UP:
-                times[way].append((time.perf_counter() - start) * 1e3)
+                times[run].append((time.perf_counter() - start) * 1e3)
 
     machine = describe_machine("cpu")
     size = f"{options.batch} clips of {options.frames} frames of {options.crop}x{options.crop}"
     print(f"{options.model}, {size}, {options.rounds} rounds")
     print(f"{machine.processor}, {options.threads} threads, {', '.join(map(' '.join, machine.packages.items()))}")
     print(f"{'precision':<12}{'ops':<8}{'ms a step':>10}{'quartiles':>16}{'steps/s':>10}{'plain / this':>14}")
-    for (precision, form), values in times.items():
+    for (precision, backend), values in times.items():
         low, median, high = statistics.quantiles(values, n=4)
         ratio = statistics.median(times[precision, "plain"]) / median
         spread = f"{low:.0f} .. {high:.0f}"
-        print(f"{precision:<12}{form:<8}{median:>10.0f}{spread:>16}{1e3 / median:>10.2f}{ratio:>14.2f}")
+        print(f"{precision:<12}{backend:<8}{median:>10.0f}{spread:>16}{1e3 / median:>10.2f}{ratio:>14.2f}")
     if options.json:
-        written = {f"{precision}, {form}": values for (precision, form), values in times.items()}
+        written = {f"{precision}, {backend}": values for (precision, backend), values in times.items()}
         write_text(options.json, json.dumps({"machine": vars(machine), "milliseconds": written}, indent=2) + "\n")
 
 

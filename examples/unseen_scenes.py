@@ -3,17 +3,19 @@
     python examples/unseen_scenes.py path/to/scene path/to/another --sweep oidn joint_bilateral --markdown
     python examples/unseen_scenes.py path/to/scene --models runs/mine/cascaded_v2.safetensors,mine.py:make
 
-Prints for every scene, and for the mean over the scenes, the mean over the frames with a reference of: SMAPE, relMSE
-and RMSE (scene-linear, lower is better), PSNR and SSIM (as displayed, higher is better), FLIP (as displayed, lower is
-better), and tSMAPE (scene-linear) and tRMSE (as displayed), the errors of the change from frame to frame, lower is
-better. Where the renderer has noted the references' own noise, also what the truth would score because of it.
+For every scene, and for the mean over the scenes, the script prints means over the frames with a reference: SMAPE,
+relMSE and RMSE (scene-linear, lower is better); PSNR and SSIM (as displayed, higher is better); FLIP (as displayed,
+lower is better); and the errors of the change from frame to frame, tSMAPE (scene-linear) and tRMSE (as displayed),
+lower is better. If the renderer has recorded the noise of the references, it also prints the resulting score of the
+truth.
 
-Models that are swept are shown at their best: a row that stands for several settings takes, for each metric by itself,
-the setting that the reference says is best. `oidn`, Intel Open Image Denoise, has 36: fast, balanced and high; albedo
-and normal taken as noisy, as clean, or denoised first; started from one sample a pixel ("raw"), from the accumulated
-image, from that one divided by albedo, or from one sample a pixel with the results accumulated by the same rule
-("accumulated after"). `joint_bilateral`, kornia's filter of the accumulated image, has 20. --json holds every setting
-by itself. A sweep of your own: --models "cascaded_v2(alpha_min=0.05|0.1|0.2)".
+Models with --sweep are shown at their best: a row for several settings has, for each metric separately, the value of
+the best setting, chosen by means of the reference. `oidn`, Intel Open Image Denoise, has 36 settings: fast, balanced
+and high quality; albedo and normal treated as noisy, as clean, or denoised first; and as input one sample per pixel
+("raw"), the accumulated image, the accumulated image divided by albedo, or one sample per pixel with the results
+accumulated by the same rule ("accumulated after"). `joint_bilateral`, kornia's filter of the accumulated image, has 20.
+The file of --json has every setting separately. For a sweep of your own, use for example --models
+"cascaded_v2(alpha_min=0.05|0.1|0.2)".
 """
 
 import argparse
@@ -46,10 +48,10 @@ from mcdenoise.models import DEFAULT
 SWEEPS = {
     "oidn": "oidn(source=raw|accumulated|demodulated|accumulated after, quality=fast|balanced|high, "
     "auxiliary=noisy|clean|prefiltered)",
-    # On nine 1-spp sequences, a step further on every side lowers the best SMAPE of one by 0.8 %, and of no other.
+    # On nine 1-spp sequences, extending the sweep by a step on every side lowers the best SMAPE of only one, by 0.8 %.
     "joint_bilateral": "joint_bilateral(sigma_color=0.05|0.1|0.2|0.3|0.5, sigma_space=1.5|2.5|4.0|6.0)",
 }
-# Rows of their own in the short tables.
+# Settings whose values have rows of their own in the tables.
 BY = ("source", "quality")
 
 
@@ -72,11 +74,11 @@ def table(scores: list[Score], markdown: bool) -> str:
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("sequences", type=Path, nargs="+", metavar="SEQUENCE", help="folder of frames with references")
-    parser.add_argument("--models", default=DEFAULT, metavar="NAMES", help="as of `mcdenoise benchmark`")
-    parser.add_argument("--sweep", choices=SWEEPS, nargs="+", default=[], help="models in all of their settings")
-    parser.add_argument("--flip-every", type=int, default=4, metavar="N", help="FLIP of the first of N frames (4)")
-    parser.add_argument("--no-flip", action="store_true", help="without FLIP, which needs mcdenoise[peers]")
-    parser.add_argument("--frames", metavar="NUMBERS", help="which frames to use, such as 0-15")
+    parser.add_argument("--models", default=DEFAULT, metavar="NAMES", help="as for `mcdenoise benchmark`")
+    parser.add_argument("--sweep", choices=SWEEPS, nargs="+", default=[], help="models to show in all their settings")
+    parser.add_argument("--flip-every", type=int, default=4, metavar="N", help="FLIP of every N-th frame (4)")
+    parser.add_argument("--no-flip", action="store_true", help="skip FLIP, which needs mcdenoise[peers]")
+    parser.add_argument("--frames", metavar="NUMBERS", help="frames to use, such as 0-15")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads(), metavar="N")
     parser.add_argument("--markdown", action="store_true", help="print Markdown tables")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every score to this file too")

@@ -1,4 +1,4 @@
-"""Error against run time: who takes turns with whom, what is counted, and what becomes of a method that fails."""
+"""Benchmarks: turns of the methods, errors, run times, failures, memory, sizes, operators, and skipping."""
 
 from __future__ import annotations
 
@@ -74,14 +74,14 @@ def _one_thread() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _no_other_process(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Memory is measured in one test only: each process that is started takes a while."""
+    """Disable measuring memory in all tests except those that measure it, because starting a process takes a while."""
     if "measures_memory" not in request.fixturenames:
         monkeypatch.setattr(mcdenoise.benchmark.memory, "peak_memory", lambda *_, **__: None)
 
 
 @pytest.fixture
 def measures_memory() -> None:
-    """Of tests that do."""
+    """A fixture for tests that measure memory."""
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def out(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Exit status, stdout and stderr of the command."""
+    """Run the command: exit status, stdout and stderr."""
 
     def call(*arguments: Any) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as stop:
@@ -103,7 +103,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
 
 
 def half() -> Model:
-    """On the way to half of the accumulated light, all of it."""
+    """A model that returns half of the accumulated light, with all of it as the intermediate image."""
     return Demodulated(Accumulated(lambda color: Output(color / 2, {"initial": color})))
 
 
@@ -112,13 +112,13 @@ NOT_FINITE = (
     "values far out of range and the network for weights that are"
 )
 
-# What scripted methods do to a frame, by name, and all that they were asked for.
+# Functions of scripted methods by name, and the log of their calls.
 ACTS: dict[str, Callable[[Frame], Tensor]] = {}
 LOG: list[str] = []
 
 
 class Scripted:
-    """Writes down what it is asked for, and whether it begins a shot; multiplies, or does what it is told to."""
+    """A method that logs its calls, marks the first of a shot, and applies its function to the frame."""
 
     needs = Needs(trainable=False)
 
@@ -141,7 +141,7 @@ def _empty_log() -> None:
 
 
 def own(name: str, factory: str, **settings: Any) -> Method:
-    """A method of this file."""
+    """A method defined in this file."""
     return Method(name, "fixed", name.replace(" ", "-"), f"{__name__}:{factory}", settings)
 
 
@@ -158,13 +158,13 @@ def test_methods_take_turns_frame_by_frame(small_sequence: Path, out: Path) -> N
         [open_sequence(small_sequence, "0-2")], methods, out, settings, on_step=lambda *step: steps.append(step)
     )
     one_pass = ["A!", "B!", "C!", *"ABC" * 2]
-    # The warm-up and two rounds over the frames; then the size: two to warm up, and two rounds.
+    # The warm-up and two rounds over the frames; then two warm-up calls and two rounds of the size.
     assert [*one_pass * 3, *"ABC" * 4] == LOG
     assert steps == [(step, 13) for step in range(1, 14)]
     for cell in results.cells:
-        # Of three frames the first, which has no history, is not counted.
+        # The first of three frames, which has no history, does not count.
         assert {spread.count for spread in (cell.whole, cell.computing, *cell.stages.values())} == {2 * 2}
-        # What says nothing of itself is a filter.
+        # The run time of a method that reports no stages counts as filter.
         assert list(cell.stages) == ["read", "accumulate", "filter", "write"]
     assert [(cost.method, cost.width, cost.height) for cost in results.costs] == [(name, 16, 12) for name in "ABC"]
     assert {cost.milliseconds.count for cost in results.costs} == {2}
@@ -172,7 +172,7 @@ def test_methods_take_turns_frame_by_frame(small_sequence: Path, out: Path) -> N
 
 def test_errors_and_pictures_are_of_the_images(small_sequence: Path, out: Path) -> None:
     sequence = open_sequence(small_sequence)
-    # What has no history of its own, and yet must be in its place.
+    # This method has no history, but its images must be in order too.
     baselines = choose_methods("none")
     assert [method.name for method in baselines] == ["noisy", "accumulated"]
     methods = [*baselines, own("half", "half")]
@@ -230,7 +230,7 @@ def test_a_method_that_fails_on_one_scene_leaves_the_rest_alone(small_sequence: 
         scripted("fine"),
         own("unmakeable", "unmakeable"),
     ]
-    # The same scene twice: names are unique, and a method that failed on the one is tried on the other.
+    # With the same scene twice, names are unique, and a method that failed on one is run on the other.
     sequences = [open_sequence(small_sequence, "0-1")] * 2
     results = run_benchmark(sequences, methods, out, Settings(rounds=1, sizes=((16, 12),)))
     assert [scene.name for scene in results.scenes] == ["plane", "plane (2)"]
@@ -249,7 +249,7 @@ def test_a_method_that_fails_on_one_scene_leaves_the_rest_alone(small_sequence: 
     for cell in results.cells:
         assert bool(cell.failure) is not bool(cell.errors)
         assert bool(cell.failure) is (cell.whole is None)
-    # A failed method's images, made before it failed, are not kept.
+    # Images of a method before it failed are removed.
     assert sorted(path.name for path in (out / "images" / "plane").iterdir()) == ["fine", "reference"]
     assert Results.read(out) == results
 
@@ -294,7 +294,7 @@ def test_cores_are_kept_busy_while_times_are_measured(small_sequence: Path, out:
     states: list[list[str]] = []
 
     def count(frame: Frame) -> Tensor:
-        # The first pass over both frames is not timed. Processes take a moment to start.
+        # The first pass over both frames is not timed. Processes need a moment to start.
         expected = 0 if len(states) < 2 else 2
         deadline = time.monotonic() + 20
         while len(running := [state for state in _spinning() if state == "R"]) < expected:
@@ -367,13 +367,13 @@ def test_nothing_stays_busy_when_the_benchmark_is_killed(tmp_path: Path) -> None
         time.sleep(0.05)
 
 
-def test_temporal_errors_are_of_neighbours_and_what_is_not_finite_is_skipped() -> None:
+def test_temporal_errors_use_successive_frames_and_infinite_values_are_skipped() -> None:
     errors = Errors()
     reference = torch.full((1, 3, 16, 16), 0.25)
     for number, level in ((3, 0.25), (4, 0.5), (6, 0.75)):
         errors.add("ours", number, torch.full_like(reference, level), reference)
     means, spreads = errors.means("ours"), errors.spreads("ours")
-    # |x - y| / (x + y + 0.01) of 0, 0.25 and 0.5; frame 6 has no neighbour.
+    # |x - y| / (x + y + 0.01) of 0, 0.25 and 0.5; frame 6 has no previous frame.
     smape = [0, 0.25 / 0.76, 0.5 / 1.01]
     assert means["SMAPE"] == pytest.approx(sum(smape) / 3)
     assert spreads["SMAPE"].median == pytest.approx(smape[1])
@@ -424,7 +424,7 @@ def absent(quality: str = "high") -> Model:
     return no_such_package.make(quality)
 
 
-def test_missing_methods_are_said_to_be_missing(
+def test_missing_methods_are_listed_as_missing(
     small_sequence: Path, weights: Path, out: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
@@ -453,7 +453,7 @@ def test_missing_methods_are_said_to_be_missing(
     assert [fit.method for fit in results.fits] == present[1:]
     assert json.loads(file.read_text()) == asdict(results)
 
-    # What is printed: the best first, and below what is missing and was not computed.
+    # The best method is printed first, and missing methods and skipped metrics below the table.
     order = [line.split("│")[2].strip() for line in printed.splitlines() if "│" in line]
     assert sorted(order) == sorted(present)
     smape = [cell.errors["SMAPE"] for name in order for cell in results.cells if cell.method == name]
@@ -461,7 +461,7 @@ def test_missing_methods_are_said_to_be_missing(
     line = f"missing: {'; '.join(missing)}: {results.methods[4].missing}"
     assert printed.splitlines()[-3:] == [line, results.notes[0], f"report: {out / 'index.html'}"]
 
-    # results.csv has the same numbers.
+    # results.csv contains the same numbers.
     with (out / "results.csv").open(newline="") as text:
         rows = list(csv.DictReader(text))
     assert [row["method"] for row in rows] == [method.name for method in results.methods]
@@ -501,10 +501,10 @@ def demanding() -> Any:
     return lambda color, hit_distance: color
 
 
-def test_a_method_that_needs_what_a_scene_has_not_is_skipped_there(
+def test_a_method_is_skipped_on_scenes_that_lack_its_buffers(
     small_sequence: Path, out: Path, run: Callable[..., Any]
 ) -> None:
-    """One line says what is missing and which methods would do, and the others are compared."""
+    """One line names the missing buffers and alternative methods, and the other methods are compared."""
     for path in (small_sequence / "inputs").glob("shading_normal*"):
         path.unlink()
     models = f"svgf,asvgf,{__name__}:demanding,guided"
@@ -525,7 +525,7 @@ def test_a_method_that_needs_what_a_scene_has_not_is_skipped_there(
     assert not (out / "images" / "plane" / "svgf").exists()
     page = (out / "index.html").read_text()
     assert "skipped: buffer &#39;normal&#39;: the model needs it" in page
-    # Whatever else goes wrong is a failure.
+    # Any other error is a failure.
     assert Results.read(out).cells[2].reason == f"skipped: {lacking['svgf']}"
     assert Cell("plane", "svgf", failure="out of luck").reason == "failed: out of luck"
 
@@ -549,7 +549,7 @@ def test_a_method_that_needs_what_a_scene_has_not_is_skipped_there(
         (("--ops",), "expected the folders of sequences, or --ops, and not both"),
     ],
 )
-def test_bad_arguments_are_refused_before_anything_is_measured(
+def test_bad_arguments_are_rejected_before_measuring(
     small_sequence: Path, out: Path, run: Callable[..., Any], arguments: tuple[Any, ...], expected: str
 ) -> None:
     out.mkdir()
@@ -563,7 +563,7 @@ def test_bad_arguments_are_refused_before_anything_is_measured(
     assert [path.name for path in out.iterdir()] == ["old"]
 
 
-def test_references_are_looked_at_first(small_sequence: Path, out: Path, run: Callable[..., Any]) -> None:
+def test_references_are_checked_first(small_sequence: Path, out: Path, run: Callable[..., Any]) -> None:
     other = small_sequence.parent / "other"
     shutil.copytree(small_sequence, other)
     pixels, channels, _ = read_exr(other / "inputs" / "reference2.exr")
@@ -585,7 +585,7 @@ def test_references_are_looked_at_first(small_sequence: Path, out: Path, run: Ca
 # Methods
 
 
-def test_what_is_compared_by_default() -> None:
+def test_the_default_methods() -> None:
     methods = choose_methods()
     names = [method.name for method in methods]
     assert names[:2] == ["noisy", "accumulated"]
@@ -599,8 +599,8 @@ def test_what_is_compared_by_default() -> None:
     assert {method.settings["quality"] for method in methods if method.model == "oidn"} == {"fast", "balanced", "high"}
 
 
-def test_all_is_every_model_there_is() -> None:
-    """What has no weights is there as missing, and one line says so of all of them."""
+def test_all_means_every_model() -> None:
+    """Models without weights are listed as missing, in one line."""
     methods = choose_methods("all", precisions="float32")
     assert {method.model for method in methods} == set(list_models())
     assert len({method.name for method in methods}) == len(methods)
@@ -614,8 +614,8 @@ def test_all_is_every_model_there_is() -> None:
     assert [method.name for method in methods if method.name in default] == default
 
 
-def test_every_model_there_is_on_two_scenes(small_sequence: Path, out: Path, tmp_path: Path) -> None:
-    """None fails, whatever its weights are; what a scene has not is said of those that need it."""
+def test_every_model_on_two_scenes(small_sequence: Path, out: Path, tmp_path: Path) -> None:
+    """No model fails with random weights; models whose buffers a scene lacks are skipped with the reason."""
     poor = tmp_path / "poor"
     shutil.copytree(small_sequence, poor)
     for stem in ("shading_normal", "world_position"):
@@ -650,7 +650,7 @@ def test_some_methods_in_some_precisions() -> None:
     assert (denoiser.precision, denoiser.keep_all) == ("bfloat16", True)
     (accumulated,) = (part for part in denoiser.model.modules() if isinstance(part, Accumulated))
     assert accumulated.alpha_min == 0.2
-    # What is named twice is there once.
+    # A method that is named twice is included once.
     assert len(choose_methods("accumulated,cascaded_v2_micro,pretrained", precisions="float32")) == (
         2 + len(pretrained_models())
     )
@@ -668,7 +668,7 @@ def test_a_method_that_asks_for_threads_gets_them() -> None:
     assert ACTS["threads"](Frame(color=torch.ones(1, 3, 2, 2))).max() == 2
 
 
-def test_network_and_filter_are_told_apart_without_touching_the_image() -> None:
+def test_network_and_filter_are_timed_separately_without_changing_the_image() -> None:
     torch.manual_seed(0)
     model = create_model("cascaded_v2", width=8, resolutions=1)
     for name, module in model.named_modules():
@@ -679,7 +679,7 @@ def test_network_and_filter_are_told_apart_without_touching_the_image() -> None:
     assert not any(module._forward_hooks for module in model.modules())
     timed = Timed(Denoiser(model))
     hooked = [name for name, module in model.named_modules() if module._forward_hooks]
-    # Both U-Nets and their three heads; neither what is inside them, nor the fusions.
+    # The networks are both U-Nets and their three heads, without the modules inside them and the fusions.
     parts = ["unet", "heads.0", "heads.1", "heads.2"]
     assert all(name.endswith(f".{part}") for name, part in zip(hooked, 2 * parts, strict=True))
     assert [name.count("initial") for name in hooked] == [1] * 4 + [0] * 4
@@ -691,7 +691,7 @@ def test_network_and_filter_are_told_apart_without_touching_the_image() -> None:
     assert torch.equal(timed(frame), alone[0])
 
 
-def test_a_convolution_of_ones_own_is_a_network_and_anything_else_a_filter() -> None:
+def test_a_users_convolution_counts_as_network_and_other_code_as_filter() -> None:
     class Own(nn.Module):
         def __init__(self) -> None:
             super().__init__()
@@ -713,7 +713,7 @@ def test_a_convolution_of_ones_own_is_a_network_and_anything_else_a_filter() -> 
 
 
 class Greedy:
-    """Holds 64 MiB while it works."""
+    """Allocates 64 MiB while it runs."""
 
     def __init__(self) -> None:
         self.weights = torch.ones(2**22)
@@ -731,14 +731,14 @@ def test_peak_memory_is_what_a_method_adds() -> None:
     peak = peak_memory(Greedy, two_frames, threads=1, device="cpu")
     if peak is None:
         pytest.skip("this system does not tell the peak of the resident set")
-    # 16 MiB of weights and 48 MiB on the way; little else.
+    # 16 MiB of weights, 48 MiB of temporary memory, and little else.
     assert 64 <= peak < 72
     assert peak_memory(lambda: Greedy(), two_frames, threads=1, device="cpu") is None
     assert peak_memory(Greedy, functools.partial(synthetic_frame, -1, -1), threads=1, device="cpu") is None
 
 
 class Stuck(Greedy):
-    """Writes the number of its process to a file and comes to no end."""
+    """Writes the id of its process to a file, and never ends."""
 
     def __init__(self, file: Path) -> None:
         file.write_text(str(os.getpid()))
@@ -783,11 +783,12 @@ def test_a_line_is_fitted_to_the_medians() -> None:
     def cost(width: int, milliseconds: float) -> Cost:
         return Cost("ours", width, 1000, Spread(milliseconds, 0.0, 0.0, 3))
 
-    # 3 ms, and 20 ms a megapixel.
+    # 3 ms plus 20 ms per megapixel.
     exact = fit_line("ours", [cost(100, 5.0), cost(1000, 23.0), cost(2000, 43.0), Cost("ours", 9000, 1000)])
     assert (exact.fixed, exact.per_megapixel) == pytest.approx((3.0, 20.0))
     assert exact.deviation == pytest.approx(0, abs=1e-9)
-    # Equal at both ends and four times as much between: y = c, with the least sum of (1 - c / y)^2 over 1, 4, 1.
+    # With equal values at both ends and four times as much between them, the fit is a constant c that minimizes the sum
+    # of (1 - c / y)^2 over y = 1, 4, 1.
     bent = fit_line("ours", [cost(1000, 1.0), cost(2000, 4.0), cost(3000, 1.0)])
     level = (1 + 1 / 4 + 1) / (1 + 1 / 16 + 1)
     assert (bent.fixed, bent.per_megapixel) == pytest.approx((level, 0.0), abs=1e-9)
@@ -830,7 +831,7 @@ def test_too_large_an_image_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize(
-    ("numbers", "scored", "most", "expected"),
+    ("numbers", "scored", "maximum", "expected"),
     [
         ([8, 9, 10, 11], [8, 9, 10, 11], 3, [9, 10, 11]),
         ([8, 9, 10, 11], [10], 3, [8, 9, 10]),
@@ -844,9 +845,9 @@ def test_too_large_an_image_is_not_tried(monkeypatch: pytest.MonkeyPatch) -> Non
     ],
 )
 def test_pictures_are_of_successive_frames_up_to_one_with_a_reference(
-    numbers: list[int], scored: list[int], most: int, expected: list[int]
+    numbers: list[int], scored: list[int], maximum: int, expected: list[int]
 ) -> None:
-    assert kept_frames(numbers, scored, most) == expected
+    assert kept_frames(numbers, scored, maximum) == expected
 
 
 # Operators
@@ -856,7 +857,7 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
     monkeypatch.setattr(mcdenoise.benchmark.operators, "_COPY_BYTES", 2**20)
     results = benchmark_ops(size=(33, 20), rounds=3, out=out, ops=OPS)
     limits = {"float32": 2e-6, "bfloat16": 2e-2, "float16": 3e-3}
-    # Their compiled forms have no derivatives.
+    # Their compiled backends have no derivatives.
     forward = ("downsample", "importance_filter", "motion_from_position")
     by_name = {(cost.op, cost.dtype): cost for cost in results.costs if cost.backend == "torch"}
     assert list(by_name) == [(op.name, dtype) for op in OPS for dtype in limits]
@@ -874,12 +875,12 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
             ratio = cost.with_derivatives.median / cost.copy_with_derivatives
             assert cost.over_copy_with_derivatives == pytest.approx(ratio)
     assert by_name["downsample", "bfloat16"].error > 1e-4
-    # A kernel of 25 taps: 25 values and an RGB image in, an RGB image out.
+    # A kernel of 25 taps reads 25 values and an RGB image per pixel, and writes an RGB image.
     assert by_name["kernel_conv", "float32"].mebibytes == (25 + 3 + 3) * 33 * 20 * 4 / 2**20
     assert by_name["kernel_conv", "float16"].mebibytes == (25 + 3 + 3) * 33 * 20 * 2 / 2**20
-    # The kernel and both images once more, and the derivatives of kernel and image.
+    # Derivatives read the kernel and both images again, and write the derivatives of kernel and image.
     assert by_name["kernel_conv", "float32"].mebibytes_with_derivatives == (31 + 31 + 28) * 33 * 20 * 4 / 2**20
-    # Five channels, of which a quarter of the pixels remains.
+    # Downsampling keeps a quarter of the pixels of five channels.
     assert by_name["downsample", "float32"].mebibytes == 5 * (33 * 20 + 17 * 10) * 4 / 2**20
     assert by_name["upsample", "float32"].mebibytes == 5 * (33 * 20 + 17 * 10) * 4 / 2**20
 
@@ -939,13 +940,13 @@ def test_the_command_for_ops(run: Callable[..., Any], out: Path, monkeypatch: py
     assert run("--ops", "--size", "1x1")[0] == 2
 
 
-# What methods skip
+# Skipping
 
 
-def test_methods_are_shown_beside_themselves_with_nothing_skipped(
+def test_methods_are_also_measured_without_skipping(
     run: Callable[..., tuple[int, str, str]], small_sequence: Path, out: Path
 ) -> None:
-    # A camera at rest: the first matrix for all frames, and the first position.
+    # A static camera: all frames have the matrix and the position of the first.
     inputs = small_sequence / "inputs"
     matrices = read_camera_matrices(inputs / "camera_matrices.h")
     still = replace(matrices, matrices=matrices.matrices[[0, 0, 0, 0]])
@@ -974,7 +975,7 @@ def test_methods_are_shown_beside_themselves_with_nothing_skipped(
     assert "What methods skipped" in (out / "index.html").read_text()
 
 
-def test_without_the_other_nothing_is_known_of_what_was_saved() -> None:
+def test_without_the_variant_without_skipping_savings_are_unknown() -> None:
     plan = [{"stage": "network", "kept": True, "skipped": 0.25, "reason": "", "exact": True}]
     machine = Machine("", 1, 1.0, "cpu", 1, "")
     cells = [Cell("a", "x", plan=plan), Cell("a", "y")]

@@ -1,4 +1,4 @@
-"""The command line as a person meets it: help, exit status, and one clear line for whatever is wrong."""
+"""The command line: help, exit statuses, and one clear line for each error."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ POSITIONAL = {"folder", "inputs", "sequence", "sequences", "scene", "images", "o
 
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
-    """Small images are quickest on one thread; and `--threads` must not outlive its test."""
+    """Small images are fastest on one thread; restore the number of threads that a test's `--threads` sets."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -57,13 +57,13 @@ def out(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def denoise(small_sequence: Path, weights: Path, out: Path) -> list[Any]:
-    """Arguments that work."""
+    """Valid arguments of `mcdenoise denoise`."""
     return ["denoise", small_sequence, "-o", out, "--weights", weights]
 
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Exit status, stdout and stderr of a command in this process."""
+    """Run a command in this process: exit status, stdout and stderr."""
 
     def call(*arguments: Any) -> tuple[int, str, str]:
         capsys.readouterr()
@@ -77,7 +77,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str
 
 @pytest.fixture
 def refused(run: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
-    """The one line on stderr with which a command refuses its arguments."""
+    """Run a command that rejects its arguments: the one line on stderr."""
 
     def call(*arguments: Any) -> str:
         status, _, message = run(*arguments)
@@ -91,7 +91,7 @@ def refused(run: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
 
 
 def process(*arguments: Any) -> subprocess.CompletedProcess[str]:
-    """A command as a shell runs it."""
+    """Run a command as a separate process."""
     code = "from mcdenoise.cli import main; main()"
     command = [sys.executable, "-c", code, *(str(argument) for argument in arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
@@ -105,7 +105,7 @@ def edit(path: Path, change: Callable[[np.ndarray[Any, Any]], object]) -> None:
 
 
 def whole_images(folder: Path) -> list[str]:
-    """Names of what a folder holds, all of them readable images."""
+    """Names of the images in a folder, all of which must be readable."""
     for path in folder.iterdir():
         read_exr(path)
     return sorted(path.name for path in folder.iterdir())
@@ -127,7 +127,7 @@ def test_help_names_every_option(run: Callable[..., tuple[int, str, str]], comma
         assert f"--{name.replace('_', '-')}" in text, name
     if "out" in names:
         assert "-o PATH" in text
-    # Every option is explained.
+    # Every option has a description.
     assert not re.search(r"--[a-z-]+ [^ ]+ +\((?:default|required)", text)
 
 
@@ -208,7 +208,7 @@ def test_bad_options_leave_nothing(
     assert not out.exists()
 
 
-def test_models_that_cannot_be_had(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
+def test_models_that_are_not_available(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
     denoise = ("denoise", small_sequence, "-o", out, "--model")
     message = refused(*denoise, "unet")
     assert "model 'unet': expected one of " in message
@@ -244,15 +244,13 @@ def nothing():
 
 @pytest.fixture
 def mine(tmp_path: Path) -> Path:
-    """Somebody's own models."""
+    """A file with a user's models."""
     path = tmp_path / "mine.py"
     path.write_text(MINE)
     return path
 
 
-def test_a_model_of_ones_own(
-    run: Callable[..., tuple[int, str, str]], small_sequence: Path, mine: Path, out: Path
-) -> None:
+def test_a_users_model(run: Callable[..., tuple[int, str, str]], small_sequence: Path, mine: Path, out: Path) -> None:
     for name in ("blur", "blur(radius=2)"):
         status, _, errors = run("denoise", small_sequence, "-o", out / name, "--model", f"{mine}:{name}")
         assert (status, errors) == (0, "")
@@ -267,7 +265,7 @@ def test_a_model_of_ones_own(
     assert in_memory["images"] == "mine.py:blur"
     assert run("evaluate", small_sequence, out / "blur", "--json", file)[0] == 0
     written = json.loads(file.read_text())["protocols"]["strict"]["mean"]
-    # Files are of half precision.
+    # Files have half precision.
     assert in_memory["protocols"]["strict"]["mean"]["SMAPE"] == pytest.approx(written["SMAPE"], rel=1e-3)
 
 
@@ -283,7 +281,7 @@ def test_a_model_of_ones_own(
         ("nothing", (), "expected a model with `needs`"),
     ],
 )
-def test_a_model_of_ones_own_that_cannot_be_had(
+def test_a_users_model_that_is_not_available(
     refused: Callable[..., str],
     small_sequence: Path,
     mine: Path,
@@ -336,7 +334,7 @@ def no_cameras(inputs: Path) -> None:
         (no_cameras, "camera_matrices.h: expected 'camera_matrices'"),
     ],
 )
-def test_a_sequence_that_does_not_fit_together_leaves_nothing(
+def test_an_inconsistent_sequence_leaves_no_files(
     refused: Callable[..., str],
     denoise: list[Any],
     small_sequence: Path,
@@ -349,7 +347,7 @@ def test_a_sequence_that_does_not_fit_together_leaves_nothing(
     assert not out.exists()
 
 
-def test_a_missing_frame_is_told_and_gone_on_with(
+def test_a_missing_frame_is_reported_and_skipped(
     run: Callable[..., tuple[int, str, str]], denoise: list[Any], small_sequence: Path, out: Path
 ) -> None:
     missing_frame(small_sequence / "inputs")
@@ -359,19 +357,19 @@ def test_a_missing_frame_is_told_and_gone_on_with(
     assert sorted(path.stem for path in out.glob("*.exr")) == ["denoised0", "denoised2", "denoised3"]
     report = json.loads((out / "denoise.json").read_text())
     assert report["warnings"] == [errors.partition("warning: ")[2].strip()]
-    # Positions and cameras lead across the gap.
+    # Positions and cameras give the motion across the gap.
     assert not report["frames"]["2"]["reset"]
     assert report["frames"]["2"]["history"] > 0.5
 
 
-def test_training_refuses_a_missing_frame(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
+def test_training_rejects_a_missing_frame(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
     missing_frame(small_sequence / "inputs")
     message = refused("train", small_sequence, "-o", out, "--frames", "2", "--crop", "16")
     assert "plane: expected frame 1 after frame 0, found 2" in message
     assert not out.exists()
 
 
-def test_a_folder_that_is_no_sequence(refused: Callable[..., str], tmp_path: Path, weights: Path, out: Path) -> None:
+def test_a_folder_that_is_not_a_sequence(refused: Callable[..., str], tmp_path: Path, weights: Path, out: Path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
     for folder, found in ((tmp_path / "nowhere", "no such folder"), (weights, "'.safetensors'"), (empty, "none")):
@@ -409,7 +407,7 @@ def test_an_invalid_feature_leaves_only_whole_files(
     assert whole_images(out) == ["denoised0.exr"]
 
 
-def test_something_in_the_way_of_the_output(refused: Callable[..., str], denoise: list[Any], out: Path) -> None:
+def test_an_output_path_that_is_taken(refused: Callable[..., str], denoise: list[Any], out: Path) -> None:
     out.write_text("a file")
     assert f"{out}: expected a folder that can be written to" in refused(*denoise)
     assert out.read_text() == "a file"
@@ -421,7 +419,7 @@ def test_something_in_the_way_of_the_output(refused: Callable[..., str], denoise
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["inspect", "--help"]])
-def test_a_standard_output_that_is_full_is_told_in_a_line(arguments: list[str]) -> None:
+def test_a_full_standard_output_is_reported_in_one_line(arguments: list[str]) -> None:
     command = [sys.executable, "-m", "mcdenoise", *arguments]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
@@ -431,8 +429,8 @@ def test_a_standard_output_that_is_full_is_told_in_a_line(arguments: list[str]) 
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX pipes")
-def test_work_goes_on_where_nobody_reads_what_is_printed(small_sequence: Path, tmp_path: Path) -> None:
-    # Unbuffered, so that the first line already meets the closed pipe.
+def test_work_continues_after_a_closed_pipe(small_sequence: Path, tmp_path: Path) -> None:
+    # Unbuffered, so that the first line fails already.
     options = ["--model", "joint_bilateral", "--frames", "0-1", "-o", str(tmp_path / "out")]
     command = [sys.executable, "-u", "-m", "mcdenoise", "denoise", str(small_sequence), *options]
     reader, writer = os.pipe()
@@ -459,7 +457,7 @@ def test_json_that_cannot_be_written(refused: Callable[..., str], tmp_path: Path
     assert f"{path}: cannot be written" in refused("models", "--json", path)
 
 
-# What works
+# Successful commands
 
 
 def test_denoise(run: Callable[..., tuple[int, str, str]], denoise: list[Any], out: Path, tmp_path: Path) -> None:
@@ -507,7 +505,7 @@ def test_models(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> Non
     assert "SMAPE" not in text
 
 
-def test_models_with_what_a_benchmark_measured(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
+def test_models_with_results_of_a_benchmark(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
     names = ("cascaded_v2_micro", "noisy", "cascaded_v2_tiny")
     methods = [Method(name, "fixed", name, name) for name in names]
     methods.append(Method("other", "fixed", "other", "cascaded_v2_small", weights="mine.safetensors"))
@@ -541,7 +539,7 @@ def test_ops(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
 
 @pytest.fixture
 def colors(small_sequence: Path, tmp_path: Path) -> Path:
-    """The noisy colors of the sequence as somebody's result."""
+    """A folder with the noisy colors of the sequence, as the images of another denoiser."""
     folder = tmp_path / "result"
     folder.mkdir()
     for number in range(4):
@@ -561,7 +559,7 @@ def test_evaluate(run: Callable[..., tuple[int, str, str]], small_sequence: Path
     first, second = text.split("strict: clamped")
     assert all(name in first for name in ("SMAPE", "relMSE", "RMSE", "PSNR", "SSIM", "FLIP", "HDR-FLIP", "tRMSE"))
     assert all(f"{strict['mean'][name]:.4g}" in first for name in ("SMAPE", "RMSE", "HDR-FLIP", "wRMSE"))
-    # The number of old stands beside the strict one.
+    # The protocol's value is listed beside the strict one.
     row = next(line for line in second.splitlines() if "mean" in line)
     values = [f"{table['mean'][name]:.4g}" for name in ("PSNR", "SSIM") for table in (meng, strict)]
     assert re.findall(r"[\d.]+", row)[:4] == values
@@ -578,7 +576,7 @@ def test_evaluate_our_own_result_of_some_frames(
     assert list(json.loads(path.read_text())["protocols"]["strict"]["frames"]) == ["1", "2"]
 
 
-def test_evaluate_what_cannot_be_compared(
+def test_evaluate_rejects_images_that_cannot_be_compared(
     run: Callable[..., tuple[int, str, str]], refused: Callable[..., str], small_sequence: Path, colors: Path
 ) -> None:
     evaluate = ["evaluate", small_sequence, colors]
@@ -634,7 +632,7 @@ def test_train(
     assert status == 0
     weights = tmp_path / "run" / "cascaded_v2.safetensors"
     assert text == f"{weights}\n"
-    # Rich colours nothing where there is no terminal.
+    # Without a terminal, rich prints no colors.
     assert re.findall(r"^step (\d)  loss 0\.\d{4}  \d+ s  validation smape", errors, re.MULTILINE) == ["1", "2"]
     assert run(*denoise, "--weights", weights)[0] == 0
 
@@ -678,7 +676,7 @@ def test_render_with_bad_paths(refused: Callable[..., str], camera_path: Path, t
 
 def test_generate(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    # The first seed has objects that move, the second has none.
+    # The scene of the first seed has moving objects, that of the second has none.
     command = ["generate", "-o", out, "--seeds", "3,7", "--frames", "2", "--size", "8x8", "--variant", "scalar_rgb"]
     command += ["--realisations", "2", "--reference-spp", "2"]
     status, text, errors = run(*command)
@@ -701,7 +699,7 @@ def test_generate(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
 
 
 def test_generate_wild(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
-    """One clip and two stills, by their sampling; what a second call finds it does not render again."""
+    """One clip and two stills, by their sampling; a second call does not render existing frames again."""
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
     command = ["generate", "-o", out, "--frames", "4", "--size", "8x8", "--variant", "scalar_rgb", "--wild"]
     command += ["--realisations", "2", "--reference-spp", "1", "--sampling", "filtered", "--seeds"]
@@ -746,7 +744,7 @@ def test_generate_with_bad_options(
     assert not out.exists()
 
 
-# As a process
+# Separate processes
 
 
 def test_a_process_denoises(denoise: list[Any], out: Path) -> None:
@@ -755,13 +753,13 @@ def test_a_process_denoises(denoise: list[Any], out: Path) -> None:
     assert (out / "denoised3.exr").is_file()
 
 
-def test_a_process_refuses_in_one_line(weights: Path, tmp_path: Path, out: Path) -> None:
+def test_a_process_prints_errors_in_one_line(weights: Path, tmp_path: Path, out: Path) -> None:
     result = process("denoise", tmp_path / "nowhere", "-o", out, "--weights", weights)
     assert (result.returncode, result.stdout) == (2, "")
     assert re.fullmatch(r"mcdenoise denoise: .*nowhere: expected a folder, an image, or a pattern.*\n", result.stderr)
 
 
-def test_the_installed_command_helps() -> None:
+def test_the_installed_command_prints_help() -> None:
     command = Path(sys.executable).parent / "mcdenoise"
     if not command.exists():
         pytest.skip("the package's commands are not installed beside this Python")
@@ -781,7 +779,7 @@ def test_the_installed_command_helps() -> None:
     ],
 )
 @pytest.mark.parametrize("place", ["nowhere/figures.json", "folder", "loop.json"])
-def test_a_json_that_cannot_be_written_is_told_before_the_work(
+def test_a_json_that_cannot_be_written_is_rejected_before_the_work(
     small_sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, place: str
 ) -> None:
     (tmp_path / "folder").mkdir()
@@ -797,7 +795,7 @@ def test_a_json_that_cannot_be_written_is_told_before_the_work(
 
 
 @pytest.mark.parametrize("name", ["camera.json", "camera_matrices.h", "color0.exr"])
-def test_a_json_in_the_place_of_an_input_is_refused(
+def test_a_json_that_would_overwrite_an_input_is_rejected(
     small_sequence: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     path = small_sequence / "inputs" / name
@@ -810,7 +808,7 @@ def test_a_json_in_the_place_of_an_input_is_refused(
     assert path.read_bytes() == before
 
 
-def test_a_json_may_lie_in_the_folder_that_the_command_makes(small_sequence: Path, tmp_path: Path) -> None:
+def test_a_json_may_be_in_the_folder_that_the_command_creates(small_sequence: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(SystemExit) as stop:
         main(["denoise", str(small_sequence), "-o", str(out), "--model", "noisy", "--json", str(out / "times.json")])
@@ -824,7 +822,7 @@ def test_a_json_may_lie_in_the_folder_that_the_command_makes(small_sequence: Pat
 def test_a_small_still_is_denoised_without_loading_the_compiler(tmp_path: Path, frames: int, loaded: str) -> None:
     if importlib.util.find_spec("numba") is None:
         pytest.skip("needs numba: pip install 'mcdenoise[fast]'")
-    # Images of fewer pixels are never worth a compiled kernel.
+    # Smaller images never use compiled kernels.
     width, height = 128, 80
     for number in range(frames):
         write_bmfr_frame(tmp_path / "frames", number, synthetic_frame(width, height))

@@ -1,4 +1,4 @@
-"""Every example runs as its docstring says, and what it claims holds."""
+"""Every example runs as in its docstring, and its claims hold."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SERVER = Server()
 
 
 def run(name: str, *arguments: Path | str, alone: bool = False) -> str:
-    """Run an example as a person would, and return what it prints; it must succeed within minutes.
+    """Run an example as a separate process, and return its output; it must succeed within minutes.
 
     What is not ``alone`` has imported the package already, which takes longer than most examples do.
     """
@@ -55,7 +55,7 @@ def real_sequence(name: str) -> Path:
 
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
-    """A small cascade that does next to nothing, for examples that need some network."""
+    """Weights of a small cascade that hardly changes its input, for examples that need a network."""
     torch.manual_seed(0)
     model = create_model("cascaded_v2", width=8)
     for name, module in model.named_modules():
@@ -78,7 +78,7 @@ def test_every_example_is_tested_and_says_how_to_run_it() -> None:
         assert f"python examples/{path.name}" in path.read_text()
 
 
-def test_film_scale_measures_what_the_driver_takes(tmp_path: Path) -> None:
+def test_film_scale_measures_the_time_of_the_driver(tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="films on a cluster need Ray: pip install 'mcdenoise[ray]'")
     file = tmp_path / "scale.json"
     run("film_scale.py", "--nodes", "2", "--shots", "1", "--frames", "2", "--json", file, alone=True)
@@ -140,14 +140,14 @@ def test_gradcheck_passes() -> None:
 
 
 def fitted(printed: str) -> tuple[list[float], float, float]:
-    """Losses on the way, and the held-out error before and after."""
+    """The printed losses, and the held-out error before and after."""
     losses = [float(value) for value in re.findall(r"^step +\d+ +SMAPE ([\d.]+)$", printed, re.MULTILINE)]
     held_out = re.search(r"held-out SMAPE +before ([\d.]+) +after ([\d.]+)", printed)
     assert held_out
     return losses, float(held_out[1]), float(held_out[2])
 
 
-def test_fitted_filter_is_better_on_frames_it_has_not_seen(small_sequence: Path) -> None:
+def test_fitted_filter_is_better_on_held_out_frames(small_sequence: Path) -> None:
     losses, before, after = fitted(run("fit_filter_parameters.py", small_sequence))
     assert losses[-1] < losses[0]
     assert after < before
@@ -155,7 +155,7 @@ def test_fitted_filter_is_better_on_frames_it_has_not_seen(small_sequence: Path)
 
 # Measured: 0.125 before and 0.082 after; the loss falls from 0.177 to 0.131.
 @pytest.mark.slow
-def test_fitted_filter_is_better_on_a_scene_it_has_not_seen() -> None:
+def test_fitted_filter_is_better_on_a_held_out_scene() -> None:
     arguments = (real_sequence("classroom"), "--held-out", real_sequence("bathroom2"), "--steps", "40")
     losses, before, after = fitted(run("fit_filter_parameters.py", *arguments))
     assert losses[-1] < 0.85 * losses[0]
@@ -180,7 +180,7 @@ def test_unseen_scenes_compares_every_image(small_sequence: Path, weights: Path,
 
     everything = json.loads(file.read_text())
     scores = everything["scores"]
-    # Two images, 20 settings of the plain filter, 36 of OIDN, two images of the network, of each scene.
+    # Two images, 20 settings of the joint bilateral filter, 36 of OIDN, and two images of the network for each scene.
     assert len(scores) == 2 * 60
     assert [score["scene"] for score in scores] == [*["plane"] * 60, *["plane (2)"] * 60]
     assert all(set(score["values"]) == set(metrics) for score in scores)
@@ -232,7 +232,7 @@ def test_unseen_scenes_sweeps_any_settings(small_sequence: Path, weights: Path) 
     assert images[2:] == ["cascaded_v2, best of 2 settings", "small, initial", "small"]
 
 
-def test_unseen_scenes_says_in_one_line_what_is_wrong(small_sequence: Path) -> None:
+def test_unseen_scenes_prints_errors_in_one_line(small_sequence: Path) -> None:
     command = [sys.executable, str(EXAMPLES / "unseen_scenes.py"), str(small_sequence)]
     command += ["--models", "cascaded_v2,cascaded_v2"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
@@ -240,7 +240,7 @@ def test_unseen_scenes_says_in_one_line_what_is_wrong(small_sequence: Path) -> N
     assert done.stderr == "methods: expected different names separated by commas, found 'cascaded_v2,cascaded_v2'\n"
 
 
-def test_unseen_scenes_looks_for_references_before_it_starts(small_sequence: Path, weights: Path) -> None:
+def test_unseen_scenes_checks_references_first(small_sequence: Path, weights: Path) -> None:
     other = small_sequence.parent / "other"
     shutil.copytree(small_sequence, other)
     for path in (other / "inputs").glob("reference*.exr"):
@@ -297,7 +297,7 @@ def test_a_scene_renders(folder: Path, tmp_path: Path) -> None:
     for number in range(2):
         frame = found.frame(number)
         frame.validate()
-        # Something is lit, and something is seen of the scene.
+        # The scene is lit and visible.
         assert (frame.color > 0).float().mean() > 0.2
         depth = frame.with_depth().depth
         assert depth is not None
@@ -332,7 +332,7 @@ def test_versions_of_a_scene_are_held_out_together() -> None:
     ]
 
 
-def test_paper_tables_of_what_is_there(dataset: Path, tmp_path: Path) -> None:
+def test_paper_tables_of_the_available_runs(dataset: Path, tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     small = ("--steps", "1", "--batch", "1", "--frames", "2", "--crop", "16", "--held-out", "hall-glossy", "yard")
     train = ("paper_tables/train_folds.py", dataset, "-o", runs, "--runs", "P+K-1", "P+K-without-TL-1", *small)
@@ -344,7 +344,7 @@ def test_paper_tables_of_what_is_there(dataset: Path, tmp_path: Path) -> None:
     assert (config["temporal_weight"], config["steps"]) == (0, 1)
     data = json.loads((grouped / "without-hall" / "P+K-1" / "data.json").read_text())
     assert [entry["name"] for entry in data["sequences"]] == ["yard"]
-    # As if the same weights had been trained on random scenes.
+    # Use the same weights as if they had been trained on random scenes.
     for seed in (1, 2, 3):
         shutil.copytree(grouped / "without-hall" / "P+K-1", runs / "ablations" / f"P+K-{seed}")
 
@@ -353,13 +353,13 @@ def test_paper_tables_of_what_is_there(dataset: Path, tmp_path: Path) -> None:
     first = run(*tables, *scenes, "--tables", "1")
     named = {(row[0], row[1]): row[2:] for row in cells_of(first)}
     assert named["method", "protocol"] == [*scenes, "average"]
-    # The same pictures: equal inputs have equal errors, and a scene that is not there none.
+    # Scenes with equal images have equal errors, and a missing scene has none.
     assert named["noisy", "strict"][0] == named["noisy", "strict"][1]
     for method in ("noisy", "accumulated", "SVGF", "BMFR"):
         assert all(re.fullmatch(r"\d+\.\d\d / 0\.\d{4}", cell) for cell in named[method, "strict"][:2])
         assert named[method, "strict"][2] == named[method, "strict"][3]
     assert "no such scene in DATASET: attic" in first
-    # Data range 2 and a box window flatter.
+    # A data range of 2 and a box window give higher values.
     assert named["SVGF", "meng2020"][0].split()[-1] > named["SVGF", "strict"][0].split()[-1]
 
     zoo = ("--recipe", EXAMPLES.parent / "recipes" / "zoo.toml", "--runs", "wskp")
@@ -379,7 +379,7 @@ def test_paper_tables_of_what_is_there(dataset: Path, tmp_path: Path) -> None:
     assert re.fullmatch(r"\d+\.\d\d / 0\.\d{4}", rows["P+K"][8])
     assert "not trained: no ablations/K-1/cascaded.safetensors" in third
     assert "not trained: no folds-grouped/without-yard/K-1/cascaded.safetensors" in third
-    # Nothing is claimed of what is not trained.
+    # There are no claims about networks that are not trained.
     assert "P+K is ahead of K" not in third
     rows = {row[0]: row[1:] for row in cells_of(fourth)}
     assert rows["P+K without TL"][1].startswith("-")
@@ -390,7 +390,7 @@ def cells_of(text: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
 
 
-# What is skipped
+# Skipping
 
 
 def test_skipped_shows_five_shots_of_a_scene(small_sequence: Path) -> None:
@@ -404,7 +404,7 @@ def test_skipped_shows_five_shots_of_a_scene(small_sequence: Path) -> None:
     for row in shots.values():
         whole, short, change = float(row[6]), float(row[7]), float(row[8])
         assert 0 < short < 1
-        # The default tolerance moves no third digit.
+        # The default tolerance does not change the third digit.
         assert abs(change) < 5e-4 * whole
         assert change == pytest.approx(short - whole, abs=1e-5)
 
@@ -425,7 +425,9 @@ def test_start_up_times_whole_processes(tmp_path: Path) -> None:
         assert re.fullmatch(rf"{re.escape(name)} +{sum(values) / 2:.2f} +.*", line)
 
 
-def test_training_speed_times_both_forms_in_both_precisions(small_sequence: Path, tmp_path: Path) -> None:
+def test_training_speed_measures_fast_backends_and_reference_in_both_precisions(
+    small_sequence: Path, tmp_path: Path
+) -> None:
     pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
     file = tmp_path / "times.json"
     small = ("--model", "cascaded_v2_tiny", "--batch", "1", "--frames", "2", "--crop", "16", "--threads", "1")
@@ -445,7 +447,7 @@ def test_training_speed_times_both_forms_in_both_precisions(small_sequence: Path
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory as Linux tells it")
-def test_large_frames_prints_what_a_pixel_costs(tmp_path: Path) -> None:
+def test_large_frames_prints_the_cost_per_pixel(tmp_path: Path) -> None:
     file = tmp_path / "costs.json"
     arguments = ("--sizes", "64x48,96x64", "--model", "cascaded_v2_tiny", "--max-memory", "2", "--threads", "1")
     lines = run("large_frames.py", *arguments, "--json", file, alone=True).splitlines()
@@ -478,7 +480,7 @@ def test_mitsuba_denoiser_denoises_a_still_and_optimises_where_mitsuba_different
     assert float(found[2]) < float(found[1])
 
 
-def test_layers_of_a_shot_of_blender_are_compared(tmp_path: Path) -> None:
+def test_layers_of_a_blender_shot_are_compared(tmp_path: Path) -> None:
     for path in (RENDERERS / "blender").iterdir():
         for name in (path.name, path.name.replace("shot", "reference")):
             shutil.copy(path, tmp_path / name)

@@ -1,19 +1,20 @@
-"""An add-on for Blender: denoise a rendered animation with the command line of mcdenoise, from the Render properties.
+"""A Blender add-on that denoises a rendered animation with the command line of mcdenoise, from the Render properties.
 
-Render an animation to OpenEXR MultiLayer files with the passes Denoising Data, Z, Position and Vector switched on, then
+Render an animation to OpenEXR MultiLayer files with the passes Denoising Data, Z, Position and Vector enabled, then
 press "Denoise Animation". The add-on runs
 
     mcdenoise denoise FOLDER/shot_####.exr -o FOLDER/denoised --frames START-END
 
-in a process of its own, shows how many frames are written, and says what it said where something is wrong. The files in
-the output folder have the names and layers of those rendered, with Combined denoised; load them as an image sequence.
+in a separate process, shows how many frames are written, and reports its error messages. The files in the output folder
+have the names and layers of the rendered ones, with a denoised Combined; load them as an image sequence.
 
-Install this file as an add-on (Edit > Preferences > Add-ons > Install from Disk) and name the program `mcdenoise` in
-its preferences. Without preferences the environment variable MCDENOISE names it, or it is looked for on PATH. It works
-with Blender 4.5 and 5.0, also without a window: `bpy.ops.render.denoise_animation()` waits until all frames are done.
+Install this file as an add-on (Edit > Preferences > Add-ons > Install from Disk) and set the path of the program
+`mcdenoise` in its preferences. By default the path comes from the environment variable MCDENOISE, or the program is
+searched on PATH. The add-on works in Blender 4.5 and 5.0, also in background mode, where
+`bpy.ops.render.denoise_animation()` waits until all frames are done.
 
-This file stands alone. It imports Blender's Python module ``bpy``, which is under the GPL; it imports nothing of
-mcdenoise, and nothing of mcdenoise imports it.
+This file is self-contained. It imports Blender's Python module ``bpy``, which is under the GPL; it does not import
+mcdenoise, and mcdenoise does not import it.
 """
 
 import atexit
@@ -39,7 +40,7 @@ bl_info = {
 
 
 class DenoiseAnimationPreferences(bpy.types.AddonPreferences):
-    """Where the program is."""
+    """Preferences of the add-on: the path of the program."""
 
     bl_idname = __package__ or __name__
 
@@ -48,12 +49,12 @@ class DenoiseAnimationPreferences(bpy.types.AddonPreferences):
     )
 
     def draw(self, context):
-        """Show the setting."""
+        """Draw the preferences."""
         self.layout.prop(self, "executable")
 
 
 class DenoiseAnimationSettings(bpy.types.PropertyGroup):
-    """What a scene remembers."""
+    """Settings that are stored with a scene."""
 
     output: bpy.props.StringProperty(
         name="Output", subtype="DIR_PATH", description="Folder to write to; empty: `denoised` beside the rendered files"
@@ -69,7 +70,7 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
     bl_label = "Denoise Animation"
 
     def invoke(self, context, event):
-        """From the panel: the window stays usable, Escape ends it."""
+        """Start from the panel; the window stays usable, and Escape stops the program."""
         if not self.start(context):
             return {"CANCELLED"}
         manager = context.window_manager
@@ -79,7 +80,7 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
-        """Show how far the program is, twice a second."""
+        """Show the progress twice a second."""
         if event.type == "ESC":
             self.process.terminate()
             self.process.wait()
@@ -96,20 +97,20 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
         return self.finish()
 
     def end(self, context):
-        """Take away what showed the progress."""
+        """Remove the display of the progress."""
         context.window_manager.event_timer_remove(self.timer)
         context.window_manager.progress_end()
         context.workspace.status_text_set(None)
 
     def execute(self, context):
-        """From a script: return when all is done."""
+        """Run from a script; return when all frames are done."""
         if not self.start(context):
             return {"CANCELLED"}
         self.process.wait()
         return self.finish()
 
     def start(self, context):
-        """Start the program, or report why not."""
+        """Start the program, or report why it cannot run."""
         scene = context.scene
         settings = scene.denoise_animation
         program = find_program(context)
@@ -136,30 +137,30 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
         if settings.model:
             command += ["--model", settings.model]
         command += shlex.split(settings.arguments)
-        # Files, not pipes: nobody reads while the program runs.
-        self.said, self.complained = (tempfile.TemporaryFile() for _ in range(2))  # noqa: SIM115 (closed when read)
+        # Files, because pipes would block the program: nothing reads them while it runs.
+        self.out, self.errors = (tempfile.TemporaryFile() for _ in range(2))  # noqa: SIM115 (closed when read)
         try:
-            self.process = subprocess.Popen(command, stdout=self.said, stderr=self.complained, stdin=subprocess.DEVNULL)
+            self.process = subprocess.Popen(command, stdout=self.out, stderr=self.errors, stdin=subprocess.DEVNULL)
         except OSError as error:
             self.report({"ERROR"}, f"{program} cannot be run ({error.strerror}); name mcdenoise in the preferences")
             return False
         return True
 
     def written(self):
-        """How many frames are there that were not there before."""
+        """Number of frames that the program has written."""
         return sum(path.is_file() and path.stat().st_mtime_ns != self.before.get(path) for path in self.frames)
 
     def finish(self):
-        """Report how it ended."""
-        said, complained = last_lines(self.said), last_lines(self.complained)
-        for line in complained:
+        """Report the result."""
+        out, errors = last_lines(self.out), last_lines(self.errors)
+        for line in errors:
             if line.startswith("warning:"):
                 self.report({"WARNING"}, line.removeprefix("warning: "))
         if self.process.returncode:
-            why = complained[-1] if complained else f"mcdenoise ended with code {self.process.returncode}"
-            self.report({"ERROR"}, why)
+            reason = errors[-1] if errors else f"mcdenoise ended with code {self.process.returncode}"
+            self.report({"ERROR"}, reason)
             return {"CANCELLED"}
-        self.report({"INFO"}, said[-1] if said else f"{len(self.frames)} frames in {self.output}")
+        self.report({"INFO"}, out[-1] if out else f"{len(self.frames)} frames in {self.output}")
         return {"FINISHED"}
 
 
@@ -173,7 +174,7 @@ class RENDER_PT_denoise_animation(bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012 (Blender reads it from the class)
 
     def draw(self, context):
-        """Show the settings, what would help, and the button."""
+        """Draw the settings, hints, and the button."""
         layout, scene = self.layout, context.scene
         layout.use_property_split = True
         for name in ("output", "model", "arguments"):
@@ -184,7 +185,7 @@ class RENDER_PT_denoise_animation(bpy.types.Panel):
 
 
 def find_program(context):
-    """The program's path: from the preferences, the environment or PATH; None where it is nowhere."""
+    """The program's path from the preferences, the environment or PATH; None if it is not found."""
     addon = context.preferences.addons.get(__package__ or __name__)
     named = (addon and addon.preferences and addon.preferences.executable) or os.environ.get("MCDENOISE")
     return bpy.path.abspath(named) if named else shutil.which("mcdenoise")
@@ -192,7 +193,7 @@ def find_program(context):
 
 def pattern(scene):
     """The name of the rendered files with ``#`` in place of the frame's number."""
-    # Blender pads to as many digits as the last run of # in the file's name has, and to four where there is none.
+    # Blender pads numbers to the length of the last run of # in the file name, or to four digits if there is none.
     runs = re.findall("#+", re.split(r"[/\\]", scene.render.filepath)[-1])
     digits = len(runs[-1]) if runs else 4
     names = [Path(scene.render.frame_path(frame=int(digit * digits))).name for digit in "12"]
@@ -200,7 +201,7 @@ def pattern(scene):
 
 
 def hints(scene):
-    """What would make the result better."""
+    """Hints that would improve the result."""
     layers = [layer for layer in scene.view_layers if layer.use]
     if not all(layer.cycles.denoising_store_passes for layer in layers):
         yield "Switch on the pass Denoising Data"
@@ -211,7 +212,7 @@ def hints(scene):
 
 
 def last_lines(file):
-    """The lines that a program wrote, without empty ones."""
+    """The non-empty lines that a program wrote."""
     with file:
         file.seek(0)
         return [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
@@ -230,7 +231,7 @@ def register():
         bpy.utils.register_class(kind)
     bpy.types.Scene.denoise_animation = bpy.props.PointerProperty(type=DenoiseAnimationSettings)
     if bpy.app.module:
-        # As a Python module, Blender 4.5 never ends while a panel or an operator is registered.
+        # As a Python module, Blender 4.5 does not exit while a panel or an operator is registered.
         atexit.register(unregister)
 
 

@@ -1,17 +1,17 @@
-"""Render a small scene with Blender's Cycles into multilayer EXR files, the way an artist's scene writes them.
+"""Render a small scene with Blender's Cycles into multilayer EXR files, as an artist would.
 
     python render.py -o shots --size 320x180 --frames 8 --samples 1 --filter none --reference-samples 256
 
-The folder then holds ``shot_0001.exr``, ``shot_0002.exr``, ... with every pass that a denoiser can use (Combined,
-Denoising Albedo, Normal and Depth, Depth, Position, Normal, Vector, the parts of the light path) and
-``reference_0001.exr``, ... with Combined alone, of the same frames with many samples.
+The folder then contains ``shot_0001.exr``, ``shot_0002.exr``, ... with every pass that a denoiser can use (Combined,
+Denoising Albedo, Normal and Depth, Depth, Position, Normal, Vector, the light passes), and ``reference_0001.exr``, ...
+with Combined only: the same frames with many samples.
 
-The scene is built here: a lacquered checkered floor, a brick wall, rough steel, glass, a mirror, a lamp that is seen,
-a sky, a matt object that moves and a camera that moves. Nothing is downloaded.
+The script builds the scene: a lacquered checkered floor, a brick wall, rough steel, glass, a mirror, a visible lamp, a
+sky, a moving diffuse object and a moving camera. It downloads nothing.
 
-This script stands alone. It imports Blender's Python module ``bpy``, which is under the GPL (``pip install
-bpy==4.5.15`` or ``bpy==5.0.1``, Python 3.11; no display is needed), and nothing else beyond the standard library.
-Blender 4.5 writes all passes into one part of the file; Blender 5.0 writes a part for each, unless ``--interleave``.
+This script is self-contained: apart from the standard library it imports only Blender's Python module ``bpy``, which is
+under the GPL (``pip install bpy==4.5.15`` or ``bpy==5.0.1``, Python 3.11; it needs no display). Blender 4.5 writes all
+passes into one part of the file; Blender 5.0 writes one part per pass, unless ``--interleave`` is given.
 """
 
 import argparse
@@ -29,8 +29,8 @@ PASSES = {
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("-o", "--output", type=Path, required=True, help="folder to write into")
-    parser.add_argument("--name", default="shot", help="what the files are called before _0001.exr")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder to write to")
+    parser.add_argument("--name", default="shot", help="name of the files before _0001.exr")
     parser.add_argument("--size", default="320x180", help="WIDTHxHEIGHT in pixels")
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--start", type=int, default=1, help="number of the first frame")
@@ -43,28 +43,28 @@ def main():
     )
     parser.add_argument("--depth-of-field", action="store_true")
     parser.add_argument("--motion-blur", action="store_true", help="Blender then writes a Vector pass of zeros")
-    parser.add_argument("--transparent", action="store_true", help="the film is transparent where the sky is seen")
-    parser.add_argument(
-        "--denoise", action="store_true", help="denoise Combined in Blender; Noisy Image lies beside it"
-    )
+    parser.add_argument("--transparent", action="store_true", help="make the film transparent where the sky is visible")
+    parser.add_argument("--denoise", action="store_true", help="denoise Combined in Blender, and write Noisy Image too")
     parser.add_argument(
         "--passes",
         nargs="*",
         choices=("denoising", "data", "light", "samples"),
         default=("denoising", "data", "light"),
-        help="groups of passes beside Combined: Denoising Albedo, Normal and Depth; Depth, Position, Normal and "
+        help="groups of passes besides Combined: Denoising Albedo, Normal and Depth; Depth, Position, Normal and "
         "Vector; diffuse, glossy and transmission light with emission and environment; Debug Sample Count",
     )
     parser.add_argument("--view-layer", default="ViewLayer", help="name of the view layer")
     parser.add_argument("--stereo", action="store_true", help="two views in one file")
-    parser.add_argument("--second-layer", metavar="NAME", help="a second view layer, which does not see the wall")
-    parser.add_argument("--composite", action="store_true", help="Blender 4.5: also write what the compositor makes")
+    parser.add_argument("--second-layer", metavar="NAME", help="add a second view layer, without the wall")
+    parser.add_argument("--composite", action="store_true", help="Blender 4.5: also write the compositor's result")
     parser.add_argument("--interleave", action="store_true", help="Blender 5: one part for all passes, as before 5.0")
     parser.add_argument("--codec", default="ZIP", help="ZIP, ZIPS, PIZ, RLE, PXR24, DWAA, DWAB, NONE")
     parser.add_argument("--float", action="store_true", help="write 32 bits for every channel, not 16 for colors")
-    parser.add_argument("--reference-samples", type=int, default=0, help="also write references, with so many samples")
-    parser.add_argument("--seed", type=int, default=0, help="noise seed; every frame draws noise of its own from it")
-    parser.add_argument("--threads", type=int, default=0, help="processor threads; 0 takes all")
+    parser.add_argument(
+        "--reference-samples", type=int, default=0, help="also write references, with this many samples"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="noise seed; every frame has independent noise")
+    parser.add_argument("--threads", type=int, default=0, help="processor threads; 0 uses all")
     args = parser.parse_args()
 
     scene = build_scene(args.start, args.frames)
@@ -82,7 +82,7 @@ def main():
     cycles = scene.cycles
     cycles.device = "CPU"
     cycles.use_adaptive_sampling = False
-    # Cycles takes a box filter as one pixel wide whatever the width says, so the narrow one is the default kind.
+    # In Cycles the width does not apply to a box filter, so the narrow filter is a Blackman-Harris filter too.
     cycles.pixel_filter_type = "BLACKMAN_HARRIS"
     cycles.filter_width = 0.01 if args.filter == "none" else 1.5
 
@@ -115,12 +115,12 @@ def main():
         for layer in layers:
             choose_passes(layer, ())
         cycles.use_denoising = False
-        # A seed of its own: the reference must not share noise with the frame that it judges.
+        # Use another seed: the noise of the reference must be independent of that of the frame.
         render(scene, args.output, "reference", args.reference_samples, args.seed + 1_000_000)
 
 
 def choose_passes(layer, groups):
-    """Switch on the passes of these groups and no others."""
+    """Enable the passes of these groups only."""
     for group, names in PASSES.items():
         for name in names:
             setattr(layer, f"use_pass_{name}", group in groups)
@@ -129,7 +129,7 @@ def choose_passes(layer, groups):
 
 
 def hide_wall(scene, layer):
-    """Keep the wall out of a view layer, by way of a collection of its own."""
+    """Exclude the wall from a view layer, by moving it to a separate collection."""
     collection = bpy.data.collections.new("Behind")
     scene.collection.children.link(collection)
     wall = bpy.data.objects["Wall"]
@@ -140,7 +140,7 @@ def hide_wall(scene, layer):
 
 
 def composite(scene):
-    """Let the compositor pass the first view layer's image through, a little darker."""
+    """Let the compositor darken the image of the first view layer a little."""
     scene.use_nodes = True
     tree = scene.node_tree
     tree.nodes.clear()
@@ -153,7 +153,7 @@ def composite(scene):
 
 
 def render(scene, folder, name, samples, seed):
-    """Render every frame of the scene to ``folder/name_0001.exr`` and on."""
+    """Render every frame of the scene to ``folder/name_0001.exr``, ``folder/name_0002.exr``, ..."""
     scene.cycles.samples = samples
     for frame in range(scene.frame_start, scene.frame_end + 1):
         scene.frame_set(frame)
@@ -163,7 +163,7 @@ def render(scene, folder, name, samples, seed):
 
 
 def build_scene(start, frames):
-    """The scene with its camera and its moving object animated over frames ``start`` and on."""
+    """Build the scene, with its camera and its moving object animated from frame ``start`` on."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
@@ -193,7 +193,7 @@ def build_scene(start, frames):
     camera_data.dof.focus_distance = 5.0
     camera_data.dof.aperture_fstop = 0.3
 
-    # For the Vector pass Cycles looks at the frames before and after, so the path begins one earlier and ends later.
+    # For the Vector pass Cycles needs the previous and the next frame, so the animation covers one more on either side.
     for frame in range(start - 1, start + frames + 1):
         step = frame - start
         camera.location = (-0.6 + 0.16 * step, -5.2 + 0.05 * step, 1.7 + 0.05 * step)
@@ -216,7 +216,7 @@ def ball(name, location, radius, material):
 
 
 def finish(name, material):
-    """Name the object just made, smooth it and give it its material."""
+    """Name the active object, smooth it and assign its material."""
     thing = bpy.context.object
     thing.name = name
     thing.data.materials.append(material)
@@ -225,7 +225,7 @@ def finish(name, material):
 
 
 def surface(name, **inputs):
-    """A material of one Principled BSDF, and its nodes for what is added to it."""
+    """A material of one Principled BSDF, its node tree, and the BSDF's node."""
     material = bpy.data.materials.new(name)
     material.use_nodes = True
     shader = material.node_tree.nodes["Principled BSDF"]
@@ -278,7 +278,7 @@ def bricks():
 
 
 def texture(tree, kind, **inputs):
-    """A texture node over the object's own coordinates (generated: 0..1)."""
+    """A texture node in the object's generated coordinates (0..1)."""
     node = tree.nodes.new(kind)
     where = tree.nodes.new("ShaderNodeTexCoord")
     tree.links.new(where.outputs["Generated"], node.inputs["Vector"])
@@ -292,7 +292,7 @@ def sky():
     world.use_nodes = True
     tree = world.node_tree
     node = tree.nodes.new("ShaderNodeTexSky")
-    # Nishita's sky has gone by another name since Blender 5.0.
+    # Blender 5.0 renamed Nishita's sky model.
     node.sky_type = "NISHITA" if bpy.app.version < (5, 0) else "SINGLE_SCATTERING"
     node.sun_elevation, node.sun_rotation = math.radians(28), math.radians(215)
     node.sun_size = math.radians(3)

@@ -1,6 +1,6 @@
-"""What the tables compare, and which scenes are trained on when one is held out.
+"""The methods in the tables, and the training scenes when one scene is held out.
 
-The methods and the budget that all of them are trained with are in `recipes/zoo.toml` and `recipes/ablations.toml`.
+The training settings of the methods are in `recipes/zoo.toml` and `recipes/ablations.toml`.
 """
 
 from collections.abc import Iterable
@@ -10,19 +10,19 @@ from typing import Literal
 Split = Literal["grouped", "paper"]
 
 RECIPES = Path(__file__).parents[2] / "recipes"
-# Of Table 1 by their names there, with those of their runs: the paper's rivals, its own, and what else there is.
+# Methods of Table 1 by name, with the names of their runs: those that the paper compares with, its own, and others.
 RIVALS = {"NBGD": "nbgd", "RAE (for ONND)": "rae", "KP": "kp", "MRKP": "mrkp", "WSKP": "wskp"}
 OWN = {"P+K": "cascaded"}
 OTHERS = {"KPCN": "kpcn", "SBMC": "sbmc", "layered": "layered", "ANF": "anf", "NPPD": "nppd"}
-# Without weights, and so by their own names.
+# Methods without weights, with the names of their models.
 FILTERS = {"SVGF": "svgf", "A-SVGF": "asvgf", "BMFR": "bmfr", "joint bilateral": "joint_bilateral"}
-# Of Tables 3 and 4: BWA is the bilateral weight adjustment, TL the temporal loss.
+# Variants of Tables 3 and 4: BWA is the bilateral weight adjustment, TL the temporal loss.
 ORDERS = ("K", "P", "K+P", "K+K", "P+K")
 PARTS = {"P+K without BWA": "P+K-without-BWA", "P+K without TL": "P+K-without-TL", "P+K": "P+K"}
 
 
 def geometry(scene: str, scenes: Iterable[str]) -> str:
-    """The scene that another one is a version of: ``sponza`` of ``sponza-glossy``, if both are there.
+    """The scene of which another one is a version: ``sponza`` for ``sponza-glossy``, if both exist.
 
     Example:
         >>> scenes = ("san-miguel", "sponza", "sponza-glossy")
@@ -33,10 +33,10 @@ def geometry(scene: str, scenes: Iterable[str]) -> str:
 
 
 def training_scenes(held_out: str, scenes: Iterable[str], split: Split) -> list[str]:
-    """What is trained on when a scene is held out.
+    """The training scenes when a scene is held out.
 
-    The paper holds out the scene alone. Three of its six scenes are one building, so that a network is then tested on
-    walls it has seen; ``"grouped"`` holds out every version of the scene.
+    The paper holds out only the scene itself. Three of its six scenes show the same building, so the network is tested
+    on walls of the training data; ``"grouped"`` holds out every version of the scene.
 
     Example:
         >>> training_scenes("sponza", ("san-miguel", "sponza", "sponza-glossy"), "grouped")
@@ -50,11 +50,11 @@ def training_scenes(held_out: str, scenes: Iterable[str], split: Split) -> list[
 
 
 def fold_folder(runs: Path, split: Split, held_out: str, scenes: Iterable[str]) -> Path:
-    """Where the runs are that have not seen a scene; versions that are held out together share one."""
+    """Folder of the runs that were trained without a scene; versions that are held out together share a folder."""
     fold = held_out if split == "paper" else geometry(held_out, scenes)
     return runs / f"folds-{split}" / f"without-{fold}"
 
 
 def scenes_of(dataset: Path) -> list[str]:
-    """The folders of a dataset, each a scene."""
+    """The scenes of a dataset, which are its folders."""
     return sorted(path.name for path in dataset.iterdir() if path.is_dir())

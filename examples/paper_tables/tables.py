@@ -1,17 +1,17 @@
-"""Print the paper's Tables 1 to 4 for what is there: scenes, trained networks, peers. What is not there says why.
+"""Print the paper's Tables 1 to 4 for the available scenes, trained networks and peers, with reasons for missing cells.
 
     python examples/paper_tables/tables.py DATASET
     python examples/paper_tables/tables.py DATASET --runs RUNS --tables 3 4 --markdown
 
 DATASET is a folder with a sequence in the BMFR layout for each scene.
 
-Table 1 is PSNR and SSIM of each method on each scene; Table 2 milliseconds of networks and filters at 1280x720; Table 3
-the order of the networks (K, P, K+P, K+K, P+K); Table 4 bilateral weights (BWA) and temporal loss (TL) on and off.
-Below each stands which of the paper's claims holds here. PSNR and SSIM are given by three protocols: "strict" (sRGB
-curve, data range 1), and those of two rivals' code, "meng2020" and "fan2021", by which the published figures on this
-dataset seem to have been made.
+Table 1 lists PSNR and SSIM of each method on each scene; Table 2 the milliseconds of networks and filters at 1280x720;
+Table 3 compares the orders of the networks (K, P, K+P, K+K, P+K); Table 4 compares networks with and without bilateral
+weights (BWA) and temporal loss (TL). Below each table, the script lists which of the paper's claims hold here. PSNR and
+SSIM are computed by three protocols: "strict" (sRGB curve, data range 1), and those of the code of two other papers,
+"meng2020" and "fan2021", which the published figures on this dataset seem to follow.
 
-Networks are those of RUNS, or else, in Table 1, the shipped ones:
+The networks are those in RUNS; in Table 1 missing ones are replaced by the shipped ones:
 
     mcdenoise train --recipe recipes/zoo.toml -o RUNS/zoo               Table 1, trained on random scenes
     mcdenoise train --recipe recipes/ablations.toml -o RUNS/ablations   Tables 3 and 4, likewise, three seeds of each
@@ -19,8 +19,8 @@ Networks are those of RUNS, or else, in Table 1, the shipped ones:
     python examples/paper_tables/train_folds.py DATASET -o RUNS --recipe recipes/zoo.toml
                                                                         Table 1 with --leave-one-out
 
-All of a table are trained alike, and get frames accumulated by the same rule with alpha 0.2: "accumulated". OIDN gets
-the noisy frames, and is told that features are clean.
+All networks of a table have the same training settings, and their input is accumulated by the same rule with alpha 0.2:
+"accumulated". OIDN denoises the noisy frames, with features declared as clean.
 """
 
 import argparse
@@ -54,14 +54,14 @@ Errors = dict[str, float]  # by "protocol metric"
 
 @dataclass
 class Table:
-    """Rows of cells, the reasons of empty ones, each told once, and what follows from the numbers."""
+    """Rows of cells, the distinct reasons of empty cells, and the claims that were checked."""
 
     rows: list[list[str]]
     reasons: list[str] = field(default_factory=list)
     claims: list[str] = field(default_factory=list)
 
     def cells(self, errors: Errors | str) -> list[str]:
-        """PSNR and SSIM by each protocol, or one empty cell for each."""
+        """PSNR and SSIM by each protocol, or empty cells with the number of the reason."""
         if isinstance(errors, str):
             if errors not in self.reasons:
                 self.reasons.append(errors)
@@ -69,7 +69,7 @@ class Table:
         return [f"{errors[f'{name} PSNR']:.2f} / {errors[f'{name} SSIM']:.4f}" for name in PROTOCOL_NAMES]
 
     def claim(self, text: str, better: Errors | str, worse: Errors | str) -> None:
-        """Say whether one is better than the other in strict PSNR."""
+        """Add whether the first is better than the second in strict PSNR."""
         if isinstance(better, str) or isinstance(worse, str):
             return
         difference = better["strict PSNR"] - worse["strict PSNR"]
@@ -77,20 +77,20 @@ class Table:
 
 
 class Measured:
-    """Errors of networks on scenes, measured when they are asked for, each once."""
+    """Errors of networks on scenes, measured on the first request."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
         self._known: dict[tuple[str, str], dict[str, Errors]] = {}
 
     def errors(self, scene: str, model: str, weights: Path | None = None, *, image: str = "") -> Errors | str:
-        """Mean errors over the frames of a scene, or why there are none.
+        """Mean errors over the frames of a scene, or the reason why there are none.
 
         Args:
-            scene: of the dataset.
-            model: a name of the zoo.
-            weights: of the model; its own by default.
-            image: a stage, in place of the result.
+            scene: a scene of the dataset.
+            model: name of a model.
+            weights: weights of the model; by default the shipped ones.
+            image: name of a stage to score instead of the result.
         """
         key = (scene, f"{model} {weights}")
         try:
@@ -101,7 +101,7 @@ class Measured:
             return str(error)
 
     def average(self, found: Iterable[Errors | str]) -> Errors | str:
-        """Mean, or the first reason why there is none."""
+        """The mean, or the first reason why there is none."""
         every = list(found)
         for each in every:
             if isinstance(each, str):
@@ -113,7 +113,7 @@ class Measured:
         if model == "oidn":
             return Denoiser("oidn", quality="high", auxiliary="clean", source="raw")
         if model == "accumulated":
-            # Nothing but what all networks are given.
+            # Only its accumulated image is used, which is the input of all networks.
             return Denoiser(create_model("cascaded", width=4))
         if weights is None or weights.exists():
             return Denoiser(model, weights=weights)
@@ -140,7 +140,7 @@ class Measured:
 
 
 def images_of(output: Output) -> dict[str, Tensor]:
-    """The result, under the empty name, and the stages that tables show."""
+    """The result, under an empty name, and the stages that tables show."""
     shown = {name: output.stages[name] for name in ("noisy", "accumulated", "initial") if name in output.stages}
     return {"": output.image, **shown}
 
@@ -183,7 +183,7 @@ def table_1(measured: Measured) -> Table:
 
 
 def table_2(measured: Measured) -> Table:
-    """What is behind the accumulation, on noise: the time does not depend on what is seen, nor on the weights."""
+    """Time the networks and filters without accumulation; a random frame suffices, as only its size matters."""
     rounds, size = measured.options.rounds, (720, 1280)
     torch.manual_seed(0)
     channels = {"color": 3, "albedo": 3, "normal": 3, "depth": 1}
@@ -225,7 +225,7 @@ def _timed() -> dict[str, tuple[str, dict[str, Any]]]:
 
 
 def _convolutions(model: Any, frame: Frame) -> float:
-    """The fraction of the time of one frame that convolutions take."""
+    """The fraction of the run time of one frame that convolutions take."""
     with profile(activities=[ProfilerActivity.CPU]) as seen:
         model(frame)
     events = seen.key_averages()
@@ -234,7 +234,7 @@ def _convolutions(model: Any, frame: Frame) -> float:
 
 
 def ablation(measured: Measured, variants: dict[str, str]) -> tuple[Table, dict[str, Errors | str]]:
-    """Rows of variants: trained on random scenes with three seeds, longer, and leaving one scene out."""
+    """Rows of variants, trained on random scenes with three seeds, trained for longer, and with one scene held out."""
     options = measured.options
     columns = [f"{kind}, {name} PSNR / SSIM" for kind in KINDS for name in PROTOCOL_NAMES]
     found = Table([["network", "parameters", columns[0], "seeds, PSNR", *columns[1:]]])
@@ -305,25 +305,25 @@ def show(rows: list[list[str]], markdown: bool) -> str:
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the scenes' folders")
-    parser.add_argument("--runs", type=Path, default=Path("runs"), metavar="RUNS", help="what was trained")
+    parser.add_argument("--runs", type=Path, default=Path("runs"), metavar="RUNS", help="folder of the training runs")
     parser.add_argument("--tables", type=int, nargs="+", choices=TABLES, default=list(TABLES))
-    parser.add_argument("--scenes", nargs="+", metavar="NAME", help="of the dataset; all by default")
+    parser.add_argument("--scenes", nargs="+", metavar="NAME", help="scenes of the dataset; all by default")
     parser.add_argument("--held-out", nargs="+", metavar="NAME", help="scenes with a fold; all by default")
-    parser.add_argument("--leave-one-out", action="store_true", help="Table 1 of networks that have not seen the scene")
-    parser.add_argument("--split", choices=get_args(Split), default="grouped", help="of the folds, see folds.py")
-    parser.add_argument("--frames", metavar="NUMBERS", help="which frames to use, such as 0-15; all by default")
-    parser.add_argument("--rounds", type=int, default=5, help="of Table 2")
-    parser.add_argument("--threads", type=int, metavar="N", help="of the networks and of OIDN")
+    parser.add_argument("--leave-one-out", action="store_true", help="Table 1 of networks trained without the scene")
+    parser.add_argument("--split", choices=get_args(Split), default="grouped", help="split of the folds, see folds.py")
+    parser.add_argument("--frames", metavar="NUMBERS", help="frames to use, such as 0-15; all by default")
+    parser.add_argument("--rounds", type=int, default=5, help="timed repetitions for Table 2")
+    parser.add_argument("--threads", type=int, metavar="N", help="threads of the networks and of OIDN")
     parser.add_argument("--markdown", action="store_true")
     return parser.parse_args()
 
 
 def main() -> None:
     options = parse()
-    for name, lowest in (("rounds", 2), ("threads", 1)):
+    for name, minimum in (("rounds", 2), ("threads", 1)):
         value = getattr(options, name)
-        if value is not None and value < lowest:
-            raise InputError(f"--{name}: expected at least {lowest}, found {value}")
+        if value is not None and value < minimum:
+            raise InputError(f"--{name}: expected at least {minimum}, found {value}")
     if not options.dataset.is_dir():
         raise InputError(f"{options.dataset}: expected a folder of scenes, found none")
     options.scenes = options.scenes or scenes_of(options.dataset)

@@ -1,13 +1,13 @@
-"""Train runs of a recipe on a dataset, leaving one scene out at a time.
+"""Train the runs of a recipe on a dataset, holding out one scene at a time.
 
     python examples/paper_tables/train_folds.py DATASET -o RUNS
     python examples/paper_tables/train_folds.py DATASET -o RUNS --runs P+K-1 K-1 --held-out sponza --steps 10000
 
-DATASET is a folder with a sequence in the BMFR layout for each scene. The recipe says what is trained and how, but for
-its data, which here are the scenes that are not held out. The recipe's budget is one for two cores; the paper's is 100
-epochs of batches of 8 clips of 8 frames of 128x128, Adam at 1e-4 (Sec. 4.2), which takes days on a GPU: the options
-below change it for all runs alike. Any run can be stopped, and the same command resumes it. Folds whose training scenes
-are the same are trained once.
+DATASET is a folder with a sequence in the BMFR layout for each scene. The recipe defines the models and their training,
+except for the data, which here are the scenes that are not held out. The recipe's settings suit two cores; the paper's
+are 100 epochs of batches of 8 clips of 8 frames of 128x128, with Adam at 1e-4 (Sec. 4.2), which takes days on a GPU.
+The options below change the settings of all runs. Every run can be interrupted, and the same command resumes it. Folds
+with equal training scenes are trained once.
 """
 
 import argparse
@@ -29,15 +29,15 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of the scenes' folders")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="RUNS", help="folder of the runs")
-    parser.add_argument("--recipe", type=Path, default=RECIPES / "ablations.toml", help="what is trained")
-    parser.add_argument("--runs", nargs="+", default=[], metavar="NAME", help="of the recipe; all by default")
-    parser.add_argument("--scenes", nargs="+", metavar="NAME", help="of the dataset; all by default")
-    parser.add_argument("--held-out", nargs="+", metavar="NAME", help="the folds; every scene by default")
-    parser.add_argument("--split", choices=get_args(Split), default="grouped", help="what is held out, see folds.py")
-    parser.add_argument("--steps", type=int, help="optimiser steps of each run")
-    parser.add_argument("--batch", type=int, help="clips in a step")
-    parser.add_argument("--frames", type=int, help="frames in a clip")
-    parser.add_argument("--crop", type=int, help="side of the patches, pixels")
+    parser.add_argument("--recipe", type=Path, default=RECIPES / "ablations.toml", help="recipe of the runs")
+    parser.add_argument("--runs", nargs="+", default=[], metavar="NAME", help="runs of the recipe; all by default")
+    parser.add_argument("--scenes", nargs="+", metavar="NAME", help="scenes of the dataset; all by default")
+    parser.add_argument("--held-out", nargs="+", metavar="NAME", help="scenes to hold out; all by default")
+    parser.add_argument("--split", choices=get_args(Split), default="grouped", help="held-out scenes, see folds.py")
+    parser.add_argument("--steps", type=int, help="optimizer steps of each run")
+    parser.add_argument("--batch", type=int, help="clips per step")
+    parser.add_argument("--frames", type=int, help="frames per clip")
+    parser.add_argument("--crop", type=int, help="side of the patches in pixels")
     parser.add_argument("--learning-rate", type=float)
     parser.add_argument("--accelerator", default="cpu", help="cpu or cuda")
     return parser.parse_args()

@@ -1,6 +1,6 @@
-"""The proof, outside the shop window: cases and equations of every op, gradient checks, stability, and the overview.
+"""Verification of the operators: test cases, equations in float64, gradient checks, stability checks, an overview.
 
-``gradcheck(function, *inputs)`` and ``check_stability(function, *inputs)`` prove a function of one's own.
+``gradcheck(function, *inputs)`` and ``check_stability(function, *inputs)`` check a function of your own.
 """
 
 from mcdenoise.check.gradients import GradcheckResult, gradcheck

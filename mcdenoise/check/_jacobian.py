@@ -1,8 +1,8 @@
-"""Derivatives against difference quotients, number by number, of what treats the images of a batch alike and alone.
+"""Jacobians against finite differences, for functions that treat the images of a batch identically and independently.
 
-The same comparison as that of ``torch.autograd.gradcheck``, with its step and its bounds. There each number is moved in
-a call of its own, and each row of derivatives takes another one; here every one of them has a copy of the images in one
-large batch. A derivative that leaks from one image of a batch to another is wrong in the copy that it leaks to.
+This makes the same comparison as ``torch.autograd.gradcheck``, with the same step and tolerances. ``gradcheck`` calls
+the function for each perturbed element and each row of the Jacobian; here each of them has its own copy of the images
+in one large batch. If gradients leak between the images of a batch, the Jacobian of the copies is wrong.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _AT_ONCE = 128  # copies of the images in one batch
 
 
 def first_mismatch(function: Function, arguments: Sequence[Tensor]) -> str:
-    """What is wrong with the first derivatives; empty if nothing is.
+    """The first mismatch of first derivatives, or an empty string.
 
     Args:
-        function: of tensors in float64 with the same first axis, which may hold the images of ``arguments`` several
-            times; it returns tensors of the same kind.
-        arguments: what it is differentiated in, and where.
+        function: takes float64 tensors with the same first axis, which may contain several copies of the images of
+            ``arguments``, and returns tensors of the same kind.
+        arguments: the point at which the derivatives in all of them are checked.
     """
     quotients = [_quotients(function, arguments, i) for i in range(len(arguments))]
     for j, derivatives in _derivatives(function, arguments):
@@ -41,11 +41,11 @@ def first_mismatch(function: Function, arguments: Sequence[Tensor]) -> str:
 
 
 def second_mismatch(function: Function, arguments: Sequence[Tensor]) -> str:
-    """What is wrong with the derivatives of the gradients, in the arguments and in upstream gradients drawn at random.
+    """The first mismatch of the gradients' derivatives in the arguments and in random upstream gradients, or empty.
 
     Args:
         function: see :func:`first_mismatch`.
-        arguments: likewise.
+        arguments: see :func:`first_mismatch`.
     """
     _, results = _leaves_and_results(function, arguments)
     upstream = [2 * torch.rand_like(result) - 1 for result in results if result.requires_grad]
@@ -66,7 +66,7 @@ def second_mismatch(function: Function, arguments: Sequence[Tensor]) -> str:
 
 @torch.no_grad()
 def _quotients(function: Function, arguments: Sequence[Tensor], moved: int) -> list[Tensor]:
-    """Of each result in one argument: a row for each number that is moved, a column for each of the result."""
+    """Finite differences of each result in one argument: a row per perturbed element, a column per element."""
     size = arguments[moved].numel()
     rows: list[list[Tensor]] = []
     for start in range(0, size, _AT_ONCE):
@@ -81,7 +81,7 @@ def _quotients(function: Function, arguments: Sequence[Tensor], moved: int) -> l
 
 
 def _derivatives(function: Function, arguments: Sequence[Tensor]) -> list[tuple[int, list[Tensor]]]:
-    """Of each result that has any, with its number, in each argument: a row for each number of the result."""
+    """Jacobians of each differentiable result, with its index, in each argument: a row per element of the result."""
     found = []
     for j, result in enumerate(_leaves_and_results(function, arguments)[1]):
         if not result.requires_grad:

@@ -1,4 +1,4 @@
-"""What a case of an op is, and what the table of ops says of each; the table itself is :mod:`mcdenoise.check.cases`."""
+"""Types of the table of ops in :mod:`mcdenoise.check.cases`: an op and its test cases."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class Case:
     """One set of inputs of an op.
 
     Args:
-        name: what is special about it; unique within its op.
-        kind: ``"ordinary"``, ``"stiff"`` (results change fast with the inputs) or ``"extreme"`` (valid, but at the end
-            of what is).
+        name: describes the inputs; unique within the op.
+        kind: ``"ordinary"``, ``"stiff"`` (results change fast with the inputs) or ``"extreme"`` (at the limits of valid
+            input).
         tensors: draws the tensor arguments by name, in float64.
-        differentiable: the arguments among them that have a derivative here.
-        settings: the other arguments, those that the Module twin stores.
+        differentiable: the tensor arguments in which the op is differentiable at these inputs.
+        settings: the other arguments, which the Module twin stores.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Case:
     def inputs(self, dtype: torch.dtype = torch.float64, seed: int = 0) -> Inputs:
         """The tensor arguments: the same numbers for the same seed, in any dtype.
 
-        What is finite stays so: beyond the dtype's range it is its largest number, as in an image that was saved.
+        Finite values are clamped to the range of the dtype, as in a saved image.
         """
         largest = torch.finfo(dtype).max
 
@@ -50,16 +50,18 @@ class Case:
 
 @dataclass(frozen=True)
 class Rounding:
-    """What the roundings inside of an op amount to, in units of the dtype's epsilon.
+    """Magnitudes of intermediate values that an op rounds, for error bounds.
 
-    Every op is taken to be backward stable: its result is the exact one of inputs that are off by few roundings. Where
-    an op computes with larger numbers on the way than its inputs are, this says with how large ones.
+    Every op is assumed to be backward stable: its result is the exact result of inputs that differ by a few rounding
+    errors. For ops whose intermediate values are larger than their inputs, this gives the magnitudes to use instead.
 
     Args:
-        arguments: for some arguments, the magnitude whose rounding they must absorb; for the others it is their own.
-        result: magnitude that is rounded beside the result itself.
-        gradients: for some arguments, the magnitude of the terms whose difference is their gradient, for upstream
-            gradients of one. A quotient's, ``n' / s - n s' / s^2``, are much larger than it is where they cancel.
+        arguments: for some arguments, the magnitude whose rounding error counts as an error of the argument; by default
+            the magnitude of the argument itself.
+        result: a magnitude that is rounded in addition to the result.
+        gradients: for some arguments, the magnitude of terms that cancel in their gradient, for upstream gradients of
+            1. For example, the terms of the derivative of a quotient, ``n' / s - n s' / s^2``, may be much larger than
+            their difference.
     """
 
     arguments: Inputs = field(default_factory=dict)
@@ -73,24 +75,24 @@ def _no_more(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 @dataclass(frozen=True)
 class Op:
-    """An op and what is known about it.
+    """An op with its test cases and properties.
 
     Args:
         function: the public function.
-        reference: the same as its equation, in float64; see :mod:`mcdenoise.check.reference`.
-        cases: at least four, among them ordinary ones.
+        reference: its equation as loops in float64; see :mod:`mcdenoise.check.reference`.
+        cases: at least four cases, including ordinary ones.
         module: the Module twin, if there is one.
-        least_dtype: results are at least as precise as this; other results have the dtype of the inputs.
-        images: the arguments that are images of one unit: the first result scales with them, and is constant where
-            they are and the weights sum to one.
-        weights: whether, with these settings, the result is non-negative weights that sum to one over the channels.
-        rounding: see :class:`Rounding`; of inputs and settings.
-        half: whether it promises anything of inputs in half precision.
-        batched: whether all its tensors have the batch first, and it treats the images of a batch alike and alone, so
-            that many inputs can be tried at once.
-        own: whether it is somebody's own function, see :mod:`mcdenoise.check.own`. Its only equation is itself in
-            float64, so that its derivatives are proven wherever it is checked; it may treat the images of a batch
-            together; and half precision is rounded between its steps.
+        least_dtype: minimum precision of the results; by default they have the dtype of the inputs.
+        images: the arguments that are images in the same unit: the first result scales with them, and is constant if
+            they are constant and the weights sum to one.
+        weights: whether, with these settings, the results are non-negative weights that sum to one over the channels.
+        rounding: returns the :class:`Rounding` for inputs and settings.
+        half: whether the op supports inputs in half precision.
+        batched: whether the first axis of all tensors is the batch, and the op treats its images identically and
+            independently, so that many inputs can be checked at once.
+        own: whether it is a user's function, see :mod:`mcdenoise.check.own`. Its reference is itself in float64, whose
+            derivatives are therefore checked first; it may combine the images of a batch; and in half precision its
+            intermediate values are rounded.
     """
 
     function: Callable[..., Any]
@@ -112,7 +114,7 @@ class Op:
 
 
 def map_tensors(function: Callable[[Tensor], Tensor], inputs: Inputs) -> Inputs:
-    """``inputs`` with ``function`` applied to each tensor in them."""
+    """Apply ``function`` to each tensor in ``inputs``."""
 
     def apply(value: Value) -> Value:
         if isinstance(value, Surface):
@@ -135,5 +137,5 @@ def normal(g: Generator, *shape: int) -> Tensor:
 
 
 def radiance(g: Generator, *shape: int) -> Tensor:
-    """Over six decades, as 1-spp renderings are: mostly dark, fireflies up to 1e4."""
+    """Radiance over six decades, as in renderings of one sample per pixel: mostly dark, with fireflies up to 1e4."""
     return 10 ** uniform(g, *shape, low=-2, high=4)

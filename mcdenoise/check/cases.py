@@ -1,12 +1,12 @@
-"""The table of ops and the inputs to try each of them on; gradient check, stability, speed and tests all read it.
+"""The table of ops with their test cases, for gradient checks, stability checks, benchmarks and tests.
 
-To add an op, add an ``Op`` to ``OPS``. Sizes are tiny, because gradients are checked one number at a time, and odd,
-because that is where borders go wrong.
+To add an op, add an ``Op`` to ``OPS``. Sizes are tiny, because gradients are checked one element at a time, and odd,
+because errors at borders show there.
 
-Inputs stay away from points without a derivative, where a difference quotient proves nothing: albedo from ``floor``,
-motion from whole pixels, brightness from the limit of fireflies, history length from the one where ``alpha`` reaches
-``alpha_min``, surfaces from the limits of the consistency test, kernel sums from zero. Where a case sits on such a
-point on purpose, the inputs concerned are not among its ``differentiable`` ones.
+Inputs avoid points without a derivative, where finite differences are meaningless: albedo near ``floor``, motion of
+whole pixels, brightness near the limit of fireflies, the history length at which ``alpha`` reaches ``alpha_min``,
+surfaces near the limits of the consistency test, kernel sums near zero. Cases that contain such points on purpose do
+not list the inputs concerned as ``differentiable``.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ def _bilateral_cases() -> tuple[Case, ...]:
 
 
 def _bilateral_filter_cases() -> tuple[Case, ...]:
-    """Those of the weights, with an image to filter."""
+    """The cases of the weights, with an image to filter."""
 
     def with_image(case: Case) -> Case:
         def tensors(g: Generator) -> Inputs:
@@ -189,7 +189,7 @@ def _bilateral_filter_cases() -> tuple[Case, ...]:
             kernel = inputs["kernel"]
             assert isinstance(kernel, Tensor)
             if case.settings["normalize"] == "none":
-                # Weights of both signs may have the sum zero.
+                # Weights of both signs may sum to zero.
                 inputs["kernel"] = kernel = kernel.abs() + 0.1
             batch, _, height, width = kernel.shape
             return {"image": _normal(g, batch, 2, height, width), **inputs}
@@ -200,7 +200,7 @@ def _bilateral_filter_cases() -> tuple[Case, ...]:
 
 
 def _image_cases(sizes: Callable[[int, int], tuple[int, int]], with_size: bool) -> tuple[Case, ...]:
-    """Of ops of one image, which has the size ``sizes`` gives for the one in the case's name."""
+    """Cases of ops of one image, whose size is ``sizes`` of the size in the case's name."""
 
     def case(
         kind: Kind, batch: int, channels: int, height: int, width: int, draw: Callable[..., Tensor] = _normal
@@ -330,7 +330,7 @@ def _demodulation_cases(image: str) -> tuple[Case, ...]:
         return values
 
     def near_floor(values: Tensor) -> Tensor:
-        # 5e-4 to either side of the floor, which is a kink, and further out where another channel is textured.
+        # Stay 5e-4 away from the kink at the floor, on both sides.
         values[:, :2] = torch.where(values[:, :2] < 0.5, 0.0095, 0.0105)
         return values
 
@@ -382,12 +382,12 @@ def _firefly_cases() -> tuple[Case, ...]:
         return image
 
     def half_precision_range(g: Generator, *shape: int) -> Tensor:
-        """Bright enough that a sum of three channels overflows, and next to it the smallest normal number."""
+        """Pixels so bright that a sum of three channels overflows, beside the smallest normal number."""
         image = _uniform(g, *shape, low=5e4, high=6.5e4)
         image[..., ::2] = torch.finfo(torch.float16).tiny
         return image
 
-    # The limits are low where a window is so small that the mean of the others says little.
+    # Small windows have low limits, so that they clamp some pixels too.
     return (
         case("5x7, one firefly", "ordinary", (1, 1, 5, 7), (2, 3)),
         case("batch of 2, RGB, window of 3", "ordinary", (2, 3, 3, 4), limit=1.5, kernel_size=3),
@@ -402,11 +402,11 @@ def _firefly_cases() -> tuple[Case, ...]:
         case("firefly at the border", "stiff", (1, 3, 4, 5), (3, 2)),
         case("fireflies side by side", "stiff", (1, 3, 4, 5), (1, 1), (1, 2), (2, 1), limit=2.0),
         case("fireflies of 100", "stiff", (1, 3, 3, 4), draw=_radiance, limit=2.0),
-        # Black pixels beside: whether they count jumps at zero, so there is no derivative.
+        # Black neighbours are excluded from the mean; this jumps at zero, so there is no derivative.
         case("black", "extreme", (1, 3, 3, 3), draw=black, differentiable=False),
         case("one bright pixel on black", "extreme", (1, 3, 3, 4), (1, 1), draw=black, differentiable=False),
         case("one pixel in five lit", "extreme", (1, 3, 3, 5), draw=sparse, limit=1.5, differentiable=False),
-        # A difference quotient of 1e30 says nothing.
+        # Finite differences are meaningless beside 1e30.
         case("1e30 beside 1e-4", "extreme", (1, 3, 3, 5), (1, 4), draw=dark, value=1e30, differentiable=False),
         case("range of half precision", "extreme", (1, 3, 3, 5), draw=half_precision_range, limit=1.1),
     )
@@ -430,7 +430,7 @@ def _lag_cases() -> tuple[Case, ...]:
 
         return Case(name, kind, tensors, differentiable, settings)
 
-    # Differences from 1 to 2 times the threshold, where the share is neither 0 nor 1: by the settings, not by chance.
+    # Settings for which differences are 1 to 2 times the threshold, so that the result is neither 0 nor 1.
     return (
         case("5x7", "ordinary", (1, 1, 5, 7), 2.0, threshold=10.0),
         case("batch of 2, RGB, window of 3", "ordinary", (2, 3, 3, 4), 2.0, threshold=3.0, kernel_size=3),
@@ -438,14 +438,14 @@ def _lag_cases() -> tuple[Case, ...]:
         case("one row, 5 channels", "ordinary", (1, 5, 1, 6), 2.0, threshold=3.0, kernel_size=3),
         case("no change", "ordinary", (1, 3, 4, 5), 1.0),
         case("darker by half", "ordinary", (1, 3, 4, 5), 0.5, threshold=4.0),
-        # Without noise only the smallest visible difference counts; beside its square, no difference quotient is fine
-        # enough for a variance.
+        # Without noise only the smallest visible difference counts; its square is smaller than the step of finite
+        # differences in the variance.
         case("no noise", "stiff", (1, 1, 1, 1), 1.0045, 0.0, ("history", "recent"), threshold=3.0),
     )
 
 
 def _wall(g: Generator, batch: int, height: int, width: int) -> Inputs:
-    """Normals and depths of a rough surface: a tap's weights are neither 0 nor 1."""
+    """Normals and depths of a rough surface, for which the weights of taps are neither 0 nor 1."""
     toward = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64).reshape(1, 3, 1, 1)
     normal = toward + 0.05 * _normal(g, batch, 3, height, width)
     depth = _uniform(g, batch, 1, height, width, low=4, high=5)
@@ -485,7 +485,7 @@ def _importance_cases() -> tuple[Case, ...]:
         case("one pixel, 13x13", "ordinary", (1, 3, 1, 1), 13),
         case("map of zeros", "stiff", (1, 1, 3, 4), 3, spread=0.0),
         case("map of tens", "stiff", (1, 2, 3, 4), 5, spread=20.0),
-        # No difference quotient is fine enough where the weights are those of a maximum.
+        # The step of finite differences is too coarse where the weights are nearly those of a maximum.
         case("fireflies", "stiff", (1, 3, 3, 4), 5, image=_radiance, differentiable=("image",)),
         case("map of ten thousands", "extreme", (1, 1, 3, 4), 3, spread=1e4, differentiable=("image",)),
     )
@@ -509,7 +509,7 @@ def _atrous_cases() -> tuple[Case, ...]:
 
         def tensors(g: Generator) -> Inputs:
             light = draw(g, batch, 3, height, width)
-            # Of the local mean, as that of a sample is.
+            # A standard deviation proportional to the mean, like that of a sample.
             spread = noise * _uniform(g, batch, 1, height, width, low=0.5) * light.mean(1, keepdim=True)
             drawn: dict[str, Any] = {"light": light, "variance": spread.square(), **_wall(g, *size)}
             if change is not None:
@@ -535,13 +535,13 @@ def _atrous_cases() -> tuple[Case, ...]:
         case("taps 2 pixels apart", "ordinary", (1, 1, 4), step=2),
         case("taps beyond the image", "ordinary", (1, 1, 2), step=16),
         case("other tolerances", "ordinary", (1, 1, 3), sigma_z=3.0, sigma_n=8.0, sigma_l=1.0),
-        # No difference quotient is fine enough for deviations of 1e-4 beside those of 1e2.
+        # The step of finite differences is too coarse for deviations of 1e-4 beside deviations of 1e2.
         case("fireflies", "stiff", (1, 1, 4), draw=_dim, smooth=("normal", "depth")),
         case("little noise", "stiff", (1, 1, 3), draw=_bright, noise=0.02),
         case("an edge", "stiff", (1, 1, 4), change=corner, smooth=("light", "variance")),
-        # Infinity has no difference quotient.
+        # Infinity has no finite difference.
         case("sky", "extreme", (1, 2, 2), change=sky, smooth=("light", "variance", "normal")),
-        # Half a difference quotient would be of a negative variance.
+        # Central differences would need a negative variance.
         case("no noise", "extreme", (1, 1, 3), noise=0.0, smooth=("light", "normal", "depth")),
     )
 
@@ -604,7 +604,7 @@ def _affinity_cases() -> tuple[Case, ...]:
         case("one column, taps 2 pixels apart, frame before", "ordinary", (1, 4, 1), (*here, *_BEFORE), dilation=2),
         case("fireflies", "stiff", (1, 2, 2), draw=_dim),
         case("bandwidths of up to 30", "stiff", (1, 2, 2), (*here, *_BEFORE), largest=30.0),
-        # A half of the difference quotient would be of a negative weight, and there the least one counts.
+        # Central differences would need a negative weight, which is clamped.
         case(
             "no weight of the centre", "extreme", (1, 1, 3), change=no_center, smooth=("image", "features", "bandwidth")
         ),
@@ -663,7 +663,7 @@ def _moments_cases() -> tuple[Case, ...]:
 
 
 def _guide(g: Generator, batch: int, height: int, width: int, bins: int) -> Tensor:
-    """Between the centres of bins, or beyond the first and the last, and away from them."""
+    """Guides between the centres of bins, or beyond the first and the last, but not near them."""
     shape = (batch, 1, height, width)
     between = torch.randint(bins + 1, shape, generator=g) - 0.5 + _uniform(g, *shape, low=0.15, high=0.85)
     return (between.clamp(0.02 * bins, 0.98 * bins) * 256 / bins - 0.5) / 255
@@ -692,7 +692,7 @@ def _grid_splat_cases() -> tuple[Case, ...]:
         case("cells of one pixel", "ordinary", (2, 1, 2, 1), 1, 2),
         case("one pixel", "ordinary", (1, 3, 1, 1), 8, 3),
         case("fireflies of 100", "stiff", (1, 1, 2, 3), 2, 2, lambda g, *shape: _radiance(g, *shape) / 100),
-        # A difference quotient in the guide of a firefly says little of the dark pixels beside it.
+        # Finite differences in the guide of a firefly are too inaccurate for the dark pixels beside it.
         case("fireflies", "extreme", (1, 3, 3, 3), 2, 2, _radiance, ("image",)),
     )
 
@@ -732,7 +732,7 @@ def _grid_slice_cases() -> tuple[Case, ...]:
         case("one pixel", "ordinary", (1, 3, 1, 1), 8, 3),
         case("fireflies of 100", "stiff", (1, 1, 2, 3), 2, 2, lambda g, *shape: _radiance(g, *shape) / 100),
         case("fireflies", "extreme", (1, 3, 3, 3), 2, 2, _radiance, differentiable=("grid",)),
-        # Where all cells around a pixel are empty, it jumps to the first that is filled.
+        # Where all cells around a pixel are empty, the result jumps once one of them is filled.
         case("empty cells", "extreme", (1, 3, 3, 5), 2, 4, known=half_empty, differentiable=("grid",)),
         case("no cell is filled", "extreme", (1, 1, 2, 2), 2, 2, known=torch.zeros_like, differentiable=("grid",)),
     )
@@ -758,7 +758,7 @@ def _gradient_cases() -> tuple[Case, ...]:
 
         def tensors(g: Generator) -> Inputs:
             previous = draw(g, batch, 1, height, width) + 0.1
-            # Darker by about as much everywhere: a change that noise does not explain, and that is not all.
+            # Darken all pixels by similar factors: a change beyond the noise, but not to black.
             current = previous * (change + 0.1 * _uniform(g, batch, 1, height, width))
             drawn: dict[str, Any] = {
                 "current": current,
@@ -774,7 +774,7 @@ def _gradient_cases() -> tuple[Case, ...]:
         return Case(name, kind, tensors, inputs if smooth is None else smooth, settings)
 
     def one_sample(drawn: dict[str, Any]) -> None:
-        """One pixel of each stratum, and none in the first."""
+        """A sample in one pixel of each stratum, and none in the first stratum."""
         drawn["weight"] = torch.zeros_like(drawn["weight"])
         drawn["weight"][..., 1::3, 2::3] = 1
         drawn["weight"][..., :3, :3] = 0
@@ -803,11 +803,11 @@ def _gradient_cases() -> tuple[Case, ...]:
         case("brighter", "ordinary", (1, 3, 4), (*both, "variance"), change=2.0, levels=2),
         case("fireflies", "stiff", (1, 3, 4), draw=_dim, smooth=("weight", "normal", "depth"), stratum=2, levels=2),
         case("nearly all noise", "stiff", (1, 4, 4), (*both, "variance"), noise=0.6, smooth=both, levels=2),
-        # A weight is no less than 0.
+        # Central differences would need a negative weight.
         case("one sample a stratum", "extreme", (1, 5, 7), (*both, "weight"), alter=one_sample, smooth=both, levels=1),
-        # Infinity has no difference quotient.
+        # Infinity has no finite difference.
         case("sky", "extreme", (1, 4, 4), alter=sky, smooth=(*both, "variance"), stratum=2, levels=2),
-        # At the limits there is no derivative.
+        # There is no derivative at the limits of the result.
         case("a light goes out", "extreme", (1, 6, 6), (*both, "depth"), alter=off, smooth=("depth",), levels=2),
         case("no light", "extreme", (1, 3, 4), alter=dark, smooth=()),
         case("nothing changes", "extreme", (1, 3, 4), alter=still, smooth=()),
@@ -836,7 +836,7 @@ def _regression_cases() -> tuple[Case, ...]:
         return Case(name, kind, tensors, differentiable, {"block": 4, **settings})
 
     def wall(g: Generator, *shape: int) -> Tensor:
-        """Constant, and one feature twice the other."""
+        """Two constant features, and two of which one is twice the other."""
         rest = _uniform(g, shape[0], 1, *shape[2:])
         return torch.cat([torch.full_like(rest, -0.8), rest, 2 * rest, torch.zeros_like(rest)], 1)
 
@@ -852,7 +852,7 @@ def _regression_cases() -> tuple[Case, ...]:
         return torch.cat([first, first + 1e-3 * _normal(g, shape[0], 1, *shape[2:])], 1)
 
     def scene(g: Generator, *shape: int) -> Tensor:
-        """In millimetres."""
+        """Positions in millimetres."""
         return 1e3 * (5 + _uniform(g, *shape))
 
     return (
@@ -865,7 +865,7 @@ def _regression_cases() -> tuple[Case, ...]:
         case("fireflies", "stiff", (1, 1, 4, 4), draw=_radiance, differentiable=("image",)),
         case("features that differ by a thousandth", "stiff", (1, 1, 4, 4), features=nearly, differentiable=("image",)),
         case("position in millimetres", "stiff", (1, 1, 4, 5), 3, features=scene, squares=3, differentiable=("image",)),
-        # Where features are not independent, or nearly all is mean, no difference quotient is fine enough.
+        # Finite differences are too inaccurate for dependent features, and for features with a large mean.
         case("a flat wall", "extreme", (1, 1, 4, 5), 4, features=wall, squares=1, differentiable=("image",)),
         case("features all equal", "extreme", (1, 3, 4, 4), features=equal, squares=2, differentiable=("image",)),
         case("positions of 1e6", "extreme", (1, 1, 4, 4), features=far, squares=2, differentiable=("image",)),
@@ -874,7 +874,7 @@ def _regression_cases() -> tuple[Case, ...]:
 
 
 def _camera(batch: int, eye_z: float, unit: float) -> Tensor:
-    """Row-vector world-to-clip matrices that look along +z, with a little of everything in every entry."""
+    """Row-vector world-to-clip matrices of a camera that looks along +z; no entry is zero."""
     matrix = torch.tensor(
         [[1.2, 0.05, 0.02, 0.03], [-0.04, 1.5, 0.01, -0.02], [0.06, -0.03, 1.01, 1.0], [0.1, 0.2, -0.5, -eye_z]],
         dtype=torch.float64,
@@ -903,20 +903,20 @@ def _motion_cases() -> tuple[Case, ...]:
         case("one row", "ordinary", 1, 1, 5),
         case("one pixel", "ordinary", 1, 1, 1),
         case("scene in millimetres", "extreme", 1, 3, 3, unit=1000.0),
-        # The previous camera stood at z = 3.5 of 2 to 5; those near its plane are seen at large angles.
+        # The previous camera was at z = 3.5, and the points are at z = 2 to 5, some of them close to its plane.
         case("points behind the camera", "stiff", 1, 3, 3, eye_z=3.5),
         Case("nothing hit", "extreme", nothing_hit, ("previous_view_projection",)),
     )
 
 
 def _motion(g: Generator, batch: int, height: int, width: int, reach: int = 1) -> Tensor:
-    """Whole pixels up to ``reach``, and a fraction that stays away from the kinks at 0 and 1."""
+    """Motion by whole pixels up to ``reach``, plus a fraction away from the kinks at 0 and 1."""
     whole = torch.randint(-reach, reach + 1, (batch, 2, height, width), generator=g)
     return whole + _uniform(g, batch, 2, height, width, low=0.1, high=0.9)
 
 
 class _History(NamedTuple):
-    """What a history case may change after it is drawn, in place."""
+    """Tensors that a history case may change in place after drawing."""
 
     previous: Tensor
     motion: Tensor
@@ -925,7 +925,7 @@ class _History(NamedTuple):
 
 
 def _surface(g: Generator, batch: int, height: int, width: int) -> dict[str, Tensor]:
-    """One of two walls in every pixel: of two such surfaces about half of the taps show the wrong wall, and clearly."""
+    """Two walls, chosen at random for each pixel, so that about half of the taps clearly show the other wall."""
     facing = torch.tensor([[0.0, 0.6, -0.8], [0.8, 0.0, -0.6]], dtype=torch.float64)
     wall = torch.randint(0, 2, (batch, height, width), generator=g)
     normal = facing[wall].movedim(-1, 1) + 0.02 * _uniform(g, batch, 3, height, width, low=-1)
@@ -1019,7 +1019,7 @@ def _history_cases(accumulating: bool) -> tuple[Case, ...]:
         case("motion unknown", "extreme", (1, 1, 2, 4), (), unknown),
         case("sky", "extreme", (1, 1, 3, 4), everything, sky),
         case("nothing but new surfaces", "extreme", (1, 3, 2, 3), everything, all_new),
-        # A difference quotient of a NaN says nothing.
+        # There are no finite differences of NaN.
         case("NaN on another surface", "extreme", (1, 3, 2, 3), everything, nan_elsewhere, smooth=("color", "motion")),
     )
 

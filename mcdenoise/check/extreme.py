@@ -1,7 +1,7 @@
-"""Stiff and extreme inputs of each op: what broken shaders, half-float files and careless settings hand over.
+"""Stiff and extreme inputs of each op, as produced by broken shaders, half-float files and careless settings.
 
-All of them are valid: an op has to give what its equation says, to rounding, or the infinity that it says.
-Where a case has ``differentiable`` inputs its numbers are scaled so that a difference quotient still means something.
+All of them are valid: the op must return the result of its equation, finite or infinite, up to rounding. Cases with
+``differentiable`` inputs are scaled so that finite differences are accurate.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mcdenoise.ops.temporal import Surface, reproject
 
 Draw = Callable[..., Tensor]
 
-# Black, far below and far above what half precision holds, its largest number, a firefly, and denormal.
+# Black, far below and far above the range of half precision, its maximum, a firefly, and a denormal number.
 RADIANCES = (0.0, 1e-30, 65504.0, 1e6, 1e30, 1e-40)
 
 
@@ -39,7 +39,7 @@ def _constant(value: float) -> Draw:
 
 
 def _alternating(size: float) -> Draw:
-    """A checkerboard of both signs, so that a sum over neighbours cancels."""
+    """A checkerboard of both signs, for which sums over neighbours cancel."""
 
     def draw(g: Generator, *shape: int) -> Tensor:
         signs = 1 - 2 * (torch.arange(shape[-2])[:, None] + torch.arange(shape[-1])) % 2
@@ -52,7 +52,7 @@ def _forty_decades(g: Generator, *shape: int) -> Tensor:
     return 10 ** uniform(g, *shape, low=-30, high=10)
 
 
-# Each image that an op may meet, by what is special about it.
+# Images for all ops, by name.
 IMAGES: dict[str, Draw] = {
     **{f"constant {value:g}": _constant(value) for value in RADIANCES},
     "six decades": radiance,
@@ -60,7 +60,7 @@ IMAGES: dict[str, Draw] = {
     "alternating signs": _alternating(1e4),
     "alternating signs at the end of half precision": _alternating(6e4),
 }
-# Sizes that borders, windows and strides trip over.
+# Sizes that are difficult for borders, windows and strides.
 SIZES: dict[str, tuple[int, int, int, int]] = {
     "one pixel": (1, 1, 1, 1),
     "one row of 9": (1, 3, 1, 9),
@@ -71,13 +71,13 @@ SIZES: dict[str, tuple[int, int, int, int]] = {
 
 
 def _tried() -> list[tuple[str, tuple[int, int, int, int], Draw]]:
-    """Every image at one size, and every size with one image."""
+    """All images in one size, and all sizes with one image."""
     images = [(name, (1, 3, 3, 5), draw) for name, draw in IMAGES.items()]
     return images + [(f"{name}, six decades", size, radiance) for name, size in SIZES.items()]
 
 
 def filters() -> tuple[Case, ...]:
-    """Of ``kernel_conv`` and ``kernel_splat``."""
+    """Cases of ``kernel_conv`` and ``kernel_splat``."""
 
     def weights(g: Generator, batch: int, *shape: int) -> Tensor:
         return torch.softmax(3 * normal(g, batch, *shape), 1)
@@ -118,7 +118,7 @@ def filters() -> tuple[Case, ...]:
         *(case(name, size, draw, next(borders)) for name, size, draw in _tried()),
         case("all weights zero", size, radiance, "replicate", _constant(0.0)),
         case("all weights zero", size, radiance, "renormalize", _constant(0.0)),
-        # A mean does not care for the scale of its weights. Its gradient has their square.
+        # The mean does not depend on the scale of the weights; its gradient contains their square.
         *(case(f"weights of {scale:g}", size, radiance, "renormalize", scaled(scale)) for scale in (1e-15, 1e15)),
         case("one weight infinite", size, radiance, "replicate", one_infinite),
         case("7x7 on 1x2", (1, 3, 1, 2), radiance, "renormalize", kernel_size=7),
@@ -127,7 +127,7 @@ def filters() -> tuple[Case, ...]:
 
 
 def filter_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """``sum(k x) / sum(k)`` grows with a weight by the pixel and shrinks by the mean, each over ``sum(k)``."""
+    """The derivative of ``sum(k x) / sum(k)`` in a weight is the pixel minus the mean, each over ``sum(k)``."""
     if settings["border"] != "renormalize":
         return Rounding()
     image, kernel = inputs["image"], inputs["kernel"]
@@ -136,14 +136,14 @@ def filter_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     size = round(kernel.shape[1] ** 0.5)
     kernel = torch.where(inside(kernel.shape[-2], kernel.shape[-1], size, kernel.device), kernel, 0)
     total = kernel.sum(1, keepdim=True).abs()
-    # Over the pixels that a window reaches, which is more than the mean of their absolute values.
+    # The maximum over the window, which bounds the mean of the absolute values.
     brightest = torch.nn.functional.max_pool2d(image.abs().sum(1, keepdim=True), size, 1, size // 2)
-    share = torch.where(total > 0, kernel.abs().sum(1, keepdim=True) / total**2, 0)
-    return Rounding(gradients={"kernel": (brightest * share).expand_as(kernel)})
+    factor = torch.where(total > 0, kernel.abs().sum(1, keepdim=True) / total**2, 0)
+    return Rounding(gradients={"kernel": (brightest * factor).expand_as(kernel)})
 
 
 def splats() -> tuple[Case, ...]:
-    """Of ``softmax_splat``."""
+    """Cases of ``softmax_splat``."""
 
     def case(name: str, size: tuple[int, int, int, int], image: Draw, logits: Draw, kernel_size: int = 3) -> Case:
         def tensors(g: Generator) -> Inputs:
@@ -167,20 +167,20 @@ def splats() -> tuple[Case, ...]:
 
 
 def splat_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """The gradient of a logit is ``w (x[p] - out[q])``, ``w <= 1``: two terms as large as what a window holds."""
+    """The gradient of a logit, ``w (x[p] - out[q])`` with ``w <= 1``, has two terms of the size of pixels."""
     image, logits = inputs["image"], inputs["logits"]
     assert isinstance(image, Tensor)
     assert isinstance(logits, Tensor)
     if not image.numel():
         return Rounding()
     size = round(logits.shape[1] ** 0.5)
-    # The means of a pixel's targets are of pixels that are up to twice the radius away.
+    # The mean at a target of a pixel contains pixels up to twice the radius away.
     brightest = torch.nn.functional.max_pool2d(image.abs().sum(1, keepdim=True), 2 * size - 1, 1, size - 1)
     return Rounding(gradients={"logits": size**2 * brightest.expand_as(logits)})
 
 
 def bilateral() -> tuple[Case, ...]:
-    """Of ``cross_bilateral_weights``."""
+    """Cases of ``cross_bilateral_weights``."""
 
     def case(
         name: str,
@@ -220,11 +220,11 @@ def bilateral() -> tuple[Case, ...]:
         return draw
 
     def far_and_near(g: Generator, *shape: int) -> Tensor:
-        """Depths without limit: the sky at 1e10 beside what stands at 0."""
+        """Depths of 1e10, as of a sky, beside depths of 0 to 1."""
         return torch.where(uniform(g, *shape) < 0.5, 1e10, uniform(g, *shape))
 
     def normals(length: float) -> Draw:
-        """Some of them zero, the others of that length."""
+        """Normals of which some are zero and the others have this length."""
 
         def draw(g: Generator, *shape: int) -> Tensor:
             direction = torch.nn.functional.normalize(normal(g, *shape))
@@ -262,10 +262,11 @@ def bilateral() -> tuple[Case, ...]:
 
 
 def bilateral_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """The exponent is a sum of large terms: its rounding is that of a logit of the sum of their sizes.
+    """The exponent is a sum of large terms; its rounding error counts as that of a logit of the sum of their sizes.
 
-    ``exponent[t] = logit[t] - sum_g f_g d_g[t]^2 - f_d |o_t|^2`` is known to eps times ``|logit| + sum_g f_g d_g^2 +
-    f_d |o_t|^2``, however small the inputs and the result are. Of a weight, ``w exp(exponent)``, it is the same share.
+    ``exponent[t] = logit[t] - sum_g f_g d_g[t]^2 - f_d |o_t|^2`` has an error of eps times ``|logit| + sum_g f_g d_g^2
+    + f_d |o_t|^2``, however small the inputs and the result are. A weight, ``w exp(exponent)``, has the same relative
+    error.
     """
     kernel, guides, scales, distance = (inputs[name] for name in ("kernel", "guides", "scales", "distance_scale"))
     assert isinstance(kernel, Tensor)
@@ -294,7 +295,7 @@ def bilateral_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 
 def bilateral_filters() -> tuple[Case, ...]:
-    """Of ``cross_bilateral_filter``: those of the weights, with an image."""
+    """Cases of ``cross_bilateral_filter``: those of the weights, with an image."""
 
     def with_image(case: Case) -> Case:
         def tensors(g: Generator) -> Inputs:
@@ -302,20 +303,20 @@ def bilateral_filters() -> tuple[Case, ...]:
             kernel = inputs["kernel"]
             assert isinstance(kernel, Tensor)
             if case.settings["normalize"] == "none":
-                # Weights of both signs may have the sum zero.
+                # Weights of both signs may sum to zero.
                 inputs["kernel"] = kernel.abs()
             return {"image": radiance(g, kernel.shape[0], 3, *kernel.shape[2:]), **inputs}
 
         return replace(case, tensors=tensors, differentiable=())
 
-    # A mean with an infinite weight is none.
+    # A mean with an infinite weight is undefined.
     return tuple(with_image(case) for case in bilateral() if case.name != "one weight infinite")
 
 
 def bilateral_filter_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """What is rounded in the weights, and differences of terms of the size of a weight times the image.
+    """The rounding of the weights, and gradients that are differences of terms of the size of a weight times the image.
 
-    So it is where the weights are normalised, by a softmax or by the sum of those inside the image.
+    The latter applies if the weights are normalized, by a softmax or by the sum of the weights inside the image.
     """
     weights = bilateral_rounding(inputs, settings)
     image, kernel = inputs["image"], inputs["kernel"]
@@ -325,17 +326,17 @@ def bilateral_filter_rounding(inputs: Inputs, settings: dict[str, Any]) -> Round
         return weights
     if settings["normalize"] == "none":
         unsigned = {name: value for name, value in inputs.items() if name != "image"} | {"kernel": kernel.abs()}
-        shares = cross_bilateral_weights(**unsigned, **settings)  # type: ignore[arg-type]
-        shares = shares / shares.sum(1, keepdim=True).clamp_min(torch.finfo(shares.dtype).tiny)
-        gradients = _softmax_gradients(inputs, 2 * shares.nan_to_num(), "renormalize")
-        gradients["kernel"] = 2 * shares.nan_to_num() / kernel.abs()
+        fractions = cross_bilateral_weights(**unsigned, **settings)  # type: ignore[arg-type]
+        fractions = fractions / fractions.sum(1, keepdim=True).clamp_min(torch.finfo(fractions.dtype).tiny)
+        gradients = _softmax_gradients(inputs, 2 * fractions.nan_to_num(), "renormalize")
+        gradients["kernel"] = 2 * fractions.nan_to_num() / kernel.abs()
         weights = replace(weights, gradients=gradients)
     brightest = image.abs().sum(1, keepdim=True).amax((2, 3), keepdim=True)
     return Rounding(weights.arguments, gradients=map_tensors(lambda size: brightest * size, weights.gradients))
 
 
 def _softmax_gradients(inputs: Inputs, exponent: Tensor, border: Border) -> Inputs:
-    """``w (v - sum(w v))`` is a difference of terms of the size of ``w``, and so is all that follows."""
+    """``w (v - sum(w v))`` is a difference of terms of the size of ``w``, and so are the gradients that follow."""
     guides, scales, distance = inputs["guides"], inputs["scales"], inputs["distance_scale"]
     assert isinstance(guides, list)
     assert isinstance(scales, list)
@@ -361,7 +362,7 @@ def _softmax_gradients(inputs: Inputs, exponent: Tensor, border: Border) -> Inpu
 
 
 def images(halved: bool) -> tuple[Case, ...]:
-    """Of ``downsample``, and of ``upsample`` to the double size."""
+    """Cases of ``downsample``, or of ``upsample`` to twice the size."""
 
     def case(name: str, size: tuple[int, int, int, int], draw: Draw) -> Case:
         settings = {"size": (2 * size[2] - 1, 2 * size[3])} if halved else {}
@@ -371,7 +372,7 @@ def images(halved: bool) -> tuple[Case, ...]:
 
 
 def fusions() -> tuple[Case, ...]:
-    """Of ``laplacian_fusion``."""
+    """Cases of ``laplacian_fusion``."""
 
     def case(name: str, size: tuple[int, int, int, int], draw: Draw, alpha: Draw = uniform) -> Case:
         batch, channels, height, width = size
@@ -393,7 +394,7 @@ def fusions() -> tuple[Case, ...]:
 
 
 def partitions() -> tuple[Case, ...]:
-    """Of ``pyramid_partition``."""
+    """Cases of ``pyramid_partition``."""
 
     def three(g: Generator, *shape: int) -> Tensor:
         return 3 * normal(g, *shape)
@@ -421,7 +422,7 @@ def partition_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 
 def learned() -> tuple[Case, ...]:
-    """Of ``learned_upsample``."""
+    """Cases of ``learned_upsample``."""
 
     def weights(g: Generator, *shape: int) -> Tensor:
         return 4 * torch.softmax(3 * normal(g, *shape), 1)
@@ -450,13 +451,13 @@ def learned() -> tuple[Case, ...]:
 
 
 def demodulations(image: str) -> tuple[Case, ...]:
-    """Of ``demodulate`` and ``remodulate``."""
+    """Cases of ``demodulate`` and ``remodulate``."""
 
     def case(name: str, size: tuple[int, int, int, int], draw: Draw, albedo: Draw = uniform) -> Case:
         return Case(name, "extreme", lambda g: {image: draw(g, *size), "albedo": albedo(g, *size)}, ())
 
     def barely(g: Generator, *shape: int) -> Tensor:
-        """Albedos to both sides of the one below which there is no texture, as half precision has them."""
+        """Half-precision albedos on both sides of the threshold below which a pixel counts as untextured."""
         return 1e-4 * (1 + 2.0 ** -uniform(g, *shape, low=6, high=12) * torch.sign(normal(g, *shape)))
 
     return (
@@ -467,7 +468,7 @@ def demodulations(image: str) -> tuple[Case, ...]:
 
 
 def fireflies() -> tuple[Case, ...]:
-    """Of ``clamp_fireflies``."""
+    """Cases of ``clamp_fireflies``."""
 
     def case(name: str, size: tuple[int, int, int, int], draw: Draw, **settings: float) -> Case:
         return Case(name, "extreme", lambda g: {"image": draw(g, *size)}, (), settings)
@@ -481,7 +482,7 @@ def fireflies() -> tuple[Case, ...]:
 
 
 def firefly_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """``x limit n / y`` does not grow with a bright ``x``: it grows by ``limit n / y`` and shrinks by as much."""
+    """The derivative of ``x limit n / y`` in a bright ``x`` is a difference of terms of the size ``limit n / y``."""
     image = inputs["image"]
     assert isinstance(image, Tensor)
     before, after = image.sum(1, keepdim=True), clamp_fireflies(image, **settings).sum(1, keepdim=True)
@@ -490,7 +491,7 @@ def firefly_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 
 def lags() -> tuple[Case, ...]:
-    """Of ``history_lag``."""
+    """Cases of ``history_lag``."""
 
     def case(
         name: str, size: tuple[int, int, int, int], history: Draw, recent: Draw | None = None, noise: float = 0.3
@@ -515,7 +516,7 @@ def lags() -> tuple[Case, ...]:
 
 
 def transforms() -> tuple[Case, ...]:
-    """Of ``atrous``."""
+    """Cases of ``atrous``."""
 
     def case(
         name: str,
@@ -548,10 +549,10 @@ def transforms() -> tuple[Case, ...]:
 
 
 def transform_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """A weight below the smallest number of float32 is 0, however large the number it would have been multiplied with.
+    """A weight below the smallest number of float32 becomes 0, however large the value is that it multiplies.
 
-    Of these there are 25 a pixel. A derivative multiplies them with the range of the images, and with that of the
-    exponent in the argument, which is at most 1e4 where it counts.
+    A pixel has 25 weights. A derivative multiplies them by the range of the images and by the derivative of the
+    exponent in the argument, which is at most 1e4 where it matters.
     """
     tensors = {name: value for name, value in inputs.items() if isinstance(value, Tensor)}
     light, variance = tensors["light"], tensors["variance"]
@@ -566,7 +567,7 @@ def transform_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 
 def affinities() -> tuple[Case, ...]:
-    """Of ``affinity_filter``."""
+    """Cases of ``affinity_filter``."""
 
     def case(
         name: str,
@@ -612,9 +613,9 @@ def affinities() -> tuple[Case, ...]:
 
 
 def affinity_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """A mean grows with a weight by the value of its tap and shrinks by the mean, each over the sum of the weights.
+    """The derivative of a mean in a weight is the value of its tap minus the mean, each over the sum of the weights.
 
-    A weight below the smallest number of float32 may be 0 besides: then all of it is lost, times its value.
+    In addition, a weight below the smallest number of float32 may become 0: then the weight times its value is lost.
     """
     tensors = {name: value for name, value in inputs.items() if isinstance(value, Tensor)}
     image, here = tensors["image"], tensors["features"]
@@ -651,7 +652,7 @@ def affinity_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 
 def _guides() -> dict[str, Draw]:
-    """Guides that are all equal, at the ends of the range and beyond, and of two values."""
+    """Constant guides at the ends of the range and beyond, and a guide of two values."""
 
     def two(g: Generator, *shape: int) -> Tensor:
         return (uniform(g, *shape) > 0.5).double()
@@ -665,7 +666,7 @@ def _guides() -> dict[str, Draw]:
 
 
 def grid_splats() -> tuple[Case, ...]:
-    """Of ``grid_splat``."""
+    """Cases of ``grid_splat``."""
 
     def case(
         name: str,
@@ -683,14 +684,14 @@ def grid_splats() -> tuple[Case, ...]:
     return (
         *(case(*tried) for tried in _tried()),
         *(case(f"guide {name}", (1, 3, 3, 4), radiance, draw) for name, draw in _guides().items()),
-        # The tents of the neighbours end there.
+        # At bin centres the tents of the neighbouring bins end.
         case("guide at the centres of bins", (1, 1, 2, 3), radiance, _guides()["0 or 1"], bins=256),
         case("cells larger than the image", (1, 3, 3, 4), radiance, cell=100),
     )
 
 
 def grid_slices() -> tuple[Case, ...]:
-    """Of ``grid_slice``."""
+    """Cases of ``grid_slice``."""
 
     def case(
         name: str,
@@ -702,7 +703,7 @@ def grid_slices() -> tuple[Case, ...]:
         batch, channels, rows, columns = size
 
         def tensors(g: Generator) -> Inputs:
-            # Of the rows and columns of an image, whose pattern is that of the cells.
+            # Draw an image over the rows and columns of cells.
             grid = image(g, batch, channels, rows, columns)[..., None] * uniform(g, batch, 1, rows, columns, 4)
             known = filled(g, batch, 1, rows, columns, 4)
             return {"grid": grid, "filled": known, "guide": guide(g, batch, 1, 2 * rows, 2 * columns - 1)}
@@ -717,10 +718,10 @@ def grid_slices() -> tuple[Case, ...]:
 
 
 def grid_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """A guide becomes a coordinate up to the number of bins, and one over 255/256 of that moves it by one.
+    """The coordinate of a guide is a number up to the number of bins, and proportional to the guide.
 
-    So one unit of the guide absorbs the rounding of the coordinate, and that of a tent's height of one. The derivatives
-    of a mean, ``sum a' (c - mean) / sum a``, are differences of terms of the size of both.
+    So the rounding errors of the coordinate, and of the height of a tent, count as those of a guide of 1. The
+    derivatives of a mean, ``sum a' (c - mean) / sum a``, are differences of terms of the size of ``c`` and of the mean.
     """
     tensors = {name: value for name, value in inputs.items() if isinstance(value, Tensor)}
     guide = tensors["guide"]
@@ -754,13 +755,13 @@ def grid_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 
 def _tents(side: int, cell: int) -> Tensor:
-    """``(cells, side)`` how much each pixel of a row is of each cell."""
+    """``(cells, side)`` weight of each pixel of a row in each cell."""
     place = (torch.arange(side, dtype=torch.float64) + 0.5) / cell
     return (1 - (place - torch.arange(-(-side // cell))[:, None] - 0.5).abs()).clamp_min(0)
 
 
 def importances() -> tuple[Case, ...]:
-    """Of ``importance_filter``."""
+    """Cases of ``importance_filter``."""
 
     def case(
         name: str, size: tuple[int, int, int, int], image: Draw, worth: Draw = normal, kernel_size: int = 3
@@ -774,7 +775,7 @@ def importances() -> tuple[Case, ...]:
         return uniform(g, *shape, low=-1e4, high=1e4)
 
     def cliff(g: Generator, *shape: int) -> Tensor:
-        """Windows on both sides of it see nothing but the lowest and nothing but the highest."""
+        """An importance with a step: on either side, windows contain only small or only large values."""
         drawn = 0.1 * normal(g, *shape)
         return drawn + torch.where(torch.arange(shape[-1]) < shape[-1] // 2, -1e4, 1e4)
 
@@ -789,12 +790,12 @@ def importances() -> tuple[Case, ...]:
 
 
 def importance_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """A weight below the smallest number of float32 is 0, and derivatives of weights near 1 are small differences.
+    """A weight below the smallest number of float32 becomes 0, and derivatives of weights near 1 are small differences.
 
-    Two windows of weights ``a`` and ``b`` and means ``x`` and ``y`` are joined to ``a x / s + b y / s``, ``s = a + b``,
-    whose derivative in ``a`` is ``x / s - a x / s^2 - b y / s^2``. These terms may cancel. As ``s`` is at least 1, they
-    are together at most three times the largest pixel, in every channel, in each joining of two windows, for each of
-    the windows that a pixel is in.
+    Two windows with weights ``a`` and ``b`` and means ``x`` and ``y`` are merged to ``a x / s + b y / s``,
+    ``s = a + b``, whose derivative in ``a`` is ``x / s - a x / s^2 - b y / s^2``. These terms may cancel. Because ``s``
+    is at least 1, their sum is at most three times the brightest pixel, per channel, per merge of two windows, and per
+    window that contains the pixel.
     """
     image, importance = inputs["image"], inputs["importance"]
     assert isinstance(image, Tensor)
@@ -810,7 +811,7 @@ def importance_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 
 def luminances() -> tuple[Case, ...]:
-    """Of ``luminance_moments``."""
+    """Cases of ``luminance_moments``."""
     return tuple(
         Case(name, "extreme", lambda g, draw=draw, size=size: {"light": draw(g, size[0], 3, *size[2:])}, ())  # type: ignore[misc]
         for name, size, draw in _tried()
@@ -818,7 +819,7 @@ def luminances() -> tuple[Case, ...]:
 
 
 def moments() -> tuple[Case, ...]:
-    """Of ``moments_variance``."""
+    """Cases of ``moments_variance``."""
 
     def case(name: str, size: tuple[int, int, int, int], draw: Draw, spread: float = 1.0, kernel_size: int = 3) -> Case:
         batch, _, height, width = size
@@ -841,7 +842,7 @@ def moments() -> tuple[Case, ...]:
 
 
 def gradients() -> tuple[Case, ...]:
-    """Of ``temporal_gradient``."""
+    """Cases of ``temporal_gradient``."""
 
     def case(
         name: str, size: tuple[int, int, int, int], draw: Draw, noise: float = 0.1, depth: Draw | None = None
@@ -870,15 +871,15 @@ def gradients() -> tuple[Case, ...]:
     )
 
 
-# Of the unit of luminance, in the unit of each.
+# Powers of the unit of luminance in the unit of each argument.
 _POWERS = {"current": 1, "previous": 1, "variance": 2}
 
 
 def gradient_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """The derivatives of ``sqrt((D / M)^2 - (t / M)^2 V)`` are differences of terms that may cancel altogether.
+    """The derivatives of ``sqrt((D / M)^2 - (t / M)^2 V)`` are differences of terms that may cancel completely.
 
-    Such as in the weight of a single pixel, which ``D / M`` does not depend on. With ``|dD| <= dM`` the terms are no
-    more than ``2 ((D / M)^2 + t^2 V / M^2) dM / M + (t^2 V / M^2) dV / V`` over the result.
+    An example is the weight of a single pixel, on which ``D / M`` does not depend. With ``|dD| <= dM`` the terms are at
+    most ``2 ((D / M)^2 + t^2 V / M^2) dM / M + (t^2 V / M^2) dV / V`` over the result.
     """
     names = ("current", "previous", "weight")
     tensors = {name: inputs[name].clone().requires_grad_() for name in names if isinstance(inputs.get(name), Tensor)}  # type: ignore[union-attr]
@@ -903,10 +904,10 @@ def gradient_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
         result = torch.sqrt(torch.where(found, change - noisy, 1))
         of_size = torch.where(found, 2 * (change + noisy) / result, 0) * torch.log(size)
         of_noise = torch.where(found, noisy / result, 0) * torch.log(torch.where(noise > 0, noise, 1))
-        # The gradient of a pixel is that of all pixels of a stratum.
+        # A pixel has the gradient terms of all pixels of its stratum.
         terms = defaults["stratum"] ** 2 * (of_size + of_noise).sum()
         found_gradients = torch.autograd.grad(terms, list(tensors.values()), allow_unused=True, materialize_grads=True)
-    # In the unit of the largest luminance, what is below the smallest number of float32 is nothing.
+    # Relative to the maximum luminance, values below the smallest number of float32 become 0.
     limits = torch.finfo(torch.float32)
     largest = max(float(tensors[name].detach().abs().max()) for name in ("current", "previous"))
     lost = {name: limits.tiny / limits.eps * largest**power for name, power in _POWERS.items()}
@@ -915,7 +916,7 @@ def gradient_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     gradients: Inputs = dict(zip(tensors, found_gradients, strict=True))
     facing, deviation = inputs.get("normal"), inputs.get("variance")
     if isinstance(facing, Tensor) and isinstance(deviation, Tensor) and found.any():
-        # So is the square of a weight, however large the variance that it is multiplied with beside that of its pixel.
+        # So do squared weights, however large the variance is that they multiply.
         spread = float(deviation.max()) / (float(size.detach()[found].min()) * largest) ** 2
         lost_weight = 9 * defaults["levels"] * limits.tiny / limits.eps * threshold**2 * spread
         gradients["normal"] = torch.full_like(facing, 2 * SIGMA_N * lost_weight)
@@ -926,7 +927,7 @@ def gradient_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 
 def regressions() -> tuple[Case, ...]:
-    """Of ``block_regression``."""
+    """Cases of ``block_regression``."""
 
     def case(name: str, size: tuple[int, int, int, int], draw: Draw, features: Draw = normal, squares: int = 1) -> Case:
         batch, _, height, width = size
@@ -939,16 +940,16 @@ def regressions() -> tuple[Case, ...]:
     size = (1, 3, 3, 4)
     return (
         *(case(*tried) for tried in _tried()),
-        # A feature of which nearly all is one pixel is its own square.
+        # No squares: a feature that is nearly all in one pixel is proportional to its square.
         *(case(f"features {name}", size, radiance, draw, squares=0) for name, draw in IMAGES.items()),
     )
 
 
 def motions() -> tuple[Case, ...]:
-    """Of ``motion_from_position``."""
+    """Cases of ``motion_from_position``."""
 
     def case(name: str, position: Draw, w: float = 1.0, size: tuple[int, int, int, int] = (1, 3, 3, 4)) -> Case:
-        """Seen from a camera at the origin that looks along z; ``w`` scales its last column."""
+        """A case with a camera at the origin that looks along z; ``w`` scales the last column of its matrix."""
 
         def tensors(g: Generator) -> Inputs:
             matrix = torch.eye(4, dtype=torch.float64).repeat(size[0], 1, 1)
@@ -974,7 +975,7 @@ def motions() -> tuple[Case, ...]:
         case("some infinite", some(torch.inf)),
         case("some NaN", some(torch.nan)),
         case("behind the camera", lambda g, *shape: -before(3.0)(g, *shape)),
-        # Of points beside the plane of the eye the motion is a very large number.
+        # Points near the plane of the camera have very large motion.
         case("w of 1e-15", before(1.0), 1e-15),
         case("w of 1e15", before(1.0), 1e15),
         case("one row of 9", before(3.0), size=(1, 3, 1, 9)),
@@ -983,14 +984,14 @@ def motions() -> tuple[Case, ...]:
 
 
 def motion_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """A motion is a difference of two places in the image, which are rounded as numbers up to its size."""
+    """Motion is a difference of two pixel positions, which are rounded as numbers up to the image's size."""
     position = inputs["position"]
     assert isinstance(position, Tensor)
     return Rounding(result=float(max(position.shape[-2:])))
 
 
 def histories(accumulating: bool) -> tuple[Case, ...]:
-    """Of ``reproject`` and ``accumulate``."""
+    """Cases of ``reproject`` and ``accumulate``."""
 
     def case(
         name: str,
@@ -1053,7 +1054,7 @@ def history_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     motion, previous = inputs["motion"], inputs["previous"]
     assert isinstance(motion, Tensor)
     assert isinstance(previous, Tensor)
-    # The derivative in the motion is a difference of neighbours, and one of the kept taps and of their weights.
+    # The derivative in the motion contains differences of neighbours, and of the accepted taps and their weights.
     here, there = inputs.get("surface"), inputs.get("previous_surface")
     assert here is None or isinstance(here, Surface)
     assert there is None or isinstance(there, Surface)
@@ -1067,7 +1068,7 @@ def history_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
         if "color" in inputs:
             color = inputs["color"]
             assert isinstance(color, Tensor)
-            # A longer history trades the present for the past.
+            # The derivative in the history length is the difference of the current color and the history.
             terms = terms * (2 + color.abs().sum(1, keepdim=True))
         gradient = gradient + 8 * (1 + terms) / torch.where(kept > 0, kept, torch.inf)
     magnitude = motion.abs() + float(max(motion.shape[-2:]))

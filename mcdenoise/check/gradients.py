@@ -1,4 +1,4 @@
-"""Prove the derivatives of every op, or of a function of one's own, against difference quotients."""
+"""Checks of the derivatives of every op, or of a function of your own, against finite differences."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from mcdenoise.check.own import find_ops, op_of
 from mcdenoise.check.step_cases import STEPS
 from mcdenoise.ops import use
 
-# Only to make a failure repeatable: any upstream gradient must do.
+# Makes failures reproducible; the checks must pass for any upstream gradient.
 SEED = 0
 
 
 @dataclass(frozen=True)
 class GradcheckResult:
-    """What became of one case of one op.
+    """Result of the gradient check of one case of an op.
 
     Args:
         op: name of the op.
         case: name of the case.
-        inputs: the arguments whose first and second derivatives were checked.
-        passed: whether all of them agree.
-        seconds: time it took.
-        message: first line of what is wrong; empty if nothing is.
+        inputs: the arguments whose derivatives were checked.
+        passed: whether all derivatives agree.
+        seconds: run time of the check.
+        message: first line of the error message; empty if the check passed.
     """
 
     op: str
@@ -43,21 +43,21 @@ class GradcheckResult:
 
 
 def gradcheck(function: Callable[..., Any], *inputs: Tensor, order: int = 2) -> list[GradcheckResult]:
-    """Compare the derivatives of a function of one's own with difference quotients, in float64 and number by number.
+    """Compare the derivatives of a function of your own with finite differences, in float64 and element by element.
 
     ``mcdenoise gradcheck path/to/file.py:function`` does the same.
 
     Args:
-        function: of floating-point tensors, which returns one or several.
-        inputs: small tensors to try it on, of any floating-point dtype; those alone that require gradients are moved,
-            if any does. Without them, its example inputs, see :mod:`mcdenoise.check.own`.
-        order: 1 for first derivatives, 2 for second ones too.
+        function: takes floating-point tensors, and returns one or several.
+        inputs: small example inputs of any floating-point dtype. If some of them require gradients, derivatives are
+            checked in these only. By default the function's example inputs, see :mod:`mcdenoise.check.own`.
+        order: 1 to check first derivatives, 2 to check second derivatives too.
 
     Returns:
         One result for each case.
 
     Raises:
-        InputError: it is no such function, or there is nothing that it runs on.
+        InputError: ``function`` is not such a function, or it runs on none of its example inputs.
 
     Example:
         >>> import torch
@@ -70,53 +70,54 @@ def gradcheck(function: Callable[..., Any], *inputs: Tensor, order: int = 2) -> 
 
 
 def check(names: Sequence[str] | None = None) -> list[GradcheckResult]:
-    """Compare first and second derivatives with difference quotients, in float64 and number by number.
+    """Compare first and second derivatives with finite differences, in float64 and element by element.
 
     Args:
-        names: ops to check, or functions of one's own, ``path/to/file.py:function`` or ``package.module:function``;
+        names: ops to check, or functions of your own, ``path/to/file.py:function`` or ``package.module:function``;
             ``None`` means all ops.
 
     Returns:
-        One result for each case of each op that has a differentiable input.
+        One result for each case that has a differentiable input.
 
     Raises:
-        InputError: there is no such op or function, or nothing that it runs on.
+        InputError: there is no such op or function, or the function runs on none of its example inputs.
     """
     return [check_case(op, case) for op, case in select(names)]
 
 
 def select(names: Sequence[str] | None = None) -> list[tuple[Op, Case]]:
-    """The cases that :func:`check` goes through, each with its op; ``InputError`` as there."""
+    """The cases that :func:`check` checks, each with its op; raises ``InputError`` like it."""
     ops = OPS + STEPS if names is None else find_ops(names, OPS + STEPS)
     return [(op, case) for op in ops for case in op.cases if case.differentiable]
 
 
 def check_case(op: Op, case: Case, order: int = 2) -> GradcheckResult:
-    """:func:`check` of one case; of ``order`` 1, of first derivatives alone."""
+    """:func:`check` for one case; with ``order`` 1 only of first derivatives."""
     start = time.perf_counter()
     try:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(SEED)
             message = _mismatch(op, case, order)
-    except Exception as error:  # whatever an op raises belongs in the report of that op, and the others go on
+    except Exception as error:  # an op may raise any exception; it is reported, and the other cases continue
         message = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
     seconds = time.perf_counter() - start
     return GradcheckResult(op.name, case.name, case.differentiable, not message, seconds, message)
 
 
 def _mismatch(op: Op, case: Case, order: int) -> str:
-    """What is wrong; torch's own check, of functions of one's own and of the smallest case of an op, raises it."""
+    """The first mismatch, or an empty string; torch's own check raises its mismatches instead."""
     function, arguments = _of_differentiable(op, case)
     batched = op.batched and all(len(tensor) for tensor in arguments)
     if batched:
-        # Of the many copies together a fast form may be chosen, which would prove nothing of the plain one.
+        # Without this, a fast backend might be chosen for a large batch, and the reference would not be checked.
         with use("torch"):
             message = first_mismatch(function, arguments)
             if order > 1 and not message:
                 message = second_mismatch(function, arguments)
         if message:
             return message
-    # It calls the op for every number, and looks at more: gradients that are undefined, or not the same each time.
+    # torch's own check calls the op for every element, so it is used for users' functions and for the smallest case of
+    # an op. It also finds undefined and non-deterministic gradients.
     if not batched or case is _smallest(op):
         torch.autograd.gradcheck(function, arguments, fast_mode=False)
         if order > 1:
@@ -125,7 +126,7 @@ def _mismatch(op: Op, case: Case, order: int) -> str:
 
 
 def _smallest(op: Op) -> Case:
-    """Of the cases with derivatives in the most arguments the one with the fewest numbers, but with some."""
+    """The smallest non-empty case among those with derivatives in the largest number of arguments."""
 
     def size(case: Case) -> tuple[int, float]:
         numbers = 0
@@ -142,7 +143,7 @@ def _smallest(op: Op) -> Case:
 
 
 def _of_differentiable(op: Op, case: Case) -> tuple[Callable[..., tuple[Tensor, ...]], tuple[Tensor, ...]]:
-    """The op as a function of its differentiable tensors alone, of one or several batches, and those tensors."""
+    """The op as a function of its differentiable tensors only, for one or several batches, and these tensors."""
     fixed = case.inputs()
     arguments: list[Tensor] = []
 
@@ -165,6 +166,6 @@ def _of_differentiable(op: Op, case: Case) -> tuple[Callable[..., tuple[Tensor, 
 
 
 def _finite(result: Tensor) -> Tensor:
-    # A constant infinity (the motion of a point behind the camera) has no difference quotient. Cut out, it still must
-    # not leave a NaN in the gradient of anything else.
+    # A constant infinity (the motion of a point behind the camera) has no finite difference. It is replaced here, but
+    # must not cause NaN in other gradients.
     return torch.where(torch.isfinite(result), result, 0)

@@ -1,4 +1,4 @@
-"""What there is in ``mcdenoise.ops``, and how exact it is."""
+"""List of the operators in ``mcdenoise.ops``, with their errors."""
 
 from __future__ import annotations
 
@@ -16,15 +16,14 @@ DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
 @dataclass(frozen=True)
 class OpOverview:
-    """One op in a few words and numbers.
+    """Summary of one op.
 
     Args:
         name: name of the op.
         summary: first line of its docstring.
-        differentiable: the arguments that it has derivatives in.
-        cases: number of cases that it is tried on.
-        errors: for each dtype (``"float32"``) the largest relative error over the ordinary cases; see
-            :func:`relative_error`.
+        differentiable: the arguments in which it is differentiable.
+        cases: number of its test cases.
+        errors: maximum relative error over the ordinary cases, by dtype (``"float32"``); see :func:`relative_error`.
         module: name of the Module twin, if there is one.
     """
 
@@ -37,7 +36,7 @@ class OpOverview:
 
 
 def overview() -> list[OpOverview]:
-    """Every op, with its error against the equations in float64 measured on the spot."""
+    """Summarize every op; this measures its errors against its equation in float64."""
     return [
         OpOverview(
             name=op.name,
@@ -57,11 +56,10 @@ def overview() -> list[OpOverview]:
 
 
 def relative_error(op: Op, case: Case, dtype: torch.dtype) -> float:
-    """``max |out - reference| / max |reference|``, the largest over the op's results.
+    """``max |out - reference| / max |reference|``, the maximum over the op's results.
 
-    Both see the same inputs, rounded to ``dtype``; the reference computes with them in float64. Where ``dtype`` cannot
-    hold the reference, infinity is the right result; a result that is infinite or NaN elsewhere counts as infinite
-    error.
+    Both get the same inputs, rounded to ``dtype``; the reference computes in float64. Where the reference exceeds the
+    range of ``dtype``, the result must be infinite; any other infinite or NaN result is an infinite error.
     """
     inputs = case.inputs(dtype)
     results = op.function(**inputs, **case.settings)

@@ -1,7 +1,7 @@
-"""Every op once more, as its equation: loops over pixels and taps on Python's float64 numbers.
+"""The equations of all ops as loops over pixels and taps, in Python's float64 numbers.
 
-Slow, and meant to be read beside the formula. Nothing here is shared with the ops, so that an error in one of them
-cannot hide in the other. The arguments are those of the ops; results are float64 whatever the inputs are.
+These functions are slow, and written to be compared with the formulas by eye. They share no code with the ops, so that
+both cannot have the same error. They take the arguments of the ops; their results are always float64.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Image = list[Any]
 
 
 def kernel_conv(image: Tensor, kernel: Tensor, *, border: str = "replicate") -> Tensor:
-    """Eq. 4: ``out[p] = sum_t kernel[t, p] image[p + o_t]``; ``"renormalize"`` divides by the weights inside."""
+    """Eq. 4: ``out[p] = sum_t kernel[t, p] image[p + o_t]``; ``"renormalize"`` divides by the sum of weights inside."""
     source, weights, out = image.tolist(), kernel.tolist(), _zeros(image.shape)
     for b, c, y, x in _indices(image.shape):
         total = inside = 0.0
@@ -39,7 +39,7 @@ def kernel_conv(image: Tensor, kernel: Tensor, *, border: str = "replicate") -> 
 
 
 def kernel_splat(image: Tensor, kernel: Tensor, *, border: str = "replicate") -> Tensor:
-    """``out[p + o_t] += kernel[t, p] image[p]``; ``"renormalize"`` first divides by the weights inside."""
+    """``out[p + o_t] += kernel[t, p] image[p]``; ``"renormalize"`` first divides by the sum of weights inside."""
     source, weights, out = image.tolist(), kernel.tolist(), _zeros(image.shape)
     for b, c, y, x in _indices(image.shape):
         value = source[b][c][y][x]
@@ -53,14 +53,14 @@ def kernel_splat(image: Tensor, kernel: Tensor, *, border: str = "replicate") ->
 
 
 def softmax_splat(image: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
-    """``sum exp(l) image / sum exp(l)`` over what arrives at a pixel, and ``log(sum exp(l))``, in decimal numbers."""
+    """``sum exp(l) image / sum exp(l)`` over the splats at a pixel, and ``log(sum exp(l))``, in decimal numbers."""
     source, exponents = image.tolist(), logits.tolist()
     batch, channels, height, width = image.shape
     out, log_weight = _zeros(image.shape), _zeros((batch, 1, height, width))
     with localcontext(prec=40):
         for b, y, x in itertools.product(range(batch), range(height), range(width)):
             weights = {}
-            # What arrives by the tap t is of the pixel opposite to it.
+            # The splat of tap t comes from the pixel in the opposite direction.
             for t, _, row, column in _taps(logits, y, x, "zeros"):
                 if row is not None:
                     weights[row, column] = Decimal(exponents[b][logits.shape[1] - 1 - t][row][column]).exp()
@@ -83,7 +83,7 @@ def cross_bilateral_weights(
 ) -> Tensor:
     """Eqs. 5-8: ``w' = w * prod_g exp(-f_g |g(q) - g(p)|^2) * exp(-f_d |q - p|^2)``.
 
-    ``"softmax"`` is the same with ``w = exp(logit)``, divided by the sum over the taps.
+    ``"softmax"`` has ``w = exp(logit)``, and divides by the sum over the taps.
     """
     logits, out = kernel.tolist(), _zeros(kernel.shape)
     images = [guide.tolist() for guide in guides]
@@ -113,9 +113,9 @@ def cross_bilateral_weights(
 
 
 def _softmax(exponents: dict[int, list[float]]) -> dict[int, float]:
-    """``exp(sum of the terms)`` of each key over their total: decimal numbers hold what float64 cannot.
+    """Softmax of the sum of terms of each key, in decimal numbers, which do not overflow like float64.
 
-    An infinite term is the limit of a large one.
+    Infinite terms are treated as limits of large ones.
     """
     infinite = [any(term == math.inf for term in terms) for terms in exponents.values()]
     vanishing = [any(term == -math.inf for term in terms) for terms in exponents.values()]
@@ -138,13 +138,13 @@ def cross_bilateral_filter(
     normalize: str = "softmax",
     border: str = "replicate",
 ) -> Tensor:
-    """Eqs. 4-8, one after the other."""
+    """Eqs. 5-8, then Eq. 4."""
     weights = cross_bilateral_weights(kernel, guides, scales, distance_scale, normalize=normalize, border=border)
     return kernel_conv(image, weights, border=border)
 
 
 def downsample(image: Tensor) -> Tensor:
-    """``D`` of Eq. 2: the mean of those pixels of each 2x2 block that exist."""
+    """``D`` of Eq. 2: the mean of each 2x2 block, over the pixels inside the image."""
     batch, channels, height, width = image.shape
     shape = (batch, channels, (height + 1) // 2, (width + 1) // 2)
     source, out = image.tolist(), _zeros(shape)
@@ -179,7 +179,7 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
 
 
 def pyramid_partition(image: Tensor, logits: Tensor) -> tuple[Tensor, ...]:
-    """``out_i[q] = mean of softmax(logits)[i] image`` over the pixels of block ``q`` that exist."""
+    """``out_i[q] = mean of softmax(logits)[i] image`` over the pixels of block ``q`` inside the image."""
     batch, channels, height, width = image.shape
     source, exponents, found = image.tolist(), logits.tolist(), []
     for level in range(logits.shape[1]):
@@ -198,7 +198,7 @@ def pyramid_partition(image: Tensor, logits: Tensor) -> tuple[Tensor, ...]:
 
 
 def learned_upsample(image: Tensor, kernel: Tensor, size: tuple[int, int], *, border: str = "replicate") -> Tensor:
-    """Tap ``(r, s)`` of coarse pixel ``(i, j)`` goes to the fine one ``(2 i + r - K / 2 + 1, 2 j + s - K / 2 + 1)``."""
+    """Tap ``(r, s)`` of coarse pixel ``(i, j)`` is added to ``(2 i + r - K / 2 + 1, 2 j + s - K / 2 + 1)``."""
     batch, channels, coarse_height, coarse_width = image.shape
     side, shape = math.isqrt(kernel.shape[1]), (batch, channels, *size)
     source, weights, out = image.tolist(), kernel.tolist(), _zeros(shape)
@@ -231,7 +231,7 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = 4e-2) -> Tensor:
 
 
 def clamp_fireflies(image: Tensor, *, limit: float = 15.0, kernel_size: int = 7) -> Tensor:
-    """``image[p] * min(1, limit n[p] / y[p])``, with the channels' mean ``y`` and its mean ``n`` over lit others."""
+    """``image[p] * min(1, limit n[p] / y[p])``, with the channel mean ``y`` and its mean ``n`` over lit neighbours."""
     source, out = image.tolist(), _zeros(image.shape)
     batch, channels, height, width = image.shape
     radius = kernel_size // 2
@@ -262,7 +262,7 @@ def atrous(
     sigma_n: float = 128.0,
     sigma_l: float = 4.0,
 ) -> tuple[Tensor, Tensor]:
-    """SVGF, Eqs. 1 to 5: weighted means over 5x5 taps ``step`` pixels apart, of the light and of its variance."""
+    """SVGF, Eqs. 1-5: weighted means of light and variance over 5x5 taps that are ``step`` pixels apart."""
     source, noise, bright = light.tolist(), variance.tolist(), luminance_moments(light).tolist()
     out, out_noise = _zeros(light.shape), _zeros(variance.shape)
     kernel = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
@@ -301,7 +301,7 @@ def affinity_filter(
     kernel_size: int = 7,
     dilation: int = 1,
 ) -> Tensor:
-    """Means with weights ``exp(-a |f_p - f_q|^2)``, ``c`` of the pixel itself; likewise over the frame before."""
+    """Means with weights ``exp(-a |f_p - f_q|^2)``, and ``c`` for the pixel itself; also over the previous frame."""
     frames: list[tuple[Image, Image, Image, Image | None]]
     frames = [(image.tolist(), features.tolist(), bandwidth.tolist(), None)]
     if previous is not None and previous_features is not None:
@@ -333,7 +333,7 @@ def affinity_filter(
 
 
 def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) -> Tensor:
-    """Fan et al. 2021: means over a window with the softmax of the importance in it; taps outside are absent."""
+    """Fan et al. 2021: means over a window, weighted by the softmax of the importance; taps outside are skipped."""
     source, worth, out = image.tolist(), importance.tolist(), _zeros(image.shape)
     radius, (_, _, height, width) = kernel_size // 2, image.shape
     for b, c, y, x in _indices(image.shape):
@@ -386,7 +386,7 @@ def moments_variance(
 def _edge_stopping(
     normal: Tensor | None, depth: Tensor | None, sigma_z: float, sigma_n: float
 ) -> Callable[[int, int, int, int, int], float]:
-    """SVGF, Eqs. 3 and 4: ``w_z w_n`` of a pixel and a tap; background is like background."""
+    """SVGF, Eqs. 3 and 4: ``w_z w_n`` of a pixel and a tap; background matches background."""
     normals, depths = (None if image is None else image.tolist() for image in (normal, depth))
 
     def slope(z: list[list[float]], y: int, x: int, dy: int, dx: int) -> float:
@@ -425,7 +425,7 @@ def _clamp(place: int, size: int) -> int:
 def history_lag(
     history: Tensor, recent: Tensor, variance: Tensor, *, threshold: float = 2.0, kernel_size: int = 5
 ) -> Tensor:
-    """``clamp((z^2 / threshold^2 - 1) / 3, 0, 1)`` of the difference of local means in standard errors ``z``."""
+    """``clamp((z^2 / threshold^2 - 1) / 3, 0, 1)``, where ``z`` is the difference of local means in standard errors."""
     batch, channels, height, width = history.shape
     shape = (batch, 1, height, width)
     long, short = (
@@ -480,7 +480,7 @@ def grid_splat(image: Tensor, guide: Tensor, *, cell: int = 8, bins: int = 32) -
 
 
 def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = 8) -> Tensor:
-    """``sum a filled grid / sum a filled`` over all cells; 0 where the divisor is."""
+    """``sum a filled grid / sum a filled`` over all cells; 0 where the divisor is 0."""
     batch, channels, *grid_shape = grid.shape
     shape = (batch, channels, *guide.shape[2:])
     means, known, guides, out = grid.tolist(), filled.tolist(), guide.tolist(), _zeros(shape)
@@ -497,7 +497,7 @@ def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = 8) ->
 
 
 def _cell_weight(y: int, x: int, guide: float, v: int, u: int, w: int, cell: int, bins: int) -> float:
-    """Of a pixel in a cell of a bilateral grid: a product of three tents."""
+    """Weight of a pixel in a cell of a bilateral grid: a product of three tents."""
     z = 255 * min(max(guide, 0.0), 1.0)
     distances = ((x + 0.5) / cell - (u + 0.5), (y + 0.5) / cell - (v + 0.5), (z + 0.5) * bins / 256 - (w + 0.5))
     return math.prod(max(1 - math.sqrt(distance**2 + 1e-8), 0.0) for distance in distances)
@@ -517,7 +517,7 @@ def temporal_gradient(
     sigma_z: float = 1.0,
     sigma_n: float = 128.0,
 ) -> Tensor:
-    """``sqrt((D^2 - threshold^2 V) / M^2)`` of sums over strata, smoothed over neighbours of the same surface."""
+    """``sqrt((D^2 - threshold^2 V) / M^2)`` of sums over strata, smoothed over neighbours on the same surface."""
     now, before, out = current.tolist(), previous.tolist(), _zeros(current.shape)
     weights = torch.ones_like(current).tolist() if weight is None else weight.tolist()
     noises = torch.zeros_like(current).tolist() if variance is None else variance.tolist()
@@ -573,7 +573,7 @@ def block_regression(
 ) -> Tensor:
     """The normal equations of each block, ``(Z^T Z + n ridge) w = Z^T (y - m)``; ``out = m + Z w``.
 
-    By elimination in decimal numbers: float64 has too few digits for the square of a condition.
+    They are solved in decimal numbers, because their condition number is squared, for which float64 is too inaccurate.
     """
     batch, channels, height, width = image.shape
     source, guides, out = image.tolist(), features.tolist(), _zeros(image.shape)
@@ -609,11 +609,11 @@ def block_regression(
     return _tensor(out, image.shape)
 
 
-def _standardized(values: list[Decimal], least: str) -> list[Decimal]:
-    """``(x - mean) / sqrt(variance + least mean square)``."""
+def _standardized(values: list[Decimal], minimum: str) -> list[Decimal]:
+    """``(x - mean) / sqrt(variance + minimum * mean square)``."""
     mean, square = _mean(values), _mean([value * value for value in values])
     variance = _mean([(value - mean) ** 2 for value in values])
-    size = (variance + Decimal(least) * square).sqrt()
+    size = (variance + Decimal(minimum) * square).sqrt()
     return [(value - mean) / size if size else Decimal(0) for value in values]
 
 
@@ -626,7 +626,7 @@ def _product(values: list[Decimal], others: list[Decimal]) -> Decimal:
 
 
 def _solved(matrix: list[list[Decimal]], right: list[Decimal]) -> list[Decimal]:
-    """Gauss's elimination; the matrix is positive definite, so that no rows need to be exchanged."""
+    """Gaussian elimination; it needs no pivoting because the matrix is positive definite."""
     rows = [[*row, value] for row, value in zip(matrix, right, strict=True)]
     for j, pivot in enumerate(rows):
         for row in rows[j + 1 :]:
@@ -719,7 +719,7 @@ def accumulate(
         found = weight[b][0][y][x] > 0
         alpha = max(1 / (n + 1), alpha_min) if found else 1.0
         out[b][c][y][x] = alpha * source[b][c][y][x] + (1 - alpha) * history[b][c][y][x]
-        # The published code keeps the length in a byte.
+        # The published code stores the length in a byte.
         grown = min(round(n) + 1, 255) if rule == "bmfr" else n + 1
         length[b][0][y][x] = grown if found else 1.0
     return _tensor(out, color.shape), _tensor(length, previous_length.shape)
@@ -739,7 +739,7 @@ def _indices(shape: Sequence[int]) -> Iterator[tuple[int, ...]]:
 
 
 def _taps(kernel: Tensor, y: int, x: int, border: str) -> Iterator[tuple[int, int, int | None, int]]:
-    """Of each tap its index, squared distance from the centre, and row and column; row ``None``: reads no pixel."""
+    """Index, squared distance from the centre, row and column of each tap; the row of a skipped tap is ``None``."""
     _, taps, height, width = kernel.shape
     size = math.isqrt(taps)
     for t in range(taps):
@@ -778,7 +778,7 @@ def _same_surface(
     position_limit: float | None,
     normal_limit: float | None,
 ) -> bool:
-    # What one of the two surfaces lacks cannot be compared.
+    # Buffers that one of the two surfaces lacks are not compared.
     both = [(a, b) if a is not None and b is not None else None for a, b in zip(here, tap, strict=True)]
     positions, normals, depths, _ = both
     if rule == "bmfr":

@@ -1,6 +1,6 @@
-"""The fused steps and the inputs to try each of them on: what :mod:`mcdenoise.check.cases` is for the public ops.
+"""The table of fused steps with their test cases, like :mod:`mcdenoise.check.cases` for the public ops.
 
-The reference of a step is its formula, written out in float64 of torch's primitives or of other references.
+The reference of a step is its formula in float64, written with torch's primitives or with other references.
 """
 
 from __future__ import annotations
@@ -106,13 +106,13 @@ def _root(size: Size, g: Generator) -> Inputs:
     return {"root": root}
 
 
-def _past(channels: tuple[int, int], size: Size, g: Generator) -> Inputs:
+def _history(channels: tuple[int, int], size: Size, g: Generator) -> Inputs:
     entering, previous = _positive((size[0], *size[1:]), g, channels[0]), _positive(size, g, channels[1])
     return {
         "entering": entering,
         "previous": previous,
         "previous_length": uniform(g, size[0], 1, *size[1:], low=1.0, high=6.0),
-        # Away from whole pixels, where the derivative jumps.
+        # Stay away from whole pixels, where the derivative jumps.
         "motion": uniform(g, size[0], 2, *size[1:], low=0.1, high=0.4),
     }
 
@@ -213,7 +213,7 @@ def _blend(
 
 
 def _low_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """A pixel's own mean cancels against it: what is left of ``w / f - f w / f^2`` may be small beside both."""
+    """A pixel cancels against its own mean: the difference ``w / f - f w / f^2`` may be small beside both terms."""
     fine, coarse = inputs["fine"], inputs["coarse"]
     assert isinstance(fine, Tensor)
     assert isinstance(coarse, Tensor)
@@ -222,7 +222,7 @@ def _low_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 _BUFFERS = ("albedo", "normal", "current", "length", "exposure", "scale")
 
-# A frame is in float32 between its accumulation and a network's convolutions, and no step promises more.
+# Between accumulation and a network's convolutions frames are in float32, so steps need not support half precision.
 STEPS: tuple[Op, ...] = tuple(
     replace(step, half=False)
     for step in (
@@ -231,7 +231,7 @@ STEPS: tuple[Op, ...] = tuple(
         Op(network.buffers_input, _of_buffers, _cases(_buffers_input, ("image", *_BUFFERS))),
         Op(network.network_guides, _network_guides, _cases(_guides, ("normal", "scale"))),
         Op(network.depth_scale, _depth_scale, _cases(lambda size, g: {"depth": _depth(size, g)}, ())),
-        # Its weights are of no batch.
+        # Its weights have no batch axis.
         Op(
             network.gated_fusion,
             _gated_fusion,
@@ -259,7 +259,7 @@ STEPS: tuple[Op, ...] = tuple(
         Op(
             history.blend,
             _blend,
-            _cases(partial(_past, (3, 3)), ("entering", "previous", "motion")),
+            _cases(partial(_history, (3, 3)), ("entering", "previous", "motion")),
             rounding=lambda inputs, settings: history_rounding({**inputs, "color": inputs["entering"]}, settings),
         ),
     )

@@ -1,4 +1,4 @@
-"""One case after the other: a copy of what is intact, what is done to it, the command, and the verdict."""
+"""Runs attack cases: copies intact files, damages them, runs a command, and judges the result."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from world import build
 from mcdenoise.data.exr import read_exr
 from mcdenoise.errors import InputError
 
-# What commands write; all else in a case's folder has to stay as it was.
+# Files that commands write; all other files in the folder of a case must not change.
 _WRITTEN = re.compile(
     r"(out|filmed|run|rendered|generated|compared|\.cache|\.config|\.triton)(/.*)?|results/(index\.html|plots(/.*)?)|model\.pt2|out\.safetensors|\.output.*"
 )
@@ -38,9 +38,9 @@ class Attacker:
     """Runs cases and counts them.
 
     Args:
-        server: that runs the commands.
-        base: folder for everything.
-        counts: of cases and of failed ones, by group.
+        server: the server that runs the commands.
+        base: folder for all files.
+        counts: numbers of cases and of failed cases, by group.
     """
 
     def __init__(self, server: Server, base: Path, counts: Counter[tuple[str, str]]) -> None:
@@ -75,7 +75,7 @@ class Attacker:
         return folder
 
     def expected(self, name: str) -> tuple[object, set[str]]:
-        """What a command makes of what is intact, and the names of all files after that."""
+        """The result of a command on intact files, and the names of all files afterwards."""
         if name not in self._expected:
             command = COMMANDS[name]
             folder = self.fresh(command.needs)
@@ -89,7 +89,7 @@ class Attacker:
         return self._expected[name]
 
     def damaged(self, kind: str, name: str, seeds: range, group: str) -> list[str]:
-        """Cases of a kind of file and a command; those that failed, in words. The first are those of another place."""
+        """Run cases of a kind of file and a command; returns the failures. The first seeds replace the file."""
         target, command, failed = KINDS[kind], COMMANDS[name], []
         if not is_installed(command.requires):
             pytest.skip(f"{command.requires} is not installed")
@@ -110,7 +110,7 @@ class Attacker:
                 content = self.intact[source]
                 content = what(np.random.default_rng(seed), content)
                 path.write_bytes(content)
-                # Only where it is asked for: hostile bytes are not for every library.
+                # Evaluated lazily, because not every library can read damaged files safely.
                 same = partial(_alike, target.meaning, content, self.intact[source])
             ended = self.run(command.command, folder, seconds=command.seconds)
             problem = self.judge(name, folder, ended, same=same, besides=str(place))
@@ -118,7 +118,7 @@ class Attacker:
         return failed
 
     def count(self, group: str, problem: str, words: str, folder: Path) -> list[str]:
-        """Count a case; in words if it failed."""
+        """Count a case; returns a description if it failed."""
         self.counts[group, "cases"] += 1
         shutil.rmtree(folder, ignore_errors=True)
         if not problem:
@@ -136,15 +136,15 @@ class Attacker:
         besides: str = "",
         needed: bool = False,
     ) -> str:
-        """What does not hold of a case, or an empty text.
+        """The problem of a case, or an empty string.
 
         Args:
-            name: of the command.
-            folder: where it ran.
-            ended: what became of it.
-            same: whether its result has to be that of what is intact, unless it warns.
-            besides: a file that has been damaged.
-            needed: whether it has to succeed.
+            name: name of the command.
+            folder: folder in which it ran.
+            ended: how it ended.
+            same: whether the result must be that of intact files, unless the command warns.
+            besides: the file that was damaged.
+            needed: whether the command must succeed.
         """
         command, (result, after) = COMMANDS[name], self.expected(name)
         problem = _of_lines(command, ended)
@@ -155,7 +155,7 @@ class Attacker:
         found = names(folder)
         if left := [each for each in found if _LEFTOVER.search(each)]:
             return f"left over: {left}"
-        # A link to nothing is followed where something is written.
+        # Writing to a dangling link creates its target.
         followed = {besides, Path(besides).with_name("nothing").as_posix()} if besides else set()
         strange = {each for each in found - after - followed if not _CHANGING.fullmatch(each)}
         if ended.status == 0 and strange:
@@ -170,11 +170,11 @@ class Attacker:
             except (InputError, OSError, ValueError, KeyError) as error:
                 return f"status 0, and no result: {error}"
             if made != result and "warning: " not in ended.err and (same if isinstance(same, bool) else same()):
-                return "another result, without a word"
+                return "another result, without a warning"
         return ""
 
     def touched(self, folder: Path, needs: tuple[str, ...], besides: str = "") -> str:
-        """Which input is not as it was."""
+        """An input that was changed, or an empty string."""
         for path, content in self.intact.items():
             place = path.relative_to(self.world).as_posix()
             if place == besides or place.split("/")[0] not in needs or _WRITTEN.fullmatch(place):
@@ -184,17 +184,17 @@ class Attacker:
         return ""
 
     def lines(self, name: str, ended: Ended) -> str:
-        """What is wrong with how a command ended, and with what it printed."""
+        """The problem with the exit status and the output of a command, or an empty string."""
         return _of_lines(COMMANDS[name], ended)
 
 
 def is_installed(module: str) -> bool:
-    """Whether a command can do anything here."""
+    """Whether a module that a command requires is installed."""
     return not module or importlib.util.find_spec(module) is not None
 
 
 def names(folder: Path) -> set[str]:
-    """All files of a folder, links too."""
+    """All files of a folder, including links."""
     found = set()
     for place, _, files in os.walk(folder):
         found |= {(Path(place) / file).relative_to(folder).as_posix() for file in files}
@@ -202,7 +202,7 @@ def names(folder: Path) -> set[str]:
 
 
 def unreadable(out: Path, besides: str = "") -> str:
-    """What is there under a final name and is not whole, or not finite."""
+    """An image under a final name that is incomplete or not finite, or an empty string."""
     if not out.is_dir():
         return ""
     for path in sorted(out.glob("[!.]*.exr")):
@@ -218,7 +218,7 @@ def unreadable(out: Path, besides: str = "") -> str:
 
 
 def _of_lines(command: Command, ended: Ended) -> str:
-    """What is wrong with how it ended, and with what it printed."""
+    """The problem with the exit status and the output of a command, or an empty string."""
     if ended.status == HUNG:
         return f"hung; {ended.err[-500:]}"
     lines = [line for line in ended.err.splitlines() if not re.fullmatch(command.progress, line)]
@@ -237,7 +237,7 @@ def _of_lines(command: Command, ended: Ended) -> str:
 
 
 def _alike(meaning: Callable[[bytes], object], one: bytes, other: bytes) -> bool:
-    """Whether two files mean the same."""
+    """Whether two files have the same meaning."""
     return _meaning(meaning, one) == _meaning(meaning, other)
 
 
@@ -249,6 +249,6 @@ def _meaning(meaning: Callable[[bytes], object], content: bytes) -> object:
 
 
 def aged(folder: Path) -> None:
-    """Let everything in a folder be of an hour ago, as it is when somebody starts a command again."""
+    """Set the times of all files in a folder to an hour ago, as when a user restarts a command later."""
     for path in folder.rglob("*"):
         os.utime(path, (time.time() - 3600,) * 2, follow_symlinks=False)

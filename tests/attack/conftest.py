@@ -10,17 +10,17 @@ import pytest
 from attacker import Attacker
 from server import Server
 
-# Of cases and of those that failed, by group.
+# Numbers of cases and of failed cases, by group.
 COUNTS: Counter[tuple[str, str]] = Counter()
 
 
 @pytest.fixture(scope="session")
 def attacker() -> Iterator[Attacker]:
-    """What is attacked, and a server that runs commands on copies of it."""
+    """Intact files, and a server that runs commands on copies of them."""
     if sys.platform != "linux":
         pytest.skip("forks, and reads /proc")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as base, Server() as server:
-        # For cases with another user's rights.
+        # Cases that run as another user need access.
         Path(base).chmod(0o755)
         yield Attacker(server, Path(base), COUNTS)
 

@@ -1,4 +1,4 @@
-"""Ways in which a file is damaged, by seed, and what may stand in its place."""
+"""Damage to files, by seed, and replacements of files."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ def truncated(g: Generator, content: bytes) -> bytes:
 
 
 def zeroed(g: Generator, content: bytes) -> bytes:
-    """A run of zeros, as a disk leaves it after a power cut."""
+    """Replace a range by zeros, as after a power failure."""
     start = int(g.integers(0, len(content)))
     length = int(g.integers(1, 1 + max(1, len(content) // 2)))
     return content[:start] + bytes(min(length, len(content) - start)) + content[start + length :]
 
 
 def flipped(g: Generator, content: bytes) -> bytes:
-    """One bit."""
+    """Flip one bit."""
     damaged = bytearray(content)
     damaged[int(g.integers(0, len(content)))] ^= 1 << int(g.integers(0, 8))
     return bytes(damaged)
 
 
 def flipped_head(g: Generator, content: bytes) -> bytes:
-    """Some bits where formats say what follows."""
+    """Flip some bits at the beginning, where the headers of formats are."""
     damaged = bytearray(content)
     for _ in range(int(g.integers(1, 5))):
         damaged[int(g.integers(0, min(len(content), 400)))] ^= 1 << int(g.integers(0, 8))
@@ -39,7 +39,7 @@ def flipped_head(g: Generator, content: bytes) -> bytes:
 
 
 def swapped(g: Generator, content: bytes) -> bytes:
-    """Two pieces in each other's place."""
+    """Swap two ranges."""
     a, b = sorted(int(each) for each in g.integers(0, len(content), 2))
     length = min(int(g.integers(1, 64)), b - a, len(content) - b)
     return (
@@ -52,7 +52,7 @@ def swapped(g: Generator, content: bytes) -> bytes:
 
 
 def inserted(g: Generator, content: bytes) -> bytes:
-    """Noise, in one place."""
+    """Insert random bytes in one place."""
     start = int(g.integers(0, len(content) + 1))
     return content[:start] + g.bytes(int(g.integers(1, 40))) + content[start:]
 
@@ -62,14 +62,14 @@ TOKENS += [b"true", b"[]", b"0", b"\n", b"//", b"/*", b";", b"Infinity", b"\x1b[
 
 
 def replaced_token(g: Generator, content: bytes) -> bytes:
-    """A value, or what stands for one, in place of some bytes."""
+    """Replace some bytes by an unusual value or token."""
     start, end = sorted(int(each) for each in g.integers(0, len(content) + 1, 2))
     end = min(end, start + int(g.integers(0, 20)))
     return content[:start] + TOKENS[int(g.integers(0, len(TOKENS)))] + content[end:]
 
 
 def other_value(g: Generator, content: bytes) -> bytes:
-    """Of a text: one of its words or numbers is another value, so that it still parses."""
+    """Replace one word or number of a text by another value, so that the text may still parse."""
     words = list(re.finditer(rb'"[^"]*"|-?[0-9][0-9.e+-]*|true|false|null', content))
     if not words:
         return flipped(g, content)
@@ -127,7 +127,7 @@ def put_nothing(path: Path) -> None:
     assert not path.exists()
 
 
-# What may be where a file is expected; no seed changes them.
+# Replacements of a file; they do not depend on a seed.
 PLACES: tuple[Callable[[Path], None], ...] = (
     *(put_folder, put_pipe, put_dangling, put_loop, put_endless, put_empty, put_nothing),
 )

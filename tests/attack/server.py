@@ -1,7 +1,7 @@
 """Runs commands and readers in forks of a process that has imported the package, with a time limit, or kills them.
 
-As a program this is the server: it reads a line of JSON that says what runs side by side, and answers with the exit
-statuses. A fork takes a few hundredths of a second, where a new process would take some seconds for its imports.
+Run as a program, this is the server: it reads a line of JSON with the processes to run at once, and answers with their
+exit statuses. A fork takes a few hundredths of a second; a new process would take some seconds for its imports.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-# Hundreds of times what most cases take on an idle machine.
+# Time limit: hundreds of times the run time of most cases on an idle machine.
 SECONDS = 60.0
-# Address space beyond what the server has: what a damaged file makes a reader ask for is far more.
+# Address space beyond that of the server; readers of damaged files may request far more.
 MEMORY = 6 * 2**30
 HUNG = -1000
 
 
 @dataclass(frozen=True)
 class Process:
-    """What is to run.
+    """A process to run.
 
     Args:
         command: arguments of ``mcdenoise``; or ``reader``, a name of ``table.READERS``, and a path.
-        folder: where it runs; also its home and the place of its cache.
-        stdout: where its output goes; a file of its own by default.
-        seconds: after so many it counts as hung.
-        delay: seconds that it waits first.
-        kill_after: seconds after which it gets ``signal``.
-        signal: to end it with.
-        largest_file: bytes that a file may have, which is how a full disk is played.
-        user: whose rights it has.
-        environment: further variables.
+        folder: working directory, home directory and location of the cache.
+        stdout: file for its output; by default a new file.
+        seconds: time limit after which it counts as hung.
+        delay: seconds to wait before it starts.
+        kill_after: seconds after which it receives ``signal``.
+        signal: the signal that ends it.
+        largest_file: maximum size of a file in bytes, which simulates a full disk.
+        user: id of the user that it runs as.
+        environment: additional environment variables.
     """
 
     command: list[str]
@@ -55,7 +55,7 @@ class Process:
 
 
 class Ended(NamedTuple):
-    """What became of it."""
+    """How a process ended."""
 
     status: int
     out: str
@@ -64,10 +64,10 @@ class Ended(NamedTuple):
 
 
 class Server:
-    """The server; it ends with the ``with`` block."""
+    """The server; it runs until the end of the ``with`` block."""
 
     def __init__(self) -> None:
-        # Threads of OpenMP do not outlive a fork: who waits for them afterwards waits for ever.
+        # OpenMP threads do not survive a fork, and a forked process that waits for them hangs.
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
         command, pipe = [sys.executable, __file__], subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment)
@@ -79,7 +79,7 @@ class Server:
         self._process.communicate()
 
     def run(self, *processes: Process) -> list[Ended]:
-        """Start all of them at once, and wait for them."""
+        """Start all processes at once, and wait for them."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         places = [f"{each.folder}/.output{i}" for i, each in enumerate(processes)]
@@ -91,11 +91,11 @@ class Server:
 
 
 def taken(place: str) -> tuple[str, str]:
-    """What a process has printed to stdout and stderr; the files are removed."""
+    """Read and remove the files with a process's stdout and stderr."""
     texts = []
     for stream in ("out", "err"):
         path = Path(f"{place}.{stream}")
-        # Killed before it has one, it has said nothing. Else, as it would reach the terminal.
+        # A process that was killed early has no file. Otherwise decode the output as for a terminal.
         texts.append(path.read_bytes().decode(errors="backslashreplace") if path.exists() else "")
         path.unlink(missing_ok=True)
     return texts[0], texts[1]
@@ -119,7 +119,7 @@ def serve() -> None:
                 if done:
                     answers[i] = (HUNG if child in told else os.waitstatus_to_exitcode(status)), now
                     del waiting[child]
-                    # Those it has started go with it.
+                    # Kill the processes that it has started.
                     signal_all(child, signal.SIGKILL)
                 elif now > tasks[i]["seconds"]:
                     told.add(child)
@@ -129,7 +129,7 @@ def serve() -> None:
                     signal_all(child, tasks[i]["signal"])
             time.sleep(0.001)
         print(json.dumps(answers), flush=True)
-    # The libraries have much to say of how they are taken down.
+    # Skip the shutdown of libraries, which print messages.
     os._exit(0)
 
 
@@ -137,7 +137,7 @@ def signal_all(group: int, number: int) -> None:
     try:
         os.killpg(group, number)
     except ProcessLookupError:
-        # Ended, or has not begun yet.
+        # The process has ended, or has not set its process group yet.
         try:
             os.kill(group, number)
         except ProcessLookupError:
@@ -188,7 +188,7 @@ def run(command: list[str]) -> int:
             return table.read(command[1], Path(command[2]))
         main(command)
     except SystemExit as stop:
-        # As Python itself does: nobody has to wait for threads of which nobody knows.
+        # Exit like Python itself, without waiting for threads of libraries.
         return int(stop.code or 0)
     return 0
 

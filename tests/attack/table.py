@@ -1,4 +1,4 @@
-"""Commands, readers, files and what holds for them: what is new enters here by a line."""
+"""The tables of commands, readers and kinds of files; each new one needs an entry here."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ class Command:
     """A command, or a reader of the API.
 
     Args:
-        arguments: as on the command line, in a folder that has the world's files.
-        needs: which of them.
-        result: what it has made, given the folder and what it printed: the same, if the input is the same.
-        progress: lines on stderr that are neither a warning nor an error.
-        statuses: that it may end with.
-        requires: a module without which it can do nothing.
-        seconds: after so many it counts as hung.
+        arguments: as on the command line, in a folder with copies of the world's files.
+        needs: the required files of the world.
+        result: returns the result, given the folder and the printed text; it must be equal for equal input.
+        progress: pattern of lines on stderr that are neither a warning nor an error.
+        statuses: allowed exit statuses.
+        requires: a module that the command needs.
+        seconds: time limit after which it counts as hung.
         out: folder of the images that it writes.
     """
 
@@ -61,7 +61,7 @@ class Command:
 
 
 def images(folder: Path, _: str) -> object:
-    """Pixels of all that was written, and what the report says of them."""
+    """Pixels of all images written, and their files in the report."""
     out = folder / "out"
     pixels = {path.name: digest(read_exr(path)[0]) for path in sorted(out.glob("*.exr"))}
     report = json.loads((out / "denoise.json").read_text())
@@ -75,7 +75,7 @@ def filmed(folder: Path, _: str) -> object:
 
 
 def printed(_: Path, out: str) -> object:
-    """What a script would read."""
+    """Checksum of the printed text."""
     return hashlib.sha256(out.encode()).hexdigest()
 
 
@@ -85,7 +85,7 @@ def weights(folder: Path, _: str) -> object:
 
 
 def calibrated(folder: Path, _: str) -> object:
-    """Checksum of the tensors, and of the ranges with them."""
+    """Checksum of the tensors and the ranges."""
     return tensors(folder / "out.safetensors")
 
 
@@ -97,17 +97,17 @@ def tensors(path: Path) -> object:
 
 
 def page(folder: Path, _: str) -> object:
-    """Whether there is one, whole."""
+    """Whether the page is complete."""
     return (folder / "results/index.html").read_text().rstrip().endswith("</html>")
 
 
 def rendered(folder: Path, _: str) -> object:
-    """Pixels of what was rendered."""
+    """Pixels of the rendered images."""
     return exr_files(folder / "rendered/inputs")
 
 
 def generated(folder: Path, _: str) -> object:
-    """The same of a random scene."""
+    """Pixels of the images of a random scene."""
     return exr_files(folder / "generated/random0000/inputs")
 
 
@@ -116,7 +116,7 @@ def exr_files(folder: Path) -> dict[str, str]:
 
 
 def pictures(folder: Path, _: str) -> object:
-    """Pixels of all that was written, of whatever format."""
+    """Pixels of all images written, in any format."""
     import OpenImageIO as oiio
 
     written = (path for path in sorted((folder / "out").iterdir()) if path.suffix != ".json")
@@ -124,13 +124,13 @@ def pictures(folder: Path, _: str) -> object:
 
 
 def errors(folder: Path, _: str) -> object:
-    """Errors of each method; times are never the same."""
+    """Errors of each method, without run times, which vary."""
     cells = json.loads((folder / "compared/results.json").read_text())["cells"]
     return [(each["scene"], each["method"], each["errors"]) for each in cells]
 
 
 def exported(folder: Path, _: str) -> object:
-    """Whether the graph is there, whole: a zip whose checksums hold."""
+    """Whether the graph is complete: a zip with correct checksums."""
     return zipfile.ZipFile(folder / "model.pt2").testzip()
 
 
@@ -170,7 +170,7 @@ COMMANDS = {
     "calibrate": Command(
         "calibrate weights.safetensors shot -o out.safetensors", ("shot", "weights.safetensors"), calibrated
     ),
-    # It says of each method why it failed, and ends with 1.
+    # If methods fail, the benchmark lists the reasons and ends with status 1.
     "benchmark": Command(COMPARISON, ("shot",), errors, statuses=(0, 1, 2)),
     "export": Command(
         f"export {MODEL} --weights weights.safetensors -o model.pt2", ("weights.safetensors",), exported, seconds=600
@@ -291,7 +291,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 def read(name: str, path: Path) -> int:
-    """Print a checksum of what a reader gives, or the one line of its error."""
+    """Print a checksum of the result of a reader, or its error message."""
     try:
         print(digest(READERS[name](path)))
     except InputError as error:
@@ -301,7 +301,7 @@ def read(name: str, path: Path) -> int:
 
 
 def pixels(content: bytes, suffix: str = ".exr") -> object:
-    """What another library reads in an image."""
+    """The content of an image as read by OpenImageIO."""
     import OpenImageIO as oiio
 
     with tempfile.TemporaryDirectory() as folder:
@@ -314,7 +314,7 @@ def pixels(content: bytes, suffix: str = ".exr") -> object:
 
 
 def of_image(file: Any) -> object:
-    """What its header says, and its pixels."""
+    """The header and the pixels of an image."""
     import OpenImageIO as oiio
 
     spec = file.spec()
@@ -326,18 +326,18 @@ def of_image(file: Any) -> object:
 
 
 def entries(content: bytes) -> object:
-    """Of a zip: what another library finds in it."""
+    """The content of a zip file as read by Python's zipfile."""
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         return {each.filename: file.read(each) for each in file.infolist()}
 
 
 def anything(content: bytes) -> object:
-    """Of text whose every character counts."""
+    """The meaning of a text in which every character matters."""
     return content
 
 
 def exactly(_: bytes) -> object:
-    """Of what has a checksum: it is as it was, or it is refused, or made anew."""
+    """The meaning of a file with a checksum: if it is damaged, it must be rejected or created again."""
     return None
 
 
@@ -347,12 +347,12 @@ def toml(content: bytes) -> object:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file, and who reads it.
+    """A kind of file, and the commands that read it.
 
     Args:
-        path: in the world; a pattern, of which the first is taken.
-        meaning: of its content: where it is the same as before, so is the result.
-        commands: names in :data:`COMMANDS`, and how many cases each has.
+        path: path in the world, or a pattern, whose first match is used.
+        meaning: returns the meaning of its content; the results of commands depend only on this.
+        commands: names in :data:`COMMANDS`, with the number of cases of each.
     """
 
     path: str
@@ -414,30 +414,30 @@ KINDS = {
     "config of a run": Kind("run/config.json", exactly, {"train": 40}),
     "data of a run": Kind("run/data.json", exactly, {"train": 12}),
     "decoded cache": Kind("run/cache/*/*/*.npy", exactly, {"train": 40}),
-    "about the decoded cache": Kind("run/cache/*/*/about.json", exactly, {"train": 40}),
+    "metadata of the decoded cache": Kind("run/cache/*/*/about.json", exactly, {"train": 40}),
     "rendered color": Kind("rendered/inputs/color0.exr", pixels, {"render": 24}),
     "rendered feature": Kind("rendered/inputs/albedo1.exr", pixels, {"render": 24}),
     "rendered reference": Kind("rendered/inputs/reference1.exr", pixels, {"render": 24}),
-    "about what was rendered": Kind("rendered/inputs/camera.json", json.loads, {"render": 24}),
+    "metadata of a rendering": Kind("rendered/inputs/camera.json", json.loads, {"render": 24}),
     "generated color": Kind("generated/random0000/inputs/color0.exr", pixels, {"generate": 16}),
     "generated matrices": Kind("generated/random0000/inputs/camera_matrices.h", anything, {"generate": 16}),
-    "about what was generated": Kind("generated/random0000/inputs/camera.json", json.loads, {"generate": 24}),
+    "metadata of generated frames": Kind("generated/random0000/inputs/camera.json", json.loads, {"generate": 24}),
     "scene": Kind("scene/scene.xml", anything, {"render": 20}),
     "precision.json": Kind("precision.json", json.loads, {"reader precision": 120}),
     "run_times.json": Kind("run_times.json", json.loads, {"reader run_times": 120}),
     "clean features": Kind("clean/clean/albedo0.exr", pixels, {"reader clean": 100}),
-    "reference in the making": Kind("reference0.partial.npz", exactly, {"reader halves": 120}),
+    "unfinished reference": Kind("reference0.partial.npz", exactly, {"reader halves": 120}),
 }
 
 
 def warm_up() -> None:
-    """Import what the commands need; nothing that starts a thread."""
+    """Import the modules that commands need, without starting threads."""
     import OpenImageIO as oiio
 
     oiio.attribute("threads", 1)
     for name in CLI:
         load_command(name)
-    # Imports that wait for their first use.
+    # Modules that are imported on first use.
     for name in ("torch.utils.tensorboard", "lightning_fabric", "kornia", "colour", "numba", "jinja2"):
         importlib.import_module(name)
     for command in ("models", "denoise --help"):
@@ -449,7 +449,7 @@ def warm_up() -> None:
 
 
 def digest(value: object) -> str:
-    """Checksum of numbers, arrays, texts, and of what holds them."""
+    """Checksum of numbers, arrays, texts, and of containers of these."""
     sha256 = hashlib.sha256()
     for piece in pieces(value):
         sha256.update(piece)

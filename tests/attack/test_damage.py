@@ -19,8 +19,8 @@ def test_some_damage(attacker: Attacker, kind: str, command: str) -> None:
 
 
 @pytest.mark.parametrize(("kind", "command"), READ)
-def test_what_is_no_file(attacker: Attacker, kind: str, command: str) -> None:
-    """Folders, pipes, devices, links to nothing and to themselves: nobody waits for them."""
+def test_replaced_files(attacker: Attacker, kind: str, command: str) -> None:
+    """Folders, pipes, devices, and links to nothing and to themselves instead of a file do not make a command hang."""
     failed = attacker.damaged(kind, command, range(len(PLACES)), "places, some")
     assert not failed, "\n".join(failed)
 

@@ -17,7 +17,7 @@ KILLED = {"denoise": 50, "denoise layers": 30, "denoise again": 30, "film": 16, 
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize(("name", "count"), KILLED.items())
 def test_killed(attacker: Attacker, name: str, count: int) -> None:
-    """Nothing partial under a final name, and the same command again ends as if nothing had happened."""
+    """No incomplete file has a final name, and the result of running the command again is as without the kill."""
     failed, command, g = [], COMMANDS[name], np.random.default_rng(1)
     attacker.expected(name)
     folder = attacker.fresh(command.needs)
@@ -39,7 +39,7 @@ def test_killed(attacker: Attacker, name: str, count: int) -> None:
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize(("name", "count"), KILLED.items())
 def test_two_at_once(attacker: Attacker, name: str, count: int) -> None:
-    """In one folder: each is done, or refused in one line, and what is there in the end is whole."""
+    """Two runs in one folder: each succeeds or is rejected in one line, and the final files are complete."""
     failed, command, g = [], COMMANDS[name], np.random.default_rng(2)
     attacker.expected(name)
     for seed in range(count // 2):

@@ -1,4 +1,4 @@
-"""Names that trip terminals, tables, patterns and file systems, wherever a command takes or finds one."""
+"""Names that are difficult for terminals, tables, patterns and file systems, in arguments and in folders."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ NAMES = [
     ),
     *("a:b", "~", "a\\b", "null", "1", "inputs", "color0.exr", "e\u0301", "\r", "#", "{}", "%s%n", "=", ","),
 ]
-# What a command line says by it: a folder is named `./-o` there.
+# Names that are options on a command line, where such a folder must be written as `./-o`.
 OPTIONS = {"-o", "--json"}
-# Commands by the part of their line that is given the name.
+# Commands by the argument that is replaced by the name.
 GIVEN = {
     "shot": ["denoise", "inspect", "evaluate", "train", "reader sequence"],
     "layers": ["denoise layers", "inspect layers"],
@@ -69,27 +69,26 @@ EVERY = [(part, command) for part, commands in GIVEN.items() for command in comm
 def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> None:
     failed, command = [], COMMANDS[name]
     attacker.expected(name)
-    # The ending tells what a picture, or a zip, is.
+    # Images, zip files and manifests are recognized by their extension.
     suffix = Path(part).suffix if part.startswith(("still", "frame", "film.")) else ""
     for given in (each + suffix for each in NAMES if len(os.fsencode(each + suffix)) <= 255):
         folder = attacker.fresh(command.needs)
         if (folder / part).exists():
             (folder / part).rename(folder / given)
         if name == "train" and part == "shot":
-            # A run belongs to data of one name; begun anew, it ends with the same weights.
+            # A run stores the name of its data; started again, it ends with the same weights.
             shutil.rmtree(folder / "run")
-        # A command line that begins with a minus is an option; nobody can mean a file by it.
-        # The name of a reader stays.
+        # Keep the name of the command or of the reader.
         kept = 2 if command.command[0] == "reader" else 1
         line = [*command.command[:kept], *(given if each == part else each for each in command.command[kept:])]
         ended = attacker.run(line, folder)
-        # Where it is expected to be found.
+        # Rename the result to the expected name.
         if os.path.lexists(folder / given) and not os.path.lexists(folder / part):
             (folder / given).rename(folder / part)
         if suffix and ended.status == 0 and name != "film":
             (written,) = (path for path in (folder / "out").iterdir() if path.name != "denoise.json")
             written.rename(written.with_name(Path(part).stem + written.suffix))
-        # What is printed, or the report of the written file, has the name in it.
+        # The printed text, or the report of the written file, contains the name.
         same = name not in ("inspect", "inspect layers", "evaluate", "reader recipe") and not suffix
         problem = attacker.judge(
             name, folder, ended, same=same, needed=is_text(given) and given.removesuffix(suffix) not in OPTIONS
@@ -102,7 +101,7 @@ def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> 
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", ["denoise", "denoise layers", "inspect", "evaluate", "train"])
 def test_names_that_are_found(attacker: Attacker, name: str) -> None:
-    """Files, folders and links of such names beside those that are read."""
+    """Files, folders and links with such names, beside the files that are read."""
     failed, command = [], COMMANDS[name]
     attacker.expected(name)
     place = "layers" if "layers" in command.needs else "shot/inputs"

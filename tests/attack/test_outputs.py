@@ -1,4 +1,4 @@
-"""Places that cannot be written to, that hold something else, and disks without room."""
+"""Outputs that exist already or cannot be written to, and full disks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def put_text(path: Path) -> None:
     path.write_text("somebody's own")
 
 
-# The place, in the folder of a case, and what may stand there instead of nothing.
+# Paths of outputs, with what may exist there already.
 STANDING = {
     "out": [link_to("shot/inputs"), link_to("shot"), link_to("layers"), put_full, put_text],
     "out/denoised0.exr": [
@@ -62,11 +62,11 @@ LINES = {
 @pytest.mark.attack
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("command", LINES)
-def test_something_stands_there(attacker: Attacker, command: str) -> None:
-    """An input is never written to, by whatever name; what is refused is refused before any frame is denoised."""
+def test_existing_outputs(attacker: Attacker, command: str) -> None:
+    """Inputs are never overwritten, under any name, and outputs are rejected before any frame is denoised."""
     failed, line = [], LINES[command].split()
     for place, own in STANDING.items():
-        # What a command does not write is nothing to it.
+        # Skip outputs that the command does not write.
         if not place.startswith(("figures", "out") if "-o" in line else "figures"):
             continue
         for put in [*PLACES, *own]:
@@ -79,7 +79,7 @@ def test_something_stands_there(attacker: Attacker, command: str) -> None:
             problem = problem or attacker.touched(folder, tuple(line[1:2]))
             written = [name for name in names(folder) if name.startswith("out/") and name != place]
             if not problem and ended.status == 2 and place.startswith("figures") and written:
-                problem = f"--json is told after the work: {written}"
+                problem = f"--json is rejected after the work: {written}"
             if not problem and ended.status == 0 and not (folder / place).is_symlink():
                 problem = unreadable(folder / "out", place)
             failed += attacker.count("outputs", problem, f"{command}, {place}: {put.__name__}", folder)
@@ -89,15 +89,15 @@ def test_something_stands_there(attacker: Attacker, command: str) -> None:
 @pytest.mark.attack
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", ["denoise", "denoise layers", "denoise again", "film", "train"])
-def test_no_room(attacker: Attacker, name: str) -> None:
-    """Files that may not grow beyond some bytes: nothing partial is left, and a run with room is complete."""
+def test_full_disk(attacker: Attacker, name: str) -> None:
+    """With a limited file size no incomplete files are left, and running again without the limit succeeds."""
     failed, command, g = [], COMMANDS[name], np.random.default_rng(0)
     attacker.expected(name)
     slow = name in ("train", "film")
     limits = g.integers(1, 400_000 if name == "train" else 2500, 6 if slow else 30)
     for limit in map(int, limits):
         folder = attacker.fresh(command.needs)
-        # What it prints is not what is tried here, and has no room either.
+        # Discard the output, whose file has the same limit.
         ended = attacker.run(command.command, folder, largest_file=max(limit, 700), stdout="/dev/null")
         problem = attacker.judge(name, folder, ended, same=False)
         if not problem:
@@ -131,7 +131,7 @@ def test_a_small_disk(attacker: Attacker, name: str) -> None:
 @pytest.mark.attack
 @pytest.mark.skipif(os.geteuid() != 0, reason="takes the rights of another user")
 @pytest.mark.parametrize("name", ["denoise", "denoise again", "denoise layers", "film", "train", "report", "inspect"])
-def test_somebody_elses_folder(attacker: Attacker, name: str) -> None:
+def test_a_folder_of_another_user(attacker: Attacker, name: str) -> None:
     failed, command = [], COMMANDS[name]
     for place in ("out", "filmed", "run", "results", "shot/inputs", "layers", "."):
         for mode in (0o700, 0o755, 0o1777):
@@ -148,7 +148,7 @@ def test_somebody_elses_folder(attacker: Attacker, name: str) -> None:
 
 @pytest.mark.attack
 def test_an_earlier_longer_run(attacker: Attacker) -> None:
-    """Whatever an earlier report lists, what is older stays and is named: it may be hours of work."""
+    """Older images are kept and named in a warning, whatever an earlier report lists: they may be hours of work."""
     failed = []
     for number, listed in enumerate([["denoised7.exr"], [], ["denoised7.exr", "denoised8.exr"], ["../out7.exr"]]):
         folder = attacker.fresh(("shot", "out"))
@@ -161,6 +161,6 @@ def test_an_earlier_longer_run(attacker: Attacker) -> None:
         problem = attacker.lines("denoise", ended)
         older = ["denoised7.exr", "denoised8.exr"]
         if not problem and not all((folder / "out" / name).is_file() and name in ended.err for name in older):
-            problem = f"not kept, or nothing is said of it: {ended.err}"
+            problem = f"not kept, or not named: {ended.err}"
         failed += attacker.count("outputs", problem, f"earlier run {number}", folder)
     assert not failed, "\n".join(failed)

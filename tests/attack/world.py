@@ -1,4 +1,4 @@
-"""What is attacked, intact: a shot in several layouts, weights, results, a training that was stopped, and so on."""
+"""The intact files: a shot in several layouts, weights, results, an interrupted training run, and so on."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ SCENE = """\
 </scene>
 """
 
-# What `train` is told besides folders.
+# Options of `train` in addition to folders.
 TRAINING = f"--model {MODEL} --steps 3 --crop 12 --frames 2 --batch 1 --checkpoint-every 1 --validation-frames 0"
 
 
 def build(folder: Path) -> None:
-    """Write all of it but what `denoise` makes of it."""
+    """Write all files except denoised images."""
     frames, cameras = rendered()
     for number, frame in enumerate(frames):
         write_bmfr_frame(folder / "shot/inputs", number, frame)
@@ -89,7 +89,7 @@ def build(folder: Path) -> None:
     (folder / "weights.safetensors").write_bytes(weights)
     (folder / "recipe.toml").write_text(RECIPE)
     (folder / "film.toml").write_text(FILM)
-    # Its folder is the scene's name.
+    # The name of the scene is that of its folder.
     (folder / "scene").mkdir()
     (folder / "scene/scene.xml").write_text(SCENE)
     poses = [{"position": [0.1 * n, 0.2, 3], "look_at": [0, 0, 0]} for n in range(FRAMES)]
@@ -107,7 +107,7 @@ def build(folder: Path) -> None:
 
 
 def stop_a_training(folder: Path) -> None:
-    """A run that was stopped after two steps of three, with its cache."""
+    """Write a run that was interrupted after two of three steps, with its cache."""
     config = TrainConfig(model=MODEL, steps=3, crop=12, frames=2, batch=1, validation_frames=0)
     whole = folder / "whole"
 
@@ -120,7 +120,7 @@ def stop_a_training(folder: Path) -> None:
 
 
 def rendered() -> tuple[list[Frame], CameraMatrices]:
-    """Frames of a wall with a pattern, noisy, and their cameras."""
+    """Noisy frames of a wall with a pattern, and their cameras."""
     g, frames, matrices = np.random.default_rng(0), [], []
     for number in range(FRAMES):
         camera = Camera.look_at((0.3 + 0.05 * number, 0.2, 4), (0, 0, 0), 40)
@@ -148,7 +148,7 @@ def tensor(values: np.ndarray) -> Tensor:
 
 
 def write_layers(path: Path, frame: Frame) -> None:
-    """One file with all layers, as Blender writes it."""
+    """Write a file with all layers, like Blender."""
     path.parent.mkdir(exist_ok=True)
     names = {"Combined": "color", "Denoising Albedo": "albedo", "Denoising Normal": "normal"}
     channels = {}
@@ -162,7 +162,7 @@ def write_layers(path: Path, frame: Frame) -> None:
 
 
 def write_zip(path: Path, frame: Frame) -> None:
-    """Four samples a pixel as Noisebase has them: radiance of three bytes and an exponent, which is 2^0 here."""
+    """Write four samples per pixel like Noisebase: radiance of three bytes and an exponent, which is 2^0 here."""
     from numcodecs import Blosc
 
     shape = (HEIGHT, WIDTH, 4)
@@ -185,7 +185,7 @@ def write_zip(path: Path, frame: Frame) -> None:
 
 
 def results() -> Results:
-    """Of a benchmark of two methods on one scene."""
+    """Results of a benchmark of two methods on one scene."""
     spread = Spread(10.0, 9.0, 11.0, 3)
     cells = [
         Cell("wall", name, {"SMAPE": error, "PSNR": 30.0}, {"SMAPE": spread}, spread, {"network": spread}, 12.0)

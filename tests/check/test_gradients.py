@@ -22,7 +22,7 @@ class _Wrong(torch.autograd.Function):
 
 
 class _Forgetful(torch.autograd.Function):
-    """Right, but without a derivative of the gradient in the image."""
+    """A correct function whose gradient has no derivative in the image."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor) -> Tensor:
@@ -36,7 +36,7 @@ class _Forgetful(torch.autograd.Function):
 
 
 class _Leaking(torch.autograd.Function):
-    """Right for one image, and of several each has a part of the others' gradients."""
+    """A function that is correct for one image, but mixes the gradients of several images."""
 
     @staticmethod
     def forward(ctx: object, image: Tensor) -> Tensor:
@@ -48,7 +48,7 @@ class _Leaking(torch.autograd.Function):
 
 
 def result_of(function: object, order: int = 2, width: int = 2) -> tuple[bool, str]:
-    """Of an image so wide, beside a smaller one, which torch's own check tries as well."""
+    """An op with a case of this width, and a smaller case, which torch's own check covers as well."""
     cases = [
         Case(f"{size} pixels", "ordinary", lambda g, size=size: {"image": uniform(g, 1, 1, 2, size)}, ("image",))
         for size in (2, width)
@@ -58,7 +58,7 @@ def result_of(function: object, order: int = 2, width: int = 2) -> tuple[bool, s
     return result.passed, result.message
 
 
-def test_a_right_derivative_passes() -> None:
+def test_a_correct_derivative_passes() -> None:
     def square(image: Tensor) -> Tensor:
         return image * image
 
@@ -90,7 +90,7 @@ def test_a_derivative_that_leaks_to_another_image_fails() -> None:
     assert "Jacobian mismatch for output 0 with respect to input 0, number 0 in number 0" in message
 
 
-def test_an_op_that_raises_fails_with_its_words() -> None:
+def test_an_op_that_raises_fails_with_its_message() -> None:
     def broken(image: Tensor) -> Tensor:
         raise RuntimeError("\nit broke")
 

@@ -25,7 +25,7 @@ number = 3
 
 
 def weighted(image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean of each channel over the whole batch, and the image without it."""
+    """The mean of each channel over the whole batch, and the image minus the mean."""
     mean = (image * weight).sum((0, 2, 3)) / weight.sum()
     return mean, image - mean[:, None, None]
 
@@ -157,7 +157,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     return command
 
 
-def test_a_right_derivative_passes(mine: Path, run: Run, tmp_path: Path) -> None:
+def test_a_correct_derivative_passes(mine: Path, run: Run, tmp_path: Path) -> None:
     path = tmp_path / "gradcheck.json"
     status, out, err = run("gradcheck", f"{mine}:weighted", "demodulate", "--json", path)
     assert (status, err) == (0, "")
@@ -188,7 +188,7 @@ def test_a_stable_function_passes(mine: Path, run: Run, tmp_path: Path) -> None:
         ("float64", "derivative"),
         *((dtype, what) for dtype in ("float32", "bfloat16", "float16") for what in ("forward", "gradient")),
     ]
-    # Each pixel depends on all images of the batch, so that they may not be tried as if they were alone.
+    # Each pixel depends on all images of the batch, so perturbed inputs must not share a batch.
     assert all(check["error"] > 0 for check in checks[1::2])
 
 
@@ -201,7 +201,7 @@ def test_a_wrong_derivative_is_not_stable(mine: Path, run: Run, tmp_path: Path) 
     assert {check["what"] for check in failed} == {"derivative"}
 
 
-def test_digits_that_cancel_fail_where_they_do(mine: Path, run: Run, tmp_path: Path) -> None:
+def test_cancellation_fails_in_the_case_where_it_occurs(mine: Path, run: Run, tmp_path: Path) -> None:
     path = tmp_path / "stability.json"
     status, _, _ = run("stability", f"{mine}:logarithm", "--dtypes", "float32", "--json", path)
     assert status == 1
@@ -213,14 +213,14 @@ def test_a_function_that_fails_in_one_precision(mine: Path, run: Run, tmp_path: 
     path = tmp_path / "stability.json"
     status, out, _ = run("stability", f"{mine}:single", "--json", path)
     assert status == 1
-    # A table may be folded between words.
+    # A table may wrap lines between words.
     assert "[/half]" in out
     (failed,) = [check for check in json.loads(path.read_text())["checks"] if not check["passed"]]
     assert (failed["dtype"], failed["what"]) == ("float16", "runs")
     assert failed["message"] == "RuntimeError: no kernel for [/half]"
 
 
-def test_derivatives_in_what_requires_gradients_alone(mine: Path, run: Run, tmp_path: Path) -> None:
+def test_derivatives_only_in_tensors_that_require_gradients(mine: Path, run: Run, tmp_path: Path) -> None:
     path = tmp_path / "gradcheck.json"
     assert run("gradcheck", f"{mine}:scaled", "--json", path)[0] == 0
     assert [result["inputs"] for result in json.loads(path.read_text())] == [["image"]]
@@ -247,7 +247,7 @@ def test_a_function_of_a_package(run: Run, mine: Path, monkeypatch: pytest.Monke
         ("undrawn", "its example inputs fail: OSError: no such image"),
     ],
 )
-def test_what_cannot_be_checked_is_refused_in_one_line(
+def test_functions_that_cannot_be_checked_are_rejected_in_one_line(
     mine: Path, run: Run, command: str, name: str, message: str
 ) -> None:
     status, _, err = run(command, f"{mine}:{name}")
@@ -257,7 +257,7 @@ def test_what_cannot_be_checked_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize("command", ["gradcheck", "stability"])
-def test_a_function_has_to_be_somewhere(tmp_path: Path, run: Run, command: str) -> None:
+def test_a_missing_function_is_rejected(tmp_path: Path, run: Run, command: str) -> None:
     bare = tmp_path / "bare.py"
     bare.write_text("def halves(image, half):\n    return image * half[..., :3]\n\ndef none(*images): ...\n")
     broken = tmp_path / "broken.py"
@@ -293,7 +293,7 @@ def test_images_are_drawn_for_a_function_without_example_inputs(tmp_path: Path, 
     assert run("gradcheck", f"{mine}:power", "--json", path)[0] == 0
     assert [result["inputs"] for result in json.loads(path.read_text())] == [["image", "other"]]
     assert failed("power", "float32") == set()
-    # The derivative of a root at 0 is no number, and a square of 300 is beyond half precision.
+    # The derivative of a root at 0 is infinite or NaN, and the square of 300 exceeds the range of half precision.
     assert failed("norm", "float32") == {("black", "gradient")}
     assert {("bright", "forward"), ("firefly", "forward")} <= failed("mean", "float16")
     assert failed("mean", "float32") == set()
@@ -307,7 +307,7 @@ def inputs() -> dict[str, tuple[Tensor, ...]]:
     return {"rows": (torch.rand(2, 3),), "number": (torch.rand(()),)}
 
 
-def test_in_python_as_by_the_command(mine: Path, run: Run, tmp_path: Path) -> None:
+def test_python_and_the_command_agree(mine: Path, run: Run, tmp_path: Path) -> None:
     path = tmp_path / "own.json"
     name = f"{Path(__file__)}:cube"
     assert run("gradcheck", name, "--json", path)[0] == 0
@@ -324,7 +324,7 @@ def test_in_python_as_by_the_command(mine: Path, run: Run, tmp_path: Path) -> No
     ]
 
 
-def test_inputs_may_be_handed_over() -> None:
+def test_inputs_may_be_passed() -> None:
     (result,) = gradcheck(cube, torch.rand(2, 2))
     assert (result.op, result.case, result.inputs, result.passed) == ("cube", "example", ("image",), True)
     (right,) = gradcheck(lambda image: image * image.detach(), torch.zeros(2, 2))
@@ -334,7 +334,7 @@ def test_inputs_may_be_handed_over() -> None:
         gradcheck(cube, torch.arange(3))
 
 
-def test_first_derivatives_alone(mine: Path, run: Run) -> None:
+def test_first_derivatives_only(mine: Path, run: Run) -> None:
     class Once(torch.autograd.Function):
         @staticmethod
         def forward(ctx: object, image: Tensor) -> Tensor:
@@ -353,6 +353,6 @@ def test_first_derivatives_alone(mine: Path, run: Run) -> None:
         gradcheck(once, torch.rand(2, 2, device="meta"))
     assert [gradcheck(once, torch.rand(2, 2), order=order)[0].passed for order in (1, 2)] == [True, False]
     assert all(check.passed for check in check_stability(once, torch.rand(2, 2)))
-    # A second derivative that is wrong where the first is right.
+    # The second derivative is wrong although the first is correct.
     assert [run("gradcheck", f"{mine}:forgetful", "--order", order)[0] for order in (1, 2)] == [0, 1]
     assert run("gradcheck", f"{mine}:forgetful", "--order", 3)[0] == 2

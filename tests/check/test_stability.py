@@ -27,7 +27,7 @@ BY_NAME = {op.name: op for op in OPS}
 
 
 def failures(op: Op, dtype: torch.dtype = torch.float32) -> dict[str, set[str]]:
-    """For each kind of check that fails the cases that it fails on."""
+    """The failed cases, by the property that fails."""
     found: dict[str, set[str]] = {}
     for check in check_op(op, (dtype,)):
         if not check.passed:
@@ -37,15 +37,15 @@ def failures(op: Op, dtype: torch.dtype = torch.float32) -> dict[str, set[str]]:
 
 
 def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
-    """The op of that name with another implementation."""
+    """An op of the table with another implementation."""
     op = replace(BY_NAME[name], function=function, **changes)
     function.__name__ = name
     return op
 
 
-# bfloat16 and float16 take the same way through the ops; `mcdenoise stability` tries them all.
-# Second derivatives of 25 taps take half a minute.
-# Whose many taps, or cases, take many seconds.
+# bfloat16 and float16 use the same code in the ops; `mcdenoise stability` checks all dtypes.
+# The check of second derivatives of 25 taps takes half a minute.
+# Ops whose many taps or cases take many seconds.
 LONG = {"atrous", "softmax_splat", "affinity_filter", "importance_filter"}
 TRIED = [
     pytest.param(op, dtype, marks=[pytest.mark.slow] if op.name in LONG or dtype == torch.float16 else [])
@@ -78,7 +78,7 @@ def test_sums_in_half_precision_fail() -> None:
 
     cases = tuple(case for case in BY_NAME["kernel_conv"].cases if case.settings["border"] == "zeros")[:2]
     assert "forward" in failures(like("kernel_conv", halved, cases=cases), torch.bfloat16)
-    # The same sum is good enough in float32.
+    # In float32 the same sum is accurate enough.
     assert not failures(like("kernel_conv", halved, cases=cases), torch.float32).get("forward")
 
 
@@ -97,7 +97,7 @@ def test_a_softmax_that_overflows_fails() -> None:
     assert "softmax" not in found["forward"]
 
 
-def test_a_gradient_that_is_no_number_fails() -> None:
+def test_a_nan_gradient_fails() -> None:
     def clamped(color: Tensor, albedo: Tensor, *, floor: float = 0.04) -> Tensor:
         divided = color / albedo
         return torch.where(albedo.amax(1, keepdim=True) >= 1e-4, color / albedo.clamp_min(floor), color + 0 * divided)
@@ -123,7 +123,7 @@ def test_splatting_that_is_not_the_transpose_fails(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("scale", [1 + 1e-5, 1 - 1e-5])
-def test_an_error_of_a_hundred_roundings_fails(scale: float) -> None:
+def test_an_error_of_a_hundred_rounding_errors_fails(scale: float) -> None:
     def scaled(image: Tensor, albedo: Tensor) -> Tensor:
         return BY_NAME["remodulate"].function(image, albedo) * scale
 
@@ -136,7 +136,7 @@ def two_forms(image: Tensor) -> Tensor:
     return plain(BY_NAME["downsample"].function)(image)
 
 
-def test_a_backend_is_tried_and_one_that_cannot_run_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_backends_are_checked_and_unavailable_ones_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(_op._forms, ("numba", "two_forms"), lambda image: 2 * two_forms.plain(image))
     tried = like("downsample", two_forms)
     assert op_checks.backends(tried) == ("torch", "numba", "triton")
@@ -149,8 +149,8 @@ def test_a_backend_is_tried_and_one_that_cannot_run_is_told(monkeypatch: pytest.
     assert "runs on an NVIDIA GPU" in told.message
 
 
-def test_the_reference_of_an_exponent_that_float64_cannot_hold() -> None:
-    """Against mpmath, with 60 digits."""
+def test_the_reference_of_an_exponent_beyond_float64() -> None:
+    """The reference agrees with mpmath at 60 digits."""
     op = BY_NAME["cross_bilateral_weights"]
     case = next(case for case in op.cases if case.name == "logits to +-1e4")
     inputs = case.inputs()
@@ -202,7 +202,7 @@ def negative():
 """
 
 
-def test_a_model_of_ones_own_is_checked(tmp_path: Path) -> None:
+def test_a_users_model_is_checked(tmp_path: Path) -> None:
     path = tmp_path / "own.py"
     path.write_text(OWN)
     failed = {}
@@ -219,7 +219,7 @@ def test_long_runs() -> None:
     assert not [run for run in runs.values() if not run.passed]
     still = runs["still", "bfloat16"]
     assert still.frames == [1, 3, 10, 30, 100, 300]
-    # Half precision is not float64, and the bound is one that a history can reach.
+    # Errors in half precision are not zero, and close enough to the bound to make it meaningful.
     assert 0.01 * still.allowed < max(still.errors) < still.allowed < 0.05
     assert runs["light off, without anti-lag", "float32"].ghost == 44
     assert runs["light off, with anti-lag", "float32"].ghost == 1
@@ -234,14 +234,14 @@ def test_the_worst_check_comes_first() -> None:
     assert [failed.case for failed in summary.failed] == ["b"]
 
 
-def test_what_is_checked_by_default_and_by_name() -> None:
+def test_the_checks_by_default_and_by_name() -> None:
     names = [stage.name for stage in stability.stages()]
     known = [op.name for op in op_checks.select()]
     assert names[: len(known)] == known
     models = names[len(known) :]
     assert models[-1] == "long runs"
     assert {f"Denoiser, {name}" for name in pretrained_models()} < set(models)
-    # What learns is checked by itself, too; what does not, within a denoiser.
+    # Trainable models are also checked by themselves, other models only in a denoiser.
     assert [name for name in models if name not in list_models()] == [
         *(f"Denoiser, {name}" for name in models if name in list_models()),
         "long runs",
@@ -275,7 +275,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert content["long_runs"] == []
 
 
-def test_the_command_says_which_backend_is_not_run(
+def test_the_command_names_backends_that_cannot_run(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = replace(BY_NAME["kernel_conv"], cases=BY_NAME["kernel_conv"].cases[:1])
@@ -285,7 +285,7 @@ def test_the_command_says_which_backend_is_not_run(
     assert "not run: backend: expected one that can run here, found 'triton'" in out
 
 
-def test_a_broken_bound_exits_with_1(
+def test_an_exceeded_bound_exits_with_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(color: Tensor, albedo: Tensor, *, floor: float = 0.04) -> Tensor:

@@ -1,7 +1,7 @@
-"""Two small shots that are the same on every machine, and what the shipped models give for them.
+"""Two small shots that are equal on every machine, and the images of the shipped models for them.
 
-Everything is arithmetic and uniform random numbers in float64, rounded to float32 at the end: where a machine rounds
-another way, an input changes by a unit roundoff, which is what the bounds are measured with.
+The shots are computed with arithmetic and uniform random numbers in float64, and rounded to float32 at the end. If a
+machine rounds differently, inputs change by a unit roundoff, for which the bounds account.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mcdenoise import Frame
 
-# What the file calls a model, and what the zoo does.
+# Names of the models in the file, with their names in the zoo.
 MODELS = {
     "full": "cascaded_v2",
     "small": "cascaded_v2_small",
@@ -25,11 +25,11 @@ MODELS = {
 }
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 FILE = Path(__file__).with_name("golden.safetensors")
-# Of each image one pixel in nine: of all phases of tiles and of coarser resolutions.
+# The file contains every third row and column, which covers all positions relative to tiles and coarser pixels.
 STRIDE = 3
-# A convolution rounds weights, activations and results, each a relative change of its products such as the one whose
-# response is stored: of the sum of three, the root mean square is at most three times as large. Of a few random changes
-# the largest response of a pixel is not the largest of all, but that is hardly four times it (as in
+# A convolution rounds weights, activations and results; each is a relative change of its products like the one whose
+# response is stored, so the root mean square of their sum is at most three times as large. The maximum response of a
+# few random changes underestimates the true maximum, but hardly by more than a factor of four (as in
 # mcdenoise.check.stability).
 ALLOWED = {"largest": 3 * 4, "rms": 3}
 
@@ -41,9 +41,9 @@ class Shot:
     Args:
         size: height and width.
         focal: width of the image plane at distance 1 is 2 / focal.
-        step: how far the camera moves in a frame, scene units: to the right, and down.
-        frames: how many there are.
-        kept: indices of those whose image is in the file.
+        step: movement of the camera per frame in scene units, to the right and down.
+        frames: number of frames.
+        kept: indices of the frames whose images are in the file.
     """
 
     size: tuple[int, int]
@@ -53,17 +53,16 @@ class Shot:
     kept: tuple[int, ...]
 
     def frame(self, number: int) -> Frame:
-        """One of the frames, float32."""
+        """One frame, in float32."""
         return _render(self, number)
 
 
 SHOTS = {
-    # Small enough for the plain forms. It moves along both axes: a motion of zero along one of them, but for rounding,
-    # would let rounding decide on which side a pixel has a neighbour.
+    # Small enough for the reference implementations. The camera moves along both axes: if the motion along one axis
+    # were zero up to rounding, rounding would decide on which side a pixel has a neighbour.
     "moving": Shot((72, 104), 1.2, (0.03, 0.017), 3, (0, 1, 2)),
-    # Large enough for the compiled forms, and wide enough for a network to run on a part of it. At first nothing is
-    # left out but what has no noise; then tiles of little noise are passed through; then those without noise are
-    # reused.
+    # Large enough for the compiled backends, and wide enough for a network to run on a part of it. At first only pixels
+    # without noise are skipped; then tiles of little noise are passed through; then unchanged tiles are reused.
     "still": Shot((40, 304), 0.5, (0.0, 0.0), 20, (0, 9, 19)),
 }
 
@@ -77,7 +76,7 @@ def _point(*coordinates: float) -> Tensor:
 
 
 def _sphere(ray: Tensor, eye: Tensor, center: Tensor, radius: float) -> Tensor:
-    """Distance along a ray, infinite where it passes by."""
+    """Distance to a sphere along a ray, infinite for rays that miss it."""
     to = center - eye
     along, length = (ray * to).sum(0), (ray * ray).sum(0)
     root = along.square() - length * (to.square().sum() - radius**2)
@@ -126,7 +125,7 @@ def _render(shot: Shot, number: int) -> Frame:
 
 
 def _noise(shot: Shot, number: int, noisy: Tensor) -> Tensor:
-    """Factors of mean one: of a path tracer, with a few fireflies; in the still shot of less and less to the right."""
+    """Noise factors like those of a path tracer, with two fireflies; in the still shot they decrease to the right."""
     height, width = shot.size
     drawn = torch.rand(4, height, width, generator=torch.Generator().manual_seed(100 + number)).double()
     strong = (0.15 + 2.55 * drawn[:1].square()) * (0.8 + 0.4 * drawn[1:])
@@ -142,19 +141,19 @@ def _noise(shot: Shot, number: int, noisy: Tensor) -> Tensor:
 
 
 def kept_pixels(image: Tensor) -> Tensor:
-    """What the file has of an image, ``(3, h, w)``."""
+    """The pixels of an image that are stored in the file, ``(3, h, w)``."""
     return image[0, :, ::STRIDE, ::STRIDE]
 
 
 def change(found: Tensor, expected: Tensor) -> dict[str, float]:
-    """How far an image is from another: relative where that is bright, and of half its mean where it is dark."""
+    """Change of an image relative to the pixel's expected value plus half of the expected mean."""
     unit = expected.double() + expected.double().mean() / 2
     relative = (found.double() - expected.double()).abs() / unit
     return {"largest": float(relative.max()), "rms": float(relative.square().mean().sqrt())}
 
 
 def golden() -> tuple[dict[str, Tensor], dict[str, list[dict[str, float]]]]:
-    """The images by ``shot.model.frame``, and how far they move by ``shot.model.precision``, for each frame."""
+    """The images by ``shot.model.frame``, and their responses to rounding of each frame by ``shot.model.precision``."""
     with safe_open(FILE, framework="pt") as file:
         images = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - a safetensors handle is no dict
         return images, json.loads(file.metadata()["responses"])

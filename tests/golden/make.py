@@ -1,8 +1,8 @@
-"""Make ``golden.safetensors`` anew: ``python tests/golden/make.py``, three minutes.
+"""Create ``golden.safetensors`` again: ``python tests/golden/make.py``, three minutes.
 
-The images are computed in float64. With them is stored how far they move when every weight changes by a unit roundoff
-of the precision, and every input by one of float32, up or down; see ``golden_shots.ALLOWED``. A file that is made anew
-is another promise: do it only where a model is meant to give another image.
+The images are computed in float64. The file also stores their responses: how much they change if every weight changes
+by a unit roundoff of the precision, and every input by one of float32, up or down; see ``golden_shots.ALLOWED``. Create
+the file again only if the images of a model are meant to change.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ _FLOAT32 = torch.finfo(torch.float32).eps / 2
 
 
 def moved(tensor: Tensor, unit: float, seed: int) -> Tensor:
-    """Changed by ``unit`` of itself, up or down; the same numbers for the same seed."""
+    """Change a tensor relatively by ``unit``, up or down; the same numbers for the same seed."""
     signs = torch.randint(0, 2, tensor.shape, generator=torch.Generator().manual_seed(seed)) * 2 - 1
     return tensor.double() * (1 + unit * signs)
 
 
 def images(shot: Shot, name: str, weights: float = 0.0, inputs: float = 0.0, seed: int = 0) -> list[Tensor]:
-    """The images that are kept of a shot, in float64, with every weight and every input changed by so much."""
+    """The stored images of a shot in float64, with relative changes of every weight and every input."""
     model = create_model(name, pretrained=True).double()
     with torch.no_grad():
         for index, parameter in enumerate(model.parameters()):
             parameter.copy_(moved(parameter, weights, 1000 * seed + 100 + index))
     found, state = [], None
     for number in range(shot.frames):
-        # The same change in every frame: what stands still stands still.
+        # Use the same changes in every frame, so that static pixels stay static.
         buffers = {
             key: moved(value, inputs, 1000 * seed + index)
             for index, (key, value) in enumerate(shot.frame(number).items())
@@ -53,7 +53,7 @@ def images(shot: Shot, name: str, weights: float = 0.0, inputs: float = 0.0, see
 
 
 def responses(shot: Shot, name: str, unit: float, expected: list[Tensor]) -> list[dict[str, float]]:
-    """The largest of several."""
+    """The maximum responses to several random changes."""
     draws = [map(change, images(shot, name, unit, _FLOAT32, seed), expected) for seed in range(1, 1 + _DRAWS)]
     return [{key: max(draw[key] for draw in frame) for key in ("largest", "rms")} for frame in zip(*draws, strict=True)]
 
@@ -74,7 +74,7 @@ def main() -> None:
                 unit = torch.finfo(dtype).eps / 2
                 found[f"{shot_name}.{model}.{precision}"] = here = responses(shot, name, unit, exact)
                 print(f"  {precision}: " + ", ".join(f"{r['largest']:.2g} (rms {r['rms']:.2g})" for r in here))
-            # A decision that is near its limit would be taken the other way, and the image would jump.
+            # Larger changes would flip decisions that are near their limits, and the image would jump.
             far = map(change, images(shot, name, _PROBE * _FLOAT32, _PROBE * _FLOAT32, 1), exact)
             for linear, probe in zip(found[f"{shot_name}.{model}.float32"], far, strict=True):
                 if probe["largest"] > 3 * _PROBE * max(linear["largest"], _FLOAT32):

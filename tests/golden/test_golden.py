@@ -1,7 +1,7 @@
-"""What the shipped models give for two shots, whatever happens to the code: whole, tiled, with less than all computed.
+"""Images of the shipped models for two shots must not change: whole, tiled, and with skipping.
 
-The images are made by ``make.py``, in float64. The bounds come from how far these move by rounding, see
-``golden_shots.ALLOWED``; each also has a test that something small is beyond them.
+``make.py`` creates the images in float64. The bounds come from the responses of the images to rounding, see
+``golden_shots.ALLOWED``. Another test shows that small errors exceed them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Precision = Literal["float32", "bfloat16"]
 
 
 def denoised(shot: str, denoiser: Denoiser) -> dict[int, Tensor]:
-    """What is in the file of each frame that is."""
+    """The pixels of the frames that the file contains."""
     found = {}
     for number in range(SHOTS[shot].frames):
         image = denoiser(SHOTS[shot].frame(number))
@@ -31,13 +31,13 @@ def denoised(shot: str, denoiser: Denoiser) -> dict[int, Tensor]:
 
 
 def beyond(shot: str, model: str, precision: str, images: dict[int, Tensor]) -> list[str]:
-    """Where images are further from those of the file than rounding can lead."""
+    """The frames whose images differ from those in the file by more than rounding."""
     wrong = []
     for index, (number, image) in enumerate(images.items()):
         error = change(image, IMAGES[f"{shot}.{model}.{number}"])
         response = RESPONSES[f"{shot}.{model}.{precision}"][index]
         for what, factor in ALLOWED.items():
-            # Outside of the convolutions everything is in float32.
+            # Everything except convolutions is in float32.
             allowed = factor * max(response[what], torch.finfo(torch.float32).eps)
             if not error[what] <= allowed:
                 wrong.append(f"frame {number}: {what} difference {error[what]:.3g}, expected at most {allowed:.3g}")
@@ -55,12 +55,12 @@ def beyond(shot: str, model: str, precision: str, images: dict[int, Tensor]) -> 
         pytest.param("still", {"tile": 64}, id="skipped and tiled"),
     ],
 )
-def test_images_are_those_of_the_file(shot: str, settings: dict[str, Any], model: str, precision: Precision) -> None:
+def test_images_agree_with_the_file(shot: str, settings: dict[str, Any], model: str, precision: Precision) -> None:
     denoiser = Denoiser(MODELS[model], precision=precision, **settings)
     assert not beyond(shot, model, precision, denoised(shot, denoiser))
 
 
-def test_the_still_shot_is_one_of_which_not_all_is_computed() -> None:
+def test_tiles_of_the_still_shot_are_skipped() -> None:
     model = "micro"
     computed = denoised("still", Denoiser(MODELS[model], keep_all=True))
     assert {message.partition(":")[0] for message in beyond("still", model, "float32", computed)} == {
@@ -70,7 +70,7 @@ def test_the_still_shot_is_one_of_which_not_all_is_computed() -> None:
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_a_weight_or_a_history_that_is_a_little_wrong_is_seen(precision: Precision) -> None:
+def test_small_errors_of_weights_and_histories_are_found(precision: Precision) -> None:
     model = "micro"
     other = create_model(MODELS[model], pretrained=True)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Numerical stability: ops, models and the whole denoiser on stiff and extreme inputs, and over thousands of frames."""
+"""Numerical stability of ops, models and the denoiser, on stiff and extreme inputs and over thousands of frames."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Stage:
-    """A part of the whole run.
+    """A group of checks.
 
     Args:
-        name: what it is about.
-        run: makes its checks, or its long runs.
+        name: of the op, the model or the denoiser that is checked.
+        run: runs the checks, or the long runs.
     """
 
     name: str
@@ -59,19 +59,19 @@ def stages(
     dtypes: Sequence[torch.dtype] = DTYPES,
     frames: int = FRAMES,
 ) -> list[Stage]:
-    """What there is to check: ops, then models, then the denoiser, then long runs.
+    """The groups of checks: ops, then models, then the denoiser, then long runs.
 
     Args:
-        ops: names of ops, or functions of one's own, ``path/to/file.py:function``; ``None`` means all ops, or none
-            where models are named.
-        models: spellings of models, see :func:`mcdenoise.methods.parse_method`, each within a denoiser, and what learns
-            also by itself; ``None`` means the whole zoo but what needs a package that is not installed or has no
-            shipped weights, or none where ops are named.
-        dtypes: the dtypes to try each in.
-        frames: length of the long runs, which belong to the whole run only.
+        ops: names of ops, or functions of your own, ``path/to/file.py:function``; ``None`` means all ops, or none if
+            models are named.
+        models: models, see :func:`mcdenoise.methods.parse_method`. Each is checked in a denoiser, and trainable ones
+            also by themselves. ``None`` means all models whose packages are installed and whose weights are shipped, or
+            none if ops are named.
+        dtypes: the dtypes to check.
+        frames: number of frames of the long runs, which are included if neither ops nor models are named.
 
     Raises:
-        InputError: there is no such op, or such a model cannot be had.
+        InputError: there is no such op, or a named model is not available.
     """
     everything = ops is None and models is None
     chosen_ops = _ops.select(ops) if everything or ops is not None else []
@@ -85,7 +85,7 @@ def stages(
 
 
 def _available(names: Sequence[str] | None) -> list[str]:
-    """Models that can be had; of those that are named, every one."""
+    """The available models; ``InputError`` if a named one is not."""
     found = []
     for name in list_models() if names is None else names:
         try:
@@ -99,7 +99,7 @@ def _available(names: Sequence[str] | None) -> list[str]:
 
 
 def as_json(checks: Sequence[Check], runs: Sequence[LongRun]) -> dict[str, Any]:
-    """Everything found, for a JSON file; what is infinite or no number becomes ``null``."""
+    """All results as JSON values; infinite values and NaN become ``null``."""
     return {
         "passed": all(check.passed for check in checks) and all(run.passed for run in runs),
         "checks": [{name: _number(value) for name, value in asdict(check).items()} for check in checks],

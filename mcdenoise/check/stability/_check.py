@@ -1,4 +1,4 @@
-"""What a check of numerical stability finds, and the dtypes it is made in."""
+"""Results of stability checks, and the dtypes in which they run."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that must hold, and what was found.
+    """Result of one check.
 
     Args:
-        subject: the op, the model, or what else was tried.
-        case: on what.
-        dtype: ``"float32"`` and so on.
-        backend: of an op; ``""`` where there is no choice.
-        what: such as ``"forward"`` or ``"constant"``.
-        error: largest error found, in units of the dtype's epsilon times the case's condition number.
-        allowed: what the analysis allows there, in the same units.
-        condition: largest condition number of the case: how much a relative change of the inputs is magnified.
-        passed: whether it holds.
-        message: what is wrong; empty if nothing is.
+        subject: the op, the model or the denoiser.
+        case: name of the inputs.
+        dtype: such as ``"float32"``.
+        backend: backend of an op; ``""`` if it has only one.
+        what: the property that was checked, such as ``"forward"`` or ``"constant"``.
+        error: the error closest to its bound, in units of the dtype's epsilon times the condition number.
+        allowed: its bound by error analysis, in the same units.
+        condition: maximum condition number of the case: the factor by which it magnifies relative input changes.
+        passed: whether the property holds.
+        message: description of a failure; empty if the check passed.
     """
 
     subject: str
@@ -51,10 +51,10 @@ class Summary:
         dtype: see :class:`Check`.
         backend: see :class:`Check`.
         what: see :class:`Check`.
-        checks: how many there are.
-        worst: the one nearest to its bound, or beyond.
-        condition: largest condition number of all.
-        failed: those that do not hold.
+        checks: number of checks.
+        worst: the check that is closest to its bound, or furthest beyond it.
+        condition: maximum condition number of all.
+        failed: the failed checks.
     """
 
     subject: str
@@ -68,7 +68,7 @@ class Summary:
 
 
 def summarize(checks: Iterable[Check]) -> list[Summary]:
-    """Gather checks by subject, dtype, backend and kind, in the order in which these appear first."""
+    """Group checks by subject, dtype, backend and property, in order of first appearance."""
     groups: dict[tuple[str, str, str, str], list[Check]] = {}
     for check in checks:
         groups.setdefault((check.subject, check.dtype, check.backend, check.what), []).append(check)
@@ -76,7 +76,7 @@ def summarize(checks: Iterable[Check]) -> list[Summary]:
         Summary(
             *key,
             checks=len(group),
-            worst=max(group, key=lambda check: (not check.passed, _share(check))),
+            worst=max(group, key=lambda check: (not check.passed, _fraction_of_bound(check))),
             condition=max(check.condition for check in group),
             failed=tuple(check for check in group if not check.passed),
         )
@@ -88,7 +88,7 @@ def parse_dtypes(names: Sequence[str]) -> tuple[torch.dtype, ...]:
     """Dtypes by name.
 
     Raises:
-        InputError: a name is none of float32, bfloat16, float16.
+        InputError: a name is not one of float32, bfloat16, float16.
     """
     known = {name_of(dtype): dtype for dtype in DTYPES}
     unknown = [name for name in names if name not in known]
@@ -98,10 +98,10 @@ def parse_dtypes(names: Sequence[str]) -> tuple[torch.dtype, ...]:
 
 
 def name_of(dtype: torch.dtype) -> str:
-    """``"float32"`` of ``torch.float32``."""
+    """Name of a dtype, such as ``"float32"`` for ``torch.float32``."""
     return str(dtype).removeprefix("torch.")
 
 
-def _share(check: Check) -> float:
-    share = check.error / check.allowed if check.allowed else 0.0
-    return math.inf if math.isnan(share) else share
+def _fraction_of_bound(check: Check) -> float:
+    fraction = check.error / check.allowed if check.allowed else 0.0
+    return math.inf if math.isnan(fraction) else fraction

@@ -1,4 +1,4 @@
-"""What must hold for a whole :class:`mcdenoise.denoiser.Denoiser`, whatever the frames are."""
+"""Properties of a :class:`mcdenoise.denoiser.Denoiser` that must hold for all frames."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ _SIZE = (17, 23)
 _MIDDLE = (8, 11)
 _PROBE = 8
 _PATTERNS = 8
-# What is never repaired, but told: no buffer but color may hold NaN.
+# NaN in these buffers is rejected; only in color is it repaired.
 _REFUSED = ("albedo", "normal", "depth", "position", "motion", "view_projection")
 
 
 def check_denoiser(model: str = DEFAULT, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
-    """Everything that must hold, with frames in each dtype; bfloat16 also runs convolutions.
+    """Check all properties with frames in each dtype; with bfloat16, convolutions are in bfloat16 too.
 
     Args:
-        model: a model's spelling, see :func:`mcdenoise.methods.parse_method`.
-        dtypes: of the frames.
+        model: a model, see :func:`mcdenoise.methods.parse_method`.
+        dtypes: dtypes of the frames.
 
     Raises:
-        InputError: there is no such model, or no weights of it.
+        InputError: there is no such model, or it has no weights.
     """
     name = f"Denoiser, {model}"
     for dtype in dtypes:
@@ -46,7 +46,7 @@ def check_denoiser(model: str = DEFAULT, dtypes: Sequence[torch.dtype] = DTYPES)
 def _checks(model: str, dtype: torch.dtype) -> Iterator[Check]:
     precision: Precision = "bfloat16" if dtype == torch.bfloat16 else "float32"
     denoiser = parse_method(model).denoiser(precision=precision)
-    # Shots without something that a model cannot do without are no shots for it.
+    # Skip shots that lack a buffer which the model needs.
     buffers = denoiser.model.needs.buffers
     for name, frames in _shots(dtype).items():
         if all(buffers <= frame.buffers for frame in frames):
@@ -60,7 +60,7 @@ def _checks(model: str, dtype: torch.dtype) -> Iterator[Check]:
 
 
 def _frame(seed: int, dtype: torch.dtype, size: tuple[int, int] = _SIZE) -> Frame:
-    """A wall of noise and mirrors that moves by a fraction of a pixel, seen from a camera at the origin."""
+    """A noisy wall with some mirrors that moves by a fraction of a pixel, seen from a camera at the origin."""
     g = torch.Generator().manual_seed(seed)
     height, width = size
     depth = 2 + torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(0))
@@ -81,7 +81,7 @@ def _frame(seed: int, dtype: torch.dtype, size: tuple[int, int] = _SIZE) -> Fram
 
 
 def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
-    """Short shots of what renderers hand over on a bad day; finite values beyond the dtype are its largest."""
+    """Short shots with the unusual values that renderers write; finite values are clamped to the range of the dtype."""
     frames = [_frame(seed, dtype) for seed in range(FRAMES)]
     limits = torch.finfo(dtype)
 
@@ -114,7 +114,7 @@ def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
     shots |= {f"position {value:g} in some rows": with_value("position", value, some) for value in (0.0, 1e10)}
     shots |= {f"{h}x{w}": [_frame(seed, dtype, (h, w)) for seed in range(FRAMES)] for h, w in ((1, 1), (1, 9), (9, 1))}
     shots |= {"nothing but color": [Frame(color=frame.color) for frame in frames]}
-    # Features that contradict one another, or come and go.
+    # Features that contradict each other, or are missing in some frames.
     shots |= {"albedo 93 in some rows": with_value("albedo", 93.0, some)}
     shots |= {"hit distance 0": [frame.replace(hit_distance=0 * frame.color[:, :1]) for frame in frames]}
     shots |= {"normal -1": with_value("normal", -1.0)}
@@ -126,7 +126,7 @@ def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
 
 
 def _valid(denoiser: Denoiser, name: str, frames: list[Frame], dtype: torch.dtype) -> Check:
-    """Finite and non-negative, frame after frame."""
+    """Every image is finite and non-negative."""
     denoiser.reset()
     message = ""
     for number, frame in enumerate(frames):
@@ -139,7 +139,7 @@ def _valid(denoiser: Denoiser, name: str, frames: list[Frame], dtype: torch.dtyp
 
 
 def _contained(denoiser: Denoiser, value: float, dtype: torch.dtype) -> Check:
-    """A pixel that is no radiance is repaired: the images are those of frames with its neighbours' mean, exactly."""
+    """An invalid pixel is repaired: the images are exactly those of frames with the mean of its neighbours instead."""
     message, images = "", list[list[Tensor]]()
     for repaired in (False, True):
         denoiser.reset()
@@ -152,18 +152,18 @@ def _contained(denoiser: Denoiser, value: float, dtype: torch.dtype) -> Check:
             kept = torch.ones_like(color, dtype=torch.bool)
             kept[(..., *_MIDDLE)] = False
             if count != 1 or not torch.equal(mended[kept], color[kept]):
-                message = "another pixel than the broken one was replaced"
+                message = "a valid pixel was replaced"
             if repaired:
                 color[(..., *_MIDDLE)] = mended[(..., *_MIDDLE)]
             shot.append(denoiser(frame.replace(color=color)))
         images.append(shot)
     if not all(torch.equal(a, b) for a, b in zip(*images, strict=True)):
-        message = message or "a broken pixel changes its neighbours"
+        message = message or "an invalid pixel changes its neighbours"
     return _found(f"one pixel of {value:g}", dtype, "contained", message)
 
 
 def _refused(denoiser: Denoiser, name: str, dtype: torch.dtype) -> Check:
-    """NaN in any other buffer is told, in one line that names it, and leaves the history as it was."""
+    """NaN in any other buffer is rejected in one line that names it, and the history does not change."""
     denoiser.reset()
     frames = [_frame(seed, dtype) for seed in range(2)]
     buffer = dict(frames[1].items())[name].clone()
@@ -178,18 +178,18 @@ def _refused(denoiser: Denoiser, name: str, dtype: torch.dtype) -> Check:
     denoiser.reset()
     denoiser(frames[0])
     if not message and not torch.equal(again, denoiser(frames[1])):
-        message = "the history was changed by a frame that was refused"
+        message = "the history was changed by a rejected frame"
     return _found(f"NaN in {name}", dtype, "refused", message)
 
 
 def _exposure(denoiser: Denoiser, exposure: float, dtype: torch.dtype) -> Check:
     """``denoise(s x) = s denoise(x)``, after a history.
 
-    Scaling rounds every pixel of every frame, and each stage once more: the bound is as of a model, so many times what
-    a relative change of all colors, albedos and normals by ``u``, up or down, does to the image, since the rounding of
-    a product of two is that of either. A single pattern of ups and downs tells too little of it (half of the largest,
-    or less): it is the largest of several. What a library makes of scaled frames is its own: by how much its images
-    differ, of which the result is a mean, is allowed besides.
+    Scaling rounds every pixel of every frame, and each stage rounds again. As for a model, the bound is a multiple of
+    the change of the image when all colors, albedos and normals change by ``u`` relatively, up or down; the rounding of
+    a product counts as that of one of its factors. One random pattern of signs underestimates this change by half or
+    more, so the maximum of several patterns is used. For images that come from the OIDN library, of which the result is
+    a mean, their own deviation is allowed in addition.
     """
 
     def outputs(change: Callable[[Frame], Frame]) -> list[Output]:
@@ -203,7 +203,7 @@ def _exposure(denoiser: Denoiser, exposure: float, dtype: torch.dtype) -> Check:
         def moved(frame: Frame) -> Frame:
             buffers = dict(frame.items())
             changed = {name: buffers[name] * (1 + _PROBE * eps * own) for name, own in signs.items()}
-            # In bfloat16 a normal of unit length moves by more than a frame may have.
+            # In bfloat16 the perturbed normal may be longer than is valid.
             return frame.replace(**{**changed, "normal": changed["normal"].clamp(-1, 1)})
 
         return relative_change(outputs(moved)[-1].image, plain[-1].image) / _PROBE / 2

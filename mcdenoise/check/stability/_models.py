@@ -1,4 +1,4 @@
-"""Errors of networks, and what must hold for them whatever the image is."""
+"""Errors of networks, and properties that must hold for all images."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from mcdenoise.models import Accumulated, Skipping, parts_of
 EXPOSURES = (1e-4, 1e-2, 1e2, 1e4)
 _DRAWS = 8
 _LEAST_RADIANCE = 1e-30
-# A convolution rounds weights, activations and results, each of which is a relative change of its products such as the
-# one that is tried.
+# A convolution rounds weights, activations and results; each is a relative change of its products like the measured
+# one.
 ROUNDED = 3
-# Of eight random changes the largest is not the largest of all, but that is hardly four times it.
+# The maximum of eight random perturbations underestimates the true maximum, but hardly by more than this factor.
 ALLOWED = 4
 
 
 @dataclass(frozen=True)
 class ModelCase:
-    """A frame for a model, with a history, by what is special about it."""
+    """A frame for a model, with a history; its name says what is special about it."""
 
     name: str
     size: tuple[int, int] = (8, 9)
@@ -36,7 +36,7 @@ class ModelCase:
     changes: dict[str, float] = field(default_factory=dict)
 
     def frame(self) -> Frame:
-        """Six decades of radiance on two walls, with a bit of sky; float32."""
+        """A frame with four decades of radiance and some sky, in float32."""
         g = torch.Generator().manual_seed(0)
         shape = (1, 3, *self.size)
         color = 10 ** (4 * torch.rand(shape, generator=g) - 2)
@@ -69,14 +69,14 @@ CASES = (
 
 
 def check_model(name: str, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
-    """Everything that must hold for a network, in each dtype: a model that learns, without the history that it wears.
+    """Check a network, that is a trainable model without its accumulation, in each dtype.
 
-    In half precision the convolutions run in it and everything else in float32, as ``Denoiser`` runs them.
+    In half precision the convolutions run in that dtype and everything else in float32, as in ``Denoiser``.
 
     Args:
-        name: a model's spelling, see :func:`mcdenoise.methods.parse_method`. One that does not learn, or that keeps a
-            state of its own, has no such checks.
-        dtypes: of the convolutions.
+        name: a model, see :func:`mcdenoise.methods.parse_method`. Models that are not trainable, or that have a state
+            of their own, have no such checks.
+        dtypes: dtypes of the convolutions.
 
     Raises:
         InputError: there is no such model.
@@ -93,7 +93,7 @@ def check_model(name: str, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[C
 
 
 def _without_history(model: Any) -> Any:
-    """What is inside of the accumulation, which hands it what a case has: a color and its history's length."""
+    """The model inside the accumulation; it takes an accumulated color and its history length, like those of a case."""
     for accumulated in parts_of(model, Accumulated):
         inner = accumulated.inner
         return inner.inner if isinstance(inner, Skipping) else inner
@@ -106,7 +106,7 @@ def _image(model: nn.Module, frame: Frame) -> Tensor:
 
 
 def _check_case(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, dtype: torch.dtype) -> Iterator[Check]:
-    """Forward against float64, in units of what a relative change of all weights and inputs by ``u`` does to it."""
+    """Check that image and gradients are finite, and compare the image with float64."""
     frame = case.frame()
     color = frame.color.clone().requires_grad_()
     with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
@@ -116,8 +116,8 @@ def _check_case(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, 
         name, case.name, name_of(dtype), "", "finite", 0, 0, 0, valid, "" if valid else "NaN, infinite or below 0"
     )
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    # Of the image in units of its own brightness, so that the largest radiance does not overflow the sum; what is below
-    # 1e-30 counts as that, as it does in `auto_exposure`.
+    # Differentiate the image relative to its brightness, so that bright images do not overflow the sum; the minimum is
+    # 1e-30, as in `auto_exposure`.
     scale = max(float(frame.color.max()), _LEAST_RADIANCE)
     if not frame.color.any():
         scale = 1.0
@@ -131,7 +131,7 @@ def _check_case(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, 
 
 @torch.no_grad()
 def _check_exposure(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, dtype: torch.dtype) -> Check:
-    """``model(s x) = s model(x)``: the worst factor of all."""
+    """``model(s x) = s model(x)``, for the factor ``s`` with the largest error."""
     frame = case.frame()
     checks: list[Check] = []
     for exposure in EXPOSURES:
@@ -148,7 +148,7 @@ def _compared(name: str, exact: nn.Module, case: ModelCase, dtype: torch.dtype, 
     unit = torch.finfo(dtype).eps / 2
     products = max(relative_change(_moved(exact, frame, unit, seed), expected) for seed in range(_DRAWS))
     sums = max(relative_change(_summed(exact, frame, seed), expected) for seed in range(_DRAWS))
-    # Everything outside of the convolutions is in float32.
+    # Everything except convolutions is in float32.
     response = ROUNDED * max(products, torch.finfo(torch.float32).eps) + sums
     error, allowed = relative_change(found, expected) / (2 * unit), ALLOWED * response / (2 * unit)
     message = "" if error <= allowed else f"error {error:.3g} eps, expected at most {allowed:.3g}"
@@ -156,7 +156,7 @@ def _compared(name: str, exact: nn.Module, case: ModelCase, dtype: torch.dtype, 
 
 
 def _moved(exact: nn.Module, frame: Frame, unit: float, seed: int) -> Tensor:
-    """The image with every weight and buffer changed by ``unit`` of itself, up or down."""
+    """The image when every weight and buffer changes by ``unit`` relatively, up or down."""
     generator = torch.Generator().manual_seed(seed)
 
     def move(tensor: Tensor) -> Tensor:
@@ -170,11 +170,12 @@ def _moved(exact: nn.Module, frame: Frame, unit: float, seed: int) -> Tensor:
 
 
 def _summed(exact: nn.Module, frame: Frame, seed: int) -> Tensor:
-    """The image with the result of every convolution changed as float32 may change a sum of n products in some order.
+    """The image when the result of every convolution changes by the rounding error of a float32 sum of n products.
 
-    The k-th partial sum of products of random signs is about sqrt(k) of one of them and rounded by ``u`` of that, so
-    that the roundings of all of them add up to ``u n / sqrt(2)`` of a product: ``u sqrt(n / 2)`` of the root of the sum
-    of their squares (Higham, Accuracy and Stability of Numerical Algorithms, 2002, Sec. 2.8 and 4.2).
+    The k-th partial sum of products with random signs has the size of sqrt(k) products, and a relative rounding error
+    of ``u``. The rounding errors of all partial sums add up to ``u n / sqrt(2)`` of a product, which is
+    ``u sqrt(n / 2)`` times the root of the sum of squared products (Higham, Accuracy and Stability of Numerical
+    Algorithms, 2002, Sec. 2.8 and 4.2).
     """
     generator = torch.Generator().manual_seed(seed)
     unit = torch.finfo(torch.float32).eps / 2
@@ -184,7 +185,7 @@ def _summed(exact: nn.Module, frame: Frame, seed: int) -> Tensor:
         squared = copy.deepcopy(layer)
         for parameter in squared.parameters():
             parameter.square_()
-        # Not as a call, which would come here again.
+        # Calling the module instead would run this hook again.
         spread = squared.forward(given[0].square(), *given[1:]).sqrt()
         signs: Tensor = torch.randint(0, 2, result.shape, generator=generator) * 2 - 1
         terms = layer.weight.numel() / layer.out_channels
@@ -202,7 +203,7 @@ def _summed(exact: nn.Module, frame: Frame, seed: int) -> Tensor:
 
 
 def relative_change(found: Tensor, expected: Tensor) -> float:
-    """The largest change, relative where the image is bright, and of half its mean where it is dark."""
+    """Maximum change relative to the pixel's value plus half of the mean of the image."""
     unit = expected.abs().double() + expected.double().mean() / 2
-    # Below the smallest normal number there are fewer digits.
+    # Numbers below the smallest normal number have fewer digits.
     return float(((found.double() - expected).abs() / (unit + torch.finfo(torch.float32).tiny)).max())
