@@ -337,7 +337,7 @@ def _format_of(path: Path, format: Format | None) -> Format:
 def _check_packages(*names: str) -> None:
     for name in names:
         if importlib.util.find_spec(name) is None:
-            raise InputError(f"{name}: expected it to be installed, found it missing; install mcdenoise[export]")
+            raise InputError(f"{name}: expected it to be installed, found it missing; pip install 'mcdenoise[export]'")
 
 
 def _example(name: str, size: tuple[int, int], batch: int) -> Tensor:

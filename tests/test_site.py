@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 
 from mcdenoise.check.cases import OPS
-from mcdenoise.models import list_models
+from mcdenoise.models import list_models, overview
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -34,6 +34,19 @@ def test_every_method_has_a_page_with_its_cost_and_its_settings(site) -> None:
     assert "| cascaded_v2 | 0.06854 |" in own
     assert "-0.50 dB" not in own
     assert ":func:" not in "".join(pages.values())
+
+
+def test_every_method_that_can_run_has_a_picture_and_its_errors(site) -> None:
+    methods = site("methods")
+    pages = methods.pages()
+    shown = {name for name in list_models() if f"../close_ups/{name}.webp" in pages[f"methods/{name}.md"]}
+    trained = {entry.name for entry in overview() if entry.weights != "to train"}
+    assert trained == shown
+    pictures = list((ROOT / "docs" / "close_ups").glob("*.webp"))
+    assert {path.stem for path in pictures} == shown
+    assert sum(path.stat().st_size for path in pictures) < 1.5e6
+    smape = {name: float(values[0]) for name, values in methods.errors().items()}
+    assert all(value < smape["noisy"] for name, value in smape.items() if name != "noisy")
 
 
 def test_every_measured_row_is_of_some_method(site) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import inspect
 import re
@@ -9,6 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import mcdenoise.models
+from mcdenoise.check.cases import OPS
 from mcdenoise.models import ModelOverview, describe_weights, find_model, overview
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -49,7 +51,7 @@ NAMES = {
     "OIDN": "oidn",
     "OIDN, best of 36 settings": "oidn",
 }
-PAPER = "*The paper*, where no other is named, is [doi:10.1007/s00371-023-02951-6](https://doi.org/10.1007/s00371-023-02951-6)."
+PAPER = "*The paper* is [doi:10.1007/s00371-023-02951-6](https://doi.org/10.1007/s00371-023-02951-6)."
 MEASURED = ("results.md", "unseen_scenes.md", "zoo.md", "layers.md")
 
 
@@ -113,13 +115,14 @@ def page(entry: ModelOverview) -> str:
         "cost": f"{cost(entry)} thousand multiply-adds a pixel in convolutions" if entry.kmacs_per_pixel else "-",
         "source": f"`{file}`",
     }
-    parts = [f"# {entry.name}", facts_table(facts)]
+    parts = [f"# {entry.name}", close_up(entry.name), facts_table(facts)]
     if entry.reason:
         parts.append(f"Not available where this page was made: {entry.reason}.")
     parts.append(f"```sh\nmcdenoise denoise shot/ -o clean/ --model {entry.name}\n```")
     parts.append("## How it works\n\n" + as_markdown(inspect.getdoc(module) or ""))
-    if "paper" in (inspect.getdoc(module) or ""):
+    if "s00371" in entry.paper:
         parts.append(PAPER)
+    parts.append(equations(construct.__module__))
     parts.append(
         f"::: {construct.__module__}.{construct.__qualname__}\n"
         "    options:\n      heading: Settings\n      toc_label: Settings"
@@ -127,6 +130,27 @@ def page(entry: ModelOverview) -> str:
     parts.append(trained(entry))
     parts.append("## Measured\n\n" + measured(entry.name))
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def close_up(name: str) -> str:
+    """The picture and the errors that ``docs/site/close_ups.py`` made; nothing for a method that it could not run."""
+    found = errors()
+    if name not in found:
+        return ""
+    smape, psnr = found[name]
+    return (
+        f"![Two crops: noisy, {name}, reference](../close_ups/{name}.webp){{ .pixels width=100% }}\n\n"
+        f"Frame 15 of `mcdenoise demo`: one sample a pixel on the left, `{name}` in the middle, the reference of 128 "
+        f"samples on the right. Over the whole frame its SMAPE is {smape} and its PSNR {psnr} dB, where the noisy "
+        f"frame has {found['noisy'][0]} and {found['noisy'][1]} dB. `python docs/site/close_ups.py demo` measured it."
+    )
+
+
+@cache
+def errors() -> dict[str, tuple[str, str]]:
+    """SMAPE and PSNR of the frame of the close-ups, by method."""
+    with (ROOT / "docs" / "close_ups" / "errors.csv").open(encoding="utf-8", newline="") as file:
+        return {row["method"]: (row["SMAPE"], row["PSNR"]) for row in csv.DictReader(file)}
 
 
 def facts_table(facts: dict[str, str]) -> str:
@@ -143,6 +167,28 @@ def paper(entry: ModelOverview) -> str:
 def code(names: list[str]) -> str:
     """Names of buffers as code."""
     return ", ".join(f"`{name}`" for name in names) or "-"
+
+
+def equations(module: str) -> str:
+    """Links to the pages of the operators that a method calls, where their formulas are."""
+    source = "".join(sources(module))
+    called = [op.name for op in OPS if re.search(rf"(?<!def )\b{op.name}\(", source)]
+    links = ", ".join(f"[`{name}`](../operators/{name}.md)" for name in called)
+    return f"The operators that its code calls have their equations on pages of their own: {links}." if called else ""
+
+
+def sources(module: str) -> list[str]:
+    """The source of a module, and of those whose classes it takes its methods and its layers from."""
+    found: dict[str, str] = {}
+    ahead = [module]
+    while ahead:
+        name = ahead.pop()
+        found[name] = inspect.getsource(importlib.import_module(name))
+        parts = re.findall(
+            r"^from (mcdenoise\.(?:models|nn)\.[a-z]\w*) import .*\b[A-Z][a-z]", found[name], re.MULTILINE
+        )
+        ahead += [part for part in parts if part not in found]
+    return list(found.values())
 
 
 def trained(entry: ModelOverview) -> str:

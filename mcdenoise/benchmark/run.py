@@ -21,6 +21,7 @@ from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import Size, measure_sizes
 from mcdenoise.benchmark.tables import write_csv
 from mcdenoise.data import Sequence, open_sequence, write_exr
+from mcdenoise.data.exr import Metadata
 from mcdenoise.data.files import new_folder
 from mcdenoise.data.sequences import with_unique_names
 from mcdenoise.errors import InputError, MissingBufferError
@@ -247,8 +248,10 @@ class _SceneRun:
         """Run every method on every frame once; score its images and store some of them."""
         for number, frame, _ in self._frames(reference=True):
             kept = number in self._scene.pictures
+            # With the primaries that the frames state, so that the report can show them.
+            primaries = {name: x for name, x in self._sequence.metadata(number).items() if name == "chromaticities"}
             if kept and frame.reference is not None:
-                self._keep("reference", number, frame.reference)
+                self._keep("reference", number, frame.reference, primaries)
             for method, timed in self._at_work():
                 output: Output | None = None
                 with self._noted(method.name):
@@ -257,7 +260,7 @@ class _SceneRun:
                     if frame.reference is not None:
                         self._compare(method.name, number, output, frame.reference)
                 if kept and output is not None and method.name not in self._failures:
-                    self._keep(method.folder, number, output.image)
+                    self._keep(method.folder, number, output.image, primaries)
             on_step()
 
     def _compare(self, name: str, number: int, output: Output, reference: Tensor) -> None:
@@ -321,13 +324,13 @@ class _SceneRun:
             if isinstance(error, MissingBufferError):
                 self._lacking.add(name)
 
-    def _keep(self, folder: str, number: int, image: Tensor) -> None:
+    def _keep(self, folder: str, number: int, image: Tensor, metadata: Metadata) -> None:
         path = self._folder / IMAGES / self._scene.name / folder / f"{number}.exr"
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._write(path, image, {})
+        self._write(path, image, metadata)
 
     @staticmethod
-    def _write(path: Path, image: Tensor, metadata: dict[str, str | int | float | tuple[float, ...]]) -> None:
+    def _write(path: Path, image: Tensor, metadata: Metadata) -> None:
         pixels = image[0].permute(1, 2, 0).cpu().numpy()
         write_exr(path, pixels, ["R", "G", "B"], metadata=metadata)
 

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
+from mcdenoise.data.color_space import to_rec709
 from mcdenoise.data.exr import read_exr
 from mcdenoise.errors import InputError
 from mcdenoise.report.pictures import (
@@ -146,13 +148,14 @@ def _ran(results: Results, scene: Scene, method: Method) -> bool:
 
 
 def _read(path: Path, scene: Scene) -> Image:
-    pixels, channels, _ = read_exr(path)
+    pixels, channels, metadata = read_exr(path)
     if pixels.shape[:2] != (scene.height, scene.width) or len(channels) < 3:
         raise InputError(
             f"{path}: expected an RGB picture of {scene.width}x{scene.height}, found {len(channels)} channels of "
             f"{pixels.shape[1]}x{pixels.shape[0]}; run the benchmark again"
         )
-    return np.ascontiguousarray(pixels[..., :3])
+    image = torch.from_numpy(np.ascontiguousarray(pixels[..., :3])).permute(2, 0, 1)
+    return np.ascontiguousarray(to_rec709(image, metadata).permute(1, 2, 0).numpy())
 
 
 def _smaller(image: Image, factor: int) -> Image:

@@ -6,12 +6,14 @@ import shutil
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from small_benchmark import FRAMES, HOSTILE, save
 
 from mcdenoise.cli import main
+from mcdenoise.data import read_exr, write_exr
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
 from mcdenoise.report import write_report
@@ -180,6 +182,20 @@ def test_pictures_of_another_size(folder: Path, tmp_path: Path):
     save(copy, "first", "ours", FRAMES[0], np.zeros((8, 8, 3), np.float32))
     with pytest.raises(InputError, match=r"ours.3\.exr: expected an RGB picture of 96x64, found 3 channels of 8x8"):
         report_writing._galleries(copy, Results.read(copy))
+
+
+def test_pictures_are_shown_in_the_primaries_of_a_display(folder: Path, tmp_path: Path, colour: Any):
+    spaces = colour.RGB_COLOURSPACES
+    matrix = colour.matrix_RGB_to_RGB(spaces["sRGB"], spaces["ACEScg"], chromatic_adaptation_transform="Bradford")
+    primaries = (*spaces["ACEScg"].primaries.flatten().tolist(), *spaces["ACEScg"].whitepoint.tolist())
+    copy = copied(folder, tmp_path / "copy")
+    results = Results.read(copy)
+    before = report_writing._galleries(copy, results)[0].codes["ours"][FRAMES[0]]
+    path = copy / "images" / "first" / "ours" / f"{FRAMES[0]}.exr"
+    write_exr(path, read_exr(path)[0] @ matrix.T, ["R", "G", "B"], half=False, metadata={"chromaticities": primaries})
+    after = report_writing._galleries(copy, results)[0].codes["ours"][FRAMES[0]]
+    # The matrices of both ways are rounded to ten digits: a value on the border of two codes may fall to either side.
+    assert np.abs(after.astype(int) - before).max() <= 1
 
 
 def test_without_pictures_the_rest_is_there(folder: Path, tmp_path: Path):
