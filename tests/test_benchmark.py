@@ -727,7 +727,7 @@ def two_frames() -> list[Frame]:
 
 
 @pytest.mark.usefixtures("measures_memory")
-def test_peak_memory_is_what_a_method_adds() -> None:
+def test_peak_memory_is_that_of_the_method() -> None:
     peak = peak_memory(Greedy, two_frames, threads=1, device="cpu")
     if peak is None:
         pytest.skip("this system does not tell the peak of the resident set")

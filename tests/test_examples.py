@@ -267,7 +267,7 @@ def test_run_time_prints_a_line_for_each_method(tmp_path: Path) -> None:
     assert written["machine"]["threads"] == 1
 
 
-def test_error_vs_runtime_draws_what_it_prints(small_sequence: Path, tmp_path: Path) -> None:
+def test_error_vs_runtime_plots_the_printed_values(small_sequence: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="plots need the packages of mcdenoise[report]")
     figure = tmp_path / "figure.svg"
     arguments = (small_sequence, "-o", figure, "--models", "cascaded_v2_tiny", "--rounds", "1")

@@ -1,4 +1,4 @@
-"""How the cost of a method grows with the number of pixels."""
+"""Run times of methods over image sizes, on synthetic frames, with an estimate of the memory that they need."""
 
 from __future__ import annotations
 

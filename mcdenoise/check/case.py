@@ -87,7 +87,7 @@ class Op:
             they are constant and the weights sum to one.
         weights: whether, with these settings, the results are non-negative weights that sum to one over the channels.
         rounding: returns the :class:`Rounding` for inputs and settings.
-        half: whether the op supports inputs in half precision.
+        half_precision: whether the op supports inputs in half precision.
         batched: whether the first axis of all tensors is the batch, and the op treats its images identically and
             independently, so that many inputs can be checked at once.
         own: whether it is a user's function, see :mod:`mcdenoise.check.own`. Its reference is itself in float64, whose
@@ -103,7 +103,7 @@ class Op:
     images: tuple[str, ...] = ()
     weights: Callable[[dict[str, Any]], bool] = lambda settings: False
     rounding: Callable[[Inputs, dict[str, Any]], Rounding] = _no_more
-    half: bool = True
+    half_precision: bool = True
     batched: bool = True
     own: bool = False
 

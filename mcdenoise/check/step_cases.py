@@ -224,7 +224,7 @@ _BUFFERS = ("albedo", "normal", "current", "length", "exposure", "scale")
 
 # Between accumulation and a network's convolutions frames are in float32, so steps need not support half precision.
 STEPS: tuple[Op, ...] = tuple(
-    replace(step, half=False)
+    replace(step, half_precision=False)
     for step in (
         Op(network.network_input, _network_input, _cases(_input, ("image", "features"))),
         Op(network.network_features, _network_features, _cases(_buffers, _BUFFERS)),

@@ -1,4 +1,4 @@
-"""A function of one's own, by its place and in Python: what is right passes, and what is wrong fails or is refused."""
+"""Checks of users' functions, by the command and in Python: correct ones pass, wrong ones fail or are rejected."""
 
 from __future__ import annotations
 

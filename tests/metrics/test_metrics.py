@@ -178,7 +178,7 @@ def test_hdr_flip_of_darkness() -> None:
     assert flip_hdr(images, torch.full_like(images, 0.5)).isfinite().all()
 
 
-def test_flip_without_its_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flip_without_its_package_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     with pytest.raises(UncomputableError, match=r"FLIP needs flip-evaluator.*mcdenoise\[peers\]"):
         flip_srgb(torch.rand(1, 3, 4, 4), torch.rand(1, 3, 4, 4))
@@ -242,7 +242,7 @@ def test_no_error_is_zero(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.int64, torch.complex64], ids=str)
 @pytest.mark.parametrize("metric", [*IMAGE_METRICS, *CLIP_METRICS])
-def test_integers_and_complex_numbers_are_refused(
+def test_integers_and_complex_numbers_are_rejected(
     metric: Callable[[Tensor, Tensor], Tensor], dtype: torch.dtype
 ) -> None:
     """Differences of unsigned integers would overflow."""

@@ -66,7 +66,7 @@ def test_row_names_are_unique_and_each_sequence_is_also_a_still() -> None:
         assert row.frames is None or int(row.frames) in row.shot.references
 
 
-def test_the_suite_has_what_a_user_tries_first() -> None:
+def test_the_suite_covers_common_renderings() -> None:
     shots = [shot for shot in SHOTS if not shot.curve]
     for renderer in ("mitsuba", "cycles"):
         own = [shot for shot in shots if shot.renderer == renderer]
@@ -176,7 +176,7 @@ def test_cycles_needs_a_blender(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(BLENDER is None, reason="no BLENDER_PYTHON: an interpreter with bpy")
 @pytest.mark.parametrize("scene", ["gallery", "garden", "attic"])
-def test_cycles_writes_what_the_reader_understands(tmp_path: Path, scene: str) -> None:
+def test_the_reader_reads_files_of_cycles(tmp_path: Path, scene: str) -> None:
     shot = Shot(f"tiny-{scene}", "cycles", scene, 1, "default", **TINY)
     render_suite([shot], tmp_path, blender_python=Path(str(BLENDER)), threads=1)
     sequence = open_row(Row(shot, False), tmp_path)
@@ -321,7 +321,7 @@ def test_close_ups_are_drawn_side_by_side(tmp_path: Path) -> None:
 # The command
 
 
-def test_the_command_scores_what_is_there(
+def test_the_command_scores_the_existing_rows(
     small_sequence: Path, tmp_path: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shot = Shot("small", "mitsuba", "parlour", 1, "centre", frames=4)
@@ -357,7 +357,7 @@ def test_the_command_scores_what_is_there(
         (("--suite", "wild", "--data", "data", "--no-render", "-o", "out"), "expected frames of the suite, found none"),
     ],
 )
-def test_bad_arguments_are_refused_in_one_line(
+def test_bad_arguments_are_rejected_in_one_line(
     tmp_path: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], expected: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

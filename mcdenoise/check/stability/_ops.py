@@ -157,7 +157,7 @@ def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
     if op.own:
         yield from (_check_derivative(op, case) for case in op.cases if case.differentiable)
     for dtype in dtypes:
-        if not op.half and accumulator_dtype(dtype) != dtype:
+        if not op.half_precision and accumulator_dtype(dtype) != dtype:
             continue
         known: list[Known] = [{} for _ in op.cases]
         for backend in backends(op):
