@@ -109,7 +109,7 @@ def _mismatch(op: Op, case: Case, order: int) -> str:
     function, arguments = _of_differentiable(op, case)
     batched = op.batched and all(len(tensor) for tensor in arguments)
     if batched:
-        # Of the many copies together a fast form may be chosen, which would prove nothing of the plain one.
+        # Of the many copies together a fast backend may be chosen, which would prove nothing of the plain one.
         with use("torch"):
             message = first_mismatch(function, arguments)
             if order > 1 and not message:
