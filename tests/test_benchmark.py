@@ -857,7 +857,7 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
     monkeypatch.setattr(mcdenoise.benchmark.operators, "_COPY_BYTES", 2**20)
     results = benchmark_ops(size=(33, 20), rounds=3, out=out, ops=OPS)
     limits = {"float32": 2e-6, "bfloat16": 2e-2, "float16": 3e-3}
-    # Their compiled backends have no derivatives.
+    # Their fast backends have no derivatives.
     forward = ("downsample", "importance_filter", "motion_from_position")
     by_name = {(cost.op, cost.dtype): cost for cost in results.costs if cost.backend == "torch"}
     assert list(by_name) == [(op.name, dtype) for op in OPS for dtype in limits]

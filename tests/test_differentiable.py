@@ -49,7 +49,7 @@ def decisions(kept: list[Tensor], *, replay: bool) -> Iterator[None]:
 
     def detach(self: Tensor) -> Tensor:
         found = original(self)
-        # A compiled form computes with the memory of its arguments, and has derivatives of its own.
+        # A fast backend computes with the memory of its arguments, and has derivatives of its own.
         if sys._getframe(1).f_globals["__name__"].startswith(COMPILED):
             return found
         if not replay:
@@ -101,7 +101,7 @@ def check(denoiser: Denoiser, frames: list[dict[str, Tensor]], names: tuple[str,
     return sizes
 
 
-# The larger one has the pixels for which compiled forms are chosen where nobody asks for a derivative.
+# The larger one has the pixels for which fast backends are chosen where nobody asks for a derivative.
 @pytest.mark.parametrize("size", [(24, 40), (96, 96)], ids=str)
 @pytest.mark.parametrize("name", ["cascaded_v2_micro", "cascaded_v2_tiny"])
 def test_derivative_of_the_third_frame_in_the_first(name: str, size: tuple[int, int]) -> None:

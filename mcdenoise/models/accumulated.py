@@ -235,7 +235,8 @@ class Accumulated(Wrapper):
             self._report(found, frame, reset, still=still_for_sure, can_move=can_move, keeps=keeps)
         after = None
         if keeps:
-            label = None if seen is None else seen * _steady(color)
+            # In most frames no light is seen, and all labels are 0.
+            label = seen if seen is None or (not blind and not seen.any()) else seen * _steady(color)
             surface = Surface(frame.position, frame.normal, frame.depth, label)
             after = History(color, length, surface, frame.view_projection, limit, carried)
         hints = frame.hints._replace(still=still_for_sure)

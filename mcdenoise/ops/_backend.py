@@ -1,4 +1,4 @@
-"""Which form of an op runs: plain torch, or the fast form of the same name in ``_numba/`` or ``_triton/``."""
+"""Which implementation of an op runs: the reference, or that of the same name in ``_numba/`` or ``_triton/``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BACKENDS: tuple[Backend, ...] = get_args(Backend)
 
 _FOUND = {name: importlib.util.find_spec(name) is not None for name in ("numba", "triton")}
 _EXTRAS = {"numba": "fast", "triton": "gpu"}
-# Pixels of a batch below which importing numba and calling it takes longer than the plain form does.
+# Pixels of a batch below which importing numba and calling it takes longer than the reference implementation does.
 _FEW_PIXELS = 8192
 # What to take, and whether to raise where it cannot run; see `use`.
 _used: tuple[Backend, bool] | None = None
@@ -39,7 +39,7 @@ def choose_backend(
     """The backend to run an op on ``tensors`` with: the fastest that can run and pays, or the one of :func:`use`.
 
     Args:
-        forms: what the op has fast forms in.
+        forms: what the op has fast backends in.
         tensors: the arguments of the op, ``(B, C, H, W)`` or with other axes behind the second.
         differentiable: those of the forms that have derivatives.
 
@@ -125,7 +125,7 @@ def _obstacle(backend: Backend, tensors: Sequence[Tensor], differentiable: bool,
 
 
 def _is_transformed() -> bool:
-    """Whether torch.func, ``vmap`` or forward mode is at work, of which a compiled form knows nothing."""
+    """Whether torch.func, ``vmap`` or forward mode is at work, of which a fast backend knows nothing."""
     if torch.compiler.is_compiling():
         return False
     return torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0

@@ -1,16 +1,16 @@
-"""The one dispatch of all ops: which form runs, and what it does to derivatives.
+"""The one dispatch of all ops: which implementation runs, and what it does to derivatives.
 
-An op is a page with a contract and a plain form in torch, which is the truth. ``@op`` takes a fast form of the same
-name from the file of the same name in ``_numba/`` or ``_triton/`` where one can run and pays. Such a form takes the
-arguments of the op, one after the other, and may return ``NotImplemented`` for what it was not written for.
+An op is a page with a contract and a reference implementation in torch, which is the truth. ``@op`` takes a fast
+backend of the same name from the file of the same name in ``_numba/`` or ``_triton/`` where one can run and pays. It
+takes the arguments of the op, one after the other, and may return ``NotImplemented`` for what it was not written for.
 
-- Derivatives: a form ``NAME`` beside which there is ``NAME_gradients`` is an operator with derivatives; or it calls
-  ``NAME_gradients.operator``, which has them, and whose arguments ``NAME_gradients.adapted(plain)`` takes. Those are
-  differentiated again by way of the plain form. Any other form is chosen only where none are asked for.
-- Under ``torch.func``, ``vmap`` and forward mode the plain form runs: no compiled form has rules for them.
-- While a model is exported the plain form runs, so that what is exported needs neither numba nor Triton.
-- Autocast: plain forms consist of products and sums in place of matrix products, so that nothing is rounded but what a
-  contract says.
+- Derivatives: a fast backend ``NAME`` beside which there is ``NAME_gradients`` is an operator with derivatives; or it
+  calls ``NAME_gradients.operator``, which has them, and whose arguments ``NAME_gradients.adapted(plain)`` takes. Those
+  are differentiated again by way of the reference. Any other is chosen only where no derivatives are asked for.
+- Under ``torch.func``, ``vmap`` and forward mode the reference runs: no fast backend has rules for them.
+- While a model is exported the reference runs, so that what is exported needs neither numba nor Triton.
+- Autocast: the reference consists of products and sums in place of matrix products, so that nothing is rounded but
+  what a contract says.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from mcdenoise.ops._operator import Operator
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
-# The fast forms that have been loaded, by backend and op.
+# The fast backends that have been loaded, by backend and op.
 _forms: dict[tuple[str, str], Callable[..., Any]] = {}
 
 
 def op(
     *backends: Backend, check: Callable[..., None] | None = None, differentiable: bool | Backend = False
 ) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
-    """Make an op of its plain form.
+    """Make an op of its reference implementation.
 
     Args:
-        backends: what it has a fast form in.
+        backends: what it has a fast backend in.
         check: takes the arguments of the op, and raises for what its contract refuses; run before any form.
-        differentiable: whether the fast forms have derivatives, or which one of them has.
+        differentiable: whether the fast backends have derivatives, or which one of them has.
     """
     of_these = (backends if differentiable else ()) if isinstance(differentiable, bool) else (differentiable,)
 
@@ -87,7 +87,7 @@ def made_of(
 
 
 def plain(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """The plain form of an op."""
+    """The reference implementation of an op."""
     form: Callable[_Arguments, _Result] = getattr(function, "plain", function)
     return form
 
@@ -107,7 +107,7 @@ def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
 
 
 def _load(backend: str, page: str, plain: Callable[..., Any]) -> None:
-    """Make sure that the fast form of an op is there."""
+    """Make sure that the fast backend of an op is there."""
     name = plain.__name__
     if (backend, name) in _forms:
         return
@@ -126,13 +126,13 @@ _load._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def _by_position(plain: Callable[..., Any]) -> Callable[..., Any]:
-    """The plain form, which takes some of its arguments by name only."""
+    """The reference implementation, which takes some of its arguments by name only."""
     names = list(inspect.signature(plain).parameters)
     return lambda *arguments: plain(**dict(zip(names, arguments, strict=True)))
 
 
 def _differentiate(operator: Operator, gradients: Callable[..., Any], plain: Callable[..., Any]) -> None:
-    """Give an operator its gradients, and gradients of those by way of the plain form.
+    """Give an operator its gradients, and gradients of those by way of the reference implementation.
 
     Of several results the first has derivatives, and the others have none; unless ``gradients.of_all`` says that all
     have them, and it takes a gradient of each.

@@ -288,7 +288,7 @@ def test_accumulation_is_the_published_average() -> None:
 @pytest.mark.slow
 @torch.no_grad()
 def test_large_images_have_the_pixels_of_small_ones() -> None:
-    """Where the compiled form of the filter is chosen, with each way of normalising."""
+    """Where the fast backend of the filter is chosen, with each way of normalising."""
     for normalize in ("softmax", "none"):
         network = drawn(KernelNetwork(8, 3, normalize=normalize)).float()
         frame = frame_of_doubles(96, 110).to(torch.float32)

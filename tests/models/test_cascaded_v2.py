@@ -189,8 +189,8 @@ def test_a_constant_guide_is_no_guide(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.slow
-def test_large_images_have_the_derivatives_of_the_plain_form() -> None:
-    """Large enough for compiled forms, some of which have no derivatives."""
+def test_large_images_have_the_derivatives_of_the_reference() -> None:
+    """Large enough for fast backends, some of which have no derivatives."""
     gradients = []
     for backend in ("torch", "numba"):
         torch.manual_seed(0)

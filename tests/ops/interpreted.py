@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from plain_form import (
+from reference_cases import (
     FAST,
     TOLERANCE,
     assert_same,
@@ -56,7 +56,7 @@ def calls_within_a_kernel_are_plain_calls(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(interpreter.InterpretedFunction, "__call__", called)
 
 
-def is_that_of_the_plain_form(op: Op, case: Case, dtype: torch.dtype) -> None:
+def is_that_of_the_reference(op: Op, case: Case, dtype: torch.dtype) -> None:
     actual = outcomes(op, case, case.inputs(dtype), "triton")
     assert {tensor.dtype for tensor in actual} == {dtype}
     exact = outcomes(op, case, map_tensors(lambda tensor: tensor.double(), case.inputs(dtype)), "torch")
@@ -65,7 +65,7 @@ def is_that_of_the_plain_form(op: Op, case: Case, dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize(("op", "case"), [pytest.param(*pair, id=f"{pair[0].name}-{pair[1].name}") for pair in CASES])
 def test_result_and_derivatives(op: Op, case: Case) -> None:
-    is_that_of_the_plain_form(op, case, torch.float64)
+    is_that_of_the_reference(op, case, torch.float64)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_result_and_derivatives(op: Op, case: Case) -> None:
 )
 @every_op
 def test_dtypes(op: Op, dtype: torch.dtype) -> None:
-    is_that_of_the_plain_form(op, drawn(1, 3, 3, 5, 3, op, border="renormalize"), dtype)
+    is_that_of_the_reference(op, drawn(1, 3, 3, 5, 3, op, border="renormalize"), dtype)
 
 
 # Wider, and taller than a tile, and no whole number of them.
@@ -83,7 +83,7 @@ def test_dtypes(op: Op, dtype: torch.dtype) -> None:
 )
 @every_op
 def test_sizes(op: Op, border: str, size: tuple[int, int, int, int, int]) -> None:
-    is_that_of_the_plain_form(op, drawn(*size, op, border=border), torch.float64)
+    is_that_of_the_reference(op, drawn(*size, op, border=border), torch.float64)
 
 
 @pytest.mark.parametrize("layout", [channels_last, slice_of_pixels, every_other_column, transposed])
@@ -134,7 +134,7 @@ def test_derivatives_of_some_arguments_only(needed: tuple[str, ...]) -> None:
     op = FAST[-1]
     case = drawn(1, 3, 2, 3, 3, op)
     partial = Case("partial", "ordinary", case.tensors, needed, {"normalize": "none", "border": "renormalize"})
-    is_that_of_the_plain_form(op, partial, torch.float64)
+    is_that_of_the_reference(op, partial, torch.float64)
 
 
 def test_second_derivatives_go_the_plain_way() -> None:
@@ -199,7 +199,7 @@ STEP_CASES = [(op, case) for op in WITHOUT for case in op.cases if case.kind == 
 
 
 def is_plain(function: Callable[..., Any], tolerance: float, *given: Any, **settings: Any) -> None:
-    """Of what was given in another precision, the plain form's result in float64."""
+    """Of what was given in another precision, the reference implementation's result in float64."""
 
     def exact(value: Any) -> Any:
         return value.double() if isinstance(value, Tensor) else value

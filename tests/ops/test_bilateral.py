@@ -5,7 +5,7 @@ from typing import Any
 import kornia
 import pytest
 import torch
-from plain_form import by
+from reference_cases import by
 from torch import Tensor
 
 from mcdenoise.ops import cross_bilateral_filter, cross_bilateral_weights, kernel_conv

@@ -1,4 +1,4 @@
-"""The compiled forms against the plain ones."""
+"""The fast backends against the reference implementations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import torch
-from plain_form import (
+from reference_cases import (
     FAST,
     TOLERANCE,
     assert_same,
@@ -51,7 +51,7 @@ def nan_in_fresh_memory() -> Iterator[None]:
     # The extreme ones have bounds of their own, see `mcdenoise stability`.
     [pytest.param(op, case, id=f"{op.name}-{case.name}") for op in FAST for case in op.cases if case.differentiable],
 )
-def test_result_and_derivatives_are_those_of_the_plain_form(op: Op, case: Case, dtype: torch.dtype) -> None:
+def test_result_and_derivatives_are_those_of_the_reference(op: Op, case: Case, dtype: torch.dtype) -> None:
     actual = outcomes(op, case, case.inputs(dtype), "numba")
     assert {tensor.dtype for tensor in actual} == {dtype}
     # The same numbers in float64: what differs is the arithmetic.
@@ -272,7 +272,7 @@ ACCUMULATE = next(op for op in OPS if op.name == "accumulate")
 
 @every_dtype
 @pytest.mark.parametrize("case", ACCUMULATE.cases, ids=lambda case: case.name)
-def test_accumulation_is_that_of_the_plain_form(case: Case, dtype: torch.dtype) -> None:
+def test_accumulation_is_that_of_the_reference(case: Case, dtype: torch.dtype) -> None:
     inputs = case.inputs(dtype)
     actual = by("numba", ops.accumulate)(**inputs, **case.settings)
     for result, plain in zip(actual, by("torch", ops.accumulate)(**inputs, **case.settings), strict=True):
@@ -326,7 +326,7 @@ def gradients_of_both(backend: Any, case: Case, dtype: torch.dtype, **changed: A
 @pytest.mark.parametrize(
     "case", [case for case in ACCUMULATE.cases if case.kind != "extreme"], ids=lambda case: case.name
 )
-def test_derivatives_of_accumulation_are_those_of_the_plain_form(case: Case, dtype: torch.dtype) -> None:
+def test_derivatives_of_accumulation_are_those_of_the_reference(case: Case, dtype: torch.dtype) -> None:
     found, expected = (gradients_of_both(backend, case, dtype) for backend in ("numba", "torch"))
     assert [each.dtype for each in found] == [each.dtype for each in expected]
     # Of a motion the derivative is a difference of the taps, which are as large as they are.
@@ -371,7 +371,7 @@ def test_large_images_are_accumulated_with_compiled_derivatives() -> None:
 
 
 @pytest.mark.parametrize(("settings", "message"), [({"rule": "svgf"}, "rule: expected"), ({"rule": "bmfr"}, "needs")])
-def test_accumulation_refuses_what_the_plain_form_refuses(settings: dict[str, Any], message: str) -> None:
+def test_accumulation_refuses_what_the_reference_refuses(settings: dict[str, Any], message: str) -> None:
     inputs = ACCUMULATE.cases[1].inputs()
     for backend in ("torch", "numba"):
         with pytest.raises(ValueError, match=message):
@@ -383,7 +383,7 @@ MOTION = next(op for op in OPS if op.name == "motion_from_position")
 
 @every_dtype
 @pytest.mark.parametrize("case", [case for case in MOTION.cases if case.kind != "extreme"], ids=lambda case: case.name)
-def test_motion_is_that_of_the_plain_form(case: Case, dtype: torch.dtype) -> None:
+def test_motion_is_that_of_the_reference(case: Case, dtype: torch.dtype) -> None:
     inputs = case.inputs(dtype)
     plain = by("torch", ops.motion_from_position)(**inputs)
     for layout in (torch.clone, channels_last, transposed):

@@ -1,4 +1,4 @@
-"""The compiled forms of the ops that the zoo's methods have beside the filters, against the plain ones."""
+"""The fast backends of the ops that methods of the zoo have beside the filters, against the reference."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from plain_form import (
+from reference_cases import (
     TOLERANCE,
     assert_same,
     by,
@@ -78,13 +78,13 @@ ZOO: dict[str, tuple[Callable[[Draw, int], Inputs], dict[str, Any]]] = {
     "temporal_gradient": (_changes, {"stratum": 2, "levels": 2, "sigma_n": 2.0}),
 }
 FAST = [op for op in OPS if op.name in ZOO]
-# Of the others the derivatives are those of the plain form.
+# Of the others the derivatives are those of the reference implementation.
 DIFFERENTIABLE = [op for op in FAST if op.name != "importance_filter"]
 every_op = pytest.mark.parametrize("op", FAST, ids=lambda op: op.name)
 
 
 def found(op: Op, case: Case, inputs: Inputs, backend: str) -> list[Tensor]:
-    """The results and, of a compiled form that has them, derivatives."""
+    """The results and, of a fast backend that has them, derivatives."""
     if op.name in {each.name for each in DIFFERENTIABLE}:
         return outcomes(op, case, inputs, backend)
     return [by(backend, op.function)(**inputs, **case.settings)]
@@ -116,7 +116,7 @@ def nan_in_fresh_memory() -> Iterator[None]:
     # The extreme ones have bounds of their own, see `mcdenoise stability`.
     [pytest.param(op, case, id=f"{op.name}-{case.name}") for op in FAST for case in op.cases if case.kind != "extreme"],
 )
-def test_result_and_derivatives_are_those_of_the_plain_form(op: Op, case: Case, dtype: torch.dtype) -> None:
+def test_result_and_derivatives_are_those_of_the_reference(op: Op, case: Case, dtype: torch.dtype) -> None:
     actual = found(op, case, case.inputs(dtype), "numba")
     assert {tensor.dtype for tensor in actual} == {dtype}
     # The same numbers in float64: what differs is the arithmetic.

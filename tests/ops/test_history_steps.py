@@ -1,4 +1,4 @@
-"""The compiled form of a shot's past against the plain one."""
+"""The fast backend of a shot's history against the reference implementation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from plain_form import by, channels_last, every_other_column, slice_of_pixels, transposed
+from reference_cases import by, channels_last, every_other_column, slice_of_pixels, transposed
 from torch import Tensor
 
 from mcdenoise.ops import Surface, clamp_fireflies, demodulate, motion_from_position, use
@@ -159,7 +159,7 @@ WAYS = {
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("rule", [{}, BMFR, {"alpha_min": 0.4}, {"alpha_min": 1.0}], ids=str)
-def test_the_past_is_that_of_the_plain_form(way: str, rule: dict[str, Any]) -> None:
+def test_the_past_is_that_of_the_reference(way: str, rule: dict[str, Any]) -> None:
     frames = WAYS[way]
     if "rule" in rule and (frames[0].normal is None or frames[0].position is None):
         with pytest.raises(ValueError, match="needs it in both frames"):
@@ -214,7 +214,7 @@ def test_other_dtypes(dtype: torch.dtype) -> None:
     frames = shot("previous_position", "position", dtype=dtype)
     found = passed(frames, "numba")
     assert found[-1].color.dtype == torch.float32
-    # The plain form rounds what is demodulated, and what is clamped, to the dtype of the frame.
+    # The reference implementation rounds what is demodulated, and what is clamped, to the dtype of the frame.
     same = [Picture(*(None if image is None else image.float() for image in frame)) for frame in frames]
     assert_same(found, passed(same, "torch"), 1e-3)
 
@@ -238,7 +238,7 @@ def test_layout_in_memory_and_threads_change_nothing(
         torch.set_num_threads(threads)
 
 
-def test_frames_with_derivatives_take_the_plain_form() -> None:
+def test_frames_with_derivatives_take_the_reference() -> None:
     frames = shot("previous_position", size=(96, 96), dtype=torch.float32)[:3]
     color = frames[1].color.requires_grad_()
     entering = steps.incoming(color, frames[1].albedo)

@@ -6,7 +6,7 @@ from typing import Any
 import kornia
 import pytest
 import torch
-from plain_form import by
+from reference_cases import by
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 

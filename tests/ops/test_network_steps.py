@@ -1,4 +1,4 @@
-"""The compiled steps between a network's convolutions against their plain forms, which are formulas of torch."""
+"""The compiled steps between the convolutions of a network against their reference, formulas of torch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from plain_form import by, channels_last, every_other_column, slice_of_pixels, transposed
+from reference_cases import by, channels_last, every_other_column, slice_of_pixels, transposed
 from torch import Tensor
 
 from mcdenoise.ops import downsample

@@ -6,7 +6,7 @@ import inspect
 
 import pytest
 import torch
-from plain_form import by
+from reference_cases import by
 from torch import Tensor
 
 from mcdenoise.check import gradients

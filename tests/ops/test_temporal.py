@@ -5,7 +5,7 @@ from typing import Any
 import kornia
 import pytest
 import torch
-from plain_form import by
+from reference_cases import by
 from torch import Tensor
 
 from mcdenoise.ops import Surface, accumulate, motion_from_position, reproject
@@ -365,7 +365,7 @@ class TestNothingMoves:
     @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
     def test_bit_by_bit(self, backend: Any, rule: Any, dtype: torch.dtype) -> None:
         if backend == "numba":
-            pytest.importorskip("numba", reason="the fast form is in the extra mcdenoise[fast]")
+            pytest.importorskip("numba", reason="the fast backend is in the extra mcdenoise[fast]")
         color, previous = (draw(2, 3, 96, 110, seed=seed).to(dtype) for seed in (1, 2))
         length = (draw(2, 1, 96, 110, seed=3) * 40).round() + 1
         here, there = self.surfaces(4), self.surfaces(4)

@@ -1,4 +1,4 @@
-"""Forward mode, ``torch.func`` and ``vmap``: right for every op, also where a fast form would be chosen otherwise."""
+"""Forward mode, ``torch.func`` and ``vmap``: right for every op, even where a fast backend exists."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from plain_form import by
+from reference_cases import by
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -27,7 +27,7 @@ every_case = pytest.mark.parametrize(
 
 @pytest.fixture(autouse=True)
 def no_image_is_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that fast forms are chosen wherever they can run."""
+    """So that fast backends are chosen wherever they can run."""
     monkeypatch.setattr(_backend, "_FEW_PIXELS", 0)
 
 

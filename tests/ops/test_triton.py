@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from plain_form import by
+from reference_cases import by
 
 from mcdenoise import ops
 
@@ -32,7 +32,7 @@ def run(*arguments: str, **variables: str) -> None:
 
 @pytest.mark.parametrize("cases", ["not slow", pytest.param("slow", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("part", [PARTS[0], pytest.param(PARTS[1], marks=pytest.mark.slow)])
-def test_the_interpreted_kernels_are_the_plain_form(part: str, cases: str) -> None:
+def test_the_interpreted_kernels_are_the_reference(part: str, cases: str) -> None:
     pytest.importorskip("triton", reason="the form for GPUs is in the extra mcdenoise[gpu]")
     arguments = ("-q", "-p", "no:cacheprovider", "-p", "no:xdist", str(HERE / "interpreted.py"))
     run("-m", "pytest", *arguments, "-k", part, "-m", cases, TRITON_INTERPRET="1")

@@ -1,13 +1,14 @@
-"""What all compiled forms share: the compiler and its cache, threads, and how kernels read and store numbers."""
+"""What all fast backends share: the compiler and its cache, threads, and how kernels read and store numbers."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
 import math
+import os
 import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -84,11 +85,21 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
     if threads == 1:
         share(0)
         return
-    with ThreadPoolExecutor(threads - 1) as pool:
-        others = [pool.submit(share, number) for number in range(1, threads)]
+    pool = _pool(threads - 1, os.getpid())
+    others = [pool.submit(share, number) for number in range(1, threads)]
+    try:
         share(0)
-        for other in others:
-            other.result()
+    finally:
+        # Nobody writes to what a caller has been given back, whatever happened here.
+        wait(others)
+    for other in others:
+        other.result()
+
+
+@functools.lru_cache(maxsize=1)
+def _pool(workers: int, process: int) -> ThreadPoolExecutor:
+    """Threads that stay: to start one takes longer than many a kernel. A forked process has none of its parent's."""
+    return ThreadPoolExecutor(workers, thread_name_prefix="mcdenoise-rows")
 
 
 def flushing(*images: Tensor) -> Callable[[], AbstractContextManager[None]]:

@@ -1,4 +1,4 @@
-"""The fast forms of what networks do between their convolutions as torch operators, without derivatives.
+"""The fast backends of what networks do between their convolutions as torch operators, without derivatives.
 
 Row by row, each a run of loops that are vectorised: no argument is copied as a whole, whatever its layout and
 precision, and nothing that is on the way to a result is stored but for a few rows.

@@ -455,7 +455,7 @@ class _Gradients:
 
     @staticmethod
     def adapted(plain: Callable[..., Any]) -> Callable[..., Any]:
-        """The plain form, with the arguments of the operator."""
+        """The reference implementation, with the arguments of the operator."""
         return lambda *arguments: _by_name(plain, _as_called(arguments))
 
     def __call__(self, needed: Sequence[Any], gradient: Tensor, of_length: Tensor, *arguments: Any) -> tuple[Any, ...]:

@@ -39,7 +39,7 @@ def network_input(image: Tensor, features: Tensor, *, logarithms: bool = True) -
         logarithms: whether to take them.
 
     Returns:
-        ``(B, C + F, H, W)``. The plain form leaves layout and precision to the convolution.
+        ``(B, C + F, H, W)``. The reference implementation leaves layout and precision to the convolution.
     """
     return torch.cat([torch.log1p(image) if logarithms else image, features], 1)
 
@@ -75,7 +75,7 @@ def buffers_input(
         image_factor: ``(B, 1, 1, 1)`` factor of the image, before any logarithm; 1 by default.
 
     Returns:
-        ``(B, 14, H, W)``: the image, then the features. The plain form leaves layout and precision to the convolution.
+        ``(B, 14, H, W)``: the image, then the features. The reference leaves layout and precision to the convolution.
     """
     features = plain(network_features)(albedo, normal, depth, current, length, exposure, scale)
     image = image if image_factor is None else image * image_factor
@@ -208,7 +208,7 @@ def gated_fusion(
         logarithms: whether to take those of ``fine``, which then is radiance: ``log1p``.
 
     Returns:
-        ``(B, C, H, W)``, at least float32. The fast form computes ``alpha`` in the dtype of the result, also under
+        ``(B, C, H, W)``, at least float32. The fast backend computes ``alpha`` in the dtype of the result, also under
         autocast.
 
     Raises:

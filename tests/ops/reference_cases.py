@@ -1,4 +1,4 @@
-"""Cases for fast forms of the filters, and their results and derivatives beside those of the plain form."""
+"""Cases for the fast backends of the filters, and results and derivatives beside those of the reference."""
 
 from __future__ import annotations
 
