@@ -1,14 +1,14 @@
-"""Compose a denoiser from operators: no network, no weights, nothing but this page.
+"""Compose a denoiser from operators, without a network or weights.
 
     python examples/compose_denoiser.py path/to/sequence
 
-The wrapper `Demodulated` divides the albedo out, `Accumulated` blends the frames of the shot, and what noise is left is
-filtered at three scales by cross-bilateral weights over normals, albedo, depth and the color itself; a Laplacian fusion
-carries each coarse result into the next finer scale, and the albedo is multiplied back. Prints the error of the noisy,
-the accumulated and the composed image for the last frames that have a reference. Change SCALES, the guides, or the
-order of the steps, and see what it does. What no guide shows, such as the image in a mirror, a filter like this one
-blurs. As a method it goes into every command: `mcdenoise denoise SEQUENCE -o OUT --model
-examples/compose_denoiser.py:method`, and likewise `benchmark` and `evaluate`.
+The wrapper `Demodulated` divides the albedo out, and `Accumulated` blends the frames of the shot. The remaining noise
+is filtered at three scales by cross-bilateral weights over normals, albedo, depth and the color itself; a Laplacian
+fusion adds each coarse result to the next finer scale, and the albedo is multiplied back. Prints the error of the
+noisy, the accumulated and the composed image for the last frames that have a reference. Change SCALES, the guides, or
+the order of the steps, and see the effect. Such a filter blurs details that no guide shows, such as a mirror image. As
+a method it can be used in every command: `mcdenoise denoise SEQUENCE -o OUT --model
+examples/compose_denoiser.py:method`, and also in `benchmark` and `evaluate`.
 """
 
 import argparse
@@ -24,52 +24,52 @@ from mcdenoise.models import Accumulated, Demodulated, Needs, Output
 from mcdenoise.nn import auto_exposure, normalize_depth
 from mcdenoise.ops import cross_bilateral_weights, downsample, kernel_conv, laplacian_fusion, upsample
 
-# How fast a neighbour's weight falls off with the squared difference of normal, albedo, depth and color, and with the
-# squared distance in pixels; one row for each scale, finest first. Coarse scales are stricter, since what leaks across
-# an edge there spreads over many pixels. fit_filter_parameters.py finds such numbers by gradient descent.
+# Falloffs of a neighbour's weight with the squared differences of normal, albedo, depth and color, and with the squared
+# distance in pixels; one row for each scale, finest first. Coarse scales are stricter, because leaks across an edge
+# there spread over many pixels. fit_filter_parameters.py finds such numbers by gradient descent.
 SCALES = torch.tensor([[5, 1, 2000, 0.1, 0.1], [50, 2, 6000, 0.7, 0.03], [100, 20, 6000, 2.5, 0.05]])
 FUSION = torch.tensor(0.9)  # fraction of the low frequencies that comes from the coarser scale
 KERNEL_SIZE = 5
 
 
 def prepare(color: Tensor, frame: Frame) -> tuple[Tensor, list[Tensor]]:
-    """Accumulated color without fireflies, and what tells one surface from another, in units that fit any scene."""
+    """Accumulated color without fireflies, and the guides, in units that fit any scene."""
     ring = color.new_full((1, KERNEL_SIZE**2, *frame.size), 1 / (KERNEL_SIZE**2 - 1))
     ring[:, KERNEL_SIZE**2 // 2] = 0
     brightness = color.mean(1, keepdim=True)
-    # Eight times brighter than all around it: one lucky path, which would leave a pale square at the coarse scales.
+    # A firefly is eight times brighter than its neighbours; it would leave a pale square at the coarse scales.
     color = color * (8 * kernel_conv(brightness, ring) / brightness.clamp_min(1e-6)).clamp_max(1)
     return color, [frame.normal, frame.albedo, normalize_depth(frame.depth), torch.log1p(color * auto_exposure(color))]
 
 
 def denoise(color: Tensor, length: Tensor, guides: list[Tensor], scales: Tensor, fusion: Tensor) -> Tensor:
-    """Filter demodulated, accumulated color; a pixel counts as often as it has frames in its history `length`."""
-    # Where there is hardly any history, a neighbour that is not quite alike is still better than noise.
+    """Filter demodulated, accumulated color; the weight of a pixel is its history `length`."""
+    # With a short history, even a dissimilar neighbour is better than noise.
     falloffs = [scale * (length / 4).clamp_max(1) for scale in scales[0, :-1]]
     if len(scales) > 1:
         coarse_length = downsample(length)
         coarse_color = downsample(color * length) / coarse_length
         coarse = denoise(coarse_color, coarse_length, [downsample(guide) for guide in guides], scales[1:], fusion)
-        # A pixel unlike the mean of its 2x2 block (an edge, a thin thing) has nothing to take from the coarse image.
+        # A pixel unlike the mean of its 2x2 block (an edge, a thin object) gets nothing from the coarse image.
         means = [upsample(downsample(guide), guide.shape[-2:]) for guide in guides]
         parts = zip(falloffs, guides, means, strict=True)
         unlike = sum(falloff * (guide - mean).square().sum(1, keepdim=True) for falloff, guide, mean in parts)
         color = laplacian_fusion(color, coarse, fusion * torch.exp(-unlike))
-    # With logits of zero, only the guides and the distance shape the kernel.
+    # With logits of zero, only the guides and the distance determine the kernel.
     logits = color.new_zeros(1, KERNEL_SIZE**2, *color.shape[-2:])
     distance = scales[0, -1].expand_as(length)
     weights = cross_bilateral_weights(logits, guides, falloffs, distance, border="renormalize")
-    # Detail on another scale's base can undershoot zero; radiance cannot.
+    # Detail added to another scale may be negative; radiance may not.
     return (kernel_conv(color * length, weights) / kernel_conv(length, weights)).clamp_min(0)
 
 
 class Composed:
-    """The filter as a method, which any wrapper takes."""
+    """The filter as a method, for use in any wrapper."""
 
     needs = Needs(frozenset({"color", "albedo", "normal", "depth", "length"}), trainable=False)
 
     def __call__(self, frame: Frame, state: None = None) -> tuple[Output, None]:
-        """Filter the color that the wrappers hand in."""
+        """Filter the color that the wrappers provide."""
         color, guides = prepare(frame.color, frame)
         return Output(denoise(color, frame.length, guides, SCALES, FUSION)), None
 

@@ -1,11 +1,12 @@
-"""Put the head of one method on the backbone of another, train it for a minute, and see what it does.
+"""Put the head of one method on the backbone of another, train it for a minute, and measure the effect.
 
     python examples/compose_zoo.py path/to/sequence
 
-The U-Net is that of `mrkp`, the maps of importance are those of `wskp`: six a pixel, for windows of 3 to 13 pixels, and
-how to blend what they give. Trains on all but the last frames of the sequence, and prints the error on these before and
-after, beside the noisy and the accumulated image. In every command the method is `examples/compose_zoo.py:method`:
-`mcdenoise train SEQUENCES -o RUN --model examples/compose_zoo.py:method` trains it for longer.
+The U-Net is that of `mrkp`; the importance maps are those of `wskp`: six per pixel, for windows of 3 to 13 pixels, and
+their blending weights. Trains on all but the last frames of the sequence, and prints the error on these before and
+after, with that of the noisy and the accumulated image. In every command the method is
+`examples/compose_zoo.py:method`: `mcdenoise train SEQUENCES -o RUN --model examples/compose_zoo.py:method` trains it
+for longer.
 """
 
 import argparse
@@ -25,11 +26,11 @@ from mcdenoise.nn import normalize_depth
 from mcdenoise.ops import importance_filter
 from mcdenoise.train import TrainConfig, train
 
-HELD_OUT = 4  # frames at the end that are not trained on
+HELD_OUT = 4  # number of frames at the end that are not trained on
 
 
 class Composed(nn.Module):
-    """Importance maps, and the weights that blend what they give, from one convolution on the U-Net's features."""
+    """Importance maps and blending weights from one convolution on the U-Net's features."""
 
     needs = Needs(frozenset({"albedo", "normal", "depth"}))
 
@@ -48,7 +49,7 @@ class Composed(nn.Module):
 
 
 def method(width: int = 16):
-    """Demodulated, accumulated, and of typical brightness, as any method may be."""
+    """The method with the usual wrappers: demodulation, accumulation and exposure."""
     return Demodulated(Accumulated(Exposed(Composed(width))))
 
 

@@ -1,11 +1,11 @@
-"""What it costs to hand out a film: processor time of the one process that does, by the number of Ray nodes.
+"""Measure the overhead of distributing a film: processor time of the driver process by the number of Ray nodes.
 
     python examples/film_scale.py
     python examples/film_scale.py --nodes 2,4,8 --shots 16 --frames 25 --json scale.json
 
-Writes small shots, starts a Ray cluster on this machine with nodes of one slot each, makes a film of them with a method
-that does nothing, and prints frames a second and the processor time of the driver, per frame and per task. All nodes
-share this machine: frames a second say nothing of a cluster, the driver's time does. Needs `mcdenoise[ray]`.
+Writes small shots, starts a Ray cluster on this machine with nodes of one slot each, denoises them with a method that
+does nothing, and prints frames per second and the driver's processor time, per frame and per task. All nodes are on
+this machine, so the driver's time applies to a real cluster, but frames per second do not. Needs `mcdenoise[ray]`.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from mcdenoise.shot import ShotSettings
 
 
 def measure(nodes: int, shots: Path, out: Path) -> dict[str, float]:
-    """Make the film with so many nodes."""
+    """Denoise the film with this number of nodes."""
     try:
         import ray
         from ray.cluster_utils import Cluster

@@ -1,12 +1,12 @@
-"""Fit a filter's parameters by gradient descent through the operators: what differentiable is good for.
+"""Fit a filter's parameters by gradient descent through the operators.
 
     python examples/fit_filter_parameters.py path/to/sequence --held-out path/to/another/sequence
 
-The filter is that of compose_denoiser.py: at each of three scales, how fast the weight of a neighbour falls off with
-the difference of normal, albedo, depth, color and distance, and the weight of the coarse scales in the fusion. These 16
-numbers start at 1 (the weight at a half), and the derivative of the error against references moves them. Prints the
-loss as it falls, the numbers it found, and the error before and after on frames that the fit has not seen: those of
-another sequence, or by default the last quarter of all.
+The filter is that of compose_denoiser.py: at each of three scales, the falloffs of a neighbour's weight with the
+differences of normal, albedo, depth, color and distance, and the weight of the coarse scales in the fusion. These 16
+numbers start at 1 (the weight at 0.5) and follow the gradient of the error against references. Prints the loss, the
+fitted numbers, and the error before and after on frames that were not used for fitting: those of another sequence, or
+by default the last quarter of all frames.
 """
 
 import argparse
@@ -26,7 +26,7 @@ REPORT_EVERY = 20
 
 
 def samples(folder: Path) -> list[dict]:
-    """Accumulated frames with references, as the arguments of the filter and what to compare its result with."""
+    """Accumulated frames with references, as arguments of the filter and the expected result."""
     sequence, found, state = open_sequence(folder), [], None
 
     def note(color: Tensor, length: Tensor) -> Output:
@@ -47,7 +47,7 @@ def samples(folder: Path) -> list[dict]:
 
 
 def error(sample: dict, log_scales: Tensor, fusion_logit: Tensor) -> Tensor:
-    # Logarithms and a logit, so that every step leaves the scales positive and the weight between 0 and 1.
+    # Logarithms and a logit keep the scales positive and the weight between 0 and 1.
     filtered = denoise(*sample["inputs"], log_scales.exp(), fusion_logit.sigmoid())
     return smape_linear(remodulate(filtered, sample["albedo"]), sample["target"]).mean()
 

@@ -1,12 +1,12 @@
-"""Prove the derivatives of a filter of your own, and those of the package's operators.
+"""Check the derivatives of a filter of your own, and those of the package's operators.
 
     python examples/gradcheck_ops.py
     python examples/gradcheck_ops.py reproject accumulate
 
 Composes demodulation, cross-bilateral weights, per-pixel kernel convolution and remodulation into one function, and
-compares its first and second derivatives in every input with difference quotients, number by number, in float64: what
-holds for each operator must hold for their composition. Then runs the package's own table of cases for the operators it
-is made of, or those named; `mcdenoise gradcheck` runs it for all. Exits with 1 where a derivative is wrong.
+compares its first and second derivatives in every input with difference quotients, number by number, in float64. Then
+runs the package's own test cases for the operators in it, or for the named ones; `mcdenoise gradcheck` runs them for
+all. The exit status is 1 if a derivative is wrong.
 """
 
 import argparse
@@ -25,7 +25,7 @@ PARTS = ["demodulate", "cross_bilateral_weights", "kernel_conv", "remodulate"]
 def my_filter(
     color: Tensor, albedo: Tensor, normal: Tensor, logits: Tensor, scale: Tensor, distance_scale: Tensor
 ) -> Tensor:
-    """Filter what the albedo does not explain with predicted kernels that stop at edges of the normal."""
+    """Filter demodulated radiance with predicted kernels that stop at edges of the normal."""
     light = demodulate(color, albedo)
     weights = cross_bilateral_weights(logits, [normal], [scale], distance_scale, border="renormalize")
     return remodulate(kernel_conv(light, weights), albedo)
@@ -37,7 +37,7 @@ def main() -> int:
     options = parser.parse_args()
 
     torch.manual_seed(0)
-    # Small, because each number of each input is moved by itself, and with odd sides, which even code slips on.
+    # Small, because each number of each input is perturbed separately, and with odd sides, which reveal border errors.
     size = (3, 5)
     inputs = {
         "color": torch.rand(1, 3, *size) * 2,
@@ -47,7 +47,7 @@ def main() -> int:
         "scale": torch.rand(1, 1, *size),
         "distance_scale": torch.rand(1, 1, *size),
     }
-    # In float64, since difference quotients need its digits.
+    # In float64, because difference quotients need its precision.
     results = gradcheck(my_filter, *inputs.values()) + check(options.ops or PARTS)
     for result in results:
         verdict = "passed" if result.passed else "FAILED"

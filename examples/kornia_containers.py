@@ -2,9 +2,9 @@
 
     python examples/kornia_containers.py
 
-Every operator with one image has a Module twin, which goes into ``ImageSequential`` beside kornia's own filters and
-augmentations. Augmenting a frame is augmenting all of its buffers alike: they are stacked along the channels, moved by
-one call, and taken apart. Flips of the image change no world-space normal, but they turn the motion around.
+Every operator with one image has a Module twin, which works in ``ImageSequential`` with kornia's own filters and
+augmentations. To augment a frame, all of its buffers are concatenated along the channels, transformed by one call, and
+split again. Flipping the image does not change world-space normals, but it reverses the motion.
 """
 
 import torch
@@ -25,7 +25,7 @@ def preview(size: int = 64) -> ImageSequential:
 
 
 def augment(frame: Frame, flip: RandomHorizontalFlip) -> Frame:
-    """Flip all buffers of a frame alike.
+    """Flip all buffers of a frame in the same way.
 
     Args:
         frame: with all of ``BUFFERS``.
@@ -33,7 +33,7 @@ def augment(frame: Frame, flip: RandomHorizontalFlip) -> Frame:
     """
     stacked = torch.cat([getattr(frame, name) for name in BUFFERS], 1)
     moved = dict(zip(BUFFERS, ImageSequential(flip)(stacked).split(list(BUFFERS.values()), 1), strict=True))
-    # What was drawn stays with the augmentation: true for the images that were flipped.
+    # The augmentation stores its random choice: true for the images that were flipped.
     flipped = flip._params["batch_prob"].bool().reshape(-1, 1, 1, 1)
     x, y = moved["motion"].split(1, 1)
     moved["motion"] = torch.cat([torch.where(flipped, -x, x), y], 1)
@@ -41,7 +41,7 @@ def augment(frame: Frame, flip: RandomHorizontalFlip) -> Frame:
 
 
 def smooth(light: Tensor, steps: tuple[int, ...] = (1, 2, 4)) -> Tensor:
-    """Filters with two images in and out are chained by hand: light and its variance."""
+    """Chain filters with two inputs and outputs by hand: light and its variance."""
     variance = light.var((1, 2, 3), keepdim=True).expand_as(light[:, :1])
     for step in steps:
         light, variance = Atrous(step=step)(light, variance)

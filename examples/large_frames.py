@@ -1,12 +1,12 @@
-"""What a pixel costs in frames of any size, whole process, within a limit of memory.
+"""Measure the cost per pixel of frames of any size, as a whole process with limited memory.
 
     python examples/large_frames.py
     python examples/large_frames.py --sizes 1280x720,3840x2160 --model cascaded_v2_tiny --max-memory 2 --json costs.json
 
 Writes a synthetic sequence of each size (color, albedo, normal, depth and position, without cameras: single frames),
-denoises it with `mcdenoise denoise --max-memory`, which chooses the tiles, and prints of each size the tiles, the
-nanoseconds a pixel of the network and of all stages but reading and writing, by the median of the frames after the
-first, and the peak of the process's memory. 7680x4320 takes minutes and a gigabyte of disk.
+denoises it with `mcdenoise denoise --max-memory`, which chooses the tiles, and prints for each size the tiles, the
+nanoseconds per pixel of the network and of all stages but reading and writing (medians of the frames after the first),
+and the peak of the process's memory. 7680x4320 takes minutes and a gigabyte of disk space.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from mcdenoise.models import DEFAULT
 
 
 def measure(width: int, height: int, options: argparse.Namespace, folder: Path) -> dict[str, object]:
-    """What it costs to denoise frames of a size, in a process of its own."""
+    """Measure denoising frames of one size in a separate process."""
     frame = synthetic_frame(width, height).replace(motion=None)
     for number in range(options.frames):
         write_bmfr_frame(folder / "wall" / "inputs", number, frame)

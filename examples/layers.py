@@ -1,13 +1,13 @@
-"""Error of denoised layers of light, and what they cost, on a shot that Blender rendered with its light passes.
+"""Measure error and run time of denoised layers of light, on a shot that Blender rendered with its light passes.
 
     python examples/blender/render.py -o shot --frames 8 --samples 1 --filter none
     python examples/blender/render.py -o shot --name reference --frames 8 --samples 256 --filter none --seed 1001
     python examples/layers.py shot [METHOD...]
 
-Each method denoises the shot three times: the color alone, the color with its layers, and every layer by itself. Errors
-are squared differences from the reference over ``reference color^2 + 0.01``, times 1000, and SMAPE; of the layers, the
+Each method denoises the shot three times: the color only, the color with its layers, and every layer separately. Errors
+are squared differences from the reference over ``reference color^2 + 0.01``, times 1000, and SMAPE; for the layers, the
 sum of the former and the mean of the latter. Times are medians over the frames after the first, without files. The last
-column is how far the sum of the layers is from the color, on average, relative to its mean.
+column is the mean difference between the sum of the layers and the color, relative to the mean color.
 """
 
 from __future__ import annotations

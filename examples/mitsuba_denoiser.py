@@ -1,12 +1,12 @@
-"""Denoise in a Mitsuba 3 script, in the line where `mi.OptixDenoiser` stood, and optimise through the denoiser.
+"""Replace `mi.OptixDenoiser` in a Mitsuba 3 script, and optimise through the denoiser.
 
     python examples/mitsuba_denoiser.py -o mitsuba_denoiser
 
-`still` renders a Cornell box at a few samples a pixel, with the albedo and the normals of the `aov` integrator, and
-denoises the bitmap. `optimise` finds the color of the walls from a picture of them: each step renders one sample a
-pixel anew, and the gradient of the loss goes back through the denoiser into Mitsuba. It needs a variant that
-differentiates, `llvm_ad_rgb` (with an LLVM library that is new enough for the processor) or `cuda_ad_rgb`, and says so
-where none runs.
+`still` renders a Cornell box with a few samples per pixel, with albedo and normals by the `aov` integrator, and
+denoises the bitmap. `optimise` recovers the color of the walls from a picture of them: each step renders one new sample
+per pixel, and the gradient of the loss passes back through the denoiser into Mitsuba. It needs a differentiable
+variant, `llvm_ad_rgb` (with an LLVM library that is new enough for the processor) or `cuda_ad_rgb`, and prints a
+message if none works.
 
 Measured at 96x96: at 4 samples a pixel, SMAPE falls from 0.314 to 0.148; in llvm_ad_rgb, after 60 steps, the largest
 error of the walls' reflectance has fallen from 0.586 to 0.007.
@@ -27,7 +27,7 @@ START = (0.3, 0.3, 0.3)
 
 def cornell_box(size: int) -> dict:
     box = mi.cornell_box()
-    # Denoisers want pixels that share no samples.
+    # Denoisers expect pixels with independent noise.
     box["sensor"]["film"] |= {"width": size, "height": size, "rfilter": {"type": "box"}}
     # Image and features in one pass.
     box["integrator"] = {
@@ -39,7 +39,7 @@ def cornell_box(size: int) -> dict:
 
 
 def still(out: Path, size: int, samples: int) -> tuple[float, float]:
-    """The error of the noisy and of the denoised image, which are written beside each other."""
+    """The errors of the noisy and of the denoised image; both are written."""
     scene = mi.load_dict(cornell_box(size))
     film = scene.sensors()[0].film()
     mi.render(scene, spp=samples, seed=1)
@@ -85,7 +85,7 @@ def optimise(size: int, steps: int) -> list[float]:
         dr.backward(loss)
         optimiser.step()
         optimiser[WALLS] = dr.clip(optimiser[WALLS], 0.01, 0.99)
-        # Adam does not settle by itself.
+        # Adam's noise does not decay without this.
         optimiser.set_learning_rate(0.05 * (1 - (step + 1) / steps))
         parameters.update(optimiser)
         errors.append(float(dr.max(dr.abs(true - optimiser[WALLS]))[0]))

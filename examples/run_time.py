@@ -1,14 +1,13 @@
-"""Time methods side by side on one frame, without accumulation: what the image filter alone costs.
+"""Time methods on one frame, interleaved, without accumulation: the cost of the image filter alone.
 
     python examples/run_time.py
     python examples/run_time.py --models cascaded_v2 "oidn(quality=fast)" mine.py:make --size 1920x1080 --rounds 9
 
-Every round runs each of them once, one after the other, so that whatever else the machine does hits all alike; the
-first round warms up and is not counted. Prints the median and the quartiles, and the ratio to the first of them, Open
-Image Denoise's fastest network by default. The input is noise, which costs as much as any picture: the time depends on
-the number of pixels only. The time of Open Image Denoise includes copies to its layout and back, 10 to 20 ms at
-1280x720 on one core. As in the commands of the package, freed memory is kept (mcdenoise/heap.py); --no-heap leaves that
-to the system.
+Every round runs each method once, one after the other, so that other load on the machine affects all of them; the first
+round warms up and is not counted. Prints the median and the quartiles, and the ratio to the first method, by default
+Open Image Denoise's fastest network. The input is noise: the run time depends only on the number of pixels. The time of
+Open Image Denoise includes copies to and from its layout, 10 to 20 ms at 1280x720 on one core. As in the package's
+commands, freed memory is kept (mcdenoise/heap.py); --no-heap returns it to the system.
 """
 
 import argparse
@@ -48,10 +47,10 @@ OIDN = (
 
 
 def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], object]]:
-    """Calls of a method on this frame; of one that learns, in every precision that it can have here."""
+    """Calls of a method on this frame; for a trained model, in every precision that is possible here."""
     spelling = parse_method(spelt)
     settings = {"threads": threads, **spelling.settings} if spelling.takes("threads") else spelling.settings
-    # Fresh weights take as long as others, but are not calibrated.
+    # Fresh weights have the same run time, but are not calibrated.
     pretrained = spelling.weights is None and spelling.model in pretrained_models()
     model = create_model(spelling.model, pretrained=pretrained, weights=spelling.weights, **settings)
     if isinstance(model, torch.nn.Module):

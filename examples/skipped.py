@@ -1,13 +1,13 @@
-"""What a scene does not need is skipped: how much time that saves, and what it does to the error.
+"""Measure skipped work: the run time that skipping saves, and the change of the error.
 
     python examples/skipped.py path/to/scene path/to/another --model cascaded_v2_tiny
     python examples/skipped.py path/to/scene --markdown --tolerance 0.01
 
-Five shots are made of each scene: the flythrough as it is; the same without albedo; the same with a sky over its upper
-half; a static shot of its last frame that has a reference, with new noise in every frame (one sample a pixel); and an
-editor's viewport, twice as long, that shows one image of that frame (64 samples a pixel) again and again, until a
-corner of it is changed and rendered anew (one sample a pixel). Each frame is denoised twice, taking turns: as it
-is, and with nothing skipped. The last column is the change of SMAPE.
+Five shots are made from each scene: the unchanged flythrough; the same without albedo; the same with a sky in its upper
+half; a static shot of its last frame with a reference, with new noise in every frame (one sample per pixel); and an
+editor's viewport, twice as long, that repeats one image of that frame (64 samples per pixel) until a corner of it is
+changed and rendered again (one sample per pixel). Each frame is denoised twice, interleaved: with and without skipping.
+The last column is the change of SMAPE.
 """
 
 import argparse
@@ -28,7 +28,7 @@ COLUMNS = ("scene", "shot", "skipped", "ms, all kept", "ms", "saved", "SMAPE, al
 
 
 def flythrough(sequence: Sequence, frames: int) -> Iterator[Frame]:
-    """The first frames as they are."""
+    """The first frames, unchanged."""
     yield from (sequence.frame(number) for number in sequence.numbers[:frames])
 
 
@@ -49,7 +49,7 @@ def half_sky(sequence: Sequence, frames: int) -> Iterator[Frame]:
 
 
 def noisy(reference: Tensor, spp: int) -> Tensor:
-    """With noise as of so many samples a pixel."""
+    """Add noise as of ``spp`` samples per pixel."""
     rate = torch.full_like(reference[:, :1], float(spp))
     return reference * torch.distributions.Gamma(rate, rate).sample()
 
@@ -68,7 +68,7 @@ def static_shot(sequence: Sequence, frames: int) -> Iterator[Frame]:
 
 
 def viewport_edit(sequence: Sequence, frames: int) -> Iterator[Frame]:
-    """An image that stays, until a corner of it is made darker in the last third of the shot."""
+    """An image that does not change until a corner becomes darker in the last third of the shot."""
     frame = at_rest(sequence)
     frame = frame.replace(color=noisy(frame.reference, 64))
     height, width = frame.size

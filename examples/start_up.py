@@ -1,13 +1,13 @@
-"""Time whole processes side by side: one frame from EXR to EXR, with this package and with Open Image Denoise.
+"""Time whole processes, interleaved: one frame from EXR to EXR, with this package and with Open Image Denoise.
 
     python examples/start_up.py
     python examples/start_up.py --size 640x360 --rounds 9 --model cascaded_v2_tiny --precision float32
 
-Every round starts each process once, one after the other, so that whatever else the machine does hits all alike; the
-first round, in which files come from the disk and kernels are compiled, is not counted. Prints the median and the
-quartiles in seconds, and how far behind the first. The peer is what a script of one's own would be: it reads color,
-albedo and normal with OpenImageIO, runs `pyoidn`, and writes the result. `pyoidn` itself imports torch where that is
-installed, as it is beside this package; the second row keeps torch from it, and the last one is torch alone.
+Every round starts each process once, one after the other, so that other load on the machine affects all of them; the
+first round, which loads files from disk and compiles kernels, is not counted. Prints the median and the quartiles in
+seconds, and the difference to the first process. The peer is a typical script for `pyoidn`: it reads color, albedo and
+normal with OpenImageIO, denoises, and writes the result. `pyoidn` imports torch if that is installed, as it is for this
+package; the second row prevents this, and the last one imports only torch.
 """
 
 import argparse

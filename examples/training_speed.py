@@ -1,13 +1,13 @@
-"""Time training steps with the fast forms of the operators and with the plain ones, on the same clips, taking turns.
+"""Time training steps with the fast backends of the operators and with the reference, on the same clips, interleaved.
 
     python examples/training_speed.py
     python examples/training_speed.py SEQUENCE... --model cascaded_v2_small --rounds 10 --json times.json
 
-A step is that of `mcdenoise train`: its clips are drawn, the network runs forward and backward, the optimiser and the
-averaged weights follow. Without a sequence the clips are noise. Every round makes one step in each way and precision,
-one after the other, so that whatever else the machine does hits all alike; two rounds warm up and are not counted.
-Prints medians, quartiles and steps a second, and how many times as fast the fast forms are. As in the command, freed
-memory is kept (mcdenoise/heap.py).
+A step is that of `mcdenoise train`: drawing clips, running the network forward and backward, updating weights and their
+averages. Without a sequence the clips are noise. Every round makes one step for each backend and precision, one after
+the other, so that other load on the machine affects all of them; two rounds warm up and are not counted. Prints
+medians, quartiles and steps per second, and the speed-up of the fast backends. As in the command, freed memory is kept
+(mcdenoise/heap.py).
 """
 
 import argparse
@@ -44,7 +44,7 @@ WARM_UP = 2
 
 
 def noise(config: TrainConfig) -> ClipSampler:
-    """Clips of a shot without a picture: every buffer is noise in its range."""
+    """Clips of a shot whose buffers are noise in their legal ranges."""
     generator = np.random.default_rng(config.seed)
 
     def uniform(channels: int) -> NDArray[np.float32]:
@@ -56,7 +56,7 @@ def noise(config: TrainConfig) -> ClipSampler:
 
 
 def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:
-    """Clips of sequences, decoded into a folder that goes with this process."""
+    """Clips of sequences, decoded into a temporary folder."""
     if not sequences:
         return noise(config)
     front, rest = split(create_model(config.model))
@@ -65,7 +65,7 @@ def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:
 
 
 def steps(config: TrainConfig, sampler: ClipSampler, plain: bool) -> Callable[[int], None]:
-    """Makes the step of a number; all start from the same weights."""
+    """Return a function that makes a training step; all start from the same weights."""
     torch.manual_seed(config.seed)
     fabric = open_fabric("cpu", config.precision, config.batch)
     losses = {"image": 1.0, "initial": 1.0}

@@ -3,17 +3,17 @@
     python examples/unseen_scenes.py path/to/scene path/to/another --sweep oidn joint_bilateral --markdown
     python examples/unseen_scenes.py path/to/scene --models runs/mine/cascaded_v2.safetensors,mine.py:make
 
-Prints for every scene, and for the mean over the scenes, the mean over the frames with a reference of: SMAPE, relMSE
-and RMSE (scene-linear, lower is better), PSNR and SSIM (as displayed, higher is better), FLIP (as displayed, lower is
-better), and tSMAPE (scene-linear) and tRMSE (as displayed), the errors of the change from frame to frame, lower is
-better. Where the renderer has noted the references' own noise, also what the truth would score because of it.
+Prints for every scene, and for the mean over the scenes, the mean over the frames with a reference of SMAPE, relMSE and
+RMSE (scene-linear, lower is better), PSNR and SSIM (displayed, higher is better), FLIP (displayed, lower is better),
+and tSMAPE (scene-linear) and tRMSE (displayed), the errors of the change between frames, lower is better. If the
+renderer has stored the noise of the references, also prints the errors that the truth would have because of it.
 
-Models that are swept are shown at their best: a row that stands for several settings takes, for each metric by itself,
-the setting that the reference says is best. `oidn`, Intel Open Image Denoise, has 36: fast, balanced and high; albedo
-and normal taken as noisy, as clean, or denoised first; started from one sample a pixel ("raw"), from the accumulated
-image, from that one divided by albedo, or from one sample a pixel with the results accumulated by the same rule
-("accumulated after"). `joint_bilateral`, kornia's filter of the accumulated image, has 20. --json holds every setting
-by itself. A sweep of your own: --models "cascaded_v2(alpha_min=0.05|0.1|0.2)".
+Models that are swept are shown at their best: a row that combines several settings takes the best setting for each
+metric separately, chosen by the reference. `oidn`, Intel Open Image Denoise, has 36: fast, balanced and high; albedo
+and normal treated as noisy, as clean, or denoised first; run on one sample per pixel ("raw"), to the accumulated image,
+to that image demodulated, or to one sample per pixel with the results accumulated by the same rule ("accumulated
+after"). `joint_bilateral`, kornia's filter of the accumulated image, has 20. --json contains every setting. A sweep of
+your own: --models "cascaded_v2(alpha_min=0.05|0.1|0.2)".
 """
 
 import argparse
@@ -46,10 +46,10 @@ from mcdenoise.models import DEFAULT
 SWEEPS = {
     "oidn": "oidn(source=raw|accumulated|demodulated|accumulated after, quality=fast|balanced|high, "
     "auxiliary=noisy|clean|prefiltered)",
-    # On nine 1-spp sequences, a step further on every side lowers the best SMAPE of one by 0.8 %, and of no other.
+    # On nine 1-spp sequences, wider ranges lower the best SMAPE of one sequence by 0.8 %, and of no other.
     "joint_bilateral": "joint_bilateral(sigma_color=0.05|0.1|0.2|0.3|0.5, sigma_space=1.5|2.5|4.0|6.0)",
 }
-# Rows of their own in the short tables.
+# Models with their own rows in the short tables.
 BY = ("source", "quality")
 
 

@@ -241,7 +241,7 @@ def nothing():
 
 @pytest.fixture
 def mine(tmp_path: Path) -> Path:
-    """Somebody's own models."""
+    """A user's own models."""
     path = tmp_path / "mine.py"
     path.write_text(MINE)
     return path
@@ -538,7 +538,7 @@ def test_ops(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
 
 @pytest.fixture
 def colors(small_sequence: Path, tmp_path: Path) -> Path:
-    """The noisy colors of the sequence as somebody's result."""
+    """The noisy colors of the sequence as another denoiser's result."""
     folder = tmp_path / "result"
     folder.mkdir()
     for number in range(4):

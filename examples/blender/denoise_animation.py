@@ -136,7 +136,7 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
         if settings.model:
             command += ["--model", settings.model]
         command += shlex.split(settings.arguments)
-        # Files, not pipes: nobody reads while the program runs.
+        # Files instead of pipes, because nothing reads them while the program runs.
         self.said, self.complained = (tempfile.TemporaryFile() for _ in range(2))  # noqa: SIM115 (closed when read)
         try:
             self.process = subprocess.Popen(command, stdout=self.said, stderr=self.complained, stdin=subprocess.DEVNULL)

@@ -1,4 +1,4 @@
-"""What the tables compare, and which scenes are trained on when one is held out.
+"""The methods of the tables, and the training scenes for each held-out scene.
 
 The methods and the budget that all of them are trained with are in `recipes/zoo.toml` and `recipes/ablations.toml`.
 """
@@ -10,13 +10,13 @@ from typing import Literal
 Split = Literal["grouped", "paper"]
 
 RECIPES = Path(__file__).parents[2] / "recipes"
-# Of Table 1 by their names there, with those of their runs: the paper's rivals, its own, and what else there is.
+# Names in Table 1 with the names of their runs: the paper's baselines, its own method, and others.
 RIVALS = {"NBGD": "nbgd", "RAE (for ONND)": "rae", "KP": "kp", "MRKP": "mrkp", "WSKP": "wskp"}
 OWN = {"P+K": "cascaded"}
 OTHERS = {"KPCN": "kpcn", "SBMC": "sbmc", "layered": "layered", "ANF": "anf", "NPPD": "nppd"}
-# Without weights, and so by their own names.
+# Without weights, so their names are those of the methods.
 FILTERS = {"SVGF": "svgf", "A-SVGF": "asvgf", "BMFR": "bmfr", "joint bilateral": "joint_bilateral"}
-# Of Tables 3 and 4: BWA is the bilateral weight adjustment, TL the temporal loss.
+# Tables 3 and 4: BWA is the bilateral weight adjustment, TL the temporal loss.
 ORDERS = ("K", "P", "K+P", "K+K", "P+K")
 PARTS = {"P+K without BWA": "P+K-without-BWA", "P+K without TL": "P+K-without-TL", "P+K": "P+K"}
 
@@ -33,10 +33,10 @@ def geometry(scene: str, scenes: Iterable[str]) -> str:
 
 
 def training_scenes(held_out: str, scenes: Iterable[str], split: Split) -> list[str]:
-    """What is trained on when a scene is held out.
+    """The scenes to train on when one is held out.
 
-    The paper holds out the scene alone. Three of its six scenes are one building, so that a network is then tested on
-    walls it has seen; ``"grouped"`` holds out every version of the scene.
+    The paper holds out only the scene. Three of its six scenes show the same building, so that a network is tested on
+    walls from its training data; ``"grouped"`` holds out every version of the scene.
 
     Example:
         >>> training_scenes("sponza", ("san-miguel", "sponza", "sponza-glossy"), "grouped")
@@ -50,7 +50,7 @@ def training_scenes(held_out: str, scenes: Iterable[str], split: Split) -> list[
 
 
 def fold_folder(runs: Path, split: Split, held_out: str, scenes: Iterable[str]) -> Path:
-    """Where the runs are that have not seen a scene; versions that are held out together share one."""
+    """Folder of the runs that were not trained on a scene; versions that are held out together have a common folder."""
     fold = held_out if split == "paper" else geometry(held_out, scenes)
     return runs / f"folds-{split}" / f"without-{fold}"
 

@@ -1,4 +1,4 @@
-"""Print the paper's Tables 1 to 4 for what is there: scenes, trained networks, peers. What is not there says why.
+"""Print the paper's Tables 1 to 4 for the available scenes, trained networks and peers, with reasons for missing ones.
 
     python examples/paper_tables/tables.py DATASET
     python examples/paper_tables/tables.py DATASET --runs RUNS --tables 3 4 --markdown
@@ -7,9 +7,9 @@ DATASET is a folder with a sequence in the BMFR layout for each scene.
 
 Table 1 is PSNR and SSIM of each method on each scene; Table 2 milliseconds of networks and filters at 1280x720; Table 3
 the order of the networks (K, P, K+P, K+K, P+K); Table 4 bilateral weights (BWA) and temporal loss (TL) on and off.
-Below each stands which of the paper's claims holds here. PSNR and SSIM are given by three protocols: "strict" (sRGB
-curve, data range 1), and those of two rivals' code, "meng2020" and "fan2021", by which the published figures on this
-dataset seem to have been made.
+Below each table are the paper's claims, and whether they hold here. PSNR and SSIM are given by three protocols:
+"strict" (sRGB curve, data range 1), and those of two baselines' code, "meng2020" and "fan2021", which seem to be those
+of the published values for this dataset.
 
 Networks are those of RUNS, or else, in Table 1, the shipped ones:
 
@@ -19,8 +19,8 @@ Networks are those of RUNS, or else, in Table 1, the shipped ones:
     python examples/paper_tables/train_folds.py DATASET -o RUNS --recipe recipes/zoo.toml
                                                                         Table 1 with --leave-one-out
 
-All of a table are trained alike, and get frames accumulated by the same rule with alpha 0.2: "accumulated". OIDN gets
-the noisy frames, and is told that features are clean.
+All methods of a table are trained alike, on frames accumulated by the same rule with alpha 0.2: "accumulated". OIDN
+takes the noisy frames, with features declared clean.
 """
 
 import argparse
@@ -48,13 +48,13 @@ from mcdenoise.models.accumulated import Accumulated
 
 PROTOCOL_NAMES = ("strict", "meng2020", "fan2021")
 SEEDS = (1, 2, 3)
-KINDS = ("random scenes", "four times the steps", "one left out")
+KINDS = ("random scenes", "four times the steps", "one held out")
 Errors = dict[str, float]  # by "protocol metric"
 
 
 @dataclass
 class Table:
-    """Rows of cells, the reasons of empty ones, each told once, and what follows from the numbers."""
+    """Rows of cells, the reasons of empty cells, and the claims."""
 
     rows: list[list[str]]
     reasons: list[str] = field(default_factory=list)
@@ -69,7 +69,7 @@ class Table:
         return [f"{errors[f'{name} PSNR']:.2f} / {errors[f'{name} SSIM']:.4f}" for name in PROTOCOL_NAMES]
 
     def claim(self, text: str, better: Errors | str, worse: Errors | str) -> None:
-        """Say whether one is better than the other in strict PSNR."""
+        """Record whether one is better than the other in strict PSNR."""
         if isinstance(better, str) or isinstance(worse, str):
             return
         difference = better["strict PSNR"] - worse["strict PSNR"]
@@ -77,7 +77,7 @@ class Table:
 
 
 class Measured:
-    """Errors of networks on scenes, measured when they are asked for, each once."""
+    """Errors of networks on scenes, measured on demand and cached."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
@@ -87,10 +87,10 @@ class Measured:
         """Mean errors over the frames of a scene, or why there are none.
 
         Args:
-            scene: of the dataset.
-            model: a name of the zoo.
-            weights: of the model; its own by default.
-            image: a stage, in place of the result.
+            scene: name of a scene in the dataset.
+            model: name in the zoo.
+            weights: weights file of the model; the shipped weights by default.
+            image: name of a stage, instead of the result.
         """
         key = (scene, f"{model} {weights}")
         try:

@@ -1,4 +1,4 @@
-"""Error against run time: every chosen method on the same frames, in the same run, taking turns."""
+"""Benchmarks of error against run time: all methods on the same frames in the same run, interleaved."""
 
 from mcdenoise.benchmark.comparison import Score, Verdict, folded, mean_over_scenes, scores_of, summary, verdicts
 from mcdenoise.benchmark.methods import BASELINES, COMPARED, Timed, choose_methods, make_method

@@ -1,4 +1,4 @@
-"""Results of many methods, settings and scenes in short: means, the best settings, and who is ahead."""
+"""Summaries of benchmarks of many methods, settings and scenes: means, best settings, and comparisons."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class Score:
     """Mean errors of one method on one scene.
 
     Args:
-        scene: its name.
-        method: what made the images: a method's name, with ``", STAGE"`` for an image on the way to its result.
+        scene: name of the scene.
+        method: name of the method, with ``", STAGE"`` for an intermediate image.
         frames: number of frames with a reference.
-        values: mean by metric, see :data:`mcdenoise.evaluate.METRICS`. What could not be computed is not in it.
-        family: the model, where the results have it with several settings.
-        settings: of the model.
-        chosen: of the best of several settings, which one it is, by metric.
+        values: mean by metric, see :data:`mcdenoise.evaluate.METRICS`. Metrics that could not be computed are missing.
+        family: name of the model, if the results contain it with several settings.
+        settings: settings of the model.
+        chosen: for the best of several settings, the chosen one by metric.
     """
 
     scene: str
@@ -36,7 +36,7 @@ class Score:
 
 
 def scores_of(results: Results) -> list[Score]:
-    """Every method and setting on every scene, scene by scene; images on the way go before their result.
+    """One score for every method and setting on every scene, by scene; intermediate images precede their result.
 
     A method that is missing, or failed on a scene, has no score there.
     """
@@ -56,10 +56,10 @@ def scores_of(results: Results) -> list[Score]:
 
 
 def mean_over_scenes(scores: Iterable[Score]) -> list[Score]:
-    """Every scene counts the same, however many frames it has.
+    """Average over scenes, with equal weights whatever the numbers of frames.
 
     Returns:
-        One score for each method, under the name ``mean of N``; a metric that one of its scenes lacks is skipped.
+        One score for each method, named ``mean of N``; a metric that one of its scenes lacks is omitted.
     """
     by_method: dict[str, list[Score]] = {}
     for score in scores:
@@ -74,16 +74,17 @@ def mean_over_scenes(scores: Iterable[Score]) -> list[Score]:
 
 
 def folded(scores: Iterable[Score], by: Collection[str] = ()) -> list[Score]:
-    """Fold the settings of every model to a row for each value of some of them, and one, ``MODEL, best of N settings``.
+    """Combine the settings of every model in one row, ``MODEL, best of N settings``, or one row per value of ``by``.
 
-    In such a row every metric is that of the setting which is best in it, by the reference: it flatters.
+    In such a row, every metric is that of the setting that is best in this metric by the reference, so it is
+    optimistic.
 
     Args:
-        scores: of :func:`scores_of`.
-        by: settings whose values have rows of their own, such as ``("quality", "source")``.
+        scores: result of :func:`scores_of`.
+        by: settings whose values have separate rows, such as ``("quality", "source")``.
 
     Returns:
-        Scores of each scene in their order, with ``chosen`` in the rows that stand for several settings.
+        Scores of each scene in their order; rows that combine several settings have ``chosen``.
     """
     rows = []
     for _, scene in groupby(scores, lambda score: score.scene):
@@ -116,15 +117,15 @@ def _best(settings: list[Score], method: str) -> Score:
 
 
 def summary(scores: Iterable[Score], by: Collection[str] = ()) -> list[Score]:
-    """The mean over the scenes, with each model of several settings twice: in one for all scenes, and the best of each.
+    """Means over the scenes; a model of several settings has two rows, the best single setting and the best per scene.
 
     Args:
-        scores: of :func:`scores_of`, for several scenes.
+        scores: result of :func:`scores_of`, for several scenes.
         by: see :func:`folded`.
 
     Returns:
-        As :func:`folded` of :func:`mean_over_scenes`, where ``best of N settings`` is the best one for all scenes;
-        after it, ``MODEL, best of each scene``: the mean of the scenes' best, each with a setting of its own.
+        The result of :func:`folded` for :func:`mean_over_scenes`, where ``best of N settings`` is the best single
+        setting for all scenes; followed by ``MODEL, best of each scene``: the mean of the best values of the scenes.
     """
     scores = list(scores)
     of_each = {row.family: row for row in _best_of_each_scene(scores)}
@@ -146,17 +147,17 @@ def _best_of_each_scene(scores: Iterable[Score]) -> list[Score]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A method against a model of several settings, in one metric.
+    """Comparison of a method with a model of several settings, in one metric.
 
     Args:
         metric: name in :data:`METRICS`.
-        method: whose image it is.
-        family: the model of several settings.
-        value: mean over the scenes of the method.
-        single: mean over the scenes of that setting of the other which has the best mean.
-        setting: its name.
-        best: mean over the scenes of the other's best setting for each scene.
-        scenes: for each scene the method's value, and that of the other's best setting for it.
+        method: name of the method.
+        family: name of the model of several settings.
+        value: the method's mean over the scenes.
+        single: the model's mean over the scenes with its best single setting.
+        setting: name of that setting.
+        best: the model's mean over the scenes with the best setting for each scene.
+        scenes: for each scene, the method's value and that of the model's best setting for it.
     """
 
     metric: str
@@ -170,12 +171,12 @@ class Verdict:
 
     @property
     def ahead(self) -> bool:
-        """Whether the method is better than the other's best single setting."""
+        """Whether the method is better than the model's best single setting."""
         return METRICS[self.metric].better(self.value, self.single)
 
     @property
     def won(self) -> list[str]:
-        """Scenes in which the method is better than the other's best setting for that scene."""
+        """Scenes in which the method is better than the model's best setting for that scene."""
         better = METRICS[self.metric].better
         return [scene for scene, (value, other) in self.scenes.items() if better(value, other)]
 
@@ -196,15 +197,15 @@ class Verdict:
 
 
 def verdicts(scores: Iterable[Score], method: str, family: str = "oidn") -> list[Verdict]:
-    """Compare a method with a model of several settings, metric by metric.
+    """Compare a method with a model of several settings in every metric.
 
     Args:
-        scores: of :func:`scores_of`.
-        method: a method's name.
-        family: a model's name.
+        scores: result of :func:`scores_of`.
+        method: name of the method.
+        family: name of the model.
 
     Raises:
-        ValueError: the scores have no such method or model.
+        ValueError: the scores do not contain the method or the model.
     """
     scores = list(scores)
     ours = {score.scene: score for score in scores if score.method == method}

@@ -1,4 +1,4 @@
-"""What it is measured on: the machine, its threads, its clock, its memory."""
+"""The machine of a benchmark: its description, number of threads, busy cores, and memory."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CGROUP = Path("/sys/fs/cgroup")
 
 
 def check_device(device: str) -> None:
-    """See that torch can use a device.
+    """Check that torch can use a device.
 
     Raises:
         InputError: it cannot.
@@ -36,7 +36,7 @@ def check_device(device: str) -> None:
 
 
 def fix_threads(threads: int) -> None:
-    """Let torch, and the reading and writing of EXRs, use so many threads."""
+    """Set the number of threads of torch, and of reading and writing EXRs."""
     torch.set_num_threads(threads)
     oiio.attribute("threads", threads)
     oiio.attribute("exr_threads", threads)
@@ -44,8 +44,8 @@ def fix_threads(threads: int) -> None:
 
 @contextmanager
 def busy_cores(count: int) -> Iterator[None]:
-    """Keep cores busy meanwhile, as a renderer beside this process does: a process for each, which never waits."""
-    # One that is left over, whatever became of this process, ends by itself.
+    """Keep cores busy inside this block, to simulate a renderer: one process per core runs an endless loop."""
+    # Each process ends itself when this process is gone.
     code = f"import os\nwhile os.getppid() == {os.getpid()}:\n    sum(range(100_000))"
     started: list[subprocess.Popen[bytes]] = []
     try:
@@ -60,7 +60,7 @@ def busy_cores(count: int) -> Iterator[None]:
 
 
 def describe_machine(device: str) -> Machine:
-    """The machine as it is, with the threads that torch has now."""
+    """Describe the machine, with torch's current number of threads."""
     return Machine(
         processor=_processor(),
         cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
@@ -73,7 +73,7 @@ def describe_machine(device: str) -> Machine:
 
 
 def available_memory(device: str) -> int | None:
-    """Bytes that could be allocated on the device now; ``None`` where the system does not say."""
+    """Bytes that can be allocated on the device; ``None`` if the system does not tell."""
     if device == "cuda":
         return torch.cuda.mem_get_info()[0]
     sizes = [size for size in (_free_memory(), _left_of_limit()) if size is not None]
@@ -89,7 +89,7 @@ def _free_memory() -> int | None:
 
 
 def _left_of_limit() -> int | None:
-    """Of a container."""
+    """Remaining memory within a container's limit."""
     try:
         limit, used = ((_CGROUP / name).read_text().strip() for name in ("memory.max", "memory.current"))
     except OSError:

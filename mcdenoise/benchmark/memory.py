@@ -1,4 +1,4 @@
-"""How much memory a method adds at its peak."""
+"""Measuring the peak memory of methods."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ Frames = Callable[[], list[Frame]]
 Make = Callable[[], Callable[[Frame], object]]
 
 _STATUS, _FORGET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-# What methods import, at the latest when they are called: torch the second of these, with the first operator of ours.
+# Modules that methods import: torch imports the second one when the first custom operator is called.
 _PRELOADED = ["__main__", "torch._dynamo", "numba", "pyoidn", "mcdenoise.benchmark.run"]
 _SECONDS = 300.0
 
 
 class Peaks:
-    """Peak memory of methods at sizes of images, each measured once.
+    """Peak memory of methods by image size, each measured once.
 
     Args:
-        threads: of the methods.
+        threads: number of threads of the methods.
         device: ``"cpu"`` or ``"cuda"``.
     """
 
@@ -42,7 +42,7 @@ class Peaks:
         self._known: dict[tuple[str, tuple[int, int]], float | None] = {}
 
     def of(self, method: Method, size: tuple[int, int], frames: Frames) -> float | None:
-        """See :func:`peak_memory`; ``frames`` are of the size, and read only if it was not asked for before."""
+        """See :func:`peak_memory`; ``frames`` have the given size, and are read only for a new combination."""
         key = method.name, size
         if key not in self._known:
             make = functools.partial(make_method, method, threads=self._threads, device=self._device)
@@ -51,31 +51,30 @@ class Peaks:
 
 
 def peak_memory(make: Make, frames: Frames, *, threads: int, device: str, seconds: float = _SECONDS) -> float | None:
-    """Memory that making a method and denoising some frames adds at its peak: weights, history and all.
+    """Peak memory that creating a method and denoising frames adds, including weights and history.
 
-    On a CPU it is the peak of the resident set in a fresh process, less the resident set before: the frames are there
-    already, and so are the modules of torch, numba and Open Image Denoise. Pages that an allocator has freed and kept
-    count, as they do for everyone else on the machine.
-    On a GPU it is what torch had allocated there at the peak, less what it had before; a library that allocates by
-    itself is not seen.
+    On a CPU this is the peak of the resident set in a new process, minus the resident set before, which includes the
+    frames and the modules of torch, numba and Open Image Denoise. Pages that an allocator has freed but kept count,
+    because they are not available to other processes either. On a GPU it is the peak of torch's allocations minus those
+    before; allocations of other libraries are not included.
 
     Args:
-        make: makes the method, whose first calls may still warm up; another process must be able to call it: a function
-            of a module, or :func:`functools.partial` of one.
-        frames: reads or makes the frames, on the CPU; another process must be able to call it.
-        threads: of the method.
+        make: creates the method, whose first calls may still warm up. It must be picklable: a function of a module, or
+            a :func:`functools.partial` of one.
+        frames: reads or makes the frames, on the CPU; it must be picklable.
+        threads: number of threads of the method.
         device: ``"cpu"`` or ``"cuda"``.
-        seconds: for which another process may take; then it is ended.
+        seconds: time limit of the process.
 
     Returns:
-        Mebibytes, or ``None`` where it cannot be measured: the system does not tell, or the method cannot be given to
-        another process, or fails there, or does not come to an end.
+        Mebibytes, or ``None`` if the memory cannot be measured: the system does not tell, or the method is not
+        picklable, fails in the process, or exceeds the time limit.
     """
     if device == "cuda":
         return _peak_on_gpu(make, frames)
     if not _FORGET_PEAK.exists():
         return None
-    # Started from a server that has imported everything, and nothing has run in: a fresh process in a moment.
+    # A fork server that has imported all modules, but run nothing, starts a fresh process quickly.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
     receiver, sender = context.Pipe(duplex=False)
@@ -83,7 +82,7 @@ def peak_memory(make: Make, frames: Frames, *, threads: int, device: str, second
     try:
         with deaf_children():
             process.start()
-    except Exception:  # whatever an object refuses with that only this process can have
+    except Exception:  # an object that is not picklable may raise anything
         return None
     sender.close()
     try:
@@ -96,15 +95,15 @@ def peak_memory(make: Make, frames: Frames, *, threads: int, device: str, second
 
 
 def _send_peak(sender: Connection, make: Make, frames: Frames, threads: int) -> None:
-    # Where it could not be made deaf from its first moment on.
+    # Ignore Ctrl+C, in case the process was not started ignoring it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    with suppress(Exception):  # whatever the method fails with: where it matters, it is found out by denoising
+    with suppress(Exception):  # denoising reports the failure
         sender.send(_peak_of_this_process(make, frames, threads))
 
 
 def _end_with_parent() -> None:
-    # A method that hangs would outlive a benchmark that was killed.
+    # A method that hangs must not outlive a killed benchmark.
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -136,8 +135,8 @@ def _peak_on_gpu(make: Make, frames: Frames) -> float | None:
         runner = make()
         for frame in shown:
             runner(frame)
-    except Exception:  # as above
+    except Exception:  # a method may raise anything
         return None
     added = torch.cuda.max_memory_allocated() - before
-    # Nothing at all: it runs elsewhere.
+    # A peak of zero means that the method runs elsewhere.
     return added / 2**20 if added else None

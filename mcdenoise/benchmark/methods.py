@@ -1,4 +1,4 @@
-"""What takes part in a benchmark: methods by name, each a :class:`mcdenoise.denoiser.Denoiser` timed stage by stage."""
+"""The methods of a benchmark: selection by name, and timing of the stages of a :class:`mcdenoise.denoiser.Denoiser`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mcdenoise.results import KEEP_ALL, Kind, Method
 
 BASELINES = ("noisy", "accumulated")
 PRETRAINED, ALL = "pretrained", "all"
-# What is compared by default: filters in a narrow and a wide setting, other denoisers, and all shipped weights.
+# The default selection: filters with a narrow and a wide setting, other denoisers, and all shipped weights.
 COMPARED = (
     "joint_bilateral(sigma_color=0.1, sigma_space=1.5),joint_bilateral(sigma_color=0.2, sigma_space=4.0),svgf,"
     f"oidn(quality=fast|balanced|high, auxiliary=clean, source=raw|accumulated),{PRETRAINED}"
@@ -38,15 +38,14 @@ COMPARED = (
 
 
 class Timed:
-    """A denoiser whose frames are timed by stages.
+    """A denoiser with timed stages.
 
-    The stages are ``accumulate`` (all that goes before: looking at every value, demodulation, accumulation, planning),
-    ``network`` (U-Nets and convolutions, wherever in the model they are) and ``filter`` (all the rest: kernels, fusion,
-    remodulation, and a method that says nothing of itself). The second is told from the third by hooks on the modules,
-    which read a clock.
+    The stages are ``accumulate`` (everything before the network: validation, demodulation, accumulation, skipping),
+    ``network`` (U-Nets and convolutions, wherever in the model they are) and ``filter`` (everything else: kernels,
+    fusion, remodulation, and methods that report no stages). Hooks on the modules separate network and filter.
 
     Args:
-        denoiser: any.
+        denoiser: the denoiser.
 
     Attributes:
         stages: milliseconds of each stage of the last call, by name in :data:`mcdenoise.results.STAGES`.
@@ -74,14 +73,14 @@ class Timed:
         network = sum(self._watch.between(begin, end) for begin, end in pairs)
         if not self._networks:
             network = times.get("network", 0.0)
-        # On a GPU they are told by different clocks.
+        # On a GPU, the two are measured by different clocks and may differ slightly.
         self.stages = {"accumulate": before, "network": network, "filter": max(whole - before - network, 0.0)}
         if not network:
             del self.stages["network"]
         return image
 
     def output(self, frame: Frame) -> Output:
-        """The same with the images on the way to the result; is not timed."""
+        """Denoise the next frame and also return intermediate images, without timing."""
         output = self.denoiser.output(frame)
         self._marks.clear()
         return output
@@ -91,12 +90,12 @@ class Timed:
 
 
 def make_method(method: Method, *, threads: int | None = None, device: str = "cpu") -> Timed:
-    """A method at work.
+    """Create a timed method.
 
     Args:
-        method: which.
-        threads: of a model that does not ask torch and has a setting ``threads``.
-        device: where to run.
+        method: the method.
+        threads: number of threads of a model that does not use torch's threads and has a setting ``threads``.
+        device: device to run on.
 
     Raises:
         InputError: see :class:`mcdenoise.denoiser.Denoiser`.
@@ -113,20 +112,20 @@ def choose_methods(
     keep_all: bool = False,
     baselines: Collection[str] = BASELINES,
 ) -> list[Method]:
-    """The baselines, and the methods that are named.
+    """Select the baselines, and methods by name.
 
     Args:
-        names: spellings of methods separated by commas, see :func:`mcdenoise.methods.split_methods`; ``"pretrained"``
-            stands for all models with shipped weights, ``None`` for :data:`COMPARED`, ``"all"`` for these and every
-            other model there is, ``"none"`` for none.
-        precisions: of the convolutions of what learns, separated by commas: ``float32``, ``bfloat16``, and ``int8`` of
-            what is calibrated for it.
-        keep_all: have each method that skips what a scene does not need twice, the second time skipping nothing.
-        baselines: methods that are there in any case, first.
+        names: methods separated by commas, see :func:`mcdenoise.methods.split_methods`; ``"pretrained"`` stands for all
+            models with shipped weights, ``None`` for :data:`COMPARED`, ``"all"`` for these and every other model,
+            ``"none"`` for none.
+        precisions: precisions of trained models, separated by commas: ``float32``, ``bfloat16``, and ``int8`` for
+            calibrated ones.
+        keep_all: also include a variant that skips nothing of each method that skips unneeded work.
+        baselines: methods that are always included, first.
 
     Returns:
-        The methods; one whose package is not installed, and one that was not named and has no weights, is there as
-        missing.
+        The methods. A method whose package is not installed, and one without weights that was not named itself, is
+        marked as missing.
 
     Raises:
         InputError: a method or precision is unknown, or a model has no weights.
@@ -150,7 +149,7 @@ def choose_methods(
             except InputError as error:
                 if named and one not in BASELINES and not isinstance(error.__cause__, ImportError):
                     raise
-                # What several lack for the same reason is told in one line.
+                # Methods that are missing for the same reason share one line.
                 methods.append(replace(method, missing=str(error).removeprefix(f"model '{one}': ")))
                 continue
             methods += _variants(method, model, chosen, keep_all)
@@ -158,20 +157,20 @@ def choose_methods(
 
 
 def _everything() -> str:
-    """The spellings that are compared by default, and the names of all other models."""
+    """The default selection, and the names of all other models."""
     known = {parse_method(each).model for each in split_methods(COMPARED) if each != PRETRAINED}
     known |= {*pretrained_models(), *BASELINES}
     return ",".join([COMPARED, *(name for name in list_models() if name not in known)])
 
 
 def one_line(error: BaseException) -> str:
-    """What went wrong, for a table."""
+    """An error's message for a table."""
     text = " ".join(str(error).split()) or "no reason given"
     return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"
 
 
 def _variants(method: Method, model: Any, precisions: list[str], keep_all: bool) -> Iterator[Method]:
-    """A model in all precisions, where it has any, and also with nothing skipped, where it skips anything."""
+    """A model in all precisions that it supports, and also with nothing skipped, if it skips anything."""
     if not model.needs.trainable:
         yield method
         return
@@ -187,7 +186,7 @@ def _variants(method: Method, model: Any, precisions: list[str], keep_all: bool)
 
 
 def _with_folders(methods: list[Method]) -> list[Method]:
-    """Each with a folder of its own; names that differ in their marks only are numbered."""
+    """Give each method a unique folder; names that differ only in punctuation are numbered."""
     taken = {"reference"}
     unique = []
     for method in methods:
@@ -201,7 +200,7 @@ def _with_folders(methods: list[Method]) -> list[Method]:
 
 
 def _networks(model: Any) -> Iterator[nn.Module]:
-    """The U-Nets and convolutions of a model, outermost only; the fusion of scales is part of the filter."""
+    """The outermost U-Nets and convolutions of a model; the fusion of scales counts as filter."""
     if isinstance(model, UNet | nn.Sequential | nn.Conv2d | nn.ConvTranspose2d):
         yield model
     elif isinstance(model, nn.Module) and not isinstance(model, FusionModule | LogFusion):

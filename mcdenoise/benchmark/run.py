@@ -1,4 +1,4 @@
-"""The benchmark itself: every method on every scene, frame by frame, taking turns."""
+"""Running a benchmark: every method on every scene, interleaved frame by frame."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.results import IMAGES, STAGES, Cell, Method, Results, Scene, Spread
 
 _WHOLE, _COMPUTING = "whole", "computing"
-# Hands its input on: the time of looking at it is nobody's.
+# The identity; the time of its call is not of interest.
 _NOTHING = "noisy"
-# Images on the way that are those of a method of their own.
+# Intermediate images that are also methods.
 _METHODS_TOO = ("noisy", "accumulated")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How to measure.
+    """Settings of a benchmark.
 
     Args:
-        rounds: how often each method denoises each frame, and an image of each size, without warming up; with 0, errors
-            are all that is measured.
-        busy: cores that other processes keep busy while times are measured.
-        threads: of torch, of methods that do not ask torch, and of reading and writing EXRs.
+        rounds: number of times that each method denoises each frame, and an image of each size, without warm-up; 0
+            measures errors only.
+        busy: number of cores that other processes keep busy while times are measured.
+        threads: threads of torch, of methods that do not use torch's, and of reading and writing EXRs.
         device: ``"cpu"`` or ``"cuda"``.
-        sizes: widths and heights for the cost over pixels, see :func:`mcdenoise.benchmark.parse_sizes`.
-        pictures: of how many frames of each scene the images are kept, at most.
+        sizes: widths and heights for measuring the cost by image size, see :func:`mcdenoise.benchmark.parse_sizes`.
+        pictures: maximum number of frames of each scene whose images are kept.
         metrics: names in :data:`mcdenoise.evaluate.METRICS`.
-        flip_every: FLIP is slow: compute it for the first of so many frames with a reference.
-        on_the_way: whether to compare the images on the way to a result, too, such as ``initial``.
-        memory: whether to measure what memory each method takes, in processes of their own.
-        command: the command line, to be stored with the results.
+        flip_every: compute FLIP, which is slow, only for every n-th frame with a reference.
+        on_the_way: whether to also compare intermediate images, such as ``initial``.
+        memory: whether to measure each method's peak memory, in separate processes.
+        command: the command line, stored with the results.
 
     Raises:
         InputError: a number is too small, or torch cannot use the device.
@@ -87,31 +87,31 @@ def run_benchmark(
     *,
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Results:
-    """Find out what each method costs on each scene, and what it leaves wrong.
+    """Measure the run time and the errors of each method on each scene.
 
-    Of each scene, all methods denoise one frame after the other, taking turns on each: A B C, A B C. The first pass
-    over the frames warms up: it is not timed; images are compared with the references, and kept, there. Then every
-    round is a pass that is timed. As all see every frame in its order, all histories are right; the first frame of a
-    pass has none, and is not counted where there are others.
+    Within a scene, the methods denoise each frame in turn: A B C, A B C. The first pass over the frames warms up: it is
+    not timed; its images are compared with the references and kept. Every round is another pass, which is timed. All
+    methods receive all frames in order, so all histories are right; the first frame of a pass has no history, and is
+    not timed if there are others.
 
-    The stages: ``read`` is reading all buffers of a frame and bringing them to the device; it is done once for all
-    methods. Then those of :class:`Timed`. ``write`` is bringing the image back and writing it as ``mcdenoise denoise``
-    does, into the folder of the results.
+    Stage ``read`` is reading all buffers of a frame and moving them to the device, once for all methods. The stages of
+    :class:`Timed` follow. Stage ``write`` is copying the image back and writing it into the folder of the results, as
+    ``mcdenoise denoise`` does.
 
     Args:
         sequences: frames with references.
-        methods: see :func:`choose_methods`; those that are missing are listed as such.
-        out: folder to make: ``results.json``, ``results.csv`` and ``images/SCENE/METHOD/N.exr``. It comes into being
-            when all is done.
-        settings: how to measure; sets the threads of torch.
-        on_step: called with the number of steps done, and that of all of them.
+        methods: see :func:`choose_methods`; missing methods are listed.
+        out: folder to create: ``results.json``, ``results.csv`` and ``images/SCENE/METHOD/N.exr``. It is renamed to
+            this name when everything is done.
+        settings: settings of the benchmark; the number of torch's threads is set.
+        on_step: called with the number of finished steps, and the number of all steps.
 
     Returns:
-        What is in ``results.json``. A method that fails on a scene, or is skipped there because the scene has not what
-        it needs, has a cell that says why; a scene whose files cannot be read fails for all methods.
+        The contents of ``results.json``. A method that fails on a scene, or is skipped because the scene lacks a
+        buffer, has a cell with the reason; a scene with unreadable files fails for all methods.
 
     Raises:
-        InputError: a sequence has no references, there is something at ``out``, or it cannot be written to.
+        InputError: a sequence has no references, ``out`` exists, or it cannot be written.
     """
     settings = settings or Settings()
     for sequence in sequences:
@@ -167,7 +167,7 @@ def run_benchmark(
 
 
 class _Made:
-    """The methods that could be made, why the others could not, and what memory they take."""
+    """The methods that could be created, the failures of the others, and their peak memory."""
 
     def __init__(self, methods: list[Method], settings: Settings) -> None:
         self.methods = [method for method in methods if not method.missing]
@@ -177,7 +177,7 @@ class _Made:
         for method in self.methods:
             try:
                 self.denoisers[method.name] = make_method(method, threads=settings.threads, device=settings.device)
-            except Exception as error:  # whatever a method fails with: the others go on
+            except Exception as error:  # a method may raise anything; the others continue
                 self.failures[method.name] = one_line(error)
 
 
@@ -218,14 +218,14 @@ class _SceneRun:
         )
 
     def measure(self, on_step: Callable[[], None]) -> tuple[Scene, list[Cell]]:
-        """The scene, and a cell for each method that is not missing."""
+        """Run all passes; return the scene, and a cell for each method that is not missing."""
         try:
             self._warm_up(on_step)
             with busy_cores(self._settings.busy):
                 for _ in range(self._settings.rounds):
                     self._round(on_step)
         except InputError as error:
-            # A frame cannot be read: nobody has seen the whole scene.
+            # A frame cannot be read, so no method has seen the whole scene.
             reason = one_line(error)
             self._failures, self._lacking = {method.name: reason for method in self._made.methods}, set()
             self._scene = replace(self._scene, pictures=[])
@@ -235,7 +235,7 @@ class _SceneRun:
         return self._scene, [self._cell(method) for method in self._made.methods]
 
     def _warm_up(self, on_step: Callable[[], None]) -> None:
-        """Every method on every frame: what its images are worth, and look like."""
+        """Run every method on every frame to compare and keep its images."""
         for number, frame, _ in self._frames(reference=True):
             kept = number in self._scene.pictures
             if kept and frame.reference is not None:
@@ -286,7 +286,7 @@ class _SceneRun:
 
     def _frames(self, *, reference: bool) -> Iterator[_Read]:
         for timed in self._made.denoisers.values():
-            # A still has neither a history nor a frame that it would be one of.
+            # A still has no history and is not part of one.
             timed.denoiser.reset(frames=1 if len(self._sequence) == 1 else None)
         for number in self._sequence.numbers:
             start = self._watch.mark()
@@ -307,7 +307,7 @@ class _SceneRun:
     def _noted(self, name: str) -> Iterator[None]:
         try:
             yield
-        except Exception as error:  # whatever a method fails with: the others go on
+        except Exception as error:  # a method may raise anything; the others continue
             self._failures[name] = one_line(error)
             if isinstance(error, MissingBufferError):
                 self._lacking.add(name)
@@ -349,12 +349,12 @@ class _SceneRun:
 
 
 def _of(method: str, stage: str) -> str:
-    """What an image on the way is called."""
+    """Name of an intermediate image."""
     return f"{method}, {stage}"
 
 
 def kept_frames(numbers: list[int], most: int) -> list[int]:
-    """The last frames of the last run of successive numbers that is long enough, or else of the longest.
+    """The last ``most`` frames of the last run of consecutive numbers that is long enough, or else of the longest run.
 
     Example:
         >>> kept_frames([0, 1, 2, 3, 5, 6, 7, 20], 3)

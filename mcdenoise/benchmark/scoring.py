@@ -1,4 +1,4 @@
-"""Errors of every method on the frames of a scene."""
+"""Errors of all methods on the frames of a scene."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from mcdenoise.evaluate import METRICS, USUAL, measure
 from mcdenoise.results import Spread
 
 
-class _Past(NamedTuple):
+class _Previous(NamedTuple):
     number: int
     image: Tensor
     reference: Tensor
 
 
 class Errors:
-    """Errors of any number of methods, frame by frame; keeps only the previous image of each.
+    """Accumulates the errors of any number of methods; keeps only the previous image of each.
 
     Args:
         metrics: names in :data:`mcdenoise.evaluate.METRICS`.
-        flip_every: FLIP is slow: compute it for the first of so many frames.
+        flip_every: compute FLIP, which is slow, only for every n-th frame.
 
     Attributes:
-        skipped: by name of a metric, why it could not be computed for some image or for any, such as a package that is
-            not installed.
+        skipped: by metric, the reason if it could not be computed for some images, such as a package that is not
+            installed.
     """
 
     def __init__(self, metrics: Collection[str] = USUAL, flip_every: int = 1) -> None:
@@ -36,23 +36,23 @@ class Errors:
         self._metrics = {name: METRICS[name] for name in METRICS if name in metrics}
         self._flip_every = flip_every
         self._count: dict[str, int] = {}
-        self._past: dict[str, _Past] = {}
+        self._previous: dict[str, _Previous] = {}
         self._values: dict[str, dict[str, list[float]]] = {}
 
     @torch.inference_mode()
     def add(self, method: str, number: int, image: Tensor, reference: Tensor) -> None:
-        """Compare an image with its reference; temporal metrics take it with the frame before, if that was added.
+        """Compare an image with its reference; temporal metrics also use the previous frame, if it was added.
 
         Args:
-            method: its name.
-            number: of the frame.
+            method: name of the method.
+            number: frame number.
             image: ``(1, 3, H, W)`` scene-linear radiance.
-            reference: of the same shape, on the same device.
+            reference: the same shape, on the same device.
         """
-        past = self._past.get(method)
-        if past is not None and past.number != number - 1:
-            past = None
-        before = None if past is None else (past.image, past.reference)
+        previous = self._previous.get(method)
+        if previous is not None and previous.number != number - 1:
+            previous = None
+        before = None if previous is None else (previous.image, previous.reference)
         count = self._count.setdefault(method, 0)
         self._count[method] += 1
         metrics = {
@@ -61,10 +61,10 @@ class Errors:
         values = self._values.setdefault(method, {})
         for name, value in measure(metrics, image, reference, before, self.skipped).items():
             values.setdefault(name, []).append(value)
-        self._past[method] = _Past(number, image, reference)
+        self._previous[method] = _Previous(number, image, reference)
 
     def means(self, method: str) -> dict[str, float]:
-        """Of each metric; one that is not finite, as the PSNR of an image that equals its reference, is skipped."""
+        """Mean of each metric; a metric that is not finite, such as the PSNR of equal images, is omitted."""
         return {name: sum(values) / len(values) for name, values in self._finite(method).items()}
 
     def spreads(self, method: str) -> dict[str, Spread]:

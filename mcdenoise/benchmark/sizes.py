@@ -1,4 +1,4 @@
-"""How the cost of a method grows with the number of pixels."""
+"""Measuring the run time of methods by image size."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ Size = tuple[int, int]
 SIZES = "320x180,640x360,960x540,1280x720,1920x1080"
 
 _LARGEST_SIDE = 16384
-# Smaller images are tried without asking whether there is memory for them.
+# Smaller images are measured without estimating the memory first.
 _SMALL = 1_000_000
-# Of the memory that is free; the histories of the other methods and all that is not foreseen have the rest.
+# Fraction of the free memory that a method may use; the rest is for the histories of other methods and for reserves.
 _USABLE_SHARE = 0.5
 
 
 def parse_sizes(text: str) -> list[Size]:
-    """Read a choice of sizes.
+    """Parse image sizes.
 
     Args:
         text: widths and heights in pixels, such as ``"320x180,1280x720"``, or ``"none"``.
 
     Returns:
-        Widths and heights, each once, from few to many pixels.
+        Widths and heights without duplicates, by increasing number of pixels.
 
     Raises:
-        InputError: the text is something else, or a side is longer than 16384 pixels.
+        InputError: the text has another form, or a side is longer than 16384 pixels.
 
     Example:
         >>> parse_sizes("1280x720,320x180")
@@ -55,9 +55,9 @@ def parse_sizes(text: str) -> list[Size]:
 
 
 def synthetic_frame(width: int, height: int) -> Frame:
-    """A wall in noisy light that slides by a third of a pixel, with every buffer that a method may want.
+    """A noisy wall that moves by a third of a pixel, with every buffer that a method may use.
 
-    The time depends on the number of pixels only; what matters is that the history of the wall is found again.
+    The run time depends only on the number of pixels, provided that the history of the wall is found.
     """
     generator = torch.Generator().manual_seed(0)
     albedo = torch.rand(1, 3, height, width, generator=generator)
@@ -84,23 +84,23 @@ def measure_sizes(
     device: str,
     on_step: Callable[[], None] = lambda: None,
 ) -> tuple[list[Cost], list[Fit]]:
-    """Time every method on synthetic frames of every size, taking turns: A B C, A B C.
+    """Time every method on synthetic frames of every size, interleaved: A B C, A B C.
 
-    Two frames warm up, the second of them with a history, and are not counted. A method is not tried where it would
-    need more than half of the memory that is free, as foretold by what it takes at a half and at a quarter of the side.
+    Two frames warm up, the second with a history, and are not timed. A method is not run if it is expected to need more
+    than half of the free memory, extrapolated from its memory at a half and at a quarter of the side.
 
     Args:
-        methods: what to time.
-        made: those that could be made, by name.
+        methods: the methods to time.
+        made: the methods that could be created, by name.
         sizes: widths and heights, ascending.
-        rounds: frames of each.
-        threads: for measuring memory.
+        rounds: number of timed frames per method.
+        threads: number of threads for measuring memory.
         device: ``"cpu"`` or ``"cuda"``.
         on_step: called ``rounds + 2`` times for each size.
 
     Returns:
-        Milliseconds in memory, without files, by size and method; a line through them for each method that was timed
-        at two sizes or more.
+        Milliseconds in memory, without files, by size and method; and a fitted line for each method that was timed at
+        two sizes or more.
     """
     memory = _Memory(threads, device)
     methods = [method for method in methods if method.name in made]
@@ -121,7 +121,7 @@ def measure_sizes(
                     start = watch.mark()
                     made[name](frame)
                     taken = watch.between(start, watch.mark())
-                except Exception as error:  # whatever a method fails with: the others go on
+                except Exception as error:  # a method may raise anything; the others continue
                     failures[name] = one_line(error)
                     continue
                 if turn >= 2:
@@ -136,7 +136,7 @@ def measure_sizes(
 
 
 def fit_line(method: str, costs: list[Cost]) -> Fit | None:
-    """The line through a method's medians with the least squares of relative deviations; ``None`` for less than two.
+    """Fit a line to a method's medians by least squares of relative deviations; ``None`` for fewer than two medians.
 
     Example:
         >>> costs = [Cost("a", 1000, h, Spread(5 + 2 * h, 0, 0, 1)) for h in (1, 4, 9)]
@@ -152,20 +152,20 @@ def fit_line(method: str, costs: list[Cost]) -> Fit | None:
     if len({pixels for pixels, _ in points}) < 2:
         return None
     megapixels, milliseconds = np.array(points).T
-    # A plain fit would be that of the largest image alone.
+    # An unweighted fit would depend on the largest image alone.
     per_megapixel, fixed = np.polyfit(megapixels, milliseconds, 1, w=1 / milliseconds)
     deviation = np.abs(fixed + per_megapixel * megapixels - milliseconds) / milliseconds
     return Fit(method, float(fixed), float(per_megapixel), float(deviation.max()))
 
 
 class _Memory:
-    """Foretells the memory a method takes."""
+    """Estimates the memory of methods."""
 
     def __init__(self, threads: int, device: str) -> None:
         self._device, self._peaks = device, Peaks(threads, device)
 
     def lack(self, method: Method, width: int, height: int) -> str:
-        """Why there is too little memory for an image, or ``""`` where there is enough, or nothing is known."""
+        """Reason why an image is too large for the memory, or ``""`` if it is not, or if nothing is known."""
         if width * height <= _SMALL:
             return ""
         smaller, small = ((max(width // share, 1), max(height // share, 1)) for share in (4, 2))

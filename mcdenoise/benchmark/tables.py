@@ -1,4 +1,4 @@
-"""Results as a table: one row for each scene and method."""
+"""Results as tables: one row for each scene and method."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from mcdenoise.results import STAGES, Cell, Method, OpResults, Results, Scene, S
 CSV = "results.csv"
 OPS_CSV = "ops.csv"
 
-# Metrics of the printed table, as far as they are there.
+# Metrics of the printed table, if they are available.
 _SHOWN = ("SMAPE", "PSNR", "SSIM", "FLIP")
 
 
 def write_csv(results: Results, folder: Path) -> None:
-    """Write ``results.csv``: a row for each scene and method, also of those that are missing."""
+    """Write ``results.csv``: one row for each scene and method, also for missing methods."""
     rows = [
         _row(scene, method, _cell(results, scene, method), results)
         for scene in results.scenes
@@ -30,7 +30,7 @@ def write_csv(results: Results, folder: Path) -> None:
 
 
 def write_ops_csv(results: OpResults, folder: Path) -> None:
-    """Write ``ops.csv``: a row for each op, backend and dtype, each with where and with what it was measured."""
+    """Write ``ops.csv``: one row for each operator, backend and dtype, with machine and versions."""
     machine = results.machine
     packages = ", ".join(f"{name} {version}" for name, version in machine.packages.items())
     rows = [
@@ -62,7 +62,7 @@ def write_ops_csv(results: OpResults, folder: Path) -> None:
 
 
 def scene_rows(results: Results) -> list[dict[str, str]]:
-    """What to print of each method that did its work: error and run time, scene by scene, the best first."""
+    """Rows with error and run time of each method that succeeded, by scene, best first."""
     rows = []
     names = [name for name in _SHOWN if any(name in cell.errors for cell in results.cells)]
     for scene in results.scenes:
@@ -84,7 +84,7 @@ def scene_rows(results: Results) -> list[dict[str, str]]:
 
 
 def skipped_rows(results: Results) -> list[dict[str, str]]:
-    """What to print of what methods skipped of the scenes."""
+    """Rows with the work that methods skipped."""
     return [
         {
             "scene": row.scene,
@@ -98,7 +98,7 @@ def skipped_rows(results: Results) -> list[dict[str, str]]:
 
 
 def remarks(results: Results) -> list[str]:
-    """What to print below: what failed, what is missing, what was not computed, each with its reason."""
+    """Lines about failed and missing methods and metrics, each with the reason."""
     lines = [
         f"{'skipped' if cell.lacking else 'failed'}: {cell.scene}, {cell.method}: {cell.failure}"
         for cell in results.cells
@@ -114,7 +114,7 @@ def remarks(results: Results) -> list[str]:
 
 
 def op_rows(results: OpResults) -> list[dict[str, str]]:
-    """What to print of each op, backend and dtype."""
+    """Rows for each operator, backend and dtype."""
     return [
         {
             "op": cost.op,
@@ -135,7 +135,7 @@ def op_rows(results: OpResults) -> list[dict[str, str]]:
 
 
 def _cell(results: Results, scene: Scene, method: Method) -> Cell:
-    """Also of a method that is missing."""
+    """The cell of a scene and method; one with the reason if the method is missing."""
     found = results.cell(scene.name, method.name)
     return found or Cell(scene.name, method.name, failure=f"missing: {method.missing}")
 

@@ -1,6 +1,6 @@
-"""The proof, outside the shop window: cases and equations of every op, gradient checks, stability, and the overview.
+"""Verification: test cases and equations of every operator, gradient checks, numerical stability, and an overview.
 
-``gradcheck(function, *inputs)`` and ``check_stability(function, *inputs)`` prove a function of one's own.
+``gradcheck(function, *inputs)`` and ``check_stability(function, *inputs)`` check a user's own function.
 """
 
 from mcdenoise.check.gradients import GradcheckResult, gradcheck

@@ -1,8 +1,8 @@
-"""Derivatives against difference quotients, number by number, of what treats the images of a batch alike and alone.
+"""Comparison of derivatives with difference quotients, for functions that process the images of a batch independently.
 
-The same comparison as that of ``torch.autograd.gradcheck``, with its step and its bounds. There each number is moved in
-a call of its own, and each row of derivatives takes another one; here every one of them has a copy of the images in one
-large batch. A derivative that leaks from one image of a batch to another is wrong in the copy that it leaks to.
+This is the comparison of ``torch.autograd.gradcheck``, with its step and its bounds. That function calls once for each
+input number and once for each row of derivatives; here each of these has a copy of the images in one large batch. A
+derivative that leaks from one image of a batch to another is detected as wrong in the other copy.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _AT_ONCE = 128  # copies of the images in one batch
 
 
 def first_mismatch(function: Function, arguments: Sequence[Tensor]) -> str:
-    """What is wrong with the first derivatives; empty if nothing is.
+    """Describe the first wrong first derivative; empty if all are right.
 
     Args:
-        function: of tensors in float64 with the same first axis, which may hold the images of ``arguments`` several
-            times; it returns tensors of the same kind.
-        arguments: what it is differentiated in, and where.
+        function: function of float64 tensors with the same first axis, which may hold several copies of ``arguments``;
+            it returns tensors of the same kind.
+        arguments: the differentiable arguments, and the point of the comparison.
     """
     quotients = [_quotients(function, arguments, i) for i in range(len(arguments))]
     for j, derivatives in _derivatives(function, arguments):
@@ -41,7 +41,7 @@ def first_mismatch(function: Function, arguments: Sequence[Tensor]) -> str:
 
 
 def second_mismatch(function: Function, arguments: Sequence[Tensor]) -> str:
-    """What is wrong with the derivatives of the gradients, in the arguments and in upstream gradients drawn at random.
+    """Describe the first wrong derivative of the gradients, in the arguments and in random upstream gradients.
 
     Args:
         function: see :func:`first_mismatch`.
@@ -66,7 +66,7 @@ def second_mismatch(function: Function, arguments: Sequence[Tensor]) -> str:
 
 @torch.no_grad()
 def _quotients(function: Function, arguments: Sequence[Tensor], moved: int) -> list[Tensor]:
-    """Of each result in one argument: a row for each number that is moved, a column for each of the result."""
+    """Difference quotients of each result in one argument: one row per input number, one column per output number."""
     size = arguments[moved].numel()
     rows: list[list[Tensor]] = []
     for start in range(0, size, _AT_ONCE):
@@ -81,7 +81,7 @@ def _quotients(function: Function, arguments: Sequence[Tensor], moved: int) -> l
 
 
 def _derivatives(function: Function, arguments: Sequence[Tensor]) -> list[tuple[int, list[Tensor]]]:
-    """Of each result that has any, with its number, in each argument: a row for each number of the result."""
+    """Derivatives of each result that has any, with its index, in each argument: one row per output number."""
     found = []
     for j, result in enumerate(_leaves_and_results(function, arguments)[1]):
         if not result.requires_grad:

@@ -1,4 +1,4 @@
-"""What a case of an op is, and what the table of ops says of each; the table itself is :mod:`mcdenoise.check.cases`."""
+"""The description of an operator and its test cases; the table of all operators is :mod:`mcdenoise.check.cases`."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ Inputs = dict[str, Value]
 
 @dataclass(frozen=True)
 class Case:
-    """One set of inputs of an op.
+    """A test case: one set of inputs of an operator.
 
     Args:
-        name: what is special about it; unique within its op.
-        kind: ``"ordinary"``, ``"stiff"`` (results change fast with the inputs) or ``"extreme"`` (valid, but at the end
-            of what is).
+        name: what is special about the case; unique for its operator.
+        kind: ``"ordinary"``, ``"stiff"`` (results change fast with the inputs) or ``"extreme"`` (valid, at a limit).
         tensors: draws the tensor arguments by name, in float64.
-        differentiable: the arguments among them that have a derivative here.
-        settings: the other arguments, those that the Module twin stores.
+        differentiable: the tensor arguments that have a derivative in this case.
+        settings: the other arguments, which the Module twin stores.
     """
 
     name: str
@@ -36,9 +35,9 @@ class Case:
     settings: dict[str, Any] = field(default_factory=dict)
 
     def inputs(self, dtype: torch.dtype = torch.float64, seed: int = 0) -> Inputs:
-        """The tensor arguments: the same numbers for the same seed, in any dtype.
+        """The tensor arguments in any dtype; the same seed gives the same numbers.
 
-        What is finite stays so: beyond the dtype's range it is its largest number, as in an image that was saved.
+        Finite values stay finite: values beyond the dtype's range become its largest number, as in a saved image.
         """
         largest = torch.finfo(dtype).max
 
@@ -50,16 +49,17 @@ class Case:
 
 @dataclass(frozen=True)
 class Rounding:
-    """What the roundings inside of an op amount to, in units of the dtype's epsilon.
+    """The effect of rounding inside an operator, in units of the dtype's epsilon.
 
-    Every op is taken to be backward stable: its result is the exact one of inputs that are off by few roundings. Where
-    an op computes with larger numbers on the way than its inputs are, this says with how large ones.
+    Every operator is assumed to be backward stable: its result is exact for inputs that are perturbed by a few
+    roundings. If it computes with larger intermediate values than its inputs, their magnitude is stated here.
 
     Args:
-        arguments: for some arguments, the magnitude whose rounding they must absorb; for the others it is their own.
-        result: magnitude that is rounded beside the result itself.
+        arguments: for some arguments, the magnitude of the intermediate values; for others it is their own.
+        result: magnitude of values that are rounded in addition to the result.
         gradients: for some arguments, the magnitude of the terms whose difference is their gradient, for upstream
-            gradients of one. A quotient's, ``n' / s - n s' / s^2``, are much larger than it is where they cancel.
+            gradients of one. Those of a quotient, ``n' / s - n s' / s^2``, are much larger than the gradient if they
+            cancel.
     """
 
     arguments: Inputs = field(default_factory=dict)
@@ -73,24 +73,24 @@ def _no_more(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 @dataclass(frozen=True)
 class Op:
-    """An op and what is known about it.
+    """An operator and its known properties.
 
     Args:
         function: the public function.
-        reference: the same as its equation, in float64; see :mod:`mcdenoise.check.reference`.
-        cases: at least four, among them ordinary ones.
+        reference: its equation in float64; see :mod:`mcdenoise.check.reference`.
+        cases: at least four test cases, including ordinary ones.
         module: the Module twin, if there is one.
-        least_dtype: results are at least as precise as this; other results have the dtype of the inputs.
-        images: the arguments that are images of one unit: the first result scales with them, and is constant where
-            they are and the weights sum to one.
-        weights: whether, with these settings, the result is non-negative weights that sum to one over the channels.
-        rounding: see :class:`Rounding`; of inputs and settings.
-        half: whether it promises anything of inputs in half precision.
-        batched: whether all its tensors have the batch first, and it treats the images of a batch alike and alone, so
-            that many inputs can be tried at once.
-        own: whether it is somebody's own function, see :mod:`mcdenoise.check.own`. Its only equation is itself in
-            float64, so that its derivatives are proven wherever it is checked; it may treat the images of a batch
-            together; and half precision is rounded between its steps.
+        least_dtype: results have at least this precision; otherwise they have the dtype of the inputs.
+        images: the image arguments with a common unit: the first result scales with them, and is constant if they are
+            and the weights sum to one.
+        weights: whether, for given settings, the result is non-negative weights that sum to one over the channels.
+        rounding: returns :class:`Rounding` for inputs and settings.
+        half: whether the operator makes promises for inputs in half precision.
+        batched: whether all its tensors begin with the batch axis, and it processes the images of a batch
+            independently, so that many inputs can be tried at once.
+        own: whether it is a user's own function, see :mod:`mcdenoise.check.own`. Its only reference is the function
+            itself in float64, so its derivatives are verified wherever it is checked; it may process the images of a
+            batch together; and half precision is rounded between its steps.
     """
 
     function: Callable[..., Any]
@@ -112,7 +112,7 @@ class Op:
 
 
 def map_tensors(function: Callable[[Tensor], Tensor], inputs: Inputs) -> Inputs:
-    """``inputs`` with ``function`` applied to each tensor in them."""
+    """Apply ``function`` to each tensor in ``inputs``."""
 
     def apply(value: Value) -> Value:
         if isinstance(value, Surface):
@@ -135,5 +135,5 @@ def normal(g: Generator, *shape: int) -> Tensor:
 
 
 def radiance(g: Generator, *shape: int) -> Tensor:
-    """Over six decades, as 1-spp renderings are: mostly dark, fireflies up to 1e4."""
+    """Radiance over six decades like that of 1-spp renderings: mostly dark, fireflies up to 1e4."""
     return 10 ** uniform(g, *shape, low=-2, high=4)

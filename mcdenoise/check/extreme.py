@@ -1,4 +1,4 @@
-"""Stiff and extreme inputs of each op: what broken shaders, half-float files and careless settings hand over.
+"""Stiff and extreme inputs of each op, such as those from broken shaders, half-float files and unusual settings.
 
 All of them are valid: an op has to give what its equation says, to rounding, or the infinity that it says.
 Where a case has ``differentiable`` inputs its numbers are scaled so that a difference quotient still means something.

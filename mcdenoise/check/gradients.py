@@ -1,4 +1,4 @@
-"""Prove the derivatives of every op, or of a function of one's own, against difference quotients."""
+"""Verification of the derivatives of every operator, or of a user's own function, by difference quotients."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from mcdenoise.check.own import find_ops, op_of
 from mcdenoise.check.step_cases import STEPS
 from mcdenoise.ops import use
 
-# Only to make a failure repeatable: any upstream gradient must do.
+# A fixed seed makes failures reproducible; any upstream gradient has to work.
 SEED = 0
 
 
 @dataclass(frozen=True)
 class GradcheckResult:
-    """What became of one case of one op.
+    """Result of checking one case of one operator.
 
     Args:
-        op: name of the op.
+        op: name of the operator.
         case: name of the case.
         inputs: the arguments whose first and second derivatives were checked.
         passed: whether all of them agree.
-        seconds: time it took.
-        message: first line of what is wrong; empty if nothing is.
+        seconds: run time of the check.
+        message: first line of the error; empty if there is none.
     """
 
     op: str
@@ -43,21 +43,21 @@ class GradcheckResult:
 
 
 def gradcheck(function: Callable[..., Any], *inputs: Tensor, order: int = 2) -> list[GradcheckResult]:
-    """Compare the derivatives of a function of one's own with difference quotients, in float64 and number by number.
+    """Compare the derivatives of a user's own function with difference quotients, in float64, number by number.
 
     ``mcdenoise gradcheck path/to/file.py:function`` does the same.
 
     Args:
-        function: of floating-point tensors, which returns one or several.
-        inputs: small tensors to try it on, of any floating-point dtype; those alone that require gradients are moved,
-            if any does. Without them, its example inputs, see :mod:`mcdenoise.check.own`.
+        function: function of floating-point tensors, which returns one or several tensors.
+        inputs: small tensors of any floating-point dtype; if some require gradients, only their derivatives are
+            checked. Without them, the function's example inputs are used, see :mod:`mcdenoise.check.own`.
         order: 1 for first derivatives, 2 for second ones too.
 
     Returns:
         One result for each case.
 
     Raises:
-        InputError: it is no such function, or there is nothing that it runs on.
+        InputError: the function is not of this kind, or there are no inputs on which it runs.
 
     Example:
         >>> import torch
@@ -73,50 +73,50 @@ def check(names: Sequence[str] | None = None) -> list[GradcheckResult]:
     """Compare first and second derivatives with difference quotients, in float64 and number by number.
 
     Args:
-        names: ops to check, or functions of one's own, ``path/to/file.py:function`` or ``package.module:function``;
-            ``None`` means all ops.
+        names: operators to check, or own functions, ``path/to/file.py:function`` or ``package.module:function``;
+            ``None`` means all operators.
 
     Returns:
         One result for each case of each op that has a differentiable input.
 
     Raises:
-        InputError: there is no such op or function, or nothing that it runs on.
+        InputError: an operator or function does not exist, or there are no inputs on which it runs.
     """
     return [check_case(op, case) for op, case in select(names)]
 
 
 def select(names: Sequence[str] | None = None) -> list[tuple[Op, Case]]:
-    """The cases that :func:`check` goes through, each with its op; ``InputError`` as there."""
+    """The cases of :func:`check`, each with its operator; raises the same ``InputError``."""
     ops = OPS + STEPS if names is None else find_ops(names, OPS + STEPS)
     return [(op, case) for op in ops for case in op.cases if case.differentiable]
 
 
 def check_case(op: Op, case: Case, order: int = 2) -> GradcheckResult:
-    """:func:`check` of one case; of ``order`` 1, of first derivatives alone."""
+    """Run :func:`check` for one case; with ``order`` 1, only for first derivatives."""
     start = time.perf_counter()
     try:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(SEED)
             message = _mismatch(op, case, order)
-    except Exception as error:  # whatever an op raises belongs in the report of that op, and the others go on
+    except Exception as error:  # any exception is reported for its operator; the others continue
         message = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
     seconds = time.perf_counter() - start
     return GradcheckResult(op.name, case.name, case.differentiable, not message, seconds, message)
 
 
 def _mismatch(op: Op, case: Case, order: int) -> str:
-    """What is wrong; torch's own check, of functions of one's own and of the smallest case of an op, raises it."""
+    """Describe the first mismatch. torch's own check runs only for own functions and each operator's smallest case."""
     function, arguments = _of_differentiable(op, case)
     batched = op.batched and all(len(tensor) for tensor in arguments)
     if batched:
-        # Of the many copies together a fast form may be chosen, which would prove nothing of the plain one.
+        # The large batch of copies might select a fast backend, which would not verify the reference.
         with use("torch"):
             message = first_mismatch(function, arguments)
             if order > 1 and not message:
                 message = second_mismatch(function, arguments)
         if message:
             return message
-    # It calls the op for every number, and looks at more: gradients that are undefined, or not the same each time.
+    # torch's check calls the operator for every number, and also tests undefined and non-deterministic gradients.
     if not batched or case is _smallest(op):
         torch.autograd.gradcheck(function, arguments, fast_mode=False)
         if order > 1:
@@ -125,7 +125,7 @@ def _mismatch(op: Op, case: Case, order: int) -> str:
 
 
 def _smallest(op: Op) -> Case:
-    """Of the cases with derivatives in the most arguments the one with the fewest numbers, but with some."""
+    """Among the cases with the most differentiable arguments, the one with the fewest (but some) numbers."""
 
     def size(case: Case) -> tuple[int, float]:
         numbers = 0
@@ -142,7 +142,7 @@ def _smallest(op: Op) -> Case:
 
 
 def _of_differentiable(op: Op, case: Case) -> tuple[Callable[..., tuple[Tensor, ...]], tuple[Tensor, ...]]:
-    """The op as a function of its differentiable tensors alone, of one or several batches, and those tensors."""
+    """The operator as a function of its differentiable tensors only, for one or several batches, and those tensors."""
     fixed = case.inputs()
     arguments: list[Tensor] = []
 
@@ -165,6 +165,6 @@ def _of_differentiable(op: Op, case: Case) -> tuple[Callable[..., tuple[Tensor, 
 
 
 def _finite(result: Tensor) -> Tensor:
-    # A constant infinity (the motion of a point behind the camera) has no difference quotient. Cut out, it still must
-    # not leave a NaN in the gradient of anything else.
+    # A constant infinity (the motion of a point behind the camera) has no difference quotient. After it is masked, it
+    # must not leave NaN in the gradients of other inputs.
     return torch.where(torch.isfinite(result), result, 0)

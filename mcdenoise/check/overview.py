@@ -1,4 +1,4 @@
-"""What there is in ``mcdenoise.ops``, and how exact it is."""
+"""Overview of all operators in ``mcdenoise.ops``, with measured errors."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
 @dataclass(frozen=True)
 class OpOverview:
-    """One op in a few words and numbers.
+    """One row of the overview.
 
     Args:
-        name: name of the op.
+        name: name of the operator.
         summary: first line of its docstring.
-        differentiable: the arguments that it has derivatives in.
-        cases: number of cases that it is tried on.
-        errors: for each dtype (``"float32"``) the largest relative error over the ordinary cases; see
+        differentiable: its differentiable arguments.
+        cases: number of its test cases.
+        errors: by dtype (``"float32"``), the largest relative error over the ordinary cases; see
             :func:`relative_error`.
         module: name of the Module twin, if there is one.
     """
@@ -37,7 +37,7 @@ class OpOverview:
 
 
 def overview() -> list[OpOverview]:
-    """Every op, with its error against the equations in float64 measured on the spot."""
+    """One entry per operator; its error against the equations in float64 is measured by this call."""
     return [
         OpOverview(
             name=op.name,
@@ -57,11 +57,10 @@ def overview() -> list[OpOverview]:
 
 
 def relative_error(op: Op, case: Case, dtype: torch.dtype) -> float:
-    """``max |out - reference| / max |reference|``, the largest over the op's results.
+    """``max |out - reference| / max |reference|``, the maximum over the operator's results.
 
-    Both see the same inputs, rounded to ``dtype``; the reference computes with them in float64. Where ``dtype`` cannot
-    hold the reference, infinity is the right result; a result that is infinite or NaN elsewhere counts as infinite
-    error.
+    Both get the same inputs, rounded to ``dtype``; the reference computes in float64. Where ``dtype`` cannot represent
+    the reference, infinity is the right result; any other infinite or NaN result counts as an infinite error.
     """
     inputs = case.inputs(dtype)
     results = op.function(**inputs, **case.settings)

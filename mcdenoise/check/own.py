@@ -1,17 +1,17 @@
-"""Somebody's own function as an op: where it is, and the example inputs that it is tried on.
+"""A user's own function as an operator: importing it, and its example inputs.
 
-It takes floating-point tensors, one after the other, and returns one or several. Its example inputs are
+The function takes floating-point tensors as positional arguments, and returns one or several. Its example inputs are
 
 - ``function.example_inputs``, or else
 - ``inputs`` in the same file, for all functions there that have no ``example_inputs``.
 
-Either is a function without arguments or a value; what it gives is a tuple of tensors, or several by name, each of
-which is a case: ``{"ordinary": (image, albedo), "black": (0 * image, albedo)}``. It draws random numbers with a fixed
-seed. If some of the tensors require gradients, derivatives are checked in these alone, otherwise in all. Every number
-is moved by itself, so that the tensors have to be small, and away from points where there is no derivative.
+Either is a value, or a function without arguments that returns one: a tuple of tensors, or several by name, each of
+which is a case: ``{"ordinary": (image, albedo), "black": (0 * image, albedo)}``. Random numbers are drawn with a fixed
+seed. If some of the tensors require gradients, only their derivatives are checked, otherwise all. Every number is
+perturbed separately, so tensors have to be small, and away from points without a derivative.
 
-A function without example inputs is tried on small images of positive radiance, one for each argument that has no
-default: derivatives on ordinary ones, stability also on dark, bright and black ones and on a firefly.
+A function without example inputs is checked on small images of positive radiance, one for each parameter without a
+default: derivatives on ordinary images, stability also on dark, bright and black ones and on a firefly.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from mcdenoise.errors import InputError
 from mcdenoise.own import in_one_line, load_own
 
 ATTRIBUTE, BESIDE = "example_inputs", "inputs"
-# The matrix of derivatives of that many results in that many inputs takes 128 MiB.
+# The Jacobian for this many inputs and results takes 128 MiB.
 LARGEST = 4096
 _SEED = 0
-# Small, because each number is moved by itself, and with unlike sides, one odd and one even.
+# Small, because each number is perturbed separately; the sides differ, one odd and one even.
 IMAGE = (1, 3, 5, 6)
 
 
 def find_ops(names: Sequence[str], table: Sequence[Op]) -> list[Op]:
-    """Ops by name.
+    """Find operators by name.
 
     Args:
-        names: of ops of the table, or ``path/to/file.py:function``, ``package.module:function``.
-        table: ops that are known.
+        names: names of operators in the table, or ``path/to/file.py:function``, ``package.module:function``.
+        table: known operators.
 
     Raises:
-        InputError: there is no such op or function, or nothing that it runs on.
+        InputError: an operator or function does not exist, or there are no inputs on which it runs.
     """
     known = {op.name: op for op in table}
     unknown = [name for name in names if name not in known and ":" not in name]
@@ -58,14 +58,14 @@ def find_ops(names: Sequence[str], table: Sequence[Op]) -> list[Op]:
 
 
 def op_of(function: Callable[..., Any], inputs: Sequence[Tensor] = ()) -> Op:
-    """A function as an op.
+    """Describe a function as an operator.
 
     Args:
-        function: of floating-point tensors, which returns one or several.
-        inputs: what to try it on; its example inputs by default, see the head of this page.
+        function: function of floating-point tensors, which returns one or several tensors.
+        inputs: inputs to check it on; by default its example inputs, see the module's docstring.
 
     Raises:
-        InputError: it is no such function, it fails on its example inputs, or it has none and fails on images.
+        InputError: the function is not of this kind, fails on its example inputs, or has none and fails on images.
     """
     name = getattr(function, "__name__", type(function).__name__)
     return _op(
@@ -79,7 +79,7 @@ def _load(name: str) -> Op:
 
 
 def _examples(name: str, function: Any, module: Any) -> Any:
-    """What the file has for example inputs; ``None`` where it has none."""
+    """The example inputs in the function's file, or ``None``."""
     found = getattr(function, ATTRIBUTE, None)
     if found is None:
         found = getattr(module, BESIDE, None)
@@ -116,7 +116,7 @@ def _op(name: str, function: Any, examples: Any) -> Op:
 
 
 def _image_cases(name: str, function: Any) -> tuple[Case, ...]:
-    """Images for a function that says nothing of what it takes."""
+    """Image inputs for a function without example inputs."""
     required = [each for each in _parameters(function) if each.default is each.empty]
     names = tuple(each.name for each in required)
     g = Generator().manual_seed(_SEED)
@@ -145,7 +145,7 @@ def _image_cases(name: str, function: Any) -> tuple[Case, ...]:
             case,
             kind,
             partial(_draw, {each: image * factor for each, image in zip(names, images, strict=True)}),
-            # Beside the others the step of a difference quotient is too large or too small.
+            # In combination with other numbers, the step of a difference quotient would be too large or too small.
             names if kind == "ordinary" else (),
         )
         for case, (kind, factor) in kinds.items()
@@ -186,7 +186,7 @@ def _check_results(where: str, function: Any, tensors: Sequence[Tensor]) -> None
 
 
 def _by_name(name: str, function: Any) -> Callable[..., Any]:
-    """The function with arguments by name, in their order."""
+    """The function with arguments by name, in order."""
 
     def called(**given: Tensor) -> Tensor | tuple[Tensor, ...]:
         results = function(*given.values())
@@ -208,13 +208,13 @@ def _draw(drawn: Mapping[str, Tensor], g: Generator) -> Inputs:
 
 
 def _arguments(function: Any, count: int) -> tuple[str, ...]:
-    """Names of the first arguments; numbers for those that have none."""
+    """Names of the first parameters; numbers for those without a name."""
     names = [each.name for each in _parameters(function)]
     return tuple(names[i] if i < len(names) else f"input {i + 1}" for i in range(count))
 
 
 def _parameters(function: Any) -> list[inspect.Parameter]:
-    """Of a function, those that may be given without a name."""
+    """The parameters that can be passed by position."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # functions of torch written in C++ have no signature

@@ -1,7 +1,7 @@
-"""Every op once more, as its equation: loops over pixels and taps on Python's float64 numbers.
+"""The equations of all operators: loops over pixels and taps with Python's float64 numbers.
 
-Slow, and meant to be read beside the formula. Nothing here is shared with the ops, so that an error in one of them
-cannot hide in the other. The arguments are those of the ops; results are float64 whatever the inputs are.
+They are slow, and meant to be read beside the formula. They have no code in common with the operators, so that an error
+in one cannot hide in the other. Arguments are those of the operators; results are float64 whatever the inputs are.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def softmax_splat(image: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
     with localcontext(prec=40):
         for b, y, x in itertools.product(range(batch), range(height), range(width)):
             weights = {}
-            # What arrives by the tap t is of the pixel opposite to it.
+            # Tap t of a destination comes from the pixel on the opposite side.
             for t, _, row, column in _taps(logits, y, x, "zeros"):
                 if row is not None:
                     weights[row, column] = Decimal(exponents[b][logits.shape[1] - 1 - t][row][column]).exp()
@@ -301,7 +301,7 @@ def affinity_filter(
     kernel_size: int = 7,
     dilation: int = 1,
 ) -> Tensor:
-    """Means with weights ``exp(-a |f_p - f_q|^2)``, ``c`` of the pixel itself; likewise over the frame before."""
+    """Means with weights ``exp(-a |f_p - f_q|^2)``, ``c`` for the pixel itself; also over the previous frame."""
     frames: list[tuple[Image, Image, Image, Image | None]]
     frames = [(image.tolist(), features.tolist(), bandwidth.tolist(), None)]
     if previous is not None and previous_features is not None:
@@ -719,7 +719,7 @@ def accumulate(
         found = weight[b][0][y][x] > 0
         alpha = max(1 / (n + 1), alpha_min) if found else 1.0
         out[b][c][y][x] = alpha * source[b][c][y][x] + (1 - alpha) * history[b][c][y][x]
-        # The published code keeps the length in a byte.
+        # The published code stores the length in a byte.
         grown = min(round(n) + 1, 255) if rule == "bmfr" else n + 1
         length[b][0][y][x] = grown if found else 1.0
     return _tensor(out, color.shape), _tensor(length, previous_length.shape)
@@ -739,7 +739,7 @@ def _indices(shape: Sequence[int]) -> Iterator[tuple[int, ...]]:
 
 
 def _taps(kernel: Tensor, y: int, x: int, border: str) -> Iterator[tuple[int, int, int | None, int]]:
-    """Of each tap its index, squared distance from the centre, and row and column; row ``None``: reads no pixel."""
+    """For each tap its index, squared distance from the centre, row and column; row ``None`` reads no pixel."""
     _, taps, height, width = kernel.shape
     size = math.isqrt(taps)
     for t in range(taps):
@@ -778,7 +778,7 @@ def _same_surface(
     position_limit: float | None,
     normal_limit: float | None,
 ) -> bool:
-    # What one of the two surfaces lacks cannot be compared.
+    # A property that one of the two surfaces lacks cannot be compared.
     both = [(a, b) if a is not None and b is not None else None for a, b in zip(here, tap, strict=True)]
     positions, normals, depths, _ = both
     if rule == "bmfr":

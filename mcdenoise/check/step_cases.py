@@ -1,6 +1,6 @@
-"""The fused steps and the inputs to try each of them on: what :mod:`mcdenoise.check.cases` is for the public ops.
+"""The test cases of the fused steps, like those of the public operators in :mod:`mcdenoise.check.cases`.
 
-The reference of a step is its formula, written out in float64 of torch's primitives or of other references.
+The reference of a step is its formula in float64, written with torch's primitives or other references.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ def _low_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
 
 _BUFFERS = ("albedo", "normal", "current", "length", "exposure", "scale")
 
-# A frame is in float32 between its accumulation and a network's convolutions, and no step promises more.
+# A frame is in float32 between accumulation and convolutions, and steps make no promises for other dtypes.
 STEPS: tuple[Op, ...] = tuple(
     replace(step, half=False)
     for step in (

@@ -1,4 +1,4 @@
-"""The command line: parses, calls, prints."""
+"""The command line: parsing, running commands, and printing results."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from mcdenoise.threads import wait_passively
 
 Command = Callable[..., int | None]
 
-# What each command does; it is the function of its name in the module of its name here.
+# One line about each command; its function has the same name as its module in this package.
 COMMANDS = {
-    "demo": "Render a short animation at one sample a pixel, denoise it, and show the result.",
+    "demo": "Render a short animation at one sample per pixel, denoise it, and show the result.",
     "denoise": "Denoise the frames of a shot, as a renderer wrote them.",
-    "film": "Denoise the shots of a film, by many processes or machines, and resume where they were stopped.",
-    "inspect": "Show what would be read of the frames of a shot, and why; denoises nothing.",
+    "film": "Denoise the shots of a film with many processes or machines; an interrupted film resumes.",
+    "inspect": "Show which layers of a shot are read as which buffers, and why; denoises nothing.",
     "render": "Render a Mitsuba 3 scene along a camera path to a noisy sequence with references.",
-    "generate": "Render random scenes to train on.",
+    "generate": "Render random scenes for training.",
     "train": "Train a model on sequences with references.",
     "calibrate": "Calibrate weights for --precision int8.",
     "evaluate": "Compare a folder of denoised images with references.",
@@ -37,7 +37,7 @@ COMMANDS = {
     "stability": "Check operators, models and the denoiser on stiff and extreme inputs, in every precision.",
     "export": "Write a model as an ONNX or torch.export graph.",
     "models": "List the models with their size and cost.",
-    "ops": "List the operators with their error against the equations written out.",
+    "ops": "List the operators with their error against their equations.",
 }
 
 _SUMMARY = """usage: mcdenoise COMMAND [OPTIONS]
@@ -51,14 +51,14 @@ commands:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command, and exit.
+    """Run a command and exit.
 
-    The status is 0; 1 where a check failed; 2 for bad usage or bad input; and, after a signal that ends it, 128 and the
+    The exit status is 0; 1 if a check failed; 2 for wrong usage or invalid input; and, after a signal, 128 plus the
     number of the signal: 130 after Ctrl+C.
 
     Args:
-        arguments: of a command that this process runs among others; those of the process by default. Then signals are
-            obeyed until its very end.
+        arguments: arguments of a command that runs inside another program; by default those of the process. Then
+            signals are handled until the process ends.
     """
     of_process = arguments is None
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -69,7 +69,7 @@ def main(arguments: list[str] | None = None) -> None:
         interruption.listening = True
         status = _status(name, arguments)
     except BaseException:
-        # Whatever has become of what a signal has raised.
+        # Any exception that followed a signal.
         if not interruption.number:
             raise
         status = 0
@@ -81,7 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _status(name: str, arguments: list[str]) -> int:
-    """Run a command, and say in one line why it could not be; the exit status."""
+    """Run a command, and print input errors in one line; return the exit status."""
     try:
         with forgiving_stdout():
             return _run(name, arguments)
@@ -89,13 +89,13 @@ def _status(name: str, arguments: list[str]) -> int:
         print(f"mcdenoise{f' {name}' if name else ''}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        # Of somebody who raises it without a signal.
+        # A KeyboardInterrupt that was raised without a signal.
         print(f"mcdenoise {name}: interrupted; finished files are kept", file=sys.stderr)
         return 130
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    """Run a command, or say what there is; the exit status."""
+    """Run a command, or print the summary; return the exit status."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_summary())
         return 0 if arguments else 2
@@ -112,19 +112,19 @@ def _run(name: str, arguments: list[str]) -> int:
         _check_json(command)
         return command() or 0
     except SystemExit as stop:
-        # Help was asked for.
+        # tyro has printed the requested help.
         return int(stop.code or 0)
 
 
 def _check_json(command: Callable[[], int | None]) -> None:
-    """See that the file of ``--json`` can be written, where a command has one, before its work and not after it."""
+    """Check that the file of ``--json`` can be written, if the command has one, before its work begins."""
     given: dict[str, Any] = getattr(command, "keywords", {})
     if given.get("json") is None:
         return
     from mcdenoise.cli._output import check_json
 
     inputs: list[Path] = []
-    # Groups of options hold paths, too.
+    # Groups of options also hold paths.
     grouped = [each for group in given.values() if is_dataclass(group) for each in vars(group).values()]
     for name, value in (*given.items(), *(("", each) for each in grouped)):
         if name not in ("json", "out"):
@@ -135,7 +135,7 @@ def _check_json(command: Callable[[], int | None]) -> None:
 
 
 def load_command(name: str) -> Command:
-    """The function that runs a command; only now are its imports paid for.
+    """Import the function of a command; its imports are only loaded now.
 
     Args:
         name: one of :data:`COMMANDS`.
@@ -145,16 +145,16 @@ def load_command(name: str) -> Command:
 
 
 def parse(name: str, arguments: list[str]) -> Callable[[], int | None]:
-    """A command with its arguments, ready to be called.
+    """Bind a command to its arguments.
 
     Args:
         name: one of :data:`COMMANDS`.
-        arguments: as on the command line.
+        arguments: arguments as on the command line.
 
     Raises:
-        InputError: the command does not take them.
+        InputError: the arguments are invalid.
     """
-    # Here, and not before signals are obeyed, because it takes its time to load.
+    # Imported here, after signal handlers are installed, because it is slow to load.
     import tyro
 
     command, prog = load_command(name), f"mcdenoise {name}"
@@ -170,7 +170,7 @@ def parse(name: str, arguments: list[str]) -> Callable[[], int | None]:
     except SystemExit as stop:
         if not stop.code:
             raise
-        # tyro frames its messages: a title, what is wrong, a rule, and more help.
+        # tyro frames its messages: a title, the errors, a rule, and further help. Keep the errors.
         lines = [line.strip("│╭╮╰╯ ") for line in messages.getvalue().splitlines()]
         wrong = itertools.takewhile(lambda line: line.strip("─"), lines[1:])
         raise InputError(f"{' '.join(wrong).rstrip('.')}; see `{prog} --help`") from stop

@@ -1,4 +1,4 @@
-"""What the options of several commands have in common."""
+"""Types of options that several commands have."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from mcdenoise.errors import InputError
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Json = Path | None
-# Frames of a shot: folders, files, patterns.
+# Inputs of a shot: folders, files, patterns.
 Inputs = tyro.conf.Positional[
     Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT [INPUT ...]", help_behavior_hint="(required)")]
 ]
 Layers = Annotated[tuple[str, ...], tyro.conf.arg(metavar="LAYER [LAYER ...]", help_behavior_hint="")]
 Map = tyro.conf.UseAppendAction[Annotated[tuple[str, ...], tyro.conf.arg(metavar="BUFFER=LAYER")]]
-# On or off, and off without a word: that needs no second option which says so.
+# A flag that is off by default, without a second option for switching it off.
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height of a ``--size``.
+    """Parse width and height of a ``--size``.
 
     Raises:
-        InputError: the text is something else.
+        InputError: the text has another form.
     """
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal()):

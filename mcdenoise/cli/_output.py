@@ -1,4 +1,4 @@
-"""What commands show, and where they show it."""
+"""Output of commands: progress bars, tables, warnings and JSON files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mcdenoise.errors import InputError, printable
 
 
 def progress_bar() -> Progress:
-    """A progress bar on stderr; silent when that is no terminal."""
+    """A progress bar on stderr; none if stderr is not a terminal."""
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
@@ -30,57 +30,57 @@ def progress_bar() -> Progress:
 
 
 def say(line: object) -> None:
-    """Print a line that has paths in it, or what else others have named: a terminal obeys nothing of it."""
+    """Print a line with names from users; control characters are escaped."""
     print(printable(str(line)), flush=True)
 
 
 def show(table: Table) -> None:
     """Print a table to stdout."""
-    # A pipe has no width: never fold what a script may read.
+    # A pipe has no width: do not wrap lines that a script may read.
     console = Console()
     Console(width=None if console.is_terminal else 200).print(table)
 
 
 def print_rows(rows: list[dict[str, str]]) -> None:
-    """Print rows with the same columns; nothing where there are none."""
+    """Print rows with the same columns; print nothing if there are none."""
     if rows:
         table = Table(*rows[0])
         for row in rows:
-            # As they stand: a layer's name may hold brackets, which are orders to a table.
+            # Disable markup, because a layer's name may contain brackets.
             table.add_row(*(Text(printable(each)) for each in row.values()))
         show(table)
 
 
 def print_times(milliseconds: dict[str, float]) -> None:
-    """Print the run time of each stage, and of all."""
+    """Print the run time of each stage, and the total."""
     print(f"milliseconds a frame (median): {stages(milliseconds)}; together {sum(milliseconds.values()):.1f}")
 
 
 def stages(milliseconds: dict[str, float]) -> str:
-    """The run time of each stage in words."""
+    """Text with the run time of each stage."""
     return ", ".join(f"{stage} {value:.1f}" for stage, value in milliseconds.items())
 
 
 def warn(warnings: Iterable[str]) -> None:
-    """Say on stderr what is probably wrong, a line each."""
+    """Print warnings to stderr, one line each."""
     for warning in warnings:
         print(f"warning: {printable(warning)}", file=sys.stderr)
 
 
 def check_json(path: Path | None, inputs: Iterable[Path], out: Path | None) -> None:
-    """See that the file of ``--json`` can be written before there is anything to be written.
+    """Check that the file of ``--json`` can be written before other output is written.
 
     Args:
-        path: of ``--json``.
-        inputs: files and folders that the command reads, which it must not be one of.
-        out: folder that the command makes, in which it may be.
+        path: argument of ``--json``.
+        inputs: files and folders that the command reads; the file must not be among them.
+        out: folder that the command creates; the file may be in it.
 
     Raises:
-        InputError: it cannot.
+        InputError: the file cannot be written.
     """
     if path is None:
         return
-    # Here because it brings the reader of images, which not every command needs.
+    # Imported here because it loads the reader of images, which not every command needs.
     from mcdenoise.data.files import check_writable
 
     real = os.path.realpath(path)
@@ -94,9 +94,9 @@ def check_json(path: Path | None, inputs: Iterable[Path], out: Path | None) -> N
 
 
 def write_json(path: Path | None, content: Any) -> None:
-    """Write what was printed to the file of ``--json``, if there is one."""
+    """Write the printed results to the file of ``--json``, if it is given."""
     if path is not None:
-        # Here because it brings the reader of images, which not every command needs.
+        # Imported here because it loads the reader of images, which not every command needs.
         from mcdenoise.data.files import write_text
 
         write_text(path, json.dumps(content, indent=2) + "\n")

@@ -1,4 +1,4 @@
-"""How a shot is denoised, as options of several commands."""
+"""The options of a shot, which several commands have."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mcdenoise.shot import ShotSettings
 
 @dataclass(frozen=True)
 class ShotOptions(ShotSettings):
-    """As :class:`mcdenoise.shot.ShotSettings` says; here, how some of it is typed."""
+    """The options for :class:`mcdenoise.shot.ShotSettings`, with types for the command line."""
 
     map: Map = ()
     color_without_albedo: Flag = False

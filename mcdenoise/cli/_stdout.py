@@ -1,4 +1,4 @@
-"""Standard output that cannot be written to does not end a command's work."""
+"""Keeps a command working if its standard output cannot be written."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from mcdenoise.errors import InputError
 
 
 class _Forgiving:
-    """A stream that takes what is written to it, whether or not it can be handed on; the first failure is kept.
+    """A stream that ignores write errors and stores the first one.
 
     Args:
-        stream: a file's, whose descriptor leads nowhere after a failure, so that no later write meets it again.
+        stream: stream of a file; after an error its descriptor is redirected to nowhere, so that later writes succeed.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -43,24 +43,24 @@ class _Forgiving:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, self._stream.fileno())
         os.close(nowhere)
-        # What is in its buffer goes there.
+        # Its buffered contents are discarded there.
         with suppress(OSError):
             self._stream.flush()
 
 
 @contextmanager
 def forgiving_stdout() -> Iterator[None]:
-    """Let a command go on where nobody reads what it prints, such as ``| head``, and print what its encoding lacks.
+    """Ignore closed pipes, such as ``| head``, inside this block, and escape characters that the encoding lacks.
 
     Raises:
-        InputError: at the end, where it could not be written for another reason, such as a full disk.
+        InputError: at the end, if the output could not be written for another reason, such as a full disk.
     """
     stdout = sys.stdout
-    # Another stream is of whoever has put it there.
+    # Another stream has been installed by the caller.
     if stdout is not sys.__stdout__ or stdout is None:
         yield
         return
-    # As Python's own stderr does: a name that ASCII lacks is shown by its number.
+    # Like Python's stderr: characters that the encoding lacks are printed as escapes.
     stdout.reconfigure(errors="backslashreplace")
     sys.stdout = forgiving = _Forgiving(stdout)
     try:

@@ -1,4 +1,4 @@
-"""`mcdenoise benchmark --suite`: renders what is missing, scores it, writes the tables."""
+"""`mcdenoise benchmark --suite`: renders missing frames, computes errors, and writes the tables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mcdenoise.report import check_packages, write_report, write_sample_plots
 from mcdenoise.suite import (
     PEERS,
     SHOWN,
-    Stage,
+    RenderingStep,
     choose_rows,
     error_lines,
     markdown,
@@ -45,20 +45,20 @@ def score_suite(
     rows = choose_rows(patterns)
     if out is None and not render:
         raise InputError("--out: expected a folder to write to with --no-render, found none; give one with -o")
-    # What is wrong with the methods is said before hours of rendering.
+    # Report wrong methods before hours of rendering.
     methods = choose_methods(f"{models or DEFAULT},{PEERS}", precisions="float32", baselines=("noisy",))
     if out is not None:
         check_packages()
     with progress_bar() as progress:
         task = progress.add_task("render", total=None)
 
-        def show(stage: Stage) -> None:
-            described = f"render {stage.shot}, references to {stage.fraction:.0%}"
-            progress.update(task, description=described, completed=stage.done, total=stage.total)
+        def show(step: RenderingStep) -> None:
+            described = f"render {step.shot}, references to {step.fraction:.0%}"
+            progress.update(task, description=described, completed=step.done, total=step.total)
 
         if render:
             shots = list(dict.fromkeys(row.shot for row in rows))
-            render_suite(shots, data, blender_python=blender_python, threads=settings.threads, on_stage=show)
+            render_suite(shots, data, blender_python=blender_python, threads=settings.threads, on_step=show)
     if out is None:
         say(data)
         return 0

@@ -45,41 +45,42 @@ def benchmark(
     render: bool = True,
     json: Json = None,
 ) -> int:
-    """Measure error against run time: any methods and doing nothing, on the same frames, taking turns.
+    """Measure error against run time of methods, baselines included, on the same frames, interleaved.
 
     Writes OUT/index.html, the report, with its plots, results.json, results.csv and images; OUT must not exist.
-    Exit status 1 if a method failed on a scene; one that needs a buffer which the scene has not is skipped there.
-    With --ops, measures the operators instead: time, error, and how near they come to a copy.
+    Exit status 1 if a method failed on a scene; a method is skipped on a scene that lacks a buffer it needs.
+    With --ops, measures the operators instead: run time, error, and run time relative to a copy.
 
     With --suite wild, renders frames that no training uses, by Mitsuba and by Blender's Cycles, to the folder of --data
-    where they are missing, and compares --models with OIDN's best setting of each: OUT/suite.md, suite.json and
-    close-ups. Without --out it only renders. Rendering everything takes hours; it can be stopped and goes on.
+    if they are missing, and compares --models with OIDN's best setting for each: OUT/suite.md, suite.json and
+    close-ups. Without --out it only renders. Rendering everything takes hours; it can be interrupted and resumes.
 
     Args:
         sequences: folders of sequences with references.
-        out: folder to make; needed except with --ops.
-        models: names separated by commas, see `mcdenoise models`, with settings if need be, several at once such as
+        out: folder to create; required except with --ops.
+        models: names separated by commas, see `mcdenoise models`, optionally with settings, several at once such as
             "oidn(quality=fast|high)"; weights files; file.py:factory; "pretrained" for all with shipped weights; "all"
-            for every name there is, saying which have no weights yet; or none. By default those with shipped weights,
-            filters, and other denoisers. Doing nothing and accumulation alone are always there.
-        precisions: precisions of the convolutions of models that learn: float32, bfloat16, and int8 where calibrated.
+            for every model, including those without weights, which are listed as missing; or none. By default those
+            with shipped weights, filters, and other denoisers. The noisy input and accumulation alone are always
+            included.
+        precisions: precisions of the convolutions of trained models: float32, bfloat16, and int8 if calibrated.
         frames: frames of each sequence to denoise, such as 0-59,70; all by default.
-        rounds: how often each method denoises each frame, and each size; 3 by default, 5 with --ops.
+        rounds: number of times that each method denoises each frame, and each size; 3 by default, 5 with --ops.
         threads: CPU threads of all methods; torch's choice by default.
-        busy: cores that other processes keep busy while times are measured, as a renderer beside a denoiser does.
+        busy: number of cores that other processes keep busy while times are measured, to simulate a renderer.
         device: cpu or cuda.
-        sizes: sizes of random images whose cost alone is measured, such as 1280x720,3840x2160, or none.
+        sizes: sizes of synthetic images for measuring run times only, such as 1280x720,3840x2160, or none.
         pictures: number of frames of each scene whose images are kept.
-        keep_all: measure each method that skips anything a second time, skipping nothing, to see what that saves.
+        keep_all: measure each method that skips anything again without skipping, to see what skipping saves.
         ops: measure the operators.
         size: size of the images with --ops, WIDTHxHEIGHT.
         suite: render and score the suite of this name.
         data: folder of the suite's frames.
         rows: rows of the suite to score, such as "cycles-*,mitsuba-parlour-box-4"; all by default.
-        blender_python: a Python that has Blender's module bpy, to render the suite's rows of Cycles; by default that
-            of the environment variable BLENDER_PYTHON, or else this one.
-        render: --no-render scores the rows that are in the folder of --data and renders nothing.
-        json: write what is in results.json, or ops.json, to this file too.
+        blender_python: a Python with Blender's module bpy, for rendering the suite's rows of Cycles; by default that of
+            the environment variable BLENDER_PYTHON, or else this one.
+        render: --no-render uses the rows that are in the folder of --data and renders nothing.
+        json: also write the contents of results.json, or ops.json, to this file.
     """
     keep_heap()
     threads = torch.get_num_threads() if threads is None else threads
@@ -169,6 +170,6 @@ def benchmark(
 
 
 def _command_line(*arguments: object, **options: object) -> str:
-    """A command line with every choice in it, also those that were made by default."""
+    """A command line with all options, including default values."""
     chosen = [f"--{name}={value}" for name, value in options.items() if value is not None]
     return shlex.join(["mcdenoise", *map(str, arguments), *chosen])

@@ -21,16 +21,16 @@ def calibrate(
     out: Out,
     frames: str | None = None,
 ) -> None:
-    """Calibrate weights for --precision int8: add the ranges of all tensors of its U-Nets on some frames.
+    """Calibrate weights for --precision int8: store the value ranges of the U-Nets' tensors on some frames.
 
-    What is brighter than anything in these frames is clamped inside of the network, not in the image: take frames of
-    the kind that will be denoised, such as some of those that the weights were trained on. The weights stay the same.
+    Values beyond the ranges of these frames are clamped inside the network, not in the image: use frames of the kind
+    that will be denoised, such as some of the training frames. The weights do not change.
 
     Args:
         weights: safetensors file of a model with a U-Net.
         sequences: folders of sequences; references are not needed.
-        out: file to write, which may be the same.
-        frames: which frames of each, such as 0-3; all by default.
+        out: file to write; may be the same as the input.
+        frames: frames of each sequence, such as 0-3; all by default.
     """
     if not sequences:
         raise InputError("sequences: expected some frames to calibrate on, found none")

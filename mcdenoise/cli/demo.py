@@ -16,14 +16,14 @@ from mcdenoise.models import DEFAULT
 
 
 def demo(out: Out = Path("demo"), model: str = DEFAULT, json: Json = None) -> None:
-    """Render 16 frames of a small scene at one sample a pixel, denoise them, print errors and times.
+    """Render 16 frames of a small scene at one sample per pixel, denoise them, and print errors and run times.
 
-    Ends with a report of error against run time: all models, filters, and what other denoisers are installed.
+    Finally writes a report of error against run time: all models, filters, and the other denoisers that are installed.
 
     Args:
-        out: folder to write to; what an earlier run rendered there is used again.
-        model: a name with settings, a weights file, or file.py:factory, as of `denoise`.
-        json: write the printed figures to this file too.
+        out: folder to write to; frames rendered there by an earlier run are used again.
+        model: a name with settings, a weights file, or file.py:factory, as for `denoise`.
+        json: also write the printed values to this file.
     """
     keep_heap()
     with progress_bar() as progress:

@@ -25,15 +25,15 @@ def denoise(
     shot: tyro.conf.OmitArgPrefixes[ShotOptions],
     json: Json = None,
 ) -> None:
-    """Denoise the frames of a shot: writes the same files, clean, to OUT, and OUT/denoise.json.
+    """Denoise the frames of a shot: writes files with the same names to OUT, and OUT/denoise.json.
 
     Args:
-        inputs: a folder; files; or a pattern such as 'shot_####.exr', 'shot_%04d.exr' or 'shot_*.exr'. Each may be an
-            EXR with layers, or one file a buffer; `mcdenoise inspect` shows what is taken from where.
-        out: folder to write to: files of the same names, with the radiance replaced and all else as it was
-            (of the BMFR layout: denoisedN.exr).
-        shot: how it is read, denoised and written.
-        json: write the run times to this file too.
+        inputs: a folder; files; or a pattern such as 'shot_####.exr', 'shot_%04d.exr' or 'shot_*.exr'. Each file may be
+            an EXR with layers, or hold a single buffer; `mcdenoise inspect` shows which layer is used for which buffer.
+        out: folder to write to: files of the same names, with the radiance replaced and everything else unchanged
+            (in the BMFR layout: denoisedN.exr).
+        shot: how the shot is read, denoised and written.
+        json: also write the run times to this file.
     """
     keep_heap()
     shot.check()

@@ -25,16 +25,16 @@ def evaluate(
     device: str = "cpu",
     json: Json = None,
 ) -> None:
-    """Compare a folder of denoised images, ours or not, or what a model makes, with the references of a sequence.
+    """Compare a folder of denoised images, from any denoiser, or a model's images with the references of a sequence.
 
     Args:
         sequence: folder of a sequence with references.
-        images: folder of one EXR a frame, such as denoised12.exr or frame.0012.exr, scene-linear RGB.
-        model: compare this model instead: a name with settings, a weights file, or file.py:factory, as of `denoise`.
-        protocol: how a publication computed its numbers; they are printed beside the strict ones.
+        images: folder with one EXR per frame, such as denoised12.exr or frame.0012.exr, scene-linear RGB.
+        model: compare this model instead: a name with settings, a weights file, or file.py:factory, as for `denoise`.
+        protocol: protocol of a publication, whose values are printed in addition to the strict ones.
         frames: frames to compare, such as 0-59,70; all that have a reference by default.
-        device: where the model runs: cpu or cuda.
-        json: write the printed figures to this file too.
+        device: device for the model: cpu or cuda.
+        json: also write the printed values to this file.
     """
     if (images is None) is (model is None):
         raise InputError("expected a folder of images, or --model, and not both; see `mcdenoise evaluate --help`")
@@ -62,7 +62,7 @@ def _print_evaluation(result: Evaluation) -> None:
         columns = []
         for metric in own.mean:
             columns.append((metric, own, "" if own is strict else name))
-            # Only these are the same quantity; a protocol's SMAPE may be one of displayed values.
+            # Only these are comparable; a protocol's SMAPE may be one of displayed values.
             if own is not strict and metric in ("PSNR", "SSIM") and metric in strict.mean:
                 columns.append((metric, strict, "strict"))
         table = Table("frame", *(f"{metric} {of}".strip() for metric, _, of in columns))

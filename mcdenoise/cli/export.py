@@ -25,7 +25,7 @@ def export(
     frames: int = 5,
     json: Json = None,
 ) -> None:
-    """Export a model as one graph: a step with its state as inputs and outputs, for frames of any size.
+    """Export one step of a model as a graph, with the state as inputs and outputs, for frames of any size.
 
     The inputs are the buffers by name and the tensors of the state as state.NAME, zeros before the first frame; the
     outputs are image and next_state.NAME. Takes some minutes.
@@ -35,11 +35,11 @@ def export(
         out: file to write, .onnx or .pt2.
         weights: safetensors file of your own weights for that model.
         buffers: names of the buffers that frames will have, such as color,albedo,normal,depth,motion; by default those
-            of --check, or else all that the model is better with.
-        format: onnx, or torch for torch.export.load; by default that of the file's ending.
-        check: folder of a sequence: run the ONNX graph by onnxruntime over its frames, and print the differences.
+            of --check, or else all that the model uses.
+        format: onnx, or torch for torch.export.load; by default determined by the file name.
+        check: folder of a sequence: run the ONNX graph with onnxruntime on its frames, and print the differences.
         frames: number of frames to check.
-        json: write the names of inputs and outputs, and the differences, to this file too.
+        json: also write the names of inputs and outputs, and the differences, to this file.
     """
     made = create_model(model, pretrained=weights is None, weights=weights)
     sequence = None if check is None else open_sequence(check)

@@ -21,15 +21,15 @@ def gradcheck(
 ) -> int:
     """Check first and second derivatives of operators against finite differences, in float64, number by number.
 
-    A function of your own takes floating-point tensors. What it is tried on is a small tuple of tensors, or several by
-    name, that its file gives as `function.example_inputs`, or as `inputs()` for all functions in it; without either,
-    images of 6 by 5 pixels for all arguments.
+    A function of your own takes floating-point tensors. Its example inputs are a small tuple of tensors, or several by
+    name, which its file provides as `function.example_inputs`, or as `inputs()` for all functions in it; without
+    either, all arguments are images of 6 by 5 pixels.
 
     Args:
         ops: names of operators, or functions of your own, path/to/file.py:function or package.module:function; all
             operators by default.
-        order: 1 for first derivatives alone, such as of a function that can be differentiated once.
-        json: write the results to this file too.
+        order: 1 for first derivatives only, for example of a function that is differentiable once.
+        json: also write the results to this file.
     """
     table = Table("op", "case", "inputs", "result", "seconds")
     with progress_bar() as progress:
@@ -38,7 +38,7 @@ def gradcheck(
     for result in results:
         outcome = "ok" if result.passed else f"FAILED {result.message}"
         row = (result.op, result.case, ", ".join(result.inputs), outcome, f"{result.seconds:.2f}")
-        # What others wrote is no markup.
+        # Escape markup in names from users.
         table.add_row(*map(escape, row))
     show(table)
     write_json(json, [asdict(result) for result in results])

@@ -18,15 +18,15 @@ def inspect(
     color_with_albedo: Flag = False,
     json: Json = None,
 ) -> None:
-    """Show what would be read of the frames of a shot, from where, and why; denoises nothing.
+    """Show which layers of a shot's frames would be read as which buffers, and why; denoises nothing.
 
     Args:
         inputs: a folder; files; or a pattern, as for `mcdenoise denoise`.
-        frames: frames to look at, such as 0-59,70; all by default.
-        map: layer of a buffer whose name does not tell, such as albedo=RGBA.diff; 'motion=' for none.
+        frames: frames to inspect, such as 0-59,70; all by default.
+        map: layer of a buffer if its name does not tell, such as albedo=RGBA.diff; 'motion=' for none.
         color_without_albedo: the noisy color was divided by the albedo.
-        color_with_albedo: the noisy color has the albedo in it.
-        json: write what is shown to this file too.
+        color_with_albedo: the noisy color includes the albedo.
+        json: also write the output to this file.
     """
     opened = ShotSettings(
         frames=frames, map=map, color_without_albedo=color_without_albedo, color_with_albedo=color_with_albedo
@@ -52,17 +52,17 @@ def inspect(
 
 
 def _users(sequence: Sequence) -> dict[str, list[str]]:
-    """The models that look at what few do: parts of the light and samples."""
+    """The models that use optional buffers: parts of the light and samples."""
     if not (found := sorted(LIGHT_PARTS & sequence.buffers)):
         return {}
-    # Here because it imports every model, which takes its time.
+    # Imported here because it imports every model, which takes time.
     from mcdenoise.models import users_of
 
     return users_of(found)
 
 
 def print_sequence(sequence: Sequence) -> None:
-    """Print what was found, what each buffer is taken from, and what is probably wrong."""
+    """Print the layout, the source of each buffer, and warnings."""
     height, width = sequence.size
     numbers = sequence.numbers
     frames = f"frame {numbers[0]}" if len(numbers) == 1 else f"{len(numbers)} frames, {numbers[0]} to {numbers[-1]},"

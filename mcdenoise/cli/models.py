@@ -14,19 +14,19 @@ from mcdenoise.cli._output import show, write_json
 from mcdenoise.models import overview
 
 _MEASURED = ("SMAPE", "ms a frame")
-# What tells motion: a model takes whichever of it there is.
+# Alternative sources of motion: a model uses whichever is available.
 _MOTION = {"motion", "position", "previous_position", "view_projection"}
 
 
 def models(results: Path | None = None, json: Json = None) -> None:
     """List the models by kind: their paper, what they need and use, weights, parameters, and operations per pixel.
 
-    A model uses `motion` if it takes motion, or positions with cameras, or whichever of them there is.
+    A model uses `motion` if it takes motion, or positions with cameras, whichever is available.
 
     Args:
-        results: folder of a finished `mcdenoise benchmark`, for columns of error and run time: means over its scenes
-            of those models that it measured as they are shipped.
-        json: write the list to this file too.
+        results: folder of a finished `mcdenoise benchmark`, for columns with error and run time: means over its scenes,
+            for models that were measured with their shipped weights.
+        json: also write the list to this file.
     """
     measured = _measured(results) if results else {}
     entries = overview()
@@ -52,8 +52,8 @@ def models(results: Path | None = None, json: Json = None) -> None:
 
 
 def _measured(folder: Path) -> dict[str, tuple[str, str]]:
-    """SMAPE and milliseconds of each model, where every scene of a benchmark has both."""
-    # Here because it brings the readers of files, which take their time to load.
+    """SMAPE and milliseconds of each model for which every scene of a benchmark has both."""
+    # Imported here because it loads the readers of files, which takes time.
     from mcdenoise.results import Results
 
     results, found = Results.read(folder), {}

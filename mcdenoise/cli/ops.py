@@ -12,10 +12,10 @@ from mcdenoise.cli._output import show, write_json
 
 
 def ops(json: Json = None) -> None:
-    """List the operators: what they do, what they are differentiable in, and their error in each precision.
+    """List the operators with a description, their differentiable arguments, and their error in each precision.
 
     Args:
-        json: write the list to this file too.
+        json: also write the list to this file.
     """
     entries = overview()
     table = Table("op", "what", "differentiable in", "cases", "float32", "bfloat16", "float16")

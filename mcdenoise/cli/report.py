@@ -14,6 +14,6 @@ def report(folder: tyro.conf.Positional[Path]) -> None:
     """Write FOLDER/index.html and FOLDER/plots/ from the results and pictures of a finished benchmark.
 
     Args:
-        folder: what `mcdenoise benchmark` wrote: results.json and images/.
+        folder: folder written by `mcdenoise benchmark`, with results.json and images/.
     """
     say(write_report(folder))

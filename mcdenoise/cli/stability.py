@@ -6,7 +6,7 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from mcdenoise.check.stability import FRAMES, Check, LongRun, Summary, as_json, parse_dtypes, stages, summarize
+from mcdenoise.check.stability import FRAMES, Check, LongRun, Summary, as_json, check_groups, parse_dtypes, summarize
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import progress_bar, show, write_json
 from mcdenoise.errors import InputError
@@ -21,29 +21,29 @@ def stability(
 ) -> int:
     """Check operators, models and the denoiser on ordinary, stiff and extreme inputs, and over thousands of frames.
 
-    Errors are in units of the dtype's epsilon times the condition number of the case; bounds come from analysis.
+    Errors are in units of the dtype's epsilon times the condition number of the case; bounds are derived by analysis.
 
-    A function of your own takes floating-point tensors, and is compared with itself in float64. What it is tried on is
-    a small tuple of tensors, or several by name, that its file gives as `function.example_inputs`, or as `inputs()` for
-    all functions in it; without either, images of 6 by 5 pixels for all arguments.
+    A function of your own takes floating-point tensors, and is compared with itself in float64. Its example inputs are
+    a small tuple of tensors, or several by name, which its file provides as `function.example_inputs`, or as `inputs()`
+    for all functions in it; without either, all arguments are images of 6 by 5 pixels.
 
     Args:
         ops: names of operators, or functions of your own, path/to/file.py:function or package.module:function; all
             operators by default.
-        models: names with settings if need be, weights files, or file.py:factory; all that can be had by default, none
-            where operators are named.
-        dtypes: precisions to try.
+        models: names, optionally with settings, weights files, or file.py:factory; by default all that are available,
+            or none if operators are named.
+        dtypes: precisions to check.
         frames: length of the long runs.
-        json: write every check to this file too, and the errors of the long runs over time.
+        json: also write every check, and the errors of the long runs over time, to this file.
     """
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
-    chosen = stages(ops or None, models or None, parse_dtypes(dtypes), frames)
+    chosen = check_groups(ops or None, models or None, parse_dtypes(dtypes), frames)
     checks: list[Check] = []
     runs: list[LongRun] = []
     with progress_bar() as progress:
-        for stage in progress.track(chosen, description="stability"):
-            for result in stage.run():
+        for group in progress.track(chosen, description="stability"):
+            for result in group.run():
                 checks.append(result) if isinstance(result, Check) else runs.append(result)
     _print_checks(checks)
     _print_long_runs(runs)
@@ -54,7 +54,7 @@ def stability(
 
 
 def _print_checks(checks: list[Check]) -> None:
-    """One row for each subject, dtype and backend: error and bound of what was nearest to its bound."""
+    """One row for each subject, dtype and backend, with the error that was closest to its bound."""
     if not checks:
         return
     rows: dict[tuple[str, str, str], list[Summary]] = {}
@@ -75,7 +75,7 @@ def _print_checks(checks: list[Check]) -> None:
         elif list(found) == ["runs"]:
             holds, result = "-", f"not run: {found['runs'].worst.message}"
         condition = max(summary.condition for summary in summaries)
-        # What others wrote is no markup.
+        # Escape markup in names from users.
         row = (*key, str(sum(s.checks for s in summaries)), f"{condition:.1g}", *errors, holds, result)
         table.add_row(*map(escape, row))
     show(table)

@@ -1,4 +1,4 @@
-"""Errors against references: of any folder of images, and of any method on a sequence."""
+"""Errors against references, for any folder of images and for any method on a sequence."""
 
 from mcdenoise.evaluate.folder import Evaluation, Table, evaluate_folder, evaluate_method, find_images
 from mcdenoise.evaluate.noise import noise_floor, reference_noise

@@ -1,4 +1,4 @@
-"""Images of a sequence, those of a folder or those that a method makes, against the sequence's references."""
+"""Comparing images with the references of a sequence: images of a folder, or images of a method."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ STRICT: ProtocolName = "strict"
 WARPED, FLICKER = "wRMSE", "flicker"
 _METRICS = {**{name: METRICS[name] for name in USUAL}, "HDR-FLIP": Metric(flip_hdr)}
 _OURS = re.compile(r"denoised(\d+)")
-# The largest motion, in pixels, of a shot in which nothing moves.
+# Largest motion in pixels of a static shot.
 _STILL = 0.05
 
 
 @dataclass
 class Table:
-    """Values of one protocol.
+    """The values of one protocol.
 
     Args:
-        description: how the protocol gets its values.
-        frames: by frame number and metric; a temporal one stands at the later frame of its pair.
-        skipped: why a metric could not be computed, or not for every frame.
+        description: how the protocol computes its values.
+        frames: by frame number and metric; a temporal metric is stored at the later frame of its pair.
+        skipped: by metric, why it could not be computed, or not for every frame.
         shots: metrics of whole shots, with the number of frames.
     """
 
@@ -62,7 +62,7 @@ class Table:
 
     @property
     def mean(self) -> dict[str, float]:
-        """Mean over the frames, by metric, and the metrics of whole shots."""
+        """Mean over the frames by metric, including metrics of whole shots."""
         return {name: sum(own) / len(own) for name, own in self._columns().items()} | {
             name: value for name, (value, _) in self.shots.items()
         }
@@ -84,15 +84,15 @@ class Table:
 
 @dataclass
 class Evaluation:
-    """Errors of the images of a sequence.
+    """The errors of the images of a sequence.
 
     Args:
-        sequence: its name.
+        sequence: name of the sequence.
         images: the folder, or the name of the method.
-        tables: by protocol; ``"strict"`` is always there, with every metric.
-        warping_error: Lai's warping error of the images and of the references, mean over the pairs of frames.
-        reference_noise: the references' own SMAPE against the truth, where the renderer has noted it.
-        floor: what a perfect result would score against references with that noise, by metric.
+        tables: by protocol; ``"strict"`` is always included, with every metric.
+        warping_error: Lai's warping error of the images and of the references, mean over pairs of frames.
+        reference_noise: SMAPE of the references against the truth, if the renderer has stored it.
+        floor: errors of a perfect result against references with that noise, by metric.
     """
 
     sequence: str
@@ -103,7 +103,7 @@ class Evaluation:
     floor: dict[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
-        """For a JSON file; ``null`` stands for the infinite PSNR of equal images."""
+        """Convert to JSON types; ``null`` stands for the infinite PSNR of equal images."""
         tables = {
             name: {
                 "description": table.description,
@@ -132,15 +132,15 @@ def _finite(values: Mapping[str, float]) -> dict[str, float | None]:
 def find_images(folder: Path, numbers: Collection[int]) -> dict[int, Path]:
     """The EXR file of each frame, by the number in its name.
 
-    Files ``denoisedN.exr`` are taken wherever there are any. Else all EXR files of the folder must be named alike up to
-    one number, such as ``frame.0012.exr`` or ``shot02_0012.exr``; a name may hold further numbers that never change.
+    Files ``denoisedN.exr`` take precedence. Otherwise the names of all EXR files of the folder must differ in only one
+    number, such as ``frame.0012.exr`` or ``shot02_0012.exr``; they may contain other numbers that do not change.
 
     Args:
-        folder: of the images.
-        numbers: frames that are needed.
+        folder: folder of the images.
+        numbers: required frames.
 
     Raises:
-        InputError: there is no such folder, the names do not tell the frames, or a frame is missing.
+        InputError: the folder does not exist, the frame numbers are ambiguous, or a frame is missing.
     """
     if not os.path.isdir(folder):
         found = "a file" if os.path.isfile(folder) else "no such folder"
@@ -165,8 +165,8 @@ def find_images(folder: Path, numbers: Collection[int]) -> dict[int, Path]:
 
 
 def _numbered(folder: Path, stems: list[str]) -> list[tuple[int, str]]:
-    """Frame number and file stem, from the one number in which the stems differ."""
-    # Text and numbers alternate: the odd parts are the numbers.
+    """Frame number and file stem, from the only number in which the stems differ."""
+    # re.split alternates text and numbers: odd elements are numbers.
     split = [re.split(r"(\d+)", stem) for stem in stems]
     alike = {tuple(parts[::2]) for parts in split}
     changing = [i for i in range(1, len(split[0]), 2) if len({parts[i] for parts in split if i < len(parts)}) > 1]
@@ -190,20 +190,20 @@ def evaluate_folder(
 ) -> Evaluation:
     """Compare the images of a folder with the references of a sequence.
 
-    Temporal metrics take pairs of frames with successive numbers and references; those along the motion need motion, or
-    positions with cameras; flicker needs shots in which nothing moves by more than 0.05 pixels.
+    Temporal metrics require pairs of consecutive frames with references. Those along the motion also require motion, or
+    positions with cameras; flicker requires shots in which nothing moves by more than 0.05 pixels.
 
     Args:
         sequence: frames with references.
-        folder: an EXR image of each, see :func:`find_images`: alone or among other layers, scene-linear, with the
-            primaries that its ``chromaticities`` state, or else Rec. 709. The references have those that the
-            color files state.
-        protocol: name in :data:`mcdenoise.metrics.PROTOCOLS`; its values come beside the strict ones.
-        on_frame: called with the number of each frame that is done.
+        folder: folder with an EXR image for each frame, see :func:`find_images`, possibly among other layers:
+            scene-linear, with the primaries stated in ``chromaticities``, or else Rec. 709. The references have the
+            primaries stated in the color files.
+        protocol: name in :data:`mcdenoise.metrics.PROTOCOLS`; its values are returned in addition to the strict ones.
+        on_frame: called with the number of each finished frame.
 
     Raises:
-        InputError: the sequence has no references; an image is missing, damaged, of another size, has other channels,
-            or pixels that are not finite; or a buffer has invalid values.
+        InputError: the sequence has no references; an image is missing, damaged, of another size, has other channels or
+            pixels that are not finite; or a buffer has invalid values.
     """
     check_references(sequence)
     files = find_images(folder, sequence.reference_numbers)
@@ -221,14 +221,14 @@ def evaluate_method(
     protocol: ProtocolName = STRICT,
     on_frame: Callable[[int], None] = lambda number: None,
 ) -> Evaluation:
-    """Compare what a method makes of a sequence with its references, without writing it; see :func:`evaluate_folder`.
+    """Compare a method's images of a sequence with its references in memory; see :func:`evaluate_folder`.
 
     Args:
-        sequence: frames with references; those without are denoised too, as a history needs them.
-        denoiser: is reset first.
-        name: what to call the method.
-        protocol: as there.
-        on_frame: as there, also for frames without a reference.
+        sequence: frames with references; frames without are also denoised, for the history.
+        denoiser: the denoiser; it is reset first.
+        name: name of the method.
+        protocol: see :func:`evaluate_folder`.
+        on_frame: see :func:`evaluate_folder`; also called for frames without a reference.
 
     Raises:
         InputError: the sequence has no references, a file is damaged, or a buffer that the method needs is missing.
@@ -255,22 +255,22 @@ def _evaluate(
     protocol: ProtocolName,
     on_frame: Callable[[int], None],
 ) -> Evaluation:
-    """Errors of images, each with its number, frame and reference."""
+    """Compute the errors of images, each with its number, frame and reference."""
     chosen = PROTOCOLS[protocol]
     strict = Table(PROTOCOLS[STRICT].description)
     tables: dict[str, Table] = {STRICT: strict}
     if protocol != STRICT:
         tables[protocol] = Table(chosen.description)
     pairs = _Pairs(strict)
-    past: tuple[int, Tensor, Tensor] | None = None
+    previous: tuple[int, Tensor, Tensor] | None = None
     for number, image, frame, reference in images:
-        before = past[1:] if past is not None and past[0] == number - 1 else None
+        before = previous[1:] if previous is not None and previous[0] == number - 1 else None
         strict.frames[number] = measure(_METRICS, image, reference, before, strict.skipped)
         pairs.add(number, frame, image, reference, before)
         if protocol != STRICT and number in sequence.numbers[chosen.skipped_frames :]:
             own, first = tables[protocol], number - 1 not in sequence.numbers[chosen.skipped_frames :]
             own.frames[number] = measure(chosen.metrics, image, reference, None if first else before, own.skipped)
-        past = number, image, reference
+        previous = number, image, reference
         on_frame(number)
     pairs.finish()
     _explain(strict, [*_temporal(_METRICS), WARPED])
@@ -286,7 +286,7 @@ def _evaluate(
 
 
 class _Pairs:
-    """What needs the motion between frames: the warped errors, and flicker where there is none."""
+    """Metrics that depend on the motion between frames: warped errors, and flicker of static shots."""
 
     def __init__(self, table: Table) -> None:
         self._table = table
@@ -298,17 +298,17 @@ class _Pairs:
     def add(
         self, number: int, frame: Frame, image: Tensor, reference: Tensor, before: tuple[Tensor, Tensor] | None
     ) -> None:
-        """The next frame, and image and reference of its predecessor."""
-        past, self._frame = self._frame, frame
+        """Add the next frame, with image and reference of the previous one."""
+        earlier, self._frame = self._frame, frame
         motion = None
-        if before is not None and past is not None:
-            motion = motion_to_previous(frame, past.view_projection)
+        if before is not None and earlier is not None:
+            motion = motion_to_previous(frame, earlier.view_projection)
             if motion is None:
                 self._table.skipped[WARPED] = "the frames have no motion, and no positions with cameras"
-        if motion is None or before is None or past is None:
+        if motion is None or before is None or earlier is None:
             self._flicker = None
             return
-        surface, previous = surface_before(frame), Surface(past.position, past.normal, past.depth)
+        surface, previous = surface_before(frame), Surface(earlier.position, earlier.normal, earlier.depth)
         clip, truth = torch.stack([before[0], image], 1), torch.stack([before[1], reference], 1)
         try:
             value = float(warped_rmse_srgb(clip, truth, motion, surface, previous))
@@ -327,7 +327,7 @@ class _Pairs:
         self._flicker.add(image, reference)
 
     def finish(self) -> None:
-        """Put the flicker of all static shots into the table, each weighted by its frames."""
+        """Add the flicker of all static shots to the table, weighted by their numbers of frames."""
         frames = sum(shot.frames for shot in self._shots)
         if frames:
             mean = sum(shot.frames * float(shot.value()) for shot in self._shots) / frames
@@ -344,7 +344,7 @@ class _Pairs:
 
 
 def _is_still(motion: Tensor) -> bool:
-    """Whether all motion that is known is next to nothing."""
+    """Whether all known motion is below the limit."""
     length = torch.hypot(motion[:, 0], motion[:, 1])
     known = length[torch.isfinite(length)]
     return known.numel() > 0 and float(known.max()) < _STILL
@@ -355,7 +355,7 @@ def _temporal(metrics: Mapping[str, Metric]) -> list[str]:
 
 
 def _explain(table: Table, temporal: Iterable[str]) -> None:
-    """Say of temporal metrics why there are none, where nothing else has said so."""
+    """Add a reason for missing temporal metrics, unless there is one."""
     counts = table.counts
     for name in temporal:
         if name not in counts:
@@ -372,7 +372,7 @@ def _check_header(path: Path, size: tuple[int, int]) -> None:
 
 
 def _read(sequence: Sequence, number: int, path: Path) -> tuple[Tensor, Frame, Tensor]:
-    """Image, frame and reference, both images with the primaries of Rec. 709."""
+    """Read image, frame and reference; both images are converted to Rec. 709 primaries."""
     image, metadata = open_result(path).read()
     bad = ~torch.isfinite(image).all(1)[0]
     if bad.any():

@@ -1,4 +1,4 @@
-"""How far the references themselves are from the truth, and what that costs a perfect result."""
+"""The noise of the references themselves, and its effect on the errors of a perfect result."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _NOISE_EPSILON = 0.01
 
 
 def reference_noise(sequence: Sequence) -> float | None:
-    """How noisy the references themselves are: the mean over the frames of what the renderer has noted.
+    """The noise of the references, as estimated and stored by the renderer.
 
     Returns:
-        The mean of ``reference_noise`` in ``camera.json``, by frame number: the references' own SMAPE against the
-        truth, as estimated by the renderer. ``None`` where nothing is noted.
+        The mean over the frames of ``reference_noise`` in ``camera.json``: the SMAPE of the references against the
+        truth. ``None`` if it is not stored.
     """
     noise = _noted(sequence)
     return sum(noise.values()) / len(noise) if noise else None
@@ -29,24 +29,24 @@ def reference_noise(sequence: Sequence) -> float | None:
 
 @torch.inference_mode()
 def noise_floor(sequence: Sequence, *, metrics: Collection[str] = ("SMAPE", "tSMAPE", "tRMSE")) -> dict[str, float]:
-    """What the truth itself would score against references as noisy as these: no method can be told from it there.
+    """Estimate the errors that the truth itself would have against these references; smaller errors are meaningless.
 
-    An estimate: the references are taken for the truth, and copies of them with the noise that the renderer has noted
-    for the references. The noise is Gaussian, its standard deviation ``s sqrt(pi / 2) (2 y + 0.01)``, where ``s`` is
-    the noted SMAPE of the frame, independent in each pixel, channel and frame. Real noise is uneven and has outliers:
-    in the demonstration's room, with 32 paths a pixel, SMAPE, tSMAPE and tRMSE come out 13 to 21 % too low. RMSE is not
-    to be had in this way: bright emitters, which have no noise, would get the most.
+    The references are taken as the truth, and compared with copies to which noise of the stored strength is added. The
+    noise is Gaussian with the standard deviation ``s sqrt(pi / 2) (2 y + 0.01)``, where ``s`` is the stored SMAPE of
+    the frame, independent in each pixel, channel and frame. Real noise is uneven and has outliers: in the
+    demonstration's room with 32 paths per pixel, SMAPE, tSMAPE and tRMSE are underestimated by 13 to 21 %. RMSE cannot
+    be estimated in this way, because bright emitters, which have no noise, would get the most.
 
     Args:
         sequence: frames with references.
         metrics: names in :data:`METRICS`.
 
     Returns:
-        Mean over the frames, or pairs of successive frames, whose noise is noted, by metric; empty where none is. What
-        cannot be computed is skipped.
+        Mean by metric over the frames, or pairs of consecutive frames, with stored noise; empty if there are none.
+        Metrics that cannot be computed are omitted.
     """
     values: dict[str, list[float]] = {}
-    past = None
+    previous = None
     noise = _noted(sequence)
     for number, smape in noise.items():
         truth = sequence.reference(number)
@@ -54,20 +54,20 @@ def noise_floor(sequence: Sequence, *, metrics: Collection[str] = ("SMAPE", "tSM
         deviation = smape * math.sqrt(math.pi / 2) * (2 * truth + _NOISE_EPSILON)
         noisy = (truth + deviation * torch.randn(truth.shape, generator=generator)).clamp_min(0)
         chosen = {name: METRICS[name] for name in metrics}
-        for name, value in measure(chosen, truth, noisy, past if number - 1 in noise else None).items():
+        for name, value in measure(chosen, truth, noisy, previous if number - 1 in noise else None).items():
             values.setdefault(name, []).append(value)
-        past = truth, noisy
+        previous = truth, noisy
     return {name: sum(own) / len(own) for name, own in values.items()}
 
 
 def _noted(sequence: Sequence) -> dict[int, float]:
-    """Noise of each reference in use, where ``camera.json`` has it."""
+    """The stored noise of each reference in use."""
     for path in (sequence.root / "camera.json", sequence.root / "inputs" / "camera.json"):
         if path.is_file():
             try:
                 noted = json.loads(read_text(path)).get("reference_noise")
             except (OSError, ValueError, AttributeError, RecursionError):
-                # Somebody else's: that of a folder in our layout has been read before.
+                # A file of another program; that of a folder in our layout has been checked before.
                 return {}
             if noted is None:
                 return {}

@@ -1,4 +1,4 @@
-"""The metrics that methods are compared by, and those of one image."""
+"""The standard metrics, and their values for one image."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ METRICS: dict[str, Metric] = {
     "FLIP": Metric(flip_srgb),
     "tSMAPE": Metric(temporal_smape_linear, temporal=True),
     "tRMSE": Metric(temporal_rmse_srgb, temporal=True),
-    # For comparison with tables of others: not computed unless it is asked for.
+    # Only for comparison with published tables: computed on request.
     "PSNR 2.2": Metric(psnr_gamma, higher_is_better=True),
 }
 USUAL = tuple(name for name in METRICS if name != "PSNR 2.2")
@@ -42,25 +42,25 @@ def measure(
     metrics: Mapping[str, Metric],
     image: Tensor,
     reference: Tensor,
-    past: tuple[Tensor, Tensor] | None = None,
+    previous: tuple[Tensor, Tensor] | None = None,
     skipped: dict[str, str] | None = None,
 ) -> dict[str, float]:
-    """Every metric of one frame that can be computed.
+    """Compute every metric of one frame that is possible.
 
     Args:
-        metrics: by name.
+        metrics: metrics by name.
         image: ``(1, 3, H, W)`` scene-linear radiance.
-        reference: of the same shape.
-        past: image and reference of the frame before; without them there are no temporal metrics.
-        skipped: gets the reason for each metric that these images, or this installation, do not allow.
+        reference: the same shape.
+        previous: image and reference of the previous frame; without them there are no temporal metrics.
+        skipped: receives the reason for each metric that cannot be computed.
     """
     values = {}
     for name, metric in metrics.items():
         try:
             if not metric.temporal:
                 values[name] = float(metric.function(image, reference))
-            elif past is not None:
-                clip, truth = torch.stack([past[0], image], 1), torch.stack([past[1], reference], 1)
+            elif previous is not None:
+                clip, truth = torch.stack([previous[0], image], 1), torch.stack([previous[1], reference], 1)
                 values[name] = float(metric.function(clip, truth))
         except UncomputableError as error:
             if skipped is not None:
@@ -69,10 +69,10 @@ def measure(
 
 
 def check_references(sequence: Sequence) -> None:
-    """See that there is something to compare with.
+    """Check that a sequence has references.
 
     Raises:
-        InputError: the sequence has no references.
+        InputError: it has none.
     """
     if not sequence.reference_numbers:
         raise InputError(f"{sequence.root}: expected references to compare with, found none; render them")

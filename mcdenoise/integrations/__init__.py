@@ -1,1 +1,1 @@
-"""Denoising inside a renderer: one module for each, which imports the renderer on first use."""
+"""Denoising inside renderers: one module per renderer, which imports the renderer on first use."""

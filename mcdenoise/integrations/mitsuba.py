@@ -1,6 +1,6 @@
-"""In the place of ``mi.OptixDenoiser``: the same arguments, with every method of the zoo, on any processor.
+"""A replacement of ``mi.OptixDenoiser``: the same arguments, with every method of the zoo, on any processor.
 
-Dr.Jit and Mitsuba are optional (``pip install 'mcdenoise[render]'``) and imported when a denoiser is made.
+Dr.Jit and Mitsuba are optional (``pip install 'mcdenoise[render]'``) and imported when a denoiser is created.
 """
 
 from __future__ import annotations
@@ -20,62 +20,62 @@ from mcdenoise.frame import Frame
 from mcdenoise.models import DEFAULT, Model
 
 _ROOT = "<root>"
-# Color, and alpha where there is one; a monochromatic variant renders luminance.
+# Number of channels: color, optionally followed by alpha; a monochromatic variant renders luminance.
 _FORMATS = ("Y", "YA", "RGB", "RGBA")
 _CHANNELS = {"albedo": 3, "normals": 3, "flow": 2}
 
 
 class MitsubaDenoiser:
-    """Denoises what Mitsuba 3 renders, called as ``mi.OptixDenoiser`` (Mitsuba 3.9) is called.
+    """Denoises images of Mitsuba 3; it is called like ``mi.OptixDenoiser`` (Mitsuba 3.9).
 
-    A script changes in the line that makes the denoiser. What differs then: it runs in every variant and on every
-    processor, and gradients of a ``TensorXf`` go through it.
+    A script changes only in the line that creates the denoiser. The differences are that it runs in every variant and
+    on every processor, and that gradients of a ``TensorXf`` pass through it.
 
-    **Bitmaps** come back in the pixel format of what was noisy, as float32 and linear; a bitmap of another component
-    format, or encoded for a display, is converted first.
+    **Bitmaps** are returned in the pixel format of the noisy layer, as float32 and linear; a bitmap with another
+    component format, or encoded for a display, is converted first.
 
-    **Tensors** come back as tensors of the same shape. In a variant that differentiates (``llvm_ad_rgb``,
-    ``cuda_ad_rgb``), derivatives in ``noisy``, ``albedo``, ``normals`` and ``flow`` go through :func:`drjit.wrap`,
-    backward and forward, if one of them has gradients enabled; if none has, no graph is kept. Decisions are held fixed,
-    see ``differentiable`` of :class:`mcdenoise.Denoiser`. A history counts as a constant: gradients do not reach the
-    frames before. Parameters of a model given by name have no gradients; those of a module of yours get theirs.
+    **Tensors** are returned as tensors of the same shape. In a differentiable variant (``llvm_ad_rgb``,
+    ``cuda_ad_rgb``), derivatives in ``noisy``, ``albedo``, ``normals`` and ``flow`` pass through :func:`drjit.wrap`,
+    backward and forward, if one of them has gradients enabled; otherwise no graph is kept. Decisions are treated as
+    constants, see ``differentiable`` of :class:`mcdenoise.Denoiser`. The history is also a constant: gradients do not
+    reach earlier frames. Parameters of a model given by name have no gradients; those of your own module do.
 
-    **Temporal denoising**: this denoiser keeps its own history, which is more than the image before (the radiance that
-    was accumulated, its length, the surfaces that were seen), and so takes no image from ``previous_denoised``. That
-    argument only tells where a shot begins: with ``None``, or with the noisy image itself (which OptiX asks for in the
-    first frame), the history is forgotten; with anything else, such as the result of the call before, it goes on. The
-    frames of a shot are to be given in order, each once.
+    **Temporal denoising**: this denoiser keeps its own history, which is more than the previous image (accumulated
+    radiance, history length, surfaces), so it does not use the image in ``previous_denoised``. That argument only tells
+    where a shot begins: ``None``, or the noisy image itself (which OptiX requires in the first frame), resets the
+    history; anything else, such as the previous result, continues the shot. Pass the frames of a shot in order, each
+    once.
 
-    **Flow** is that of OptiX: pixels, x right and y down, from where a point was in the previous frame to where it is
-    now, ``previous = current - flow``. (NVIDIA's Falcor hands the negative of its motion vectors, which lead from the
+    **Flow** is that of OptiX: pixels, x right and y down, from a point's position in the previous frame to its current
+    one, ``previous = current - flow``. (NVIDIA's Falcor passes the negative of its motion vectors, which point from the
     current to the previous frame, to OptiX.) Zeros mean that nothing moves.
 
-    **Normals** may be in world space, as the ``aov`` integrator writes them, or in that of the sensor. ``to_sensor`` is
-    accepted and not needed: methods compare normals with each other and with those of the frame before, which in world
-    space stay what they are while the camera turns.
+    **Normals** may be in world space, as the ``aov`` integrator writes them, or in sensor space. ``to_sensor`` is
+    accepted but not needed: methods compare normals with one another and with previous ones, and in world space these
+    do not change when the camera turns.
 
-    Values that an ``aov`` integrator is known to write are mended: albedo is clamped to [0, 1] (a rough conductor
-    reaches 93), normals to [-1, 1] (reconstruction filters overshoot). Pixels of the color that are NaN, infinite,
-    negative or above 1e16 are replaced, see ``denoiser.report``.
+    Invalid values that an ``aov`` integrator is known to write are repaired: albedo is clamped to [0, 1] (a rough
+    conductor reaches 93), normals to [-1, 1] (reconstruction filters overshoot). Pixels of the color that are NaN,
+    infinite, negative or above 1e16 are replaced, see ``denoiser.report``.
 
     Args:
         input_size: width and height of every image.
-        albedo: whether the renderer's albedo will be given, too. What is given without having been announced is not
-            looked at, as by OptiX.
-        normals: whether shading normals will be given; unlike OptiX, also without albedo.
-        temporal: whether calls are the frames of a shot, with flow; else each is a still.
-        denoise_alpha: whether alpha, the second or fourth channel, is denoised, too, with the kernels of the color;
-            else, and by a method without kernels, it stays as it is.
-        model: as of :class:`mcdenoise.Denoiser`.
-        device: of torch. By default a GPU for the CUDA variants, where torch has one, else the CPU.
-        precision: as of :class:`mcdenoise.Denoiser`.
-        settings: its further arguments (``weights``, ``tile``, ``max_memory``), and settings of the model.
+        albedo: whether the albedo will be passed. A buffer that was not announced here is ignored, as by OptiX.
+        normals: whether shading normals will be passed; unlike OptiX, also without albedo.
+        temporal: whether calls are the frames of a shot, with flow; otherwise each is a still.
+        denoise_alpha: whether alpha, the second or fourth channel, is also denoised, with the kernels of the color;
+            otherwise, and by a method without kernels, it is kept.
+        model: see :class:`mcdenoise.Denoiser`.
+        device: torch device. By default a GPU for the CUDA variants, if torch has one, else the CPU.
+        precision: see :class:`mcdenoise.Denoiser`.
+        settings: further arguments of :class:`mcdenoise.Denoiser` (``weights``, ``tile``, ``max_memory``), and settings
+            of the model.
 
     Attributes:
-        denoiser: the :class:`mcdenoise.Denoiser` as it was after the last call; its ``report`` says what was done.
+        denoiser: the :class:`mcdenoise.Denoiser`; its ``report`` describes the last call.
 
     Raises:
-        InputError: Mitsuba is missing, the size is none, or :class:`mcdenoise.Denoiser` refuses its arguments.
+        InputError: Mitsuba is missing, the size is invalid, or :class:`mcdenoise.Denoiser` rejects its arguments.
 
     Example:
         ::
@@ -145,23 +145,22 @@ class MitsubaDenoiser:
 
         For a ``mi.TensorXf`` the arguments are ``(noisy, albedo=None, normals=None, to_sensor=None, flow=None,
         previous_denoised=None)``, all tensors ``(height, width, channels)``; for a ``mi.Bitmap`` they are ``(noisy,
-        albedo_ch="", normals_ch="", to_sensor=None, flow_ch="", previous_denoised_ch="", noisy_ch="<root>")``, names of
-        layers in it.
+        albedo_ch="", normals_ch="", to_sensor=None, flow_ch="", previous_denoised_ch="", noisy_ch="<root>")``, with
+        names of layers.
 
         Args:
-            noisy: radiance, 3 or 4 channels, of a monochromatic variant 1 or 2: with alpha behind. A bitmap of several
-                layers holds the other buffers, too.
-            arguments: see above; the meaning of each is that of ``mi.OptixDenoiser``, as far as the class does not say
-                otherwise.
-            named: the same by name.
+            noisy: radiance with 3 or 4 channels, in a monochromatic variant 1 or 2; alpha is last. A bitmap of several
+                layers also holds the other buffers.
+            arguments: see above; they have the meaning of ``mi.OptixDenoiser``, except as stated in the class.
+            named: the same arguments by name.
 
         Returns:
-            Clean radiance: a tensor of the shape of ``noisy``, or a float32 bitmap with the pixel format of the noisy
-            layer. Alpha is kept.
+            Denoised radiance: a tensor of the shape of ``noisy``, or a float32 bitmap with the pixel format of the
+            noisy layer. Alpha is kept.
 
         Raises:
-            InputError: a buffer that was announced is not given, a layer is not there, a buffer has another size or
-                number of channels, or values that no denoiser can use.
+            InputError: an announced buffer is missing, a layer does not exist, or a buffer has another size or number
+                of channels, or invalid values.
         """
         if isinstance(noisy, self._mi.Bitmap):
             return self._bitmap(noisy, *arguments, **named)
@@ -223,7 +222,7 @@ class MitsubaDenoiser:
         for name, each in given.items():
             if each is not None and not self._dr.is_tensor_v(each):
                 raise InputError(f"{name}: expected a TensorXf like noisy, found {type(each).__name__}")
-        # As in Mitsuba, an empty tensor is one that is not given.
+        # As in Mitsuba, an empty tensor counts as missing.
         given = {name: each for name, each in given.items() if each is not None and len(each)}
         last = given.pop("previous_denoised", None)
         given = {name: each for name, each in given.items() if self._announced[name]}
@@ -235,8 +234,8 @@ class MitsubaDenoiser:
         return self._differentiable(noisy, given)
 
     def _differentiable(self, noisy: Any, given: Mapping[str, Any]) -> Any:
-        """The step as an operation of Dr.Jit."""
-        # Dr.Jit may compute the function again for derivatives forward: each time from the history before the frame.
+        """Run the step as an operation of Dr.Jit."""
+        # Dr.Jit may call the function again for forward derivatives: always start from the history before the frame.
         before, after = self.denoiser, []
 
         def step(color: Tensor, buffers: dict[str, Tensor]) -> Tensor:
@@ -256,7 +255,7 @@ class MitsubaDenoiser:
         return clean
 
     def _begin(self, noisy: Tensor, previous: Tensor | None) -> None:
-        """Forget the history where a shot begins."""
+        """Reset the history at the beginning of a shot."""
         if not self._temporal:
             self.denoiser.reset(frames=1)
         elif previous is None or torch.equal(previous.nan_to_num(), noisy.nan_to_num()):
@@ -265,7 +264,7 @@ class MitsubaDenoiser:
     def _step(
         self, denoiser: Denoiser, noisy: Tensor, buffers: Mapping[str, Tensor], *, differentiable: bool
     ) -> Tensor:
-        """Denoise ``(H, W, C)`` images, and keep the history in this denoiser."""
+        """Denoise ``(H, W, C)`` images, and store the history in this denoiser."""
         colors = 3 if noisy.shape[2] > 2 else 1
         color, alpha = _planes(noisy[..., :colors]).expand(-1, 3, -1, -1), _planes(noisy[..., colors:])
         features: dict[str, Any] = {}
@@ -286,7 +285,7 @@ class MitsubaDenoiser:
         return torch.cat([clean, alpha], 1)[0].permute(1, 2, 0).contiguous()
 
     def _checked(self, noisy: Tensor, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The buffers that were announced, all of the size that was."""
+        """The announced buffers, all of the announced size."""
         width, height = self._size
         sized = f"for images of {width}x{height} (width x height)"
         if noisy.ndim != 3 or noisy.shape[2] not in (1, 2, 3, 4) or noisy.shape[:2] != (height, width):
@@ -310,7 +309,7 @@ class MitsubaDenoiser:
 
     def _read(self, bitmap: Any) -> Tensor:
         """``(H, W, C)`` linear float32 pixels."""
-        # Mitsuba converts no channels that it has no name for; those of vectors are numbers as they are.
+        # Mitsuba does not convert channels with unknown names; those of vectors need no conversion.
         if bitmap.pixel_format() != self._mi.Bitmap.PixelFormat.MultiChannel:
             bitmap = bitmap.convert(component_format=self._mi.Struct.Type.Float32, srgb_gamma=False)
         pixels = torch.from_numpy(np.array(bitmap).astype(np.float32))
@@ -322,7 +321,7 @@ def _planes(image: Tensor) -> Tensor:
 
 
 def _size(input_size: Any) -> tuple[int, int]:
-    # A vector of Dr.Jit has an axis for its lanes.
+    # A Dr.Jit vector has an additional axis.
     sizes = np.ravel(np.array(input_size)).tolist()
     if len(sizes) != 2 or any(int(each) != each or each < 1 for each in sizes):
         raise InputError(f"input_size: expected width and height in pixels, found {input_size}")

@@ -1,6 +1,6 @@
-"""How far an image is from its reference: one value for each image, with the domain in the name.
+"""Image metrics: one value for each image; function names state the domain.
 
-Images are ``(..., 3, H, W)`` scene-linear radiance; whatever stands before the last three axes is a batch.
+Images are ``(..., 3, H, W)`` scene-linear radiance; all axes before the last three are batch axes.
 """
 
 from mcdenoise.metrics._check import UncomputableError

@@ -1,4 +1,4 @@
-"""What images and clips must be alike in."""
+"""Checks that images and clips match."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from mcdenoise.errors import InputError
 
 
 class UncomputableError(InputError):
-    """A metric that these images, or this installation, do not allow; the message says why."""
+    """A metric cannot be computed for these images or in this installation; the message states the reason."""
 
 
 def check_images(image: Tensor, reference: Tensor) -> None:
-    """``ValueError`` for shapes that differ, ``TypeError`` for integers, which wrap around, and complex numbers."""
+    """Raise ``ValueError`` for different shapes, ``TypeError`` for integers, which wrap around, and complex numbers."""
     for name, tensor in (("image", image), ("reference", reference)):
         if not tensor.is_floating_point():
             raise TypeError(f"{name}: expected a floating-point dtype, found {tensor.dtype}")

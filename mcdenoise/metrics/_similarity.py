@@ -1,4 +1,4 @@
-"""Structural similarity in the forms that published numbers were computed with."""
+"""Structural similarity in the variants of published results."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch.nn.functional import avg_pool2d, conv2d
 from mcdenoise.metrics._check import UncomputableError
 
 _K1, _K2 = 0.01, 0.03
-# Of the five scales, from fine to coarse: Wang, Simoncelli and Bovik 2003, Sec. 3.2.
+# Weights of the five scales, from fine to coarse: Wang, Simoncelli and Bovik 2003, Sec. 3.2.
 _SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
@@ -28,17 +28,17 @@ def uniform(size: int = 7) -> Tensor:
 def similarity(
     image: Tensor, reference: Tensor, window: Tensor, data_range: float, *, sample_covariance: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Structural similarity of every channel, over those pixels whose window lies within the image.
+    """Structural similarity of every channel, over the pixels whose window lies inside the image.
 
     With local means, variances and covariance under the window: ``SSIM = mean(l cs)``,
     ``l = (2 ux uy + C1) / (ux^2 + uy^2 + C1)``, ``cs = (2 sxy + C2) / (sx^2 + sy^2 + C2)``, ``C = (K data_range)^2``.
 
     Args:
         image: ``(B, C, H, W)``.
-        reference: of the same shape.
+        reference: the same shape.
         window: ``(size,)`` weights, applied in both directions.
-        data_range: of the values.
-        sample_covariance: divide by the number of pixels less one; for a window of equal weights.
+        data_range: range of the values.
+        sample_covariance: divide by the number of pixels minus one; for windows of equal weights.
 
     Returns:
         ``(B, C)`` mean SSIM, and ``(B, C)`` mean cs.
@@ -73,14 +73,14 @@ def multiscale_similarity(image: Tensor, reference: Tensor, data_range: float) -
 
     Args:
         image: ``(B, C, H, W)``.
-        reference: of the same shape.
-        data_range: of the values.
+        reference: the same shape.
+        data_range: range of the values.
 
     Returns:
         ``(B, C)`` in [0, 1].
 
     Raises:
-        UncomputableError: the images are not larger than 160 pixels, too small for five scales.
+        UncomputableError: a side is at most 160 pixels, which is too small for five scales.
 
     Source: Wang, Simoncelli and Bovik 2003.
     """

@@ -1,4 +1,4 @@
-"""Errors of what a display shows: clamped to [0, 1] on the sRGB curve, or (HDR-FLIP) at every exposure."""
+"""Errors of displayed images: clamped to [0, 1] on the sRGB curve, or (HDR-FLIP) at several exposures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcdenoise.metrics._check import UncomputableError, check_images
 
 _SSIM_WINDOW = 11
 _LARGEST = 65504.0
-# Of a reference darker than this HDR-FLIP finds no exposures, and ends the process.
+# HDR-FLIP finds no exposures for a darker reference and ends the process.
 _BLACK = 1e-5
 
 
@@ -31,7 +31,7 @@ def displayed(image: Tensor) -> Tensor:
 
 
 def display_codes(image: Tensor) -> Tensor:
-    """What :func:`displayed` gives as 8-bit codes: ``round(255 displayed)``.
+    """Convert to 8-bit codes: ``round(255 displayed)``, see :func:`displayed`.
 
     Args:
         image: ``(..., 3, H, W)`` scene-linear radiance, Rec. 709 primaries; no NaN.
@@ -67,12 +67,12 @@ def psnr_srgb(image: Tensor, reference: Tensor) -> Tensor:
 
 
 def psnr_gamma(image: Tensor, reference: Tensor, *, gamma: float = 2.2) -> Tensor:
-    """Peak signal-to-noise ratio of values clamped to [0, 1] on a plain power curve, peak 1.
+    """Peak signal-to-noise ratio of values clamped to [0, 1] on a power curve, peak 1.
 
     Args:
         image: ``(..., 3, H, W)`` scene-linear radiance.
         reference: of the same shape.
-        gamma: the values are raised to ``1 / gamma``.
+        gamma: values are raised to ``1 / gamma``.
 
     Returns:
         ``(...)`` decibels, higher is better; infinite for equal images.
@@ -93,8 +93,8 @@ def psnr_gamma(image: Tensor, reference: Tensor, *, gamma: float = 2.2) -> Tenso
 def ssim_srgb(image: Tensor, reference: Tensor) -> Tensor:
     """Structural similarity as displayed: clamped to [0, 1], sRGB curve, data range 1.
 
-    Gaussian window of 11x11 pixels with sigma 1.5, K1 = 0.01, K2 = 0.03, weighted (not sample) covariance, each channel
-    by itself; the mean over channels and those pixels whose window lies within the image. It is
+    Gaussian window of 11x11 pixels with sigma 1.5, K1 = 0.01, K2 = 0.03, weighted (not sample) covariance, for each
+    channel; the mean over channels and over the pixels whose window lies within the image. It is
     ``kornia.metrics.ssim`` with ``padding="valid"``, and agrees with scikit-image's ``structural_similarity`` with
     ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1``; published values with that
     function's defaults (7x7 uniform window, and once a data range of 2) are higher.
@@ -129,7 +129,7 @@ def ssim_srgb(image: Tensor, reference: Tensor) -> Tensor:
 
 
 def flip_srgb(image: Tensor, reference: Tensor) -> Tensor:
-    """Mean LDR-FLIP as displayed: clamped to [0, 1], sRGB curve, 67 pixels a degree; what a viewer sees on flipping.
+    """Mean LDR-FLIP as displayed: clamped to [0, 1], sRGB curve, 67 pixels per degree.
 
     Computed by the authors' ``flip-evaluator``, on the CPU, about 1 microsecond a pixel; no gradient.
 
@@ -151,14 +151,14 @@ def flip_srgb(image: Tensor, reference: Tensor) -> Tensor:
 
 
 def flip_hdr(image: Tensor, reference: Tensor) -> Tensor:
-    """Mean HDR-FLIP: the worst LDR-FLIP of each pixel over the exposures that the reference's luminances call for.
+    """Mean HDR-FLIP: the worst LDR-FLIP of each pixel over exposures chosen by the reference's luminances.
 
     Scene-linear radiance, not clamped; every exposure goes through the ACES curve of the metric's authors. 67 pixels a
-    degree. Computed by the authors' ``flip-evaluator`` with its defaults, on the CPU; as slow as so many LDR-FLIPs as
-    there are exposures (2 to about 15). No gradient.
+    degree. Computed by the authors' ``flip-evaluator`` with its defaults, on the CPU; it takes the time of
+    one LDR-FLIP per exposure (2 to about 15). No gradient.
 
     Args:
-        image: ``(..., 3, H, W)`` scene-linear radiance; what is outside [0, 65504] is clamped.
+        image: ``(..., 3, H, W)`` scene-linear radiance, clamped to [0, 65504].
         reference: of the same shape.
 
     Returns:
@@ -182,7 +182,7 @@ def flip(image: Tensor, reference: Tensor, dynamic_range: Literal["LDR", "HDR"])
     Args:
         image: ``(..., 3, H, W)`` in [0, 1] on the sRGB curve for ``"LDR"``, else scene-linear and at least 0.
         reference: of the same shape.
-        dynamic_range: which of the two metrics.
+        dynamic_range: selects the metric.
 
     Returns:
         ``(...)`` in [0, 1], lower is better.

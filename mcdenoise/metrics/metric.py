@@ -1,4 +1,4 @@
-"""What a metric is to those who compute and compare many of them."""
+"""The description of a metric."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Metric:
-    """How to compare an image with its reference.
+    """A metric with its properties.
 
     Args:
-        function: of image and reference, ``(1, 3, H, W)``, or of two clips, ``(1, 2, 3, H, W)``.
-        higher_is_better: whether it is a similarity; else it is an error.
-        temporal: whether it takes pairs of successive frames.
+        function: takes image and reference, ``(1, 3, H, W)``, or two clips, ``(1, 2, 3, H, W)``.
+        higher_is_better: whether it is a similarity rather than an error.
+        temporal: whether it takes pairs of consecutive frames.
     """
 
     function: Callable[[Tensor, Tensor], Tensor]
@@ -23,5 +23,5 @@ class Metric:
     temporal: bool = False
 
     def better(self, value: float, other: float) -> bool:
-        """Whether the first value is better than the other; equal ones are not."""
+        """Whether the first value is strictly better than the second."""
         return value > other if self.higher_is_better else value < other

@@ -1,7 +1,7 @@
-"""How published numbers were computed: tone curve, rounding, windows, data range, and what is left out.
+"""Protocols of published results: tone curve, rounding, windows, data range, and excluded pixels.
 
-A number means little without its protocol: at the same error the SSIM of ``meng2020`` is higher than that of
-``strict`` by 0.04 to 0.1.
+A value means little without its protocol: at the same error, the SSIM of ``meng2020`` is higher than that of ``strict``
+by 0.04 to 0.1.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from mcdenoise.metrics.metric import Metric
 
 ProtocolName = Literal["strict", "meng2020", "fan2021", "noisebase"]
 
-# Both codes write 1 / 2.2 in this way.
+# Both public codes write 1 / 2.2 in this way.
 _GAMMA = 0.454545
 # The ACES fit by Stephen Hill (BakingLab): linear sRGB to the curve's space and back, and the curve between.
 _ACES_IN = ((0.59719, 0.35458, 0.04823), (0.07600, 0.90834, 0.01566), (0.02840, 0.13383, 0.83777))
 _ACES_OUT = ((1.60475, -0.53108, -0.07367), (-0.10208, 1.10813, -0.00605), (-0.00327, -0.07276, 1.07602))
 _REC709_LUMINANCE = (0.2126, 0.7152, 0.0722)
-# Noisebase renders 1080 rows and leaves out as many at the top and at the bottom, so that 1024 remain.
+# Noisebase renders 1080 rows and excludes equally many at the top and at the bottom, so that 1024 remain.
 _NOISEBASE_ROWS, _NOISEBASE_CUT = 1080, 28
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """What a publication did to get its numbers from scene-linear images.
+    """The computation of a publication's values from scene-linear images.
 
     Args:
-        description: tone curve, rounding, SSIM and what is left out, in one line.
-        show: the values it compares, of ``(..., 3, H, W)`` scene-linear radiance.
-        metrics: by name, of scene-linear radiance like those of :mod:`mcdenoise.metrics`.
-        skipped_frames: so many frames at the start of a sequence are not compared.
-        missing: what it also defines and is not computed here, with the reason.
+        description: tone curve, rounding, SSIM and excluded pixels, in one line.
+        show: maps ``(..., 3, H, W)`` scene-linear radiance to the values that are compared.
+        metrics: by name, for scene-linear radiance like those of :mod:`mcdenoise.metrics`.
+        skipped_frames: number of frames at the start of a sequence that are not compared.
+        missing: metrics of the protocol that are not computed here, with the reason.
     """
 
     description: str
@@ -51,7 +51,7 @@ class Protocol:
 
 
 def gamma_displayed(image: Tensor) -> Tensor:
-    """Scene-linear radiance by a plain gamma: ``min(max(x, 0)^0.454545, 1)``, as Meng et al. and Fan et al. show it.
+    """Gamma-map radiance: ``min(max(x, 0)^0.454545, 1)``, as Meng et al. and Fan et al. display it.
 
     Args:
         image: scene-linear radiance of any shape.
@@ -63,7 +63,7 @@ def gamma_displayed(image: Tensor) -> Tensor:
 
 
 def aces_displayed(image: Tensor) -> Tensor:
-    """Scene-linear radiance by Stephen Hill's fit of the ACES curves, clamped to [0, 1], then a gamma of 1/2.2.
+    """Map radiance by Stephen Hill's fit of the ACES curves, clamped to [0, 1], then by a gamma of 1/2.2.
 
     Args:
         image: ``(..., 3, H, W)`` scene-linear radiance, Rec. 709 primaries.
@@ -93,7 +93,7 @@ def _show_noisebase(image: Tensor) -> Tensor:
 def _of_shown(
     show: Callable[[Tensor], Tensor], function: Callable[[Tensor, Tensor], Tensor]
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """A metric of shown values as one of scene-linear radiance."""
+    """Convert a metric of displayed values to one of scene-linear radiance."""
 
     def metric(image: Tensor, reference: Tensor) -> Tensor:
         check_images(image, reference)
@@ -115,7 +115,7 @@ def _psnr(image: Tensor, reference: Tensor) -> Tensor:
 
 
 def _ssim_default(image: Tensor, reference: Tensor) -> Tensor:
-    """What scikit-image below 0.20 gives for floats: 7x7 box, sample covariance, and a data range of 2."""
+    """SSIM by the defaults of scikit-image below 0.20 for floats: 7x7 box, sample covariance, data range 2."""
     tests, truths = (x.reshape(-1, *x.shape[-3:]) for x in (image, reference))
     values, _ = similarity(tests, truths, uniform(), data_range=2, sample_covariance=True)
     return values.mean(1).reshape(image.shape[:-3])
@@ -131,7 +131,7 @@ def _relmse(image: Tensor, reference: Tensor) -> Tensor:
 
 
 def _luminance(shown: Tensor) -> Tensor:
-    """``(B, 1, H, W)`` luminance of values on a gamma of 2.2."""
+    """``(B, 1, H, W)`` luminance of values with a gamma of 2.2."""
     weights = torch.tensor(_REC709_LUMINANCE, dtype=shown.dtype, device=shown.device).reshape(3, 1, 1)
     return (shown.reshape(-1, *shown.shape[-3:]).pow(2.2) * weights).sum(1, keepdim=True)
 
@@ -151,7 +151,7 @@ def _temporal_psnr(clip: Tensor, reference: Tensor) -> Tensor:
 
 
 def _temporal_rmae(clip: Tensor, reference: Tensor) -> Tensor:
-    """The third is noisebase's: it divides a mean over the channels by their number once more."""
+    """Relative error in time; a third of the mean, because noisebase divides by the number of channels twice."""
     moved, truth = clip.diff(dim=-4), reference.diff(dim=-4)
     return ((moved - truth).abs() / (truth.abs() + 0.01)).mean((-3, -2, -1)).mean(-1) / 3
 

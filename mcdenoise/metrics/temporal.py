@@ -1,4 +1,4 @@
-"""Errors of the change from frame to frame: as it is, along the motion, and where nothing moves."""
+"""Errors of the change between frames: without motion compensation, along the motion, and in static shots."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from mcdenoise.ops import Surface, reproject
 
 
 def temporal_smape_linear(clip: Tensor, reference: Tensor, *, epsilon: float = 1e-2) -> Tensor:
-    """SMAPE of the absolute differences between successive frames, which sees flicker and lag.
+    """SMAPE of the absolute differences between consecutive frames, which measures flicker and lag.
 
     With ``dx = |x_i - x_(i-1)|``, not motion-compensated: ``mean(|dx - dy| / (dx + dy + epsilon))``.
 
     Args:
-        clip: ``(..., T, C, H, W)`` scene-linear radiance of successive frames, T at least 2.
-        reference: of the same shape.
+        clip: ``(..., T, C, H, W)`` scene-linear radiance of consecutive frames, T at least 2.
+        reference: the same shape.
         epsilon: in the unit of the radiance.
 
     Returns:
@@ -39,14 +39,14 @@ def temporal_smape_linear(clip: Tensor, reference: Tensor, *, epsilon: float = 1
 
 
 def temporal_rmse_srgb(clip: Tensor, reference: Tensor) -> Tensor:
-    """Root mean squared error of the differences between successive frames as displayed, which sees flicker and lag.
+    """Root mean squared error of displayed differences between consecutive frames, which measures flicker and lag.
 
     ``sqrt(mean(((x_i - x_(i-1)) - (y_i - y_(i-1)))^2))`` of values clamped to [0, 1] on the sRGB curve, not
-    motion-compensated, of each pair of frames; then the mean over the pairs. A steady error, however large, is 0.
+    motion-compensated, for each pair of frames; then the mean over the pairs. A constant error does not count.
 
     Args:
-        clip: ``(..., T, 3, H, W)`` scene-linear radiance of successive frames, T at least 2.
-        reference: of the same shape.
+        clip: ``(..., T, 3, H, W)`` scene-linear radiance of consecutive frames, T at least 2.
+        reference: the same shape.
 
     Returns:
         ``(...)`` in [0, 2], lower is better. The gradient is undefined where it is 0.
@@ -67,26 +67,26 @@ def temporal_rmse_srgb(clip: Tensor, reference: Tensor) -> Tensor:
 def warping_error_srgb(
     clip: Tensor, motion: Tensor, surface: Surface | None = None, previous_surface: Surface | None = None
 ) -> Tensor:
-    """Warping error of one clip as displayed: how much a surface point changes from one frame to the next.
+    """Warping error of one displayed clip: how much a surface point changes from one frame to the next.
 
-    ``sum(m |x_i - W x_(i-1)|^2) / sum(m)`` over the pixels, with the squared distance summed over R, G and B: ``W``
-    fetches the previous frame along the motion (:func:`mcdenoise.ops.reproject`), and ``m`` in [0, 1] is the share of
-    the four bilinear taps that passes its consistency test, 0 where the point was not seen before. Needs no reference;
-    but a reference has such an error too (highlights and shadows move, and fetching blurs), and a blurry result a
-    smaller one: compare with the reference's, or use :func:`warped_rmse_srgb`.
+    ``sum(m |x_i - W x_(i-1)|^2) / sum(m)`` over the pixels, with the squared distance summed over R, G and B. ``W``
+    reprojects the previous frame along the motion (:func:`mcdenoise.ops.reproject`), and ``m`` in [0, 1] is the weight
+    of the four bilinear taps that pass its consistency test, 0 where the point was not visible before. No reference is
+    needed. But a reference also has such an error (highlights and shadows move, and reprojection blurs), and a blurry
+    result has a smaller one: compare with the reference's error, or use :func:`warped_rmse_srgb`.
 
     Args:
         clip: ``(B, 2, 3, H, W)`` scene-linear radiance of the previous and the current frame.
         motion: ``(B, 2, H, W)`` pixels, ``previous position = current position + motion``.
-        surface: what the current frame shows, see :func:`mcdenoise.ops.reproject`; ``None`` tests for the border only.
-        previous_surface: what the previous frame shows.
+        surface: surface of the current frame, see :func:`mcdenoise.ops.reproject`; ``None`` tests only for the border.
+        previous_surface: surface of the previous frame.
 
     Returns:
         ``(B,)`` in [0, 3], lower is steadier.
 
     Raises:
-        ValueError: the clip is no pair of frames, or shapes disagree.
-        UncomputableError: no pixel has a past.
+        ValueError: the clip is not a pair of frames, or shapes do not match.
+        UncomputableError: no pixel has a history.
 
     Source: Lai et al. 2018, Learning Blind Video Temporal Consistency, flow warping error: there the motion is an
     estimated optical flow and the mask binary.
@@ -101,15 +101,15 @@ def warped_rmse_srgb(
     surface: Surface | None = None,
     previous_surface: Surface | None = None,
 ) -> Tensor:
-    """Root mean squared error of the change along the motion, as displayed: flicker that sticks to no surface.
+    """Root mean squared error of the change along the motion, as displayed: flicker that does not follow surfaces.
 
-    :func:`warping_error_srgb` with the reference's own warped difference taken off each pixel's before it is squared,
-    ``sqrt(sum(m |(x_i - W x_(i-1)) - (y_i - W y_(i-1))|^2) / (3 sum(m)))``. So what really changes on a surface counts
-    as right, and an error that moves with its surface is none; :func:`temporal_rmse_srgb` is the same without motion.
+    This is :func:`warping_error_srgb` with the reference's warped difference subtracted before squaring,
+    ``sqrt(sum(m |(x_i - W x_(i-1)) - (y_i - W y_(i-1))|^2) / (3 sum(m)))``. So real changes on a surface are not
+    counted, nor is an error that moves with its surface; :func:`temporal_rmse_srgb` is the same without motion.
 
     Args:
         clip: ``(B, 2, 3, H, W)`` scene-linear radiance of the previous and the current frame.
-        reference: of the same shape.
+        reference: the same shape.
         motion: see :func:`warping_error_srgb`.
         surface: see :func:`warping_error_srgb`.
         previous_surface: see :func:`warping_error_srgb`.
@@ -118,8 +118,8 @@ def warped_rmse_srgb(
         ``(B,)`` in [0, 2], lower is better. The gradient is undefined where it is 0.
 
     Raises:
-        ValueError: the clip is no pair of frames, or shapes disagree.
-        UncomputableError: no pixel has a past.
+        ValueError: the clip is not a pair of frames, or shapes do not match.
+        UncomputableError: no pixel has a history.
 
     Source: Lai et al. 2018, flow warping error; relative to the reference.
     """
@@ -129,7 +129,7 @@ def warped_rmse_srgb(
 
 
 def _warped_square(clip: Tensor, motion: Tensor, surface: Surface | None, previous_surface: Surface | None) -> Tensor:
-    """Mean over the pixels that have a past of the squared length of current minus warped previous values."""
+    """Mean squared length of current minus warped previous values, over the pixels with a history."""
     if clip.ndim != 5 or clip.shape[1] != 2:
         raise ValueError(f"clip: expected (B, 2, 3, H, W), found {tuple(clip.shape)}")
     warped, weight = reproject(clip[:, 0], motion, surface, previous_surface)
@@ -143,15 +143,15 @@ def flicker_srgb(clip: Tensor, reference: Tensor) -> Tensor:
     """Flicker of a static shot: mean temporal standard deviation of the displayed values, minus the reference's.
 
     ``mean(std_t(x)) - mean(std_t(y))`` over pixels and channels of values clamped to [0, 1] on the sRGB curve; the
-    standard deviation over the T frames, with the divisor T. Of use where neither camera nor objects move. Moving
-    lights are in both terms: a result that lags behind them can be below 0.
+    standard deviation is over the T frames, with the divisor T. It is meaningful if neither camera nor objects move.
+    Moving lights contribute to both terms: a result that lags behind them can be below 0.
 
     Args:
-        clip: ``(..., T, 3, H, W)`` scene-linear radiance of successive frames, T at least 2.
-        reference: of the same shape.
+        clip: ``(..., T, 3, H, W)`` scene-linear radiance of consecutive frames, T at least 2.
+        reference: the same shape.
 
     Returns:
-        ``(...)`` in [-0.5, 0.5], nearer to 0 is better.
+        ``(...)`` in [-0.5, 0.5], closer to 0 is better.
 
     Raises:
         ValueError: the shapes differ, or there are fewer than two frames.
@@ -169,24 +169,24 @@ def flicker_srgb(clip: Tensor, reference: Tensor) -> Tensor:
 
 
 class Flicker:
-    """:func:`flicker_srgb` frame by frame: keeps two sums for each image, however long the shot."""
+    """Computes :func:`flicker_srgb` frame by frame, with two sums per image whatever the length of the shot."""
 
     def __init__(self) -> None:
         self.frames = 0
-        # Of the images and of their references.
+        # One sum for the images and one for their references.
         self._mean = self._square = torch.zeros((), dtype=torch.float32, device="cpu")
 
     def add(self, image: Tensor, reference: Tensor) -> None:
         """Add the next frame: ``(..., 3, H, W)`` scene-linear radiance, and its reference."""
         check_images(image, reference)
         both = torch.stack([displayed(image), displayed(reference)])
-        # Welford's update: differences of squares would lose what little a converged image flickers.
+        # Welford's update: a difference of sums of squares would lose the small flicker of a converged image.
         self.frames += 1
         change = both - self._mean
         self._mean = self._mean + change / self.frames
         self._square = self._square + change * (both - self._mean)
 
     def value(self) -> Tensor:
-        """``(...)`` flicker of the frames so far."""
+        """The flicker ``(...)`` of all frames so far."""
         deviation = (self._square / self.frames).clamp_min(0).sqrt().mean((-3, -2, -1))
         return deviation[0] - deviation[1]

@@ -1,7 +1,7 @@
-"""A suite of frames that nothing was trained on, as renderers write them: what it has, its rendering, its tables."""
+"""A suite of rendered frames that are never used for training: its contents, rendering, and tables."""
 
 from mcdenoise.suite.close_ups import write_close_ups
-from mcdenoise.suite.rendering import Stage, open_row, render_suite, rows_there
+from mcdenoise.suite.rendering import RenderingStep, open_row, render_suite, rows_there
 from mcdenoise.suite.rows import SHOTS, Row, Shot, choose_rows
 from mcdenoise.suite.tables import PEERS, SHOWN, Line, error_lines, markdown, sample_curves, suite_lines
 
@@ -10,9 +10,9 @@ __all__ = [
     "SHOTS",
     "SHOWN",
     "Line",
+    "RenderingStep",
     "Row",
     "Shot",
-    "Stage",
     "choose_rows",
     "error_lines",
     "markdown",

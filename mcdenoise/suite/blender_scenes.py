@@ -1,14 +1,15 @@
-"""Scenes of the suite for Blender's Cycles, written as Blender writes: multilayer EXR files with every pass.
+"""Scenes of the suite for Blender's Cycles, written as multilayer EXR files with every pass.
 
     python blender_scenes.py job.json
 
-This script stands alone. It imports Blender's Python module ``bpy``, which is under the GPL (``pip install
-bpy==4.5.15``, Python 3.11; no display is needed), and nothing else beyond the standard library. The job names the
-scene, its settings and the images that are wanted, see :func:`main`; :mod:`mcdenoise.suite.rendering` writes it.
+This script is run by itself. It imports Blender's Python module ``bpy``, which is under the GPL (``pip install
+bpy==4.5.15``, Python 3.11; no display is needed), and otherwise only the standard library. The job names the scene, its
+settings and the requested images, see :func:`main`; :mod:`mcdenoise.suite.rendering` writes the job.
 
-``gallery``: lacquered planks, a brick wall, brushed steel, glass, a mirror, a lamp, a page of marks, thin rods, a head
-that moves. ``garden``: outdoors under the sun and an HDR sky, with grass, a fence, lacquer and a glass ball.
-``attic``: matt things only, in a room that light enters by a window.
+``gallery``: lacquered planks, a brick wall, brushed steel, glass, a mirror, a lamp, a page of marks, thin rods, a
+    moving
+head. ``garden``: outdoors under the sun and an HDR sky, with grass, a fence, lacquer and a glass ball. ``attic``:
+diffuse surfaces only, in a room lit through a window.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from typing import Any
 bpy: Any
 try:
     bpy = importlib.import_module("bpy")
-except ImportError:  # mcdenoise's own Python need not have it.
+except ImportError:  # The script is also imported without Blender.
     bpy = None
 
 PASSES: tuple[str, ...] = ("z", "position", "normal", "vector", "emit", "environment")
@@ -33,10 +34,10 @@ Color = tuple[float, float, float]
 
 
 def main() -> None:
-    """Read the job and render it.
+    """Read the job, and render its images.
 
     It has ``scene``, ``size``, ``frames``, ``filter`` (``"default"`` or ``"centre"``), ``lens``, ``blur``, ``threads``,
-    and ``images``: a list of ``frame``, ``samples``, ``seed``, ``passes`` and ``out``. A file gets its name when whole.
+    and ``images``: a list of ``frame``, ``samples``, ``seed``, ``passes`` and ``out``. Files are renamed when complete.
     """
     with open(sys.argv[1], encoding="utf-8") as file:
         job = json.load(file)
@@ -58,7 +59,7 @@ def main() -> None:
 
 
 def set_up(scene: Any, job: dict[str, Any]) -> None:
-    """Everything that is not the scene."""
+    """Render settings, independent of the scene."""
     scene.render.engine = "CYCLES"
     scene.frame_start, scene.frame_end = 0, job["frames"] - 1
     scene.render.resolution_x, scene.render.resolution_y = job["size"]
@@ -70,7 +71,7 @@ def set_up(scene: Any, job: dict[str, Any]) -> None:
     cycles = scene.cycles
     cycles.device = "CPU"
     cycles.use_adaptive_sampling = cycles.use_denoising = False
-    # Cycles takes a box filter as one pixel wide whatever the width says, so the narrow one is the default kind.
+    # A box filter in Cycles is always one pixel wide, so the narrow filter has the default type.
     cycles.pixel_filter_type = "BLACKMAN_HARRIS"
     cycles.filter_width = 0.01 if job["filter"] == "centre" else 1.5
     settings = scene.render.image_settings
@@ -82,7 +83,7 @@ def set_up(scene: Any, job: dict[str, Any]) -> None:
 
 
 def gallery(frames: int) -> None:
-    """What shines, indoors and under a little sky."""
+    """Shiny surfaces, indoors with some light from the sky."""
     sky(24, 160, 0.05)
     plane("Floor", (0, 0, 0), (0, 0, 0), (12, 12), planks())
     plane("Wall", (0, 3.2, 1.5), (math.pi / 2, 0, 0), (9, 3), bricks())
@@ -107,7 +108,7 @@ def gallery(frames: int) -> None:
 
 
 def garden(frames: int) -> None:
-    """Outdoors: a bright sun, sharp shadows, thin things."""
+    """Outdoors: a bright sun, sharp shadows, thin objects."""
     sky(34, 130, 0.09)
     rng = random.Random(5)
     plane("Ground", (0, 0, 0), (0, 0, 0), (40, 40), soil())
@@ -140,7 +141,7 @@ def garden(frames: int) -> None:
 
 
 def attic(frames: int) -> None:
-    """A closed room of matt things; most of it sees the window's light after several bounces."""
+    """A closed room of diffuse surfaces; most of them receive the window's light after several bounces."""
     sky(30, 60, 0.16)
     plaster = matt("Plaster", (0.72, 0.68, 0.6))
     plane("Floor", (0, 0, 0), (0, 0, 0), (6, 6), boards())
@@ -176,7 +177,7 @@ def attic(frames: int) -> None:
 
 
 def camera(frames: int, lens: float, place: Any, target: Color) -> None:
-    """A camera on a path that looks at one place."""
+    """A camera that moves on a path and looks at a fixed point."""
     data = bpy.data.cameras.new("Camera")
     thing = bpy.data.objects.new("Camera", data)
     scene = bpy.context.scene
@@ -193,7 +194,7 @@ def camera(frames: int, lens: float, place: Any, target: Color) -> None:
 
 
 def path(thing: Any, frames: int, place: Any) -> None:
-    """Keyframes; for the Vector pass from one before the first frame to one after the last."""
+    """Keyframes, from one before the first frame to one after the last, which the Vector pass needs."""
     bpy.context.preferences.edit.keyframe_new_interpolation_type = "LINEAR"
     for step in range(-1, frames + 1):
         thing.location = place(step)
@@ -203,7 +204,7 @@ def path(thing: Any, frames: int, place: Any) -> None:
 def plane(
     name: str, where: Color, turned: Color, size: tuple[float, float], material: Any, height: float | None = None
 ) -> None:
-    """A rectangle, or with a height a box."""
+    """A rectangle, or a box if a height is given."""
     make = bpy.ops.mesh.primitive_plane_add if height is None else bpy.ops.mesh.primitive_cube_add
     make(size=1, location=where, rotation=turned)
     bpy.context.object.scale = (*size, 1 if height is None else height)
@@ -223,7 +224,7 @@ def cylinder(name: str, where: Color, radius: float, height: float, material: An
 
 
 def finish(name: str, material: Any, smooth: bool = True) -> Any:
-    """Name the object just made and give it its material."""
+    """Name the object that was just created, and assign its material."""
     thing = bpy.context.object
     thing.name = name
     thing.data.materials.append(material)
@@ -232,7 +233,7 @@ def finish(name: str, material: Any, smooth: bool = True) -> Any:
 
 
 def surface(name: str, **inputs: Any) -> tuple[Any, Any, Any]:
-    """A material of one Principled BSDF, its tree, and the node."""
+    """A material with one Principled BSDF; also returns its node tree and the node."""
     material = bpy.data.materials.new(name)
     material.use_nodes = True
     shader = material.node_tree.nodes["Principled BSDF"]
@@ -242,12 +243,12 @@ def surface(name: str, **inputs: Any) -> tuple[Any, Any, Any]:
 
 
 def matt(name: str, color: Color) -> Any:
-    """No gloss at all."""
+    """A diffuse surface without gloss."""
     return surface(name, Base_Color=(*color, 1), Roughness=1.0, Specular_IOR_Level=0.0)[0]
 
 
 def metal(name: str, value: float, roughness: float, color: Color = (1.0, 1.0, 1.02)) -> Any:
-    """A mirror, or a rough one."""
+    """A mirror, or a rough metal."""
     shade = tuple(value * channel for channel in color)
     return surface(name, Base_Color=(*shade, 1), Metallic=1.0, Roughness=roughness)[0]
 
@@ -263,7 +264,7 @@ def coat(name: str, color: Color) -> Any:
 
 
 def lamp(strength: float, color: Color) -> Any:
-    """What gives light."""
+    """An emitting surface."""
     material, _, shader = surface("Lamp")
     shader.inputs["Emission Color"].default_value = (*color, 1)
     shader.inputs["Emission Strength"].default_value = strength
@@ -271,7 +272,7 @@ def lamp(strength: float, color: Color) -> Any:
 
 
 def patterned(name: str, kind: str, low: Color, high: Color, output: str, scale: float, **inputs: Any) -> Any:
-    """A surface whose color goes from one to another along a texture over its own coordinates."""
+    """A surface whose color follows a procedural texture between two colors."""
     material, tree, shader = surface(name, **inputs)
     node = tree.nodes.new(kind)
     node.inputs["Scale"].default_value = scale
@@ -285,7 +286,7 @@ def patterned(name: str, kind: str, low: Color, high: Color, output: str, scale:
 
 
 def planks() -> Any:
-    """Dark wood of strong grain under lacquer."""
+    """Dark wood with a strong grain under lacquer."""
     material, node, _ = patterned(
         "Planks", "ShaderNodeTexWave", (0.02, 0.01, 0.006), (0.2, 0.1, 0.05), "Fac", 9.0, Roughness=0.5, Coat_Weight=1.0
     )
@@ -304,7 +305,7 @@ def boards() -> Any:
 
 
 def marks() -> Any:
-    """A page of fine black marks on white."""
+    """A page with fine black marks on white."""
     _, node, ramp = made = patterned(
         "Marks", "ShaderNodeTexVoronoi", (0.02, 0.02, 0.02), (0.85, 0.85, 0.82), "Distance", 34.0, Roughness=1.0
     )
@@ -315,17 +316,17 @@ def marks() -> Any:
 
 
 def soil() -> Any:
-    """Earth in many shades."""
+    """Soil in many shades."""
     return patterned("Soil", "ShaderNodeTexNoise", (0.05, 0.03, 0.02), (0.4, 0.3, 0.2), "Fac", 60.0, Roughness=1.0)[0]
 
 
 def checks() -> Any:
-    """A board of squares."""
+    """A checkerboard."""
     return patterned("Checks", "ShaderNodeTexChecker", (0.06, 0.07, 0.1), (0.75, 0.7, 0.6), "Fac", 8.0)[0]
 
 
 def bricks() -> Any:
-    """A wall of bricks with bright mortar."""
+    """A brick wall with bright mortar."""
     material, tree, shader = surface("Bricks", Roughness=1.0, Specular_IOR_Level=0.0)
     wall = tree.nodes.new("ShaderNodeTexBrick")
     wall.inputs["Scale"].default_value = 7.0
@@ -339,13 +340,13 @@ def bricks() -> Any:
 
 
 def sky(elevation: float, rotation: float, strength: float) -> None:
-    """A clear sky with its sun."""
+    """A clear sky with a sun."""
     world = bpy.data.worlds.new("Sky")
     bpy.context.scene.world = world
     world.use_nodes = True
     tree = world.node_tree
     node = tree.nodes.new("ShaderNodeTexSky")
-    # Nishita's sky has gone by another name since Blender 5.0.
+    # Blender 5.0 renamed Nishita's sky.
     node.sky_type = "NISHITA" if bpy.app.version < (5, 0) else "SINGLE_SCATTERING"
     node.sun_elevation, node.sun_rotation = math.radians(elevation), math.radians(rotation)
     node.sun_size, node.sun_intensity = math.radians(1.5), 0.5

@@ -1,4 +1,4 @@
-"""Close-ups of the suite at full size: what a denoiser does to a mirror, lacquer, glass, rods, print and shadows."""
+"""Close-ups of the suite: a mirror, lacquer, glass, rods, print and shadows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mcdenoise.report.pictures import Codes, Crop, crop_errors, to_srgb
 from mcdenoise.results import IMAGES, Results
 from mcdenoise.suite.rows import Row
 
-# By scene: left, top, right and bottom as parts of the frame.
+# Regions by scene: left, top, right and bottom as fractions of the frame.
 PARTS: dict[str, dict[str, tuple[float, float, float, float]]] = {
     "parlour": {
         "mirror": (0.2, 0.05, 0.46, 0.4),
@@ -39,18 +39,18 @@ _GAP, _TITLE, _LEAST_WIDTH = 4, 26, 240
 
 
 def write_close_ups(folder: Path, results: Results, rows: Iterable[Row], shown: Sequence[str]) -> list[Path]:
-    """Write ``close-ups/ROW/PART.png``: input, methods, and reference side by side, each with its PSNR and SMAPE.
+    """Write ``close-ups/ROW/REGION.png``: input, methods and reference side by side, each with its PSNR and SMAPE.
 
-    Pixels stay square and sharp: small frames are shown several times as large.
+    Small regions are enlarged by an integer factor without interpolation.
 
     Args:
-        folder: of the finished benchmark, with its images.
-        results: of it.
-        rows: whose scenes have named parts.
-        shown: names of methods, in this order; one that is missing on a row is skipped there.
+        folder: folder of the finished benchmark, with its images.
+        results: results of the benchmark.
+        rows: rows whose scenes have named regions.
+        shown: names of methods, in order; a method that is missing on a row is omitted there.
 
     Returns:
-        The files.
+        Paths of the files.
     """
     written = []
     for row in rows:
@@ -75,7 +75,7 @@ def write_close_ups(folder: Path, results: Results, rows: Iterable[Row], shown: 
 
 
 def _pictures(folder: Path, results: Results, row: Row, shown: Sequence[str]) -> list[tuple[str, Image]]:
-    """The last frame that was kept, by each method; the reference comes last."""
+    """The last kept frame by each method; the reference is last."""
     folders = {method.name: method.folder for method in results.methods}
     scene = next((scene for scene in results.scenes if scene.name == row.name), None)
     if scene is None or not scene.pictures:
@@ -93,7 +93,7 @@ def _panel(title: str, image: Image, reference: Image, crop: Crop) -> tuple[list
     own, truth = np.ascontiguousarray(crop.of(image)), np.ascontiguousarray(crop.of(reference))
     factor = max(1, -(-_LEAST_WIDTH // own.shape[1]))
     pixels = to_srgb(own).repeat(factor, 0).repeat(factor, 1)
-    # Of settings the values are enough: their names would not fit.
+    # Show only the values of settings, because their names would not fit.
     title = re.sub(r"\w+=", "", title)
     if image is reference:
         return [title, ""], pixels
@@ -111,7 +111,7 @@ def _write(path: Path, panels: list[tuple[list[str], Codes]]) -> None:
     for index, (lines, pixels) in enumerate(panels):
         left = index * (width + _GAP)
         for line, text in enumerate(lines):
-            # What is too long would run into its neighbour.
+            # Longer text would overlap the next panel.
             draw.text((left + 2, 1 + 12 * line), text[: width // 6], fill="black")
         sheet.paste(PIL.Image.fromarray(pixels), (left, _TITLE))
     sheet.save(path)

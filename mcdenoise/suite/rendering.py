@@ -1,4 +1,4 @@
-"""Rendering the suite into a folder, which can be stopped at any time and goes on where it was."""
+"""Rendering the suite into a folder; it can be interrupted at any time and resumes."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from mcdenoise.scenes.render.halves import ReferenceHalves
 from mcdenoise.suite.rows import SHOTS, Row, Shot
 
 _SCRIPT = Path(__file__).with_name("blender_scenes.py")
-# References are rendered in so many equal parts, whose halves tell the noise that is left.
+# References are rendered in this number of equal parts; two halves of them give an estimate of the noise.
 _PARTS = 8
-# All references get a quarter of their samples before any gets more: then the suite can be used.
+# All references get a quarter of their samples before any gets more, so that the suite becomes usable early.
 _FRACTIONS = (0.25, 1.0)
 _SEED, _REFERENCE_SEED = 77, 1_000_000
 _LENS, _FOCUS = 0.03, 3.4
 
 
-class Stage(NamedTuple):
-    """How far the rendering is.
+class RenderingStep(NamedTuple):
+    """Progress of the rendering.
 
     Args:
-        shot: what is rendered next.
-        fraction: of the samples of its references.
-        done: shots that are finished, counted once for each fraction.
-        total: all of them.
+        shot: name of the next shot to render.
+        fraction: fraction of the samples of its references.
+        done: number of finished steps: shots, counted once for each fraction.
+        total: number of all steps.
     """
 
     shot: str
@@ -55,24 +55,24 @@ def render_suite(
     *,
     blender_python: Path | None = None,
     threads: int = 0,
-    on_stage: Callable[[Stage], None] = lambda stage: None,
+    on_step: Callable[[RenderingStep], None] = lambda step: None,
 ) -> None:
-    """Render what is missing; files have their names only when whole.
+    """Render missing files; files are renamed when complete.
 
     Args:
-        shots: in this order. Their references get a quarter of their samples first, and then all.
-        data: the folder; a shot's files go to ``data/NAME``.
-        blender_python: an interpreter that can import ``bpy``, for the shots of Cycles; by default as
-            :class:`mcdenoise.scenes.cycles.Blender` has it.
-        threads: of Cycles; all processors by default.
-        on_stage: called before each step.
+        shots: the shots in order. Their references get a quarter of their samples first, and then all.
+        data: the folder; the files of a shot go to ``data/NAME``.
+        blender_python: an interpreter that can import ``bpy``, for shots of Cycles; the default is that of
+            :class:`mcdenoise.scenes.cycles.Blender`.
+        threads: number of threads of Cycles; all processors by default.
+        on_step: called before each step.
 
     Raises:
         InputError: a renderer is missing or failed, or the folder cannot be written or holds something else.
     """
     shots = list(shots)
     if any(shot.renderer == "cycles" and not _is_whole(shot, data) for shot in shots):
-        # Before the hours that Mitsuba takes.
+        # Check this before hours of rendering with Mitsuba.
         with Blender(blender_python) as blender:
             blender_python = blender.python
     try:
@@ -81,7 +81,7 @@ def render_suite(
         raise InputError(f"{data}: cannot be created ({error.strerror}); choose another folder with --data") from error
     steps = [(fraction, shot) for fraction in _FRACTIONS for shot in shots]
     for number, (fraction, shot) in enumerate(steps):
-        on_stage(Stage(shot.name, fraction, number, len(steps)))
+        on_step(RenderingStep(shot.name, fraction, number, len(steps)))
         if shot.renderer == "mitsuba":
             _render_mitsuba(shot, data, fraction)
         else:
@@ -89,15 +89,15 @@ def render_suite(
 
 
 def rows_there(rows: Iterable[Row], data: Path) -> list[Row]:
-    """Those of the rows that can be opened: their frames and references are there, however noisy these still are."""
+    """The rows that can be opened: their frames and references exist, even if the references are still noisy."""
     return [row for row in rows if _is_there(row.shot, data)]
 
 
 def open_row(row: Row, data: Path) -> Sequence:
-    """The frames of a row, under its name.
+    """Open the frames of a row, under its name.
 
     Raises:
-        InputError: they are not there, or damaged.
+        InputError: files are missing or damaged.
     """
     return replace(open_sequence(data / row.shot.name, row.frames), name=row.name)
 
@@ -114,7 +114,7 @@ def _is_there(shot: Shot, data: Path) -> bool:
 
 
 def _is_whole(shot: Shot, data: Path) -> bool:
-    """Whether nothing of a shot of Cycles is missing."""
+    """Whether all files of a Cycles shot exist."""
     parts = _parts_of(shot, data)
     return _is_there(shot, data) and all(_part(parts, k, n).is_file() for k in range(_PARTS) for n in shot.references)
 
@@ -149,7 +149,7 @@ def _mitsuba_scene(shot: Shot) -> tuple[dict[str, Any], list[Camera], dict[str, 
 
 
 def _take_references(shot: Shot, data: Path) -> None:
-    """Take the references of the first shot of the same picture: then they need not be rendered twice."""
+    """Copy references from an earlier shot of the same picture, so that they are rendered only once."""
     first = next((other for other in SHOTS if other.picture == shot.picture), shot)
     if first == shot:
         return
@@ -201,7 +201,7 @@ def _run_blender(shot: Shot, images: list[dict[str, Any]], python: Path, threads
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "job.json"
         path.write_text(json.dumps(job))
-        # -P: the modules beside the script are none of Blender's.
+        # -P: do not import the modules beside the script.
         command = [str(python), "-P", str(_SCRIPT), str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode or not all(Path(image["out"]).is_file() for image in images):
@@ -210,7 +210,7 @@ def _run_blender(shot: Shot, images: list[dict[str, Any]], python: Path, threads
 
 
 def _write_reference(path: Path, parts: list[Path], samples: int) -> float:
-    """The mean of the parts, and the estimate of its noise."""
+    """Write the mean of the parts, and return an estimate of its noise."""
     halves: ReferenceHalves | None = None
     for part in parts:
         pixels, channels, _ = read_exr(part)
@@ -226,7 +226,7 @@ def _write_reference(path: Path, parts: list[Path], samples: int) -> float:
 
 
 def _parts_of(shot: Shot, data: Path) -> Path:
-    """Where the parts of its references lie: shots of the same picture have them in common."""
+    """Folder of the parts of its references; shots of the same picture have a common folder."""
     first = next((other for other in SHOTS if other.picture == shot.picture), shot)
     return data / ".parts" / first.name
 

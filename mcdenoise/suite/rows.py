@@ -1,4 +1,4 @@
-"""The suite as data: what is rendered, and which frames of it make a row of the table."""
+"""The contents of the suite: shots to render, and the frames of each row of the table."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from typing import Literal
 from mcdenoise.errors import InputError
 
 Renderer = Literal["mitsuba", "cycles"]
-# ``centre`` has every sample at the pixel centre; ``default`` is Blender's, Blackman-Harris over 1.5 pixels.
+# ``centre`` puts every sample at the pixel centre; ``default`` is Blender's, Blackman-Harris over 1.5 pixels.
 Filter = Literal["centre", "box", "gaussian", "default"]
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One rendering.
+    """One rendered sequence or still.
 
     Args:
-        name: also of its folder.
-        renderer: who renders it.
+        name: name of the shot and of its folder.
+        renderer: the renderer.
         scene: ``parlour``, or ``room`` or ``shiny`` and the seed of a random scene, for Mitsuba; a name in
             ``blender_scenes.py`` for Cycles.
-        samples: a pixel.
-        filter: of the pixels.
-        frames: how many; a still has one.
+        samples: samples per pixel.
+        filter: pixel filter.
+        frames: number of frames; 1 for a still.
         size: width and height in pixels.
-        reference_samples: a pixel.
+        reference_samples: samples per pixel of the references.
         lens: whether there is depth of field.
         blur: whether there is motion blur; Cycles only.
-        curve: whether it is a point of the curve of error over samples, and no row of the table.
+        curve: whether it is a point of the curves of error over samples, rather than a row of the table.
     """
 
     name: str
@@ -46,12 +46,12 @@ class Shot:
 
     @property
     def references(self) -> range:
-        """Frames that have a reference: of a sequence the second half, which has a history."""
+        """Frames that have a reference: the second half of a sequence, which has a history."""
         return range(self.frames // 2, self.frames)
 
     @property
     def picture(self) -> tuple[object, ...]:
-        """What its references depend on: those of equal pictures are the same."""
+        """Everything that its references depend on: shots with equal pictures have the same references."""
         return astuple(replace(self, name="", samples=0))
 
 
@@ -60,8 +60,8 @@ class Row:
     """A row of the table.
 
     Args:
-        shot: what it is of.
-        still: whether it is the last frame alone.
+        shot: the shot.
+        still: whether the row consists of the last frame only.
     """
 
     shot: Shot
@@ -69,24 +69,24 @@ class Row:
 
     @property
     def name(self) -> str:
-        """Unique in the suite."""
+        """Unique name in the suite."""
         return f"{self.shot.name}-still" if self.still and self.shot.frames > 1 else self.shot.name
 
     @property
     def frames(self) -> str | None:
-        """As :func:`mcdenoise.data.open_sequence` takes it."""
+        """The selection of frames for :func:`mcdenoise.data.open_sequence`."""
         return str(self.shot.frames - 1) if self.still else None
 
 
 def choose_rows(patterns: str | None = None) -> list[Row]:
-    """Rows of the suite; every sequence is a row, and its last frame as a still another one.
+    """Select rows of the suite; every sequence is a row, and its last frame as a still is another one.
 
     Args:
-        patterns: names separated by commas, with ``*`` for anything, such as ``"cycles-*,mitsuba-parlour-box-4"``;
-            all rows by default.
+        patterns: names separated by commas, with ``*`` as wildcard, such as ``"cycles-*,mitsuba-parlour-box-4"``; all
+            rows by default.
 
     Raises:
-        InputError: a pattern fits no row.
+        InputError: a pattern matches no row.
 
     Example:
         >>> [row.name for row in choose_rows("mitsuba-parlour-box-4*")]
@@ -123,7 +123,7 @@ def _curve(name: str, renderer: Renderer, scene: str, pixel_filter: Filter, refe
     ]
 
 
-# In the order of rendering: what tells most comes first. Rooms have seeds that no training uses.
+# In order of rendering, the most informative first. No training uses the seeds of these rooms.
 SHOTS: tuple[Shot, ...] = (
     Shot("cycles-gallery-4", "cycles", "gallery", 4, "default"),
     Shot("mitsuba-parlour-centre-1", "mitsuba", "parlour", 1, "centre"),

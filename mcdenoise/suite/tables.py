@@ -1,4 +1,4 @@
-"""The suite's tables: each model against OIDN's best setting of each row, and error over samples."""
+"""The tables of the suite: each model against OIDN's best setting for each row, and error over samples."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from mcdenoise.suite.rows import Row
 
 SMAPE, PSNR, TEMPORAL = "SMAPE", "PSNR 2.2", "tRMSE"
 SHOWN = (SMAPE, PSNR, TEMPORAL)
-# With noisy features the library's high quality is its balanced network.
+# With noisy features, OIDN's high quality uses its balanced network.
 PEERS = (
     "oidn(quality=fast|balanced, auxiliary=clean|noisy, source=raw|accumulated),"
     "oidn(quality=high, auxiliary=clean, source=raw|accumulated)"
 )
 _PEER = "oidn"
-# Where a reference has this part of an error itself, the row cannot tell much.
+# If a reference itself has this fraction of an error, the row is not conclusive.
 _NOISY = 0.5
 
 
 @dataclass(frozen=True)
 class Best:
-    """A value of the peer, and the setting that has it.
+    """The peer's best value in a metric, with its setting.
 
     Args:
-        value: of the metric.
-        setting: the method's name.
-        milliseconds: of that setting, where it was timed.
+        value: value of the metric.
+        setting: name of the method.
+        milliseconds: run time per frame of that setting, if it was timed.
     """
 
     value: float
@@ -39,18 +39,18 @@ class Best:
 
 @dataclass(frozen=True)
 class Line:
-    """One model on one row.
+    """The values of one model on one row.
 
     Args:
-        row: its name.
-        model: the method's name.
-        samples: a pixel.
-        values: of the model, by metric: SMAPE, PSNR of values clamped to [0, 1] on a power curve of 1/2.2, and the root
-            mean squared error of differences between frames where there are several.
-        best: of the peer, by metric, each of the setting that is best in it on this row; empty without the peer.
-        noisy: of the input.
-        milliseconds: a frame, where it was timed.
-        reference_noise: SMAPE that the references themselves are estimated to have.
+        row: name of the row.
+        model: name of the method.
+        samples: samples per pixel.
+        values: the model's values by metric: SMAPE, PSNR of values clamped to [0, 1] on a power curve of 1/2.2, and for
+            several frames the root mean squared error of differences between frames.
+        best: the peer's values by metric, each with the setting that is best in it on this row; empty without the peer.
+        noisy: values of the input.
+        milliseconds: run time per frame, if it was timed.
+        reference_noise: estimated SMAPE of the references.
     """
 
     row: str
@@ -68,12 +68,12 @@ class Line:
 
 
 def suite_lines(results: Results, rows: Iterable[Row]) -> list[Line]:
-    """Each model on each row of the table, model by model; where a model failed, it has no line."""
+    """One line for each model and row of the table, by model; none where a model failed."""
     return _lines(results, [row for row in rows if not row.shot.curve])
 
 
 def error_lines(results: Results, rows: Iterable[Row]) -> list[Line]:
-    """As :func:`suite_lines`, of the points of the curves of error over samples."""
+    """Like :func:`suite_lines`, for the points of the curves of error over samples."""
     return _lines(results, [row for row in rows if row.shot.curve])
 
 
@@ -127,7 +127,7 @@ def _best(results: Results, row: Row, peers: list[Method]) -> dict[str, Best]:
 
 
 def markdown(lines: list[Line], curves: list[Line]) -> str:
-    """The tables as text: one for each model with its wins and losses, and one of error over samples."""
+    """The tables in Markdown: one for each model with its wins and losses, and one of error over samples."""
     parts = []
     for model in dict.fromkeys(line.model for line in lines):
         own = [line for line in lines if line.model == model]
@@ -138,7 +138,7 @@ def markdown(lines: list[Line], curves: list[Line]) -> str:
 
 
 def sample_curves(curves: list[Line]) -> dict[str, dict[str, list[tuple[int, float]]]]:
-    """SMAPE over samples by scene (a row's name without its samples), and by model, ``input`` and ``OIDN, best``."""
+    """SMAPE by number of samples, by scene (a row's name without samples) and model, ``input`` and ``OIDN, best``."""
     found: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for line in curves:
         own = found.setdefault(line.row.rpartition("-")[0], {})
@@ -152,7 +152,7 @@ def sample_curves(curves: list[Line]) -> dict[str, dict[str, list[tuple[int, flo
 
 
 def verdict(lines: list[Line]) -> list[str]:
-    """One model against the peer in a few lines: rows ahead and behind, and the mean ratio of SMAPE."""
+    """Comparison of one model with the peer: rows ahead and behind, and the mean ratio of SMAPE."""
     judged = [line for line in lines if line.best]
     if not judged:
         return ["OIDN was not there to compare with; pip install 'mcdenoise[peers]'"]

@@ -246,6 +246,6 @@ def _meaning(meaning: Callable[[bytes], object], content: bytes) -> object:
 
 
 def aged(folder: Path) -> None:
-    """Let everything in a folder be of an hour ago, as it is when somebody starts a command again."""
+    """Set the times of everything in a folder to an hour ago, as if a command were started again later."""
     for path in folder.rglob("*"):
         os.utime(path, (time.time() - 3600,) * 2, follow_symlinks=False)

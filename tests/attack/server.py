@@ -188,7 +188,7 @@ def run(command: list[str]) -> int:
             return table.read(command[1], Path(command[2]))
         main(command)
     except SystemExit as stop:
-        # As Python itself does: nobody has to wait for threads of which nobody knows.
+        # As Python itself does: do not wait for threads.
         return int(stop.code or 0)
     return 0
 

@@ -409,7 +409,7 @@ KINDS = {
     "precision.json": Kind("precision.json", json.loads, {"reader precision": 120}),
     "run_times.json": Kind("run_times.json", json.loads, {"reader run_times": 120}),
     "clean features": Kind("clean/clean/albedo0.exr", pixels, {"reader clean": 100}),
-    "reference in the making": Kind("reference0.partial.npz", exactly, {"reader halves": 120}),
+    "unfinished reference": Kind("reference0.partial.npz", exactly, {"reader halves": 120}),
 }
 
 

@@ -20,7 +20,7 @@ def test_some_damage(attacker: Attacker, kind: str, command: str) -> None:
 
 @pytest.mark.parametrize(("kind", "command"), READ)
 def test_what_is_no_file(attacker: Attacker, kind: str, command: str) -> None:
-    """Folders, pipes, devices, links to nothing and to themselves: nobody waits for them."""
+    """Folders, pipes, devices, broken and circular links: no command waits for them."""
     failed = attacker.damaged(kind, command, range(len(PLACES)), "places, some")
     assert not failed, "\n".join(failed)
 

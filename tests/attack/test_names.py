@@ -76,7 +76,7 @@ def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> 
         if name == "train" and part == "shot":
             # A run belongs to data of one name; begun anew, it ends with the same weights.
             shutil.rmtree(folder / "run")
-        # A command line that begins with a minus is an option; nobody can mean a file by it.
+        # A command line that begins with a minus is an option; it cannot name a file.
         # The name of a reader stays.
         kept = 2 if command.command[0] == "reader" else 1
         line = [*command.command[:kept], *(given if each == part else each for each in command.command[kept:])]

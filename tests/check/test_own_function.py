@@ -17,7 +17,7 @@ from mcdenoise.cli import main
 from mcdenoise.errors import InputError
 
 OWN = '''
-"""Somebody's own."""
+"""A user's own."""
 import torch
 from torch import Tensor
 

@@ -235,7 +235,7 @@ def test_the_worst_check_comes_first() -> None:
 
 
 def test_what_is_checked_by_default_and_by_name() -> None:
-    names = [stage.name for stage in stability.stages()]
+    names = [group.name for group in stability.check_groups()]
     known = [op.name for op in op_checks.select()]
     assert names[: len(known)] == known
     models = names[len(known) :]
@@ -246,12 +246,12 @@ def test_what_is_checked_by_default_and_by_name() -> None:
         *(f"Denoiser, {name}" for name in models if name in list_models()),
         "long runs",
     ]
-    assert [stage.name for stage in stability.stages(["demodulate"])] == ["demodulate"]
-    named = [stage.name for stage in stability.stages(None, ["cascaded_v2_tiny"])]
+    assert [group.name for group in stability.check_groups(["demodulate"])] == ["demodulate"]
+    named = [group.name for group in stability.check_groups(None, ["cascaded_v2_tiny"])]
     assert named == ["cascaded_v2_tiny", "Denoiser, cascaded_v2_tiny"]
     for arguments in ((["sharpen"], None), (None, ["unet"])):
         with pytest.raises(InputError, match=r"(expected .* found sharpen|model 'unet': expected one of)"):
-            stability.stages(*arguments)
+            stability.check_groups(*arguments)
     with pytest.raises(InputError, match="found float8"):
         stability.parse_dtypes(["float32", "float8"])
 

@@ -58,11 +58,11 @@ class Shot:
 
 
 SHOTS = {
-    # Small enough for the plain forms. It moves along both axes: a motion of zero along one of them, but for rounding,
-    # would let rounding decide on which side a pixel has a neighbour.
+    # Small enough for the reference implementations. It moves along both axes: with a motion of zero along one of them,
+    # rounding would decide on which side a pixel has a neighbour.
     "moving": Shot((72, 104), 1.2, (0.03, 0.017), 3, (0, 1, 2)),
     # Large enough for the compiled forms, and wide enough for a network to run on a part of it. At first nothing is
-    # left out but what has no noise; then tiles of little noise are passed through; then those without noise are
+    # skipped but what has no noise; then tiles of little noise are passed through; then those without noise are
     # reused.
     "still": Shot((40, 304), 0.5, (0.0, 0.0), 20, (0, 9, 19)),
 }

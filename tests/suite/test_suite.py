@@ -124,9 +124,9 @@ def test_rendering_goes_on_where_it_was_and_shares_references(tmp_path: Path, tw
     mitsuba = pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
     # So small an image is rendered sooner than a kernel is compiled.
     mitsuba.set_variant("scalar_rgb")
-    stages = []
-    render_suite(two_shots, tmp_path, on_stage=stages.append)
-    assert [(stage.shot, stage.fraction) for stage in stages] == [
+    steps = []
+    render_suite(two_shots, tmp_path, on_step=steps.append)
+    assert [(stage.shot, stage.fraction) for stage in steps] == [
         ("tiny-1", 0.25),
         ("tiny-2", 0.25),
         ("tiny-1", 1.0),

@@ -1,4 +1,4 @@
-"""Numerical stability: ops, models and the whole denoiser on stiff and extreme inputs, and over thousands of frames."""
+"""Numerical stability: operators, models and the denoiser on stiff and extreme inputs, and over thousands of frames."""
 
 from __future__ import annotations
 
@@ -24,68 +24,67 @@ __all__ = [
     "DTYPES",
     "FRAMES",
     "Check",
+    "CheckGroup",
     "LongRun",
-    "Stage",
     "Summary",
     "as_json",
     "check_case",
     "check_denoiser",
+    "check_groups",
     "check_model",
     "check_op",
     "check_stability",
     "long_runs",
     "parse_dtypes",
-    "stages",
     "summarize",
 ]
 
 
 @dataclass(frozen=True)
-class Stage:
-    """A part of the whole run.
+class CheckGroup:
+    """A group of checks.
 
     Args:
-        name: what it is about.
-        run: makes its checks, or its long runs.
+        name: subject of the checks.
+        run: runs the checks, or the long runs.
     """
 
     name: str
     run: Callable[[], Iterable[Check | LongRun]]
 
 
-def stages(
+def check_groups(
     ops: Sequence[str] | None = None,
     models: Sequence[str] | None = None,
     dtypes: Sequence[torch.dtype] = DTYPES,
     frames: int = FRAMES,
-) -> list[Stage]:
-    """What there is to check: ops, then models, then the denoiser, then long runs.
+) -> list[CheckGroup]:
+    """All groups: operators, then models, then the denoiser, then long runs.
 
     Args:
-        ops: names of ops, or functions of one's own, ``path/to/file.py:function``; ``None`` means all ops, or none
-            where models are named.
-        models: spellings of models, see :func:`mcdenoise.methods.parse_method`, each within a denoiser, and what learns
-            also by itself; ``None`` means the whole zoo but what needs a package that is not installed or has no
-            shipped weights, or none where ops are named.
-        dtypes: the dtypes to try each in.
-        frames: length of the long runs, which belong to the whole run only.
+        ops: names of operators, or own functions, ``path/to/file.py:function``; ``None`` means all operators, or none
+            if models are named.
+        models: models, see :func:`mcdenoise.methods.parse_method`; each is checked in a denoiser, and a trained network
+            also by itself. ``None`` means all available models of the zoo, or none if operators are named.
+        dtypes: dtypes to check.
+        frames: length of the long runs, which are included only if nothing is named.
 
     Raises:
-        InputError: there is no such op, or such a model cannot be had.
+        InputError: an operator or model does not exist, or is not available.
     """
     everything = ops is None and models is None
     chosen_ops = _ops.select(ops) if everything or ops is not None else []
     chosen_models = _available(models) if everything or models is not None else []
     return [
-        *(Stage(op.name, partial(_ops.check_op, op, dtypes)) for op in chosen_ops),
-        *(Stage(name, partial(_models.check_model, name, dtypes)) for name in chosen_models),
-        *(Stage(f"Denoiser, {name}", partial(_denoiser.check_denoiser, name, dtypes)) for name in chosen_models),
-        *([Stage("long runs", partial(_long_runs.long_runs, dtypes, frames))] if everything else []),
+        *(CheckGroup(op.name, partial(_ops.check_op, op, dtypes)) for op in chosen_ops),
+        *(CheckGroup(name, partial(_models.check_model, name, dtypes)) for name in chosen_models),
+        *(CheckGroup(f"Denoiser, {name}", partial(_denoiser.check_denoiser, name, dtypes)) for name in chosen_models),
+        *([CheckGroup("long runs", partial(_long_runs.long_runs, dtypes, frames))] if everything else []),
     ]
 
 
 def _available(names: Sequence[str] | None) -> list[str]:
-    """Models that can be had; of those that are named, every one."""
+    """The available models; all of the named ones."""
     found = []
     for name in list_models() if names is None else names:
         try:
@@ -99,7 +98,7 @@ def _available(names: Sequence[str] | None) -> list[str]:
 
 
 def as_json(checks: Sequence[Check], runs: Sequence[LongRun]) -> dict[str, Any]:
-    """Everything found, for a JSON file; what is infinite or no number becomes ``null``."""
+    """Convert results to JSON types; infinity and NaN become ``null``."""
     return {
         "passed": all(check.passed for check in checks) and all(run.passed for run in runs),
         "checks": [{name: _number(value) for name, value in asdict(check).items()} for check in checks],

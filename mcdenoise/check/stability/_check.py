@@ -1,4 +1,4 @@
-"""What a check of numerical stability finds, and the dtypes it is made in."""
+"""The result of a check of numerical stability, and the checked dtypes."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that must hold, and what was found.
+    """A property that must hold, and the measured error.
 
     Args:
-        subject: the op, the model, or what else was tried.
-        case: on what.
+        subject: the operator, model, or other subject.
+        case: name of the test case.
         dtype: ``"float32"`` and so on.
-        backend: of an op; ``""`` where there is no choice.
-        what: such as ``"forward"`` or ``"constant"``.
-        error: largest error found, in units of the dtype's epsilon times the case's condition number.
-        allowed: what the analysis allows there, in the same units.
-        condition: largest condition number of the case: how much a relative change of the inputs is magnified.
-        passed: whether it holds.
-        message: what is wrong; empty if nothing is.
+        backend: backend of an operator; ``""`` if there is no choice.
+        what: kind of check, such as ``"forward"`` or ``"constant"``.
+        error: largest error, in units of the dtype's epsilon times the case's condition number.
+        allowed: bound of the error by analysis, in the same units.
+        condition: largest condition number of the case: amplification of a relative change of the inputs.
+        passed: whether the property holds.
+        message: description of the error; empty if there is none.
     """
 
     subject: str
@@ -44,17 +44,17 @@ class Check:
 
 @dataclass(frozen=True)
 class Summary:
-    """The checks of one kind of one subject in one dtype, worst first.
+    """The checks of one kind for one subject and dtype, worst first.
 
     Args:
         subject: see :class:`Check`.
         dtype: see :class:`Check`.
         backend: see :class:`Check`.
         what: see :class:`Check`.
-        checks: how many there are.
-        worst: the one nearest to its bound, or beyond.
-        condition: largest condition number of all.
-        failed: those that do not hold.
+        checks: number of checks.
+        worst: the check closest to its bound, or farthest above it.
+        condition: largest condition number.
+        failed: the failed checks.
     """
 
     subject: str
@@ -68,7 +68,7 @@ class Summary:
 
 
 def summarize(checks: Iterable[Check]) -> list[Summary]:
-    """Gather checks by subject, dtype, backend and kind, in the order in which these appear first."""
+    """Group checks by subject, dtype, backend and kind, in order of first appearance."""
     groups: dict[tuple[str, str, str, str], list[Check]] = {}
     for check in checks:
         groups.setdefault((check.subject, check.dtype, check.backend, check.what), []).append(check)
@@ -88,7 +88,7 @@ def parse_dtypes(names: Sequence[str]) -> tuple[torch.dtype, ...]:
     """Dtypes by name.
 
     Raises:
-        InputError: a name is none of float32, bfloat16, float16.
+        InputError: a name is not one of float32, bfloat16, float16.
     """
     known = {name_of(dtype): dtype for dtype in DTYPES}
     unknown = [name for name in names if name not in known]
@@ -98,7 +98,7 @@ def parse_dtypes(names: Sequence[str]) -> tuple[torch.dtype, ...]:
 
 
 def name_of(dtype: torch.dtype) -> str:
-    """``"float32"`` of ``torch.float32``."""
+    """The name of a dtype, such as ``"float32"``."""
     return str(dtype).removeprefix("torch.")
 
 

@@ -1,4 +1,4 @@
-"""What must hold for a whole :class:`mcdenoise.denoiser.Denoiser`, whatever the frames are."""
+"""Properties of a :class:`mcdenoise.denoiser.Denoiser` that must hold for all frames."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _SIZE = (17, 23)
 _MIDDLE = (8, 11)
 _PROBE = 8
 _PATTERNS = 8
-# What is never repaired, but told: no buffer but color may hold NaN.
+# Buffers in which NaN is not repaired but reported: all but color.
 _REFUSED = ("albedo", "normal", "depth", "position", "motion", "view_projection")
 
 
 def check_denoiser(model: str = DEFAULT, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
-    """Everything that must hold, with frames in each dtype; bfloat16 also runs convolutions.
+    """Run all checks, with frames in each dtype; bfloat16 also runs convolutions in it.
 
     Args:
-        model: a model's spelling, see :func:`mcdenoise.methods.parse_method`.
+        model: a model, see :func:`mcdenoise.methods.parse_method`.
         dtypes: of the frames.
 
     Raises:
@@ -46,7 +46,7 @@ def check_denoiser(model: str = DEFAULT, dtypes: Sequence[torch.dtype] = DTYPES)
 def _checks(model: str, dtype: torch.dtype) -> Iterator[Check]:
     precision: Precision = "bfloat16" if dtype == torch.bfloat16 else "float32"
     denoiser = parse_method(model).denoiser(precision=precision)
-    # Shots without something that a model cannot do without are no shots for it.
+    # Skip shots without a buffer that the model needs.
     buffers = denoiser.model.needs.buffers
     for name, frames in _shots(dtype).items():
         if all(buffers <= frame.buffers for frame in frames):
@@ -60,7 +60,7 @@ def _checks(model: str, dtype: torch.dtype) -> Iterator[Check]:
 
 
 def _frame(seed: int, dtype: torch.dtype, size: tuple[int, int] = _SIZE) -> Frame:
-    """A wall of noise and mirrors that moves by a fraction of a pixel, seen from a camera at the origin."""
+    """A moving wall with noise and mirrors, seen from a camera at the origin; the motion is a fraction of a pixel."""
     g = torch.Generator().manual_seed(seed)
     height, width = size
     depth = 2 + torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(0))
@@ -81,7 +81,7 @@ def _frame(seed: int, dtype: torch.dtype, size: tuple[int, int] = _SIZE) -> Fram
 
 
 def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
-    """Short shots of what renderers hand over on a bad day; finite values beyond the dtype are its largest."""
+    """Short shots with difficult inputs; finite values beyond the dtype's range become its largest number."""
     frames = [_frame(seed, dtype) for seed in range(FRAMES)]
     limits = torch.finfo(dtype)
 
@@ -114,7 +114,7 @@ def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
     shots |= {f"position {value:g} in some rows": with_value("position", value, some) for value in (0.0, 1e10)}
     shots |= {f"{h}x{w}": [_frame(seed, dtype, (h, w)) for seed in range(FRAMES)] for h, w in ((1, 1), (1, 9), (9, 1))}
     shots |= {"nothing but color": [Frame(color=frame.color) for frame in frames]}
-    # Features that contradict one another, or come and go.
+    # Features that contradict one another, or are missing in some frames.
     shots |= {"albedo 93 in some rows": with_value("albedo", 93.0, some)}
     shots |= {"hit distance 0": [frame.replace(hit_distance=0 * frame.color[:, :1]) for frame in frames]}
     shots |= {"normal -1": with_value("normal", -1.0)}
@@ -126,7 +126,7 @@ def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
 
 
 def _valid(denoiser: Denoiser, name: str, frames: list[Frame], dtype: torch.dtype) -> Check:
-    """Finite and non-negative, frame after frame."""
+    """Check that images are finite and non-negative, frame after frame."""
     denoiser.reset()
     message = ""
     for number, frame in enumerate(frames):
@@ -139,7 +139,7 @@ def _valid(denoiser: Denoiser, name: str, frames: list[Frame], dtype: torch.dtyp
 
 
 def _contained(denoiser: Denoiser, value: float, dtype: torch.dtype) -> Check:
-    """A pixel that is no radiance is repaired: the images are those of frames with its neighbours' mean, exactly."""
+    """Check that an invalid pixel is repaired: images equal those for the mean of its neighbours exactly."""
     message, images = "", list[list[Tensor]]()
     for repaired in (False, True):
         denoiser.reset()
@@ -163,7 +163,7 @@ def _contained(denoiser: Denoiser, value: float, dtype: torch.dtype) -> Check:
 
 
 def _refused(denoiser: Denoiser, name: str, dtype: torch.dtype) -> Check:
-    """NaN in any other buffer is told, in one line that names it, and leaves the history as it was."""
+    """Check that NaN in any other buffer is reported in one line that names it, and does not change the history."""
     denoiser.reset()
     frames = [_frame(seed, dtype) for seed in range(2)]
     buffer = dict(frames[1].items())[name].clone()
@@ -185,11 +185,11 @@ def _refused(denoiser: Denoiser, name: str, dtype: torch.dtype) -> Check:
 def _exposure(denoiser: Denoiser, exposure: float, dtype: torch.dtype) -> Check:
     """``denoise(s x) = s denoise(x)``, after a history.
 
-    Scaling rounds every pixel of every frame, and each stage once more: the bound is as of a model, so many times what
-    a relative change of all colors, albedos and normals by ``u``, up or down, does to the image, since the rounding of
-    a product of two is that of either. A single pattern of ups and downs tells too little of it (half of the largest,
-    or less): it is the largest of several. What a library makes of scaled frames is its own: by how much its images
-    differ, of which the result is a mean, is allowed besides.
+    Scaling rounds every pixel of every frame, and each stage rounds again. The bound is a multiple of the effect of a
+    relative change of all colors, albedos and normals by ``u``, up or down, on the image, because rounding a product is
+    equivalent to changing a factor. A single random pattern of signs underestimates this (half of the maximum, or
+    less), so the maximum of several is taken. The result of an external library for scaled frames may differ; this
+    difference is added to the bound.
     """
 
     def outputs(change: Callable[[Frame], Frame]) -> list[Output]:
@@ -203,7 +203,7 @@ def _exposure(denoiser: Denoiser, exposure: float, dtype: torch.dtype) -> Check:
         def moved(frame: Frame) -> Frame:
             buffers = dict(frame.items())
             changed = {name: buffers[name] * (1 + _PROBE * eps * own) for name, own in signs.items()}
-            # In bfloat16 a normal of unit length moves by more than a frame may have.
+            # In bfloat16, a normal of unit length may change by more than a frame's check allows.
             return frame.replace(**{**changed, "normal": changed["normal"].clamp(-1, 1)})
 
         return relative_change(outputs(moved)[-1].image, plain[-1].image) / _PROBE / 2

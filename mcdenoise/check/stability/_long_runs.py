@@ -1,4 +1,4 @@
-"""Thousands of frames: whether an accumulated history drifts, overflows, or keeps what is long gone."""
+"""Runs over thousands of frames: whether the accumulated history drifts, overflows, or keeps outdated light."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from mcdenoise.ops.lag import THRESHOLD
 FRAMES, MOVING_FRAMES = 10_000, 1_000
 ALPHA_MIN = 0.1
 _SIZE = (4, 6)
-_WINDOW = 24  # pixels: a light that goes out is seen in more than one window
+_WINDOW = 24  # in pixels, so that several windows contain a light that is switched off
 _CONSTANT = 0.3
-# Sixteenths and thirty-seconds of a pixel, which every dtype holds.
+# Multiples of 1/16 and 1/32 pixel, which every dtype represents exactly.
 _MOTION = (0.375, -0.21875)
 _GHOST = 0.01
-_LIT = 60  # frames, after which an exponential window has forgotten that it began
+_LIT = 60  # number of frames after which an exponential window has forgotten its beginning
 
 
 @dataclass(frozen=True)
 class LongRun:
-    """What became of a history over many frames.
+    """Result of accumulating a history over many frames.
 
     Args:
-        name: which run.
-        dtype: of the frames.
-        frames: numbers of frames after which the error was taken, ascending.
-        errors: largest error at these, of the largest value that was accumulated in the channel.
-        allowed: bound of the errors; of ``ghost`` where that is what is bounded.
-        ghost: frames until less than 1 % is left of a light that went out, where that is asked.
+        name: name of the run.
+        dtype: dtype of the frames.
+        frames: numbers of frames after which the error was measured, ascending.
+        errors: largest error at these frames, relative to the largest accumulated value of the channel.
+        allowed: bound of the errors, or of ``ghost`` if that is measured.
+        ghost: number of frames until less than 1 % of a switched-off light remains, if that is measured.
         passed: whether everything holds.
-        message: what is wrong; empty if nothing is.
+        message: description of the error; empty if there is none.
     """
 
     name: str
@@ -54,18 +54,18 @@ class LongRun:
 def long_runs(
     dtypes: Sequence[torch.dtype] = DTYPES, frames: int = FRAMES, moving_frames: int = MOVING_FRAMES
 ) -> Iterator[LongRun]:
-    """Every run in every dtype.
+    """All runs in every dtype.
 
     Args:
-        dtypes: of the frames.
-        frames: how many to accumulate at rest.
-        moving_frames: how many with a moving camera.
+        dtypes: dtypes of the frames.
+        frames: number of frames at rest.
+        moving_frames: number of frames with a moving camera.
     """
     yield from still(dtypes, frames)
     yield from moving(dtypes, moving_frames)
     for dtype in dtypes:
         yield cut(dtype)
-    # The frames are the only thing that the dtype changes here.
+    # Here the dtype affects only the frames.
     yield average(max(dtypes, key=_unit), frames)
     for anti_lag in (False, True):
         yield light_off(anti_lag)
@@ -75,9 +75,9 @@ def long_runs(
 def still(dtypes: Sequence[torch.dtype] = DTYPES, frames: int = FRAMES) -> list[LongRun]:
     """``accumulate`` with a history in the dtype itself, against float64 on the same frames.
 
-    A step multiplies the error by ``1 - alpha`` and adds a rounding to the dtype and at most 8 in float32, of what is
-    stored: ``e <= (u + 8 u32) max / alpha``. A constant channel must stay as it is. The history length counts exactly
-    up to the first integer whose successor the dtype cannot hold, and stays there.
+    A step multiplies the error by ``1 - alpha`` and adds one rounding to the dtype and at most 8 in float32, relative
+    to the stored value: ``e <= (u + 8 u32) max / alpha``. A constant channel must not change. The history length counts
+    exactly up to the first integer whose successor the dtype cannot represent, and stays there.
     """
     motion = torch.zeros(1, 2, *_SIZE)
     bounds = {dtype: (_unit(dtype) + 8 * _unit(torch.float32)) / ALPHA_MIN for dtype in dtypes}
@@ -88,8 +88,8 @@ def still(dtypes: Sequence[torch.dtype] = DTYPES, frames: int = FRAMES) -> list[
 def moving(dtypes: Sequence[torch.dtype] = DTYPES, frames: int = MOVING_FRAMES) -> list[LongRun]:
     """The same with a camera that moves by fractions of a pixel, so that every step interpolates.
 
-    To the error of a step comes that of the bilinear weights, ``q = p + motion`` rounded as a number of up to the
-    image's width ``W``: 4 taps times ``2 u32 W`` of the largest value.
+    In addition to the error of a step, the bilinear weights have an error, because ``q = p + motion`` is rounded as a
+    number up to the image width ``W``: 4 taps times ``2 u32 W`` of the largest value.
     """
     motion = torch.tensor(_MOTION).reshape(1, 2, 1, 1).expand(1, 2, *_SIZE)
     weights = 8 * max(_SIZE) * _unit(torch.float32)
@@ -101,7 +101,7 @@ def _accumulated(
     name: str, dtypes: Sequence[torch.dtype], frames: int, motion: Tensor, bounds: dict[torch.dtype, float]
 ) -> Iterator[LongRun]:
     at = _times(frames)
-    # Each dtype's history beside that of float64; of a length that float64 never rounds.
+    # Each dtype's history is compared with that of float64, whose length is never rounded.
     histories = {dtype: _noise(torch.Generator().manual_seed(0)).to(dtype) for dtype in (torch.float64, *dtypes)}
     lengths = {dtype: torch.ones(1, 1, *_SIZE, dtype=dtype) for dtype in histories}
     errors: dict[torch.dtype, list[float]] = {dtype: [] for dtype in dtypes}
@@ -131,7 +131,7 @@ def _accumulated(
 
 
 def _wrong(name: str, dtype: torch.dtype, number: int, history: Tensor, length: Tensor) -> str:
-    """What is wrong with a history after so many frames."""
+    """Describe the error of a history after the given number of frames."""
     if not torch.isfinite(history).all() or not torch.isfinite(length).all():
         return f"frame {number}: a value or a length is not finite"
     if name != "still":
@@ -145,10 +145,10 @@ def _wrong(name: str, dtype: torch.dtype, number: int, history: Tensor, length: 
 
 
 def average(dtype: torch.dtype, frames: int = FRAMES) -> LongRun:
-    """The mean of all frames (no least weight of the current one) in :class:`mcdenoise.models.Accumulated`.
+    """The mean of all frames (``alpha_min`` of 0) in :class:`mcdenoise.models.Accumulated`.
 
-    It is kept in float32 whatever the frames are in. The error of frame ``n`` counts ``(n - 1) / n`` in the next one,
-    so that 6 roundings a frame come to at most ``6 u32 (n + 1) / 2``.
+    It is kept in float32 whatever the dtype of the frames. The error of frame ``n`` has the weight ``(n - 1) / n`` in
+    the next one, so 6 roundings per frame add up to at most ``6 u32 (n + 1) / 2``.
     """
     at = _times(frames)
     shot = _Shot(alpha_min=1 / (2 * frames), lag_threshold=math.inf)
@@ -170,7 +170,7 @@ def average(dtype: torch.dtype, frames: int = FRAMES) -> LongRun:
 
 
 def cut(dtype: torch.dtype) -> LongRun:
-    """A scene cut after a long history: the first frame behind it is that frame exactly, and the history says so."""
+    """A cut after a long history: the next result must be exactly that frame, and the history length must show it."""
     shot, generator = _Shot(), torch.Generator().manual_seed(0)
     walls = torch.eye(3, dtype=dtype).reshape(3, 1, 3, 1, 1).expand(3, 1, 3, *_SIZE)
     motion = torch.zeros(1, 2, *_SIZE, dtype=dtype)
@@ -184,10 +184,10 @@ def cut(dtype: torch.dtype) -> LongRun:
 
 
 def light_off(anti_lag: bool) -> LongRun:
-    """A light that goes out, at one sample a pixel: how many frames until less than 1 % of it is left.
+    """A light that is switched off at one sample per pixel: number of frames until less than 1 % of it remains.
 
-    Without the anti-lag rule ``(1 - alpha)^k < 0.01``: 44 frames for 0.1. With it one: a black frame has no noise that
-    could hide the change.
+    Without anti-lag ``(1 - alpha)^k < 0.01``: 44 frames for 0.1. With anti-lag one, because a black frame has no noise
+    that could hide the change.
     """
     means = _light([1.0] * _LIT + [0.0] * _LIT, anti_lag)[_LIT:]
     ghost = next((number for number, mean in enumerate(means, start=1) if mean < _GHOST), len(means))
@@ -198,10 +198,10 @@ def light_off(anti_lag: bool) -> LongRun:
 
 
 def light_on() -> LongRun:
-    """Light that does not change must not be taken for lag: the mean stays, as without the rule, within 1 %.
+    """Constant light must not be taken for lag: the mean must not change by more than 1 %.
 
-    Of normal noise 5 % of the windows differ by 2 standard errors, and not one in ten thousand by 4, from where on the
-    whole history is given up: on average less than 1 % of it, which gets at most 4 times the variance.
+    For normal noise 5 % of the windows differ by 2 standard errors, and fewer than one in ten thousand by 4, where the
+    whole history is discarded: on average less than 1 % of it, which gets at most 4 times the variance.
     """
     runs = {anti_lag: _light([1.0] * 2 * _LIT, anti_lag, deviation=True)[_LIT:] for anti_lag in (False, True)}
     rise = sum(runs[True]) / sum(runs[False]) - 1
@@ -210,12 +210,12 @@ def light_on() -> LongRun:
 
 
 def _light(levels: Sequence[float], anti_lag: bool, deviation: bool = False) -> list[float]:
-    """Mean of the history after each frame of a surface in light of these levels, or its deviation from the level."""
+    """Mean of the history after each frame of a surface with these light levels, or its deviation from the level."""
     shot = _Shot(alpha_min=ALPHA_MIN, lag_threshold=THRESHOLD if anti_lag else math.inf)
     generator, shape = torch.Generator().manual_seed(0), (1, 3, _WINDOW, _WINDOW)
     found: list[float] = []
     for level in levels:
-        # The exponential distribution has the long tail that path tracing has.
+        # Like path tracing, the exponential distribution has a long tail.
         noise = -torch.log(torch.rand(shape, generator=generator).clamp_min(1e-6))
         color, _ = shot.accumulate(Frame(color=level * noise, motion=torch.zeros(1, 2, _WINDOW, _WINDOW)))
         found.append(float((color - level).square().mean().sqrt() if deviation else color.mean()))
@@ -223,7 +223,7 @@ def _light(levels: Sequence[float], anti_lag: bool, deviation: bool = False) -> 
 
 
 class _Shot:
-    """The accumulated frames of a shot, by the model that wears nothing else."""
+    """The accumulated frames of a shot, by a model without other wrappers."""
 
     def __init__(self, **settings: float) -> None:
         self._model = Accumulated(_with_length, **settings)  # type: ignore[arg-type]
@@ -232,7 +232,7 @@ class _Shot:
 
     @torch.no_grad()
     def accumulate(self, frame: Frame) -> tuple[Tensor, Tensor]:
-        """The accumulated color of the next frame, and the length of its history."""
+        """The accumulated color of the next frame, and its history length."""
         journal = Journal()
         with listening(journal):
             output, self._state = self._model(frame, self._state)
@@ -245,7 +245,7 @@ def _with_length(color: Tensor, length: Tensor) -> Output:
 
 
 def _noise(generator: torch.Generator, fireflies: bool = True) -> Tensor:
-    """Noise, a constant, and noise with fireflies of 1e4, in three channels: numbers that every dtype holds."""
+    """Noise, a constant, and noise with fireflies of 1e4, in three channels: values that every dtype represents."""
     color = torch.rand(1, 3, *_SIZE, generator=generator).clamp_min(1e-3)
     color[:, 1] = _CONSTANT
     if fireflies:
@@ -255,7 +255,7 @@ def _noise(generator: torch.Generator, fireflies: bool = True) -> Tensor:
 
 
 def _times(frames: int) -> list[int]:
-    """1, 3, 10, 30, 100, ... and the last."""
+    """1, 3, 10, 30, 100, ... and the last frame."""
     numbers = (digit * 10**power for power in range(9) for digit in (1, 3))
     return sorted({number for number in numbers if number < frames} | {frames})
 

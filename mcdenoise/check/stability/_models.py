@@ -1,4 +1,4 @@
-"""Errors of networks, and what must hold for them whatever the image is."""
+"""Errors of networks, and properties that must hold for all images."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from mcdenoise.models import Accumulated, Skipping, parts_of
 EXPOSURES = (1e-4, 1e-2, 1e2, 1e4)
 _DRAWS = 8
 _LEAST_RADIANCE = 1e-30
-# A convolution rounds weights, activations and results, each of which is a relative change of its products such as the
-# one that is tried.
+# A convolution rounds weights, activations and results; each rounding is a relative change of its products like the
+# random changes that are tried.
 ROUNDED = 3
-# Of eight random changes the largest is not the largest of all, but that is hardly four times it.
+# The largest of eight random changes is not the maximum, but that is hardly four times as large.
 ALLOWED = 4
 
 
 @dataclass(frozen=True)
 class ModelCase:
-    """A frame for a model, with a history, by what is special about it."""
+    """A test frame for a model, with a history."""
 
     name: str
     size: tuple[int, int] = (8, 9)
@@ -69,14 +69,14 @@ CASES = (
 
 
 def check_model(name: str, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
-    """Everything that must hold for a network, in each dtype: a model that learns, without the history that it wears.
+    """Run all checks for a network in each dtype: a trained model without its accumulation.
 
-    In half precision the convolutions run in it and everything else in float32, as ``Denoiser`` runs them.
+    In half precision only the convolutions run in it and everything else in float32, as ``Denoiser`` does.
 
     Args:
-        name: a model's spelling, see :func:`mcdenoise.methods.parse_method`. One that does not learn, or that keeps a
-            state of its own, has no such checks.
-        dtypes: of the convolutions.
+        name: a model, see :func:`mcdenoise.methods.parse_method`. There are no checks for a model that is not trained,
+            or that has a state of its own.
+        dtypes: dtypes of the convolutions.
 
     Raises:
         InputError: there is no such model.
@@ -93,7 +93,7 @@ def check_model(name: str, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[C
 
 
 def _without_history(model: Any) -> Any:
-    """What is inside of the accumulation, which hands it what a case has: a color and its history's length."""
+    """The model inside the accumulation, which receives a color and its history length."""
     for accumulated in parts_of(model, Accumulated):
         inner = accumulated.inner
         return inner.inner if isinstance(inner, Skipping) else inner
@@ -106,7 +106,7 @@ def _image(model: nn.Module, frame: Frame) -> Tensor:
 
 
 def _check_case(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, dtype: torch.dtype) -> Iterator[Check]:
-    """Forward against float64, in units of what a relative change of all weights and inputs by ``u`` does to it."""
+    """Compare with float64, in units of the effect of a relative change of all weights and inputs by ``u``."""
     frame = case.frame()
     color = frame.color.clone().requires_grad_()
     with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
@@ -116,8 +116,8 @@ def _check_case(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, 
         name, case.name, name_of(dtype), "", "finite", 0, 0, 0, valid, "" if valid else "NaN, infinite or below 0"
     )
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    # Of the image in units of its own brightness, so that the largest radiance does not overflow the sum; what is below
-    # 1e-30 counts as that, as it does in `auto_exposure`.
+    # Normalize the image by its brightness, so that the sum does not overflow; values below 1e-30 count as 1e-30, as in
+    # `auto_exposure`.
     scale = max(float(frame.color.max()), _LEAST_RADIANCE)
     if not frame.color.any():
         scale = 1.0
@@ -131,7 +131,7 @@ def _check_case(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, 
 
 @torch.no_grad()
 def _check_exposure(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, dtype: torch.dtype) -> Check:
-    """``model(s x) = s model(x)``: the worst factor of all."""
+    """``model(s x) = s model(x)``: the check with the worst factor."""
     frame = case.frame()
     checks: list[Check] = []
     for exposure in EXPOSURES:
@@ -148,7 +148,7 @@ def _compared(name: str, exact: nn.Module, case: ModelCase, dtype: torch.dtype, 
     unit = torch.finfo(dtype).eps / 2
     products = max(relative_change(_moved(exact, frame, unit, seed), expected) for seed in range(_DRAWS))
     sums = max(relative_change(_summed(exact, frame, seed), expected) for seed in range(_DRAWS))
-    # Everything outside of the convolutions is in float32.
+    # Everything but the convolutions is in float32.
     response = ROUNDED * max(products, torch.finfo(torch.float32).eps) + sums
     error, allowed = relative_change(found, expected) / (2 * unit), ALLOWED * response / (2 * unit)
     message = "" if error <= allowed else f"error {error:.3g} eps, expected at most {allowed:.3g}"
@@ -156,7 +156,7 @@ def _compared(name: str, exact: nn.Module, case: ModelCase, dtype: torch.dtype, 
 
 
 def _moved(exact: nn.Module, frame: Frame, unit: float, seed: int) -> Tensor:
-    """The image with every weight and buffer changed by ``unit`` of itself, up or down."""
+    """The image after changing every weight and buffer by the relative amount ``unit``, up or down."""
     generator = torch.Generator().manual_seed(seed)
 
     def move(tensor: Tensor) -> Tensor:
@@ -184,7 +184,7 @@ def _summed(exact: nn.Module, frame: Frame, seed: int) -> Tensor:
         squared = copy.deepcopy(layer)
         for parameter in squared.parameters():
             parameter.square_()
-        # Not as a call, which would come here again.
+        # Call forward directly, because a call would run this hook again.
         spread = squared.forward(given[0].square(), *given[1:]).sqrt()
         signs: Tensor = torch.randint(0, 2, result.shape, generator=generator) * 2 - 1
         terms = layer.weight.numel() / layer.out_channels
@@ -202,7 +202,7 @@ def _summed(exact: nn.Module, frame: Frame, seed: int) -> Tensor:
 
 
 def relative_change(found: Tensor, expected: Tensor) -> float:
-    """The largest change, relative where the image is bright, and of half its mean where it is dark."""
+    """The largest change, relative to the pixel in bright areas, and to half the image's mean in dark ones."""
     unit = expected.abs().double() + expected.double().mean() / 2
-    # Below the smallest normal number there are fewer digits.
+    # Subnormal numbers have fewer digits.
     return float(((found.double() - expected).abs() / (unit + torch.finfo(torch.float32).tiny)).max())

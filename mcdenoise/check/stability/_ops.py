@@ -1,25 +1,26 @@
-"""Errors of ops and their gradients, against bounds from the analysis of rounding.
+"""Errors of operators and their gradients, compared with bounds by rounding analysis.
 
-The bound of a result ``y = f(x)``. Let ``u`` be the unit roundoff of the dtype in which an op computes (half precision
-computes in float32) and ``v`` that of the result's. An op that is backward stable gives the exact result of inputs off
-by at most ``n u`` of their magnitude ``s``, and rounds the result:
+The bound for a result ``y = f(x)``: let ``u`` be the unit roundoff of the dtype in which an operator computes (float32
+for half precision) and ``v`` that of the result. A backward stable operator returns the exact result for inputs
+perturbed by at most ``n u`` of their magnitude ``s``, and rounds it:
 
     ``|error| <= v |y| + n u (|y| + sum_j s_j |dy / dx_j|)``
 
-The sum is the (absolute, componentwise) condition number: how far the exact result moves when inputs do. It is not
-taken from derivatives but measured in float64, by moving every input up and down by ``16 u``, so that a kink or a jump
-as near as rounding can reach is in it. ``s_j`` is ``|x_j|``, at least the smallest normal number (below it there are
-fewer digits), and more where an op computes with larger numbers, see :class:`mcdenoise.check.case.Rounding`.
+The sum is the (absolute, componentwise) condition number: the change of the exact result when inputs change. It is not
+computed from derivatives but measured in float64, by moving every input up and down by ``16 u``, so that it includes
+kinks and jumps within the range of rounding. ``s_j`` is ``|x_j|``, at least the smallest normal number (subnormal
+numbers have fewer digits), and more if an operator computes with larger values, see
+:class:`mcdenoise.check.case.Rounding`.
 
-``n`` is a count of roundings. A sum of ``m`` terms has ``m - 1``, and a result that depends on ``m`` inputs is made of
-sums of at most so many; what is multiplied, divided and exponentiated on the way adds no more than 8. So ``n = m + 8``.
+``n`` is the number of roundings. A sum of ``m`` terms has ``m - 1``, and a result that depends on ``m`` inputs consists
+of sums of at most ``m`` terms; other operations add no more than 8. So ``n = m + 8``.
 
 The same holds for gradients, as functions of inputs and upstream gradient; half precision is rounded between the steps
-of an op, since that is what it hands to autograd, so that ``u`` is the dtype's own there.
+of an operator, because autograd receives it, so ``u`` is the dtype's own roundoff there.
 
-A function of one's own is compared with itself in float64. Nothing is known of what it computes in between, so that
-``u`` is the dtype's own in its results, too, and its images are tried one by one. Its gradients in float64, with which
-those in other dtypes are compared, are first compared with difference quotients.
+A user's own function is compared with itself in float64. Its intermediate values are unknown, so ``u`` is the dtype's
+own roundoff also for results, and its images are checked one by one. Its float64 gradients, which are the reference for
+other dtypes, are first compared with difference quotients.
 """
 
 from __future__ import annotations
@@ -48,10 +49,10 @@ from mcdenoise.own import in_one_line
 
 _DEPTH = 8
 _PROBE = 16
-_AT_ONCE = 256  # changed inputs in one batch
-_NOISE = 1e-12  # of float64 itself: a vectorised exponential rounds its last elements differently
+_AT_ONCE = 256  # number of changed inputs in one batch
+_NOISE = 1e-12  # rounding of float64 itself: a vectorised exponential rounds its last elements differently
 _CONSTANT = 0.7
-# Powers of two scale without rounding, so that results must scale bit by bit: 1.2e-4 and 8.2e3.
+# Powers of two scale without rounding, so results must scale exactly: 1.2e-4 and 8.2e3.
 _EXPOSURES = (2.0**-13, 2.0**13)
 ADJOINTS = (("kernel_conv", "kernel_splat"),)
 
@@ -60,7 +61,7 @@ Function = Callable[[Sequence[Tensor]], list[Tensor]]
 
 @dataclass(frozen=True)
 class _Trial:
-    """An op on a case in a dtype: what it is a function of, and the numbers to try."""
+    """An operator with a case and a dtype: its rounded arguments, and their values."""
 
     op: Op
     case: Case
@@ -70,14 +71,14 @@ class _Trial:
 
     @property
     def leaves(self) -> list[Tensor]:
-        """The tensors that are rounded; a surface is only compared."""
+        """The tensors that are rounded; surfaces are only compared."""
         found: list[Tensor] = []
         map_tensors(lambda tensor: found.append(tensor) or tensor, self.numbers)  # type: ignore[func-returns-value]
         return found
 
     @property
     def images(self) -> list[str]:
-        """The op's images, as far as the case has them."""
+        """The operator's image arguments that the case has."""
         return [name for name in self.op.images if name in self.inputs]
 
     @property
@@ -91,20 +92,20 @@ class _Trial:
         return {name: value for name, value in self.inputs.items() if not isinstance(value, Surface)}
 
     def run(self, leaves: Sequence[Tensor]) -> list[Tensor]:
-        """The op with other tensors in place of :attr:`leaves`, possibly several batches of them."""
+        """Run the operator with other tensors in place of :attr:`leaves`, possibly several batches of them."""
         remaining = iter(leaves)
         given = map_tensors(lambda _: next(remaining), self.numbers)
         surfaces = {name: value for name, value in self.inputs.items() if name not in given}
         copies = leaves[0].shape[0] // max(self.leaves[0].shape[0], 1) if surfaces else 1
         repeated = map_tensors(lambda tensor: tensor.to(leaves[0].dtype).repeat(copies, 1, 1, 1), surfaces)
-        # The float64 twin always runs on the first backend, the plain one.
+        # The float64 twin always runs on the first backend, the reference.
         backend = self.backend if leaves[0].dtype == self.dtype else backends(self.op)[0]
         with use(backend) if backend else nullcontext():
             results = self.op.function(**given, **repeated, **self.case.settings)
         return [results] if isinstance(results, Tensor) else list(results)
 
     def gradients(self, leaves: Sequence[Tensor]) -> list[Tensor]:
-        """Of the results with upstream gradients, which are the last of ``leaves``, in the others."""
+        """Gradients in all ``leaves`` but the last ones, which are the upstream gradients."""
         own = [leaf.detach().requires_grad_() for leaf in leaves[: len(self.leaves)]]
         with torch.enable_grad():
             results = self.run(own)
@@ -119,7 +120,7 @@ class _Trial:
 
 @dataclass(frozen=True)
 class _Exact:
-    """One result in float64, with what its error may be."""
+    """A float64 result, and the bound of its error."""
 
     value: Tensor
     condition: Tensor
@@ -130,28 +131,28 @@ Known = dict[str, list[_Exact]]
 
 
 def select(names: Sequence[str] | None = None) -> list[Op]:
-    """Ops by name, or functions of one's own, ``path/to/file.py:function``; all ops for ``None``.
+    """Find operators by name, or own functions, ``path/to/file.py:function``; ``None`` means all operators.
 
     Raises:
-        InputError: there is no such op or function, or nothing that it runs on.
+        InputError: an operator or function does not exist, or there are no inputs on which it runs.
     """
-    # What is not of a batch cannot be tried many times at once.
+    # An operator without a batch axis cannot be checked with many inputs at once.
     every = OPS + tuple(step for step in STEPS if step.batched)
     return list(every) if names is None else find_ops(names, every)
 
 
 def backends(op: Op) -> tuple[Backend | None, ...]:
-    """What the op has forms in; ``(None,)`` where there is nothing to choose."""
+    """The backends of an operator; ``(None,)`` if there is no choice."""
     found = backends_of(op.function)
     return found if len(found) > 1 else (None,)
 
 
 def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
-    """Everything that must hold for an op, in each dtype, on each backend that runs here, case by case.
+    """Run all checks of an operator, in each dtype, on each backend that works here, case by case.
 
     Args:
-        op: an op of the table.
-        dtypes: the dtypes to try it in.
+        op: an operator of the table.
+        dtypes: dtypes to check.
     """
     if op.own:
         yield from (_check_derivative(op, case) for case in op.cases if case.differentiable)
@@ -170,17 +171,17 @@ def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
 def check_stability(
     function: Callable[..., Any], *inputs: Tensor, dtypes: Sequence[torch.dtype] = DTYPES
 ) -> list[Check]:
-    """Compare a function of one's own, and its gradients, with itself in float64, against bounds from analysis.
+    """Compare a user's own function and its gradients with itself in float64, with bounds by rounding analysis.
 
     ``mcdenoise stability path/to/file.py:function`` does the same.
 
     Args:
-        function: of floating-point tensors, which returns one or several.
-        inputs: small tensors to try it on; without them, its example inputs, see :mod:`mcdenoise.check.own`.
-        dtypes: the dtypes to try it in.
+        function: function of floating-point tensors, which returns one or several tensors.
+        inputs: small tensors; without them, its example inputs are used, see :mod:`mcdenoise.check.own`.
+        dtypes: dtypes to check.
 
     Raises:
-        InputError: it is no such function, or there is nothing that it runs on.
+        InputError: the function is not of this kind, or there are no inputs on which it runs.
 
     Example:
         >>> import torch
@@ -194,24 +195,24 @@ def check_stability(
 def check_case(
     op: Op, case: Case, dtype: torch.dtype, backend: Backend | None = None, known: Known | None = None
 ) -> list[Check]:
-    """Everything that must hold for an op on one case.
+    """Run all checks of an operator on one case.
 
     Args:
-        op: an op of the table.
+        op: an operator of the table.
         case: one of its cases.
-        dtype: of the inputs.
+        dtype: dtype of the inputs.
         backend: see :func:`backends`.
-        known: what is exact in this case and dtype, which takes most of the time and is the same for every backend;
-            what is not yet in it is put there.
+        known: cache of the exact results of this case and dtype, which take most of the time and are the same for every
+            backend.
 
     Returns:
-        One check of each kind that applies; a single one, ``"runs"``, where the backend refuses.
+        One check of each kind that applies; a single one, ``"runs"``, if the backend raises an error.
     """
     trial = _Trial(op, case, dtype, backend, case.inputs(dtype))
     try:
         results = trial.run(trial.leaves)
     except Exception as error:
-        # A backend that cannot run on this machine says so, and a function of one's own may fail in one dtype alone.
+        # A backend that does not work on this machine raises an error, and an own function may fail in a single dtype.
         if not (op.own or isinstance(error, ValueError)):
             raise
         passed = bool(backend) and "can run here" in str(error)
@@ -227,7 +228,7 @@ def check_case(
     except Exception as error:
         if op.own:
             return [*checks, _found(trial, "gradient", 0, 0, 0, in_one_line(error))]
-        # A backend that has no derivatives says so too.
+        # A backend without derivatives raises an error, too.
         if not isinstance(error, ValueError) or not backend or "can run here" not in str(error):
             raise
     else:
@@ -241,14 +242,14 @@ def check_case(
 
 
 def _once(known: Known, what: str, find: Callable[..., list[_Exact]], *arguments: Any) -> list[_Exact]:
-    """What is exact, found anew only where it is not known."""
+    """Look up exact results in the cache, or compute them."""
     if what not in known:
         known[what] = find(*arguments)
     return known[what]
 
 
 def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
-    """The op's results by its equation, and how far they may be missed."""
+    """The results of the operator's equation, with bounds of the error."""
     inputs = map_tensors(Tensor.double, trial.inputs)
     references = trial.op.reference(**inputs, **trial.case.settings)
     references = [references] if isinstance(references, Tensor) else list(references)
@@ -264,7 +265,7 @@ def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
 
 
 def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact]) -> list[_Exact]:
-    """The gradients of the float64 op, which gradcheck proves against difference quotients."""
+    """The gradients of the float64 operator, which gradcheck compares with difference quotients."""
     rounding = trial.op.rounding(map_tensors(Tensor.double, trial.inputs), trial.case.settings)
     exact = [leaf.double() for leaf in leaves]
     magnitudes = _magnitudes(trial, exact[: len(trial.leaves)], rounding, trial.dtype)
@@ -272,7 +273,7 @@ def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact])
     conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype, at_once=trial.op.batched)
     largest = max((leaf.abs().max().item() for leaf in exact[len(trial.leaves) :] if leaf.numel()), default=0.0)
     cancelling = _by_leaf(trial, [torch.zeros_like(leaf) for leaf in exact[: len(trial.leaves)]], rounding.gradients)
-    # Where a result is infinite by right, so may its derivative be, or be nothing at all; elsewhere nothing excuses it.
+    # If a result is infinite, its derivative may be infinite or NaN; elsewhere it may not.
     defined = all(result.value.isfinite().all() for result in results)
     bounded = []
     for value, terms, (condition, fan_in) in zip(trial.gradients(exact), cancelling, conditions, strict=True):
@@ -283,13 +284,13 @@ def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact])
 
 
 def _magnitudes(trial: _Trial, leaves: list[Tensor], rounding: Rounding, dtype: torch.dtype) -> list[Tensor]:
-    """How large the numbers are whose rounding each input must absorb."""
+    """The magnitudes of the values whose rounding each input must absorb."""
     inner = _by_leaf(trial, [leaf.abs() for leaf in leaves], rounding.arguments)
     return [magnitude + torch.finfo(dtype).tiny for magnitude in inner]
 
 
 def _by_leaf(trial: _Trial, defaults: list[Tensor], given: Inputs) -> list[Tensor]:
-    """One tensor for each leaf: what is given for its argument, or else its default."""
+    """One tensor for each leaf: the given one for its argument, or else its default."""
     remaining, found = iter(defaults), list[Tensor]()
     named = map_tensors(lambda _: next(remaining), trial.numbers)
     map_tensors(lambda tensor: found.append(tensor) or tensor, named | given)  # type: ignore[func-returns-value]
@@ -299,15 +300,15 @@ def _by_leaf(trial: _Trial, defaults: list[Tensor], given: Inputs) -> list[Tenso
 def _conditions(
     function: Function, leaves: list[Tensor], magnitudes: list[Tensor], dtype: torch.dtype, *, at_once: bool
 ) -> list[tuple[Tensor, Tensor]]:
-    """Of each result ``sum_j s_j |dy / dx_j|``, measured, and the number of inputs that it depends on.
+    """For each result, the measured ``sum_j s_j |dy / dx_j|``, and the number of inputs that it depends on.
 
-    All ops treat the images of a batch alike and alone, so that many changed inputs are tried in one call,
+    Operators process the images of a batch independently, so many changed inputs are evaluated in one call,
     ``at_once``.
     """
     step = _PROBE * torch.finfo(dtype).eps / 2
     base = function(leaves)
     changing = function if at_once else _one_by_one(function, leaves)
-    # Infinity is not rounded, and what is never negative is not moved below zero.
+    # Infinity is not rounded, and non-negative inputs are not moved below zero.
     up = [torch.where(size.isfinite(), step * size, 0).flatten() for size in magnitudes]
     down = [move * ((leaf != 0) | (leaf < 0).any()).flatten() for move, leaf in zip(up, leaves, strict=True)]
     totals = [torch.zeros_like(result) for result in base]
@@ -317,7 +318,7 @@ def _conditions(
         count = min(_AT_ONCE, starts[-1] - start)
         copies = [leaf.repeat(2 * count, *(1,) * (leaf.ndim - 1)) for leaf in leaves]
         for i, (first, end) in enumerate(pairwise(starts)):
-            # Those numbers of the leaf whose turn it is: each has two copies to itself.
+            # The numbers of the current leaf: each has two copies of its own.
             numbers = torch.arange(max(start, first), max(start, first, min(start + count, end)))
             if not len(numbers):
                 continue
@@ -335,7 +336,7 @@ def _conditions(
 
 
 def _one_by_one(function: Function, leaves: list[Tensor]) -> Function:
-    """The function of many copies of its inputs, called for each."""
+    """Call the function once for each of several copies of its inputs."""
 
     def run(copies: Sequence[Tensor]) -> list[Tensor]:
         count = copies[0].numel() // leaves[0].numel()
@@ -353,11 +354,11 @@ def _bounded(value: Tensor, condition: Tensor, fan_in: Tensor, inner: torch.dtyp
 
 
 def _compare(trial: _Trial, what: str, results: list[Tensor], exact: list[_Exact]) -> Check:
-    """The result nearest to its bound, or beyond; what cannot be held must be infinite, and all else finite."""
+    """The result closest to its bound; values beyond the dtype's range must be infinite, all others finite."""
     worst, highest, condition, message = (0.0, 0.0), 0.0, 0.0, ""
     for result, truth in zip(results, exact, strict=True):
         largest = torch.finfo(result.dtype).max
-        # Sums of both signs may leave the range on the way to a result within it.
+        # Sums of both signs may exceed the range before they return to it.
         safe = truth.condition < torch.finfo(accumulator_dtype(result.dtype)).max / 2
         safe &= truth.value.abs() + truth.bound < largest
         found = result.double()
@@ -388,13 +389,13 @@ def _compare(trial: _Trial, what: str, results: list[Tensor], exact: list[_Exact
 
 
 def _check_derivative(op: Op, case: Case) -> Check:
-    """First derivatives in float64, which are the reference of those in other dtypes."""
+    """Check first derivatives in float64, which are the reference for other dtypes."""
     result = gradients.check_case(op, case, order=1)
     return Check(op.name, case.name, "float64", "", "derivative", 0, 0, 0, result.passed, result.message)
 
 
 def _check_weights(trial: _Trial, weights: Tensor) -> Check:
-    """Non-negative, and of sum one: each is rounded by its share of ``v``, and the sum by one more for each tap."""
+    """Check that weights are non-negative and sum to one: each is rounded by ``v``, and the sum once for each tap."""
     total = weights.double().sum(1)
     allowed = _unit(weights.dtype) + (weights.shape[1] + _DEPTH) * _unit(accumulator_dtype(weights.dtype))
     allowed += weights.shape[1] * torch.finfo(weights.dtype).tiny
@@ -407,7 +408,7 @@ def _check_weights(trial: _Trial, weights: Tensor) -> Check:
 
 
 def _check_constant(trial: _Trial, known: Known) -> Check:
-    """The forward check once more, with constant images: a mean of equal numbers is that number."""
+    """Run the forward check with constant images: a mean of equal numbers is that number."""
     inputs = dict(trial.inputs)
     for name in trial.images:
         inputs[name] = torch.full_like(_tensor(inputs[name]), _CONSTANT)
@@ -418,7 +419,7 @@ def _check_constant(trial: _Trial, known: Known) -> Check:
 
 
 def _check_exposure(trial: _Trial, result: Tensor) -> Check:
-    """``f(s x) = s f(x)``, bit by bit while nothing leaves the range of the dtype."""
+    """``f(s x) = s f(x)`` exactly, unless the range of the dtype is exceeded."""
     message = ""
     for exposure in _EXPOSURES:
         inputs = dict(trial.inputs)
@@ -441,7 +442,7 @@ def _normal_range(tensor: Tensor) -> Tensor:
 
 
 def _check_adjoint(op: Op, transpose: Op, dtype: torch.dtype) -> Iterator[Check]:
-    """``<f(x), y> = <x, f^T(y)>``: both are the same sum, of terms rounded no more than those of a result are."""
+    """``<f(x), y> = <x, f^T(y)>``: both are the same sum, whose terms have at most the rounding of a result."""
     for case in op.cases:
         if case.kind == "extreme":
             continue
@@ -455,7 +456,7 @@ def _check_adjoint(op: Op, transpose: Op, dtype: torch.dtype) -> Iterator[Check]
         absolute = map_tensors(lambda tensor: tensor.double().abs(), others)
         terms = (op.function(**{name: x.double().abs()}, **absolute, **case.settings) * y.double().abs()).sum().item()
         count = _tensor(others["kernel"]).shape[1]
-        # Signed weights are not the normalised ones of their absolute values: the terms are larger by that ratio.
+        # Signed weights are not normalised by their absolute values: the terms are larger by this ratio.
         if case.settings.get("border") == "renormalize":
             terms *= _cancellation(_tensor(others["kernel"]))
         allowed = 2 * (_unit(dtype) + 2 * (count + _DEPTH) * _unit(accumulator_dtype(dtype))) * terms
