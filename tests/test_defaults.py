@@ -22,7 +22,7 @@ HEIGHT, WIDTH = 40, 48
 
 @contextmanager
 def default(name: str) -> Iterator[None]:
-    """A default that somebody's program has set. Of a device that holds no data every use is an error."""
+    """A default that the user's program has set. On a device without data every use is an error."""
     try:
         if name == "meta":
             torch.set_default_device("meta")

@@ -109,7 +109,7 @@ def test_the_past_matters_until_it_is_reset(frames: list[Frame]) -> None:
 
 
 def test_a_module_of_your_own(frames: list[Frame]) -> None:
-    """It may wear what the zoo wears."""
+    """It works in the wrappers of the zoo."""
     network = Keep()
     output = Denoiser(Demodulated(Accumulated(network))).output(frames[0])
     assert frames[0].albedo is not None

@@ -101,7 +101,7 @@ def check(denoiser: Denoiser, frames: list[dict[str, Tensor]], names: tuple[str,
     return sizes
 
 
-# The larger one has the pixels for which fast backends are chosen where nobody asks for a derivative.
+# The larger one has enough pixels for compiled backends, which are chosen if no derivative is requested.
 @pytest.mark.parametrize("size", [(24, 40), (96, 96)], ids=str)
 @pytest.mark.parametrize("name", ["cascaded_v2_micro", "cascaded_v2_tiny"])
 def test_derivative_of_the_third_frame_in_the_first(name: str, size: tuple[int, int]) -> None:

@@ -19,7 +19,7 @@ from mcdenoise.models import Recurrent as Recurrence
 RTOL, ATOL = 1e-4, 1e-5
 
 MINE = '''
-"""Somebody's own network, with what it wears."""
+"""A user's own network, with its wrappers."""
 import torch
 from torch import nn
 

@@ -71,7 +71,7 @@ ALLOWED: dict[str, set[str]] = {
     "": LIBRARY,
 }
 OPS_KNOW = {"torch", "kornia"}
-# Fast forms are imported when one is chosen; `_backend` looks whether that is possible.
+# Fast backends are imported when one is chosen; `_backend` tests whether that is possible.
 FAST_OPS_KNOW = OPS_KNOW | {"numba", "numpy", "triton"}
 FAST_FORMS = ("mcdenoise.ops._numba", "mcdenoise.ops._triton")
 # Rooms in which a file still imports one that imports it.

@@ -513,7 +513,7 @@ def test_a_reference_is_resumed_in_the_middle(tmp_path: Path, monkeypatch: pytes
     assert calls[-1] == (71, 71)
     (folder / "reference0.exr").unlink()
     (folder / "reference0.partial.npz").write_text("hello")
-    with pytest.raises(InputError, match=r"reference0\.partial\.npz: expected a reference in the making"):
+    with pytest.raises(InputError, match=r"reference0\.partial\.npz: expected an unfinished reference"):
         render_sequence(demo_scene(), demo_cameras(1), folder.parent, **settings)
 
 

@@ -48,7 +48,7 @@ from mcdenoise.models.accumulated import Accumulated
 
 PROTOCOL_NAMES = ("strict", "meng2020", "fan2021")
 SEEDS = (1, 2, 3)
-KINDS = ("random scenes", "four times the steps", "one left out")
+KINDS = ("random scenes", "four times the steps", "leave one out")
 Errors = dict[str, float]  # by "protocol metric"
 
 

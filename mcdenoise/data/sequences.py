@@ -170,7 +170,7 @@ class Sequence:
         if not isinstance(self._source, RenderedFiles):
             raise InputError(
                 f"{self.root}: expected files with layers to add '{name}' to, found the {self.layout} layout; "
-                "leave out --output-layer: the files stay as they are"
+                "omit --output-layer: each result is a file of its own"
             )
         self._source.check_output_layer(name)
 

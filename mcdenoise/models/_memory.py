@@ -54,7 +54,7 @@ class Division:
     """How a model's images are divided into tiles.
 
     Args:
-        model: any method; where it wears no :class:`mcdenoise.models.Tiled`, whole images are computed.
+        model: any method; whole images are computed unless it contains :class:`mcdenoise.models.Tiled`.
         side: of the tiles in pixels, a multiple of 32 from 64 on; by default as memory allows.
         max_memory: in GB, see :class:`mcdenoise.denoiser.Denoiser`.
         device: where the model runs.

@@ -1,4 +1,4 @@
-"""A-SVGF: SVGF that gives up as much of its history as the light has changed.
+"""A-SVGF: SVGF that discards the history in proportion to how much the light has changed.
 
 Schied et al. 2018, "Gradient Estimation for Real-Time Adaptive Temporal Filtering", Proceedings of the ACM on Computer
 Graphics and Interactive Techniques 1(2). What it has in common with SVGF is :class:`mcdenoise.models.svgf.Svgf`: it
@@ -29,7 +29,7 @@ of an exponential window;
 paper's samples: a change that is smaller than the noise of a neighbourhood is not seen at once, and sharp edges of
 light delay it.
 
-What the paper leaves open: the length of a history of which a part is given up. A history in which the current frame
+What the paper leaves open: the length of a history that is partly discarded. A history in which the current frame
 has the weight ``alpha'`` counts as ``1 / alpha'`` frames, so that light that went on or off begins with an average
 anew. The transform of the strata (five levels of 3x3 taps, as many as the published code has) has the edge-stopping
 functions of SVGF without that of the luminance, which is what may have changed. The published code then takes the
@@ -98,7 +98,7 @@ class Asvgf(Svgf):
         return Needs(needs.buffers, needs.uses | {GRADIENT}, trainable=False)
 
     def changed(self, frame: Frame, history: History, motion: Tensor | None) -> Tensor:
-        """Lambda: how much of the history is to be given up.
+        """Lambda: the fraction of the history to discard.
 
         Args:
             frame: the current frame.

@@ -154,8 +154,8 @@ class PyramidNetwork(nn.Module):
         weighted = torch.cat([*light, torch.ones_like(worth)], 1) * worth
         filtered = self._filtered(weighted, predicted, guides)
         mean = filtered[:, :-1] / filtered[:, -1:]
-        near, past, wide = torch.softmax(parts["albedo"], 1).split(1, 1)
-        smooth = near * smooth + past * before + wide * mean[:, 3:6]
+        near, history, wide = torch.softmax(parts["albedo"], 1).split(1, 1)
+        smooth = near * smooth + history * before + wide * mean[:, 3:6]
         gain = torch.exp(_MOST_GAIN * torch.tanh(parts["gain"]))
         result = mean[:, :3] * gain / _ratio(albedo, smooth, matt)
         if others:

@@ -1,4 +1,4 @@
-"""Numbers that the reference of an op and its fast backends share; compiled kernels have them built in."""
+"""Numbers that the reference of an op and its fast backends fraction; compiled kernels have them built in."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much the light has changed since the frame before, and so how much of the history is to be given up."""
+"""How much the light has changed since the frame before, and so which fraction of the history to discard."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def _check(image: Tensor, kernel: Tensor, *, border: str = "replicate") -> None:
 
 @op("numba", "triton", check=_check, differentiable=True)
 def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
-    """Filter an image with a kernel of its own at every pixel; all channels share the pixel's kernel.
+    """Filter an image with a kernel of its own at every pixel; all channels fraction the pixel's kernel.
 
     ``out[p] = sum_t kernel[t, p] * image[p + o_t]`` over the offsets ``o_t`` of the ``K x K`` window.
 

@@ -23,7 +23,7 @@ def history_lag(
     threshold: float = THRESHOLD,
     kernel_size: int = KERNEL_SIZE,
 ) -> Tensor:
-    """How much of a long history to give up for a shorter one, because the light has changed.
+    """Fraction of a long history to replace by a shorter one, because the light has changed.
 
     Noise hides a change of the light in a pixel, but not in the mean of a window. With ``y`` the mean over channels,
     ``m_h`` and ``m_r`` its means over the ``n`` pixels of the window that lie in the image, of ``history`` and of

@@ -13,7 +13,7 @@ from mcdenoise.ops._window import Border, accumulator_dtype, corner, unpad
 
 
 def pyramid_partition(image: Tensor, logits: Tensor) -> tuple[Tensor, ...]:
-    """Share out every pixel's light among the levels of a pyramid, each half the size of the one before.
+    """Split every pixel's light among the levels of a pyramid, each half the size of the one before.
 
     ``out_i[q] = mean of softmax(logits)[i] * image over the pixels of block q``, blocks of ``2^i x 2^i`` pixels for
     ``i = 0, ..., K - 1``. Blocks at the lower and right border hold only the pixels that exist. No light is lost: the

@@ -60,7 +60,7 @@ def to_srgb(radiance: Image) -> Codes:
 
 
 def halved(radiance: Image) -> Image:
-    """Mean of 2x2 pixels; an odd last row or column is left out."""
+    """Mean of 2x2 pixels; an odd last row or column is dropped."""
     height, width = (length // 2 * 2 for length in radiance.shape[:2])
     blocks = radiance[:height, :width].reshape(height // 2, 2, width // 2, 2, -1)
     return np.asarray(blocks.mean((1, 3)), dtype=np.float32)

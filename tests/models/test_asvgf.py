@@ -70,7 +70,7 @@ def test_a_light_that_goes_out_is_gone_at_once() -> None:
 def test_noise_is_hardly_taken_for_a_change() -> None:
     """Of steady light with the noise of one sample, a history of hardly less than the 10 frames of ``alpha``.
 
-    What exceeds two standard errors of a neighbourhood gives up as much, which is a few parts in a hundred.
+    Pixels that exceed two standard errors of a neighbourhood discard as much, which is a few parts in a hundred.
     """
     model, plain, state, other = Asvgf(alpha=0.1), Svgf(alpha=0.1), None, None
     for seed in range(16):

@@ -255,7 +255,7 @@ def test_weights_of_another_method_or_width_are_refused(name: str, tmp_path: Pat
 
 
 def test_weights_of_a_model_in_a_wrapper_are_those_of_the_model(tmp_path: Path) -> None:
-    """What it wears has none; of another one in the same wrapper, a layer is named."""
+    """Names in messages do not include wrappers; for another model in the same wrapper, the message names a layer."""
     path = tmp_path / "weights.safetensors"
     path.write_bytes(save_weights(Recurrent(model_of("kp")), "kp", {"width": WIDTH}, {}))
     loaded = create_model("kp", weights=path)

@@ -106,7 +106,7 @@ def test_without_a_history_a_frame_is_all_there_is() -> None:
     with torch.no_grad():
         alone = chain(frame)[0].image
         assert torch.equal(chain(frame.replace(length=length))[0].image, alone)
-        # The first network takes the frame's color for it, where nobody says what the frame is alone.
+        # Without a buffer for the current frame, the first network uses the frame's color for it.
         pixel = networks(chain)[0]
         assert torch.equal(pixel(frame.replace(current=None))[0].image, pixel(frame)[0].image)
         for other in (frame.replace(current=2 * frame.color, length=length), frame.replace(length=4 * length)):

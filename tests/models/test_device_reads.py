@@ -236,7 +236,7 @@ def test_repairs_are_those_of_validation() -> None:
         late.judge(late.numbers.tolist())
 
 
-# Time on a device that runs behind: marks are made, and nothing waits for them before somebody asks.
+# Time on an asynchronous device: marks are recorded, and nothing waits for them until they are requested.
 
 
 class Event:

@@ -311,7 +311,7 @@ def test_histories_of_layers_have_the_weights_of_the_color_s() -> None:
 
 @torch.no_grad()
 def test_a_light_that_goes_out_goes_out_of_its_layer() -> None:
-    """The test for lag gives up a layer's history where it gives up that of the color."""
+    """The test for lag discards a layer's history where it discards that of the color."""
     denoiser = Denoiser("accumulated")
     steady, lamp = torch.full((1, 3, 32, 40), 0.2), torch.ones(1, 3, 32, 40)
     for number in range(20):
@@ -400,8 +400,8 @@ def test_whatever_a_method_wears_its_layers_come_through() -> None:
     blur = JointBilateral(sigma_space=1.0)
     frames = shot(blur, 1, (64, 96))[0]
     bare = blur(frames)[0]
-    for worn in (Exposed(blur), Tiled(blur, 32), Skipping(blur), Accumulated(blur, firefly_limit=float("inf"))):
-        output, _ = worn(frames)
+    for wrapped in (Exposed(blur), Tiled(blur, 32), Skipping(blur), Accumulated(blur, firefly_limit=float("inf"))):
+        output, _ = wrapped(frames)
         for name, layer in output.layers.items():
             torch.testing.assert_close(layer, bare.layers[name], rtol=1e-4, atol=1e-5)
     output, _ = Demodulated(blur)(frames)

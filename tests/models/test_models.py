@@ -364,7 +364,7 @@ def test_a_module_of_images_is_a_method() -> None:
     frame = whole_frame(model, 4, 5).replace(extra={})
     expected = net(frame.color, frame.albedo)
     assert torch.equal(model(frame)[0].image, expected)
-    # A buffer that nobody foresaw is found by its name, too.
+    # A buffer outside the vocabulary is found by its name, too.
     crypto = torch.rand(1, 3, 4, 5)
     assert torch.equal(model(frame.replace(extra={"crypto": crypto}))[0].image, expected + crypto)
     assert as_model(lambda color: Output(color, {"half": color / 2}))(frame)[0].stages.keys() == {"half"}

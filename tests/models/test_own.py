@@ -26,7 +26,7 @@ def mine(tmp_path: Path) -> Path:
     path = tmp_path / "mine.py"
     path.write_text(
         '''
-"""Somebody's own."""
+"""A user's own."""
 import torch
 from torch import nn
 

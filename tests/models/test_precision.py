@@ -1,4 +1,4 @@
-"""In which precision convolutions run where nobody asks for one."""
+"""The precision of convolutions if none is requested."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_measuring_draws_none_of_the_callers_random_numbers() -> None:
 def test_who_gets_it(measured: list[float]) -> None:
     measured.append(2.0)
     assert Denoiser("cascaded_v2_micro").precision == "bfloat16"
-    # Nobody has looked at what it does to these.
+    # The effect on these methods has not been measured.
     for others in (
         Denoiser("cascaded_v2_micro", differentiable=True),
         Denoiser("joint_bilateral"),

@@ -437,7 +437,7 @@ def test_a_recurrent_method_keeps_its_state_beside_what_is_skipped() -> None:
 
 
 def test_the_state_has_a_batch() -> None:
-    """Whoever takes a batch apart, takes its state apart."""
+    """Splitting a batch splits its state."""
     frames = [wall(number, 0.003) for number in range(12)]
     both = [
         Frame(**{name: value.repeat(2, *[1] * (value.dim() - 1)) for name, value in frame.items()}) for frame in frames

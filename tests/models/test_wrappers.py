@@ -245,7 +245,7 @@ def test_each_method_sees_the_image_of_the_one_before() -> None:
     assert torch.equal(output.stages["second"], 4 * frame.color)
     assert torch.equal(watching.frames[0].color, 4 * frame.color)
     assert watching.frames[0].albedo is frame.albedo
-    # States are kept by name, and none where nobody has one.
+    # States are stored by name, or None if no method has one.
     assert {name: each is None for name, each in state.items()} == {"first": True, "second": True, "third": False}
     Chain(first=double, second=Staged(), third=watching)(frame, state)
     assert torch.equal(watching.states[-1]["seen"], torch.ones_like(frame.color))

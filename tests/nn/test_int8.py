@@ -111,7 +111,7 @@ def test_features_are_those_of_the_network(half: bool, coarse: int) -> None:
         # Each of a dozen convolutions adds noise of a third of a step of 1/160 to 1/255 of its range.
         noise = (one - other).square().mean().sqrt() / other.square().mean().sqrt()
         assert 0 < noise < 0.05
-    # Whoever asks for derivatives gets them, of the network itself.
+    # With derivatives requested, the network itself runs, so they are available.
     with integers():
         assert all(torch.equal(a, b) for a, b in zip(unet(x, given), unet(x, given), strict=True))
         assert unet(x.requires_grad_(), given)[0].requires_grad

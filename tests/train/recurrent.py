@@ -1,4 +1,4 @@
-"""A recurrent denoiser of somebody's own: hidden features that are warped by the motion, from file to factory."""
+"""A user's own recurrent denoiser, given as a file and a factory: hidden features that are warped by the motion."""
 
 from __future__ import annotations
 

@@ -534,7 +534,7 @@ def test_the_checksum_is_that_of_the_images(small_sequence: Path, tmp_path: Path
 
 
 def test_links_to_nothing_and_names_that_are_no_text_are_no_part_of_a_sequence(noisy: Path, tmp_path: Path) -> None:
-    """Whoever makes a link that leads nowhere, or to itself, beside the frames, trains on the frames."""
+    """Broken and circular links beside the frames do not prevent training on the frames."""
     settings = {"front": FRONT, "features": FEATURES, "firsts": [0]}
     first = open_cached(open_sequence(noisy), tmp_path / "cache", **settings).sha256
     for folder in (noisy, noisy / "inputs", noisy / "inputs" / "realisation1"):

@@ -98,7 +98,7 @@ def test_a_clip_depends_on_its_seed_alone() -> None:
     torch.manual_seed(1)
     before = torch.random.get_rng_state()
     batch = sampler.draw([7, 8, 9])
-    # Whoever else draws random numbers does not notice.
+    # The global random generator is not changed.
     assert torch.equal(torch.random.get_rng_state(), before)
     assert batch["color"].shape == (3, 2, 3, 4, 4)
     torch.manual_seed(2)

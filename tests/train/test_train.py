@@ -51,7 +51,7 @@ def _one_thread() -> Iterator[None]:
 
 
 class Stopped(Exception):
-    """Somebody pulled the plug."""
+    """The power fails."""
 
 
 def refused(action: Callable[[], object]) -> str:
@@ -690,7 +690,7 @@ def test_a_run_can_start_from_weights(small_sequence: Path, tmp_path: Path) -> N
 
 
 def test_weights_of_another_width_are_gone_on_with(small_sequence: Path, tmp_path: Path) -> None:
-    """The run does not say a width; its result must, or nobody could load it."""
+    """The run does not state a width; its result must, so that it can be loaded."""
     first = train(TrainConfig(**{**SMALL, "steps": 1}), [small_sequence], tmp_path / "first")
     config = TrainConfig(**{**SMALL, "steps": 1, "width": 0})
     second = train(config, [small_sequence], tmp_path / "second", initial_weights=first)

@@ -279,7 +279,7 @@ def open_bmfr(
                 missing = path / f"{_STEMS[name]}{number}.exr"
                 raise InputError(
                     f"{missing}: expected buffer '{name}' for every frame, found it for some; "
-                    f"render it, or leave out all {_STEMS[name]} files"
+                    f"render it, or remove all {_STEMS[name]} files"
                 )
     cameras = find_camera_matrices(path, numbers[-1])
     more = _find_realisations(path, numbers, first, used - {"reference"})

@@ -19,7 +19,7 @@ from numba.core.serialize import dumps
 _DIGEST = hashlib.sha256
 # Object code of one kernel takes some hundred KB.
 _LARGEST = 64 << 20
-# Seconds after which nobody writes to a temporary file any more.
+# Age in seconds after which a temporary file is abandoned.
 _ABANDONED = 3600.0
 
 
@@ -71,7 +71,7 @@ class VerifiedCache(FunctionCache):
 
 
 def _read(path: Path) -> bytes:
-    # A pipe of this name would wait for somebody who writes into it.
+    # Opening a pipe of this name would block until another process writes into it.
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with os.fdopen(handle, "rb") as file:
         status = os.fstat(handle)

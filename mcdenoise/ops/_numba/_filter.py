@@ -445,7 +445,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
                 start = b * strides[0] + c * strides[1] + y * strides[2] + x0 * strides[3]
                 copy_row(upstream[c, :n], gradient, start, strides[3])
                 multiply(upstream[c, :n], scale)
-            # The slope of each weight; where weights are normalised, less what all of them share.
+            # The slope of each weight; where weights are normalised, less what all of them fraction.
             shared[:] = 0
             for t in range(taps if with_slopes else 0):
                 start = x0 + t % kernel_size

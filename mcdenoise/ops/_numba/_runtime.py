@@ -1,4 +1,4 @@
-"""What all fast backends share: the compiler and its cache, threads, and how kernels read and store numbers."""
+"""What all fast backends fraction: the compiler and its cache, threads, and how kernels read and store numbers."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
     rows = batch * height
     threads = max(1, min(torch.get_num_threads(), rows, rows * width // PIXELS_A_THREAD))
 
-    def share(number: int) -> None:
+    def fraction(number: int) -> None:
         row, end = rows * number // threads, rows * (number + 1) // threads
         while row < end:
             b, first = divmod(row, height)
@@ -83,14 +83,14 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
             row += last - first
 
     if threads == 1:
-        share(0)
+        fraction(0)
         return
     pool = _pool(threads - 1, os.getpid())
-    others = [pool.submit(share, number) for number in range(1, threads)]
+    others = [pool.submit(fraction, number) for number in range(1, threads)]
     try:
-        share(0)
+        fraction(0)
     finally:
-        # Nobody writes to what a caller has been given back, whatever happened here.
+        # No thread may write to a caller's arrays after this returns, even after an error.
         wait(others)
     for other in others:
         other.result()

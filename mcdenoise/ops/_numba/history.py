@@ -71,7 +71,7 @@ def blend(
         Shorter(recent_alpha, albedo, specular_length + 1, STILL),
     )
     if not math.isinf(lag_threshold):
-        _give_up_lag(color, length, entering, lag_threshold, lag_kernel_size, recent_alpha, RECENT_FRAMES)
+        _discard_lag(color, length, entering, lag_threshold, lag_kernel_size, recent_alpha, RECENT_FRAMES)
     return Blended(color, length, counts.sum(1) / max(length.shape[-2] * length.shape[-1], 1))
 
 
@@ -283,11 +283,11 @@ def _lights(found: Any, root: Any, even: float, brighter: float, radius: int, b:
 @custom_op(
     "mcdenoise::give_up_lag",
     device_types="cpu",
-    schema="(Tensor(a!) past, Tensor(b!) length, Tensor color, float threshold, int kernel_size, float recent_alpha, "
-    "float recent_frames) -> ()",
+    schema="(Tensor(a!) history, Tensor(b!) length, Tensor color, float threshold, int kernel_size, "
+    "float recent_alpha, float recent_frames) -> ()",
 )
-def _give_up_lag(
-    past: Tensor,
+def _discard_lag(
+    history: Tensor,
     length: Tensor,
     color: Tensor,
     threshold: float,
@@ -295,39 +295,39 @@ def _give_up_lag(
     recent_alpha: float,
     recent_frames: float,
 ) -> None:
-    """Give up what does not hold any more: of the recent past by the frame, of the long one by the recent one.
+    """Discard outdated history: the recent one where the frame contradicts it, the long one where the recent one does.
 
     Args:
-        past: ``(B, 9, H, W)`` contiguous: color, root and its square, and the recent color and root; changed.
-        length: ``(B, 1, H, W)`` contiguous, of the longer past, in frames; changed.
+        history: ``(B, 9, H, W)`` contiguous: color, root and its square, and the recent color and root; changed.
+        length: ``(B, 1, H, W)`` contiguous, of the longer history, in frames; changed.
         color: ``(B, 5, H, W)`` contiguous, of the current frame, as :func:`incoming` has it.
         threshold: see :func:`mcdenoise.ops.history_lag`.
         kernel_size: likewise, in half the resolution.
-        recent_alpha: smallest weight of a frame in the recent past.
+        recent_alpha: smallest weight of a frame in the recent history.
         recent_frames: as many equally weighted frames have its noise.
     """
-    batch, _, height, width = past.shape
-    # Of blocks of four pixels: the roots of recent past, frame and past, the variances of the first two's noise; then
-    # the recent past without lag, and both shares.
-    halves = past.new_empty((batch, 8, (height + 1) // 2, (width + 1) // 2))
-    settings = past.new_tensor([threshold, SMALLEST_LAG, recent_alpha, recent_frames]).numpy()
+    batch, _, height, width = history.shape
+    # For blocks of four pixels: the roots of recent history, frame and history; the variances of the first two's noise;
+    # the recent history without lag; and both fractions.
+    halves = history.new_empty((batch, 8, (height + 1) // 2, (width + 1) // 2))
+    settings = history.new_tensor([threshold, SMALLEST_LAG, recent_alpha, recent_frames]).numpy()
     limits, alpha, frames = settings[:2], settings[2], settings[3]
-    blocks, image, lengths, radius = halves.numpy(), past.numpy(), length.numpy(), kernel_size // 2
+    blocks, image, lengths, radius = halves.numpy(), history.numpy(), length.numpy(), kernel_size // 2
     share_rows(halves, lambda *rows: _halve(blocks, image, lengths, color.numpy(), frames, *rows))
     share_rows(halves, lambda *rows: _find_recent_lag(blocks, *limits, radius, *rows))
     share_rows(halves, lambda *rows: _find_lag(blocks, image, lengths, color.numpy(), *limits, alpha, radius, *rows))
 
 
-@_give_up_lag.register_fake
-def _(past: Tensor, *_: Any) -> None:
+@_discard_lag.register_fake
+def _(history: Tensor, *_: Any) -> None:
     return None
 
 
 @compiled
-def _between(a: float, b: float, share: float) -> float:
+def _between(a: float, b: float, fraction: float) -> float:
     """From the nearer end, as torch.lerp does."""
     one, change = type(a)(1), b - a
-    return a + share * change if share + share < one else b - change * (one - share)
+    return a + fraction * change if fraction + fraction < one else b - change * (one - fraction)
 
 
 @compiled
@@ -341,9 +341,9 @@ def _variance(variance: Any, root: Any, square: Any, length: Any) -> None:
 
 @compiled
 def _halve(
-    halves: Any, past: Any, lengths: Any, color: Any, recent_frames: float, b: int, first: int, last: int
+    halves: Any, history: Any, lengths: Any, color: Any, recent_frames: float, b: int, first: int, last: int
 ) -> None:
-    _, _, height, width = past.shape
+    _, _, height, width = history.shape
     _, _, _, columns = halves.shape
     number = halves.dtype.type
     # Sums of two rows; where the width is odd, the last column is there twice.
@@ -353,10 +353,10 @@ def _halve(
         rows[:] = 0
         for row in range(2 * y, 2 * y + count):
             length = lengths[b, 0, row]
-            _variance(variance, past[b, 3, row], past[b, 4, row], length)
-            add(rows[0, :width], past[b, 8, row])
+            _variance(variance, history[b, 3, row], history[b, 4, row], length)
+            add(rows[0, :width], history[b, 8, row])
             add(rows[1, :width], color[b, 3, row])
-            add(rows[2, :width], past[b, 3, row])
+            add(rows[2, :width], history[b, 3, row])
             add(rows[3, :width], variance)
             for x in range(width):
                 variance[x] /= min(length[x], recent_frames)
@@ -373,7 +373,7 @@ def _halve(
 
 @compiled
 def _lag(
-    share: Any,
+    fraction: Any,
     sums: Any,
     history: Any,
     recent: Any,
@@ -385,10 +385,10 @@ def _lag(
 ) -> None:
     """One row of :func:`mcdenoise.ops.history_lag`; ``sums`` has room for three with ``radius`` more at both ends."""
     height, width = history.shape
-    number = share.dtype.type
+    number = fraction.dtype.type
     zero, one, half, third = number(0), number(1), number(0.5), number(1 / 3)
     top, bottom = max(y - radius, 0), min(y + radius + 1, height)
-    means, differences, errors = np.zeros((3, width), share.dtype)
+    means, differences, errors = np.zeros((3, width), fraction.dtype)
     sums[:] = 0
     recents, changes, noises = sums[:, radius : radius + width]
     for row in range(top, bottom):
@@ -408,28 +408,28 @@ def _lag(
         least = smallest * (abs(mean - difference) + abs(mean)) * half
         noise = square * (errors[x] * inverse * inverse + least * least)
         ratio = difference * difference / noise if noise > zero else zero
-        share[x] = min(max((ratio - one) * third, zero), one)
+        fraction[x] = min(max((ratio - one) * third, zero), one)
 
 
 @compiled
 def _find_recent_lag(
     halves: Any, threshold: float, smallest: float, radius: int, b: int, first: int, last: int
 ) -> None:
-    """How far the recent past lags behind the frame, and its root without that."""
+    """How far the recent history lags behind the frame, and its root without that."""
     width = halves.shape[3]
     sums = np.empty((3, width + 2 * radius), halves.dtype)
     recent, current, variance = halves[b, 0], halves[b, 1], halves[b, 3]
     for y in range(first, last):
-        share, root, before, now = halves[b, 6, y], halves[b, 5, y], recent[y], current[y]
-        _lag(share, sums, recent, current, variance, threshold, smallest, radius, y)
+        fraction, root, before, now = halves[b, 6, y], halves[b, 5, y], recent[y], current[y]
+        _lag(fraction, sums, recent, current, variance, threshold, smallest, radius, y)
         for x in range(width):
-            root[x] = _between(before[x], now[x], share[x])
+            root[x] = _between(before[x], now[x], fraction[x])
 
 
 @compiled
 def _find_lag(
     halves: Any,
-    past: Any,
+    history: Any,
     lengths: Any,
     color: Any,
     threshold: float,
@@ -440,27 +440,27 @@ def _find_lag(
     first: int,
     last: int,
 ) -> None:
-    """How far the past lags behind the recent one; both without their lag."""
-    _, _, height, width = past.shape
+    """How far the history lags behind the recent one; both without their lag."""
+    _, _, height, width = history.shape
     columns = halves.shape[3]
     sums, variance = np.empty((3, columns + 2 * radius), halves.dtype), np.empty(width, halves.dtype)
     number = halves.dtype.type
     zero, shortest = number(0), number(1) / recent_alpha
     for y in range(first, last):
-        recent_share, share = halves[b, 6, y], halves[b, 7, y]
-        _lag(share, sums, halves[b, 2], halves[b, 5], halves[b, 4], threshold, smallest, radius, y)
+        recent_fraction, fraction = halves[b, 6, y], halves[b, 7, y]
+        _lag(fraction, sums, halves[b, 2], halves[b, 5], halves[b, 4], threshold, smallest, radius, y)
         for row in range(2 * y, min(2 * y + 2, height)):
             length = lengths[b, 0, row]
-            _variance(variance, past[b, 3, row], past[b, 4, row], length)
+            _variance(variance, history[b, 3, row], history[b, 4, row], length)
             # Most pixels keep what they have.
             for x in range(width):
-                little, much = recent_share[x >> 1], share[x >> 1]
+                little, much = recent_fraction[x >> 1], fraction[x >> 1]
                 if not (little > zero or much > zero):
                     continue
                 for c in range(4):
-                    recent = _between(past[b, 5 + c, row, x], color[b, c, row, x], little)
-                    past[b, 5 + c, row, x] = recent
-                    past[b, c, row, x] = _between(past[b, c, row, x], recent, much)
-                square = past[b, 8, row, x] * past[b, 8, row, x] + variance[x]
-                past[b, 4, row, x] = _between(past[b, 4, row, x], square, much)
+                    recent = _between(history[b, 5 + c, row, x], color[b, c, row, x], little)
+                    history[b, 5 + c, row, x] = recent
+                    history[b, c, row, x] = _between(history[b, c, row, x], recent, much)
+                square = history[b, 8, row, x] * history[b, 8, row, x] + variance[x]
+                history[b, 4, row, x] = _between(history[b, 4, row, x], square, much)
                 length[x] = _between(length[x], min(length[x], shortest), much)

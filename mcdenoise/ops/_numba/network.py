@@ -362,10 +362,10 @@ def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
     image = source(readable(depth, dtype))
     rows = torch.zeros((2, batch, height), dtype=dtype, device="cpu")
     arguments = (rows.numpy(), image, depth.shape[3])
-    share_rows(depth, lambda *share: _roots_of_rows(*arguments, *share))
+    share_rows(depth, lambda *fraction: _roots_of_rows(*arguments, *fraction))
     root = _mean(rows)
     near = torch.where(root > 0, 1 / root.square(), 1).to(dtype)
-    share_rows(depth, lambda *share: _logarithms_of_rows(*arguments, near.numpy(), *share))
+    share_rows(depth, lambda *fraction: _logarithms_of_rows(*arguments, near.numpy(), *fraction))
     return near.reshape(batch, 1, 1, 1), torch.exp(_mean(rows)).to(dtype).reshape(batch, 1, 1, 1)
 
 
@@ -510,7 +510,7 @@ def _fuse(
     first: int,
     last: int,
 ) -> None:
-    """Rows ``first`` to ``last`` of the result, two at a time: they share the blocks whose mean is exchanged."""
+    """Rows ``first`` to ``last`` of the result, two at a time: they fraction the blocks whose mean is exchanged."""
     _, channels, height, width = out.shape
     dtype = out.dtype
     # Four rows of both images, the coarse one upsampled, with the zeros of the convolution around them.
@@ -618,9 +618,9 @@ def _sigmoid(values: Any) -> None:
 
 
 @compiled
-def _add_share(out: Any, values: Any, share: Any, change: Any) -> None:
+def _add_share(out: Any, values: Any, fraction: Any, change: Any) -> None:
     for x in range(out.size):
-        out[x] = values[x] + share[x] * change[x]
+        out[x] = values[x] + fraction[x] * change[x]
 
 
 @compiled
@@ -675,9 +675,9 @@ def _replace_means(
     number = out.dtype.type
     found, wanted = np.empty(columns, out.dtype), np.empty(columns, out.dtype)
     left, right = np.empty(width, np.int64), np.empty(width, np.int64)
-    share = np.empty(width, out.dtype)
+    fraction = np.empty(width, out.dtype)
     for x in range(width):
-        left[x], right[x], share[x] = _between_blocks(x, columns, number(0))
+        left[x], right[x], fraction[x] = _between_blocks(x, columns, number(0))
     for y in range(first, last):
         upper, lower, part = _between_blocks(y, rows, number(0))
         for c in range(channels):
@@ -687,7 +687,7 @@ def _replace_means(
             row, limit = out[b, c, y], most[b]
             read_row(row, fine, b, c, y, 0)
             for x in range(width):
-                i, k, s = left[x], right[x], share[x]
+                i, k, s = left[x], right[x], fraction[x]
                 new, old = wanted[i] + s * (wanted[k] - wanted[i]), found[i] + s * (found[k] - found[i])
                 row[x] = min(row[x] * (new / old), limit)
 

@@ -246,7 +246,7 @@ def _accumulate(
     weights, places = np.empty((_CHUNK, 4), accumulated.dtype), np.empty((_CHUNK, 4), np.uint64)
     own = np.empty(4, np.bool_)
     sums, values = np.empty((channels, _CHUNK), accumulated.dtype), np.empty(_CHUNK, accumulated.dtype)
-    # Weight of the frame, and that in the recent past.
+    # Weight of the frame, and that in the recent history.
     alphas = np.empty((2, _CHUNK), accumulated.dtype)
     for y in range(first, last):
         count = 0
@@ -309,18 +309,18 @@ def _accumulate(
                                 if not distance <= position_limit * depth:
                                     continue
                     bilinear = (fx if tap % 2 else one - fx) * (fy if tap // 2 else one - fy)
-                    past = (
+                    taken = (
                         bilinear
                         * old_length[b * length_strides[0] + row * length_strides[2] + column * length_strides[3]]
                     )
                     weight += bilinear
-                    length += past
+                    length += taken
                     if labels:
                         at_label = b * tap_k_strides[0] + row * tap_k_strides[2] + column * tap_k_strides[3]
                         own[kept] = tap_k[at_label] == label
                         if own[kept]:
                             own_weight += bilinear
-                            own_length += past
+                            own_length += taken
                     weights[i, kept] = bilinear
                     places[i, kept] = b * old_strides[0] + row * old_strides[2] + column * old_strides[3]
                     kept += 1
@@ -331,7 +331,7 @@ def _accumulate(
                             weights[i, kept], places[i, kept] = weights[i, tap], places[i, tap]
                             kept += 1
                     weight, length = own_weight, own_length
-                # What is left out may hold anything: beside the others, one of them stands once more, weightless.
+                # Rejected taps may be NaN, and 0 * NaN is NaN: point them at an accepted tap with weight 0.
                 for tap in range(kept, 4):
                     weights[i, tap] = zero
                     places[i, tap] = places[i, 0] if kept else np.uint64(0)
@@ -473,15 +473,15 @@ class _Gradients:
             settings = (alpha_min, *_limits(surface, *limits), 1.0, None, math.inf, 0.0, rule == "bmfr")
             _pass(images[0], images[1], images[2], motion, surface, previous_surface, *settings, taps)
             # What each pixel's history and its length get.
-            shares = images[0].new_empty((batch, channels + 1, height, width))
+            spread = images[0].new_empty((batch, channels + 1, height, width))
             given = [each.to(dtype).contiguous() for each in (gradient, of_length)]
-            arrays = [each.numpy() for each in (*images, moved.to(dtype).contiguous(), *given, *taps, shares)]
+            arrays = [each.numpy() for each in (*images, moved.to(dtype).contiguous(), *given, *taps, spread)]
             results = [each.numpy() for each in found]
             least = images[0].new_tensor([alpha_min]).numpy()[0]
             handed = (results[0], results[3], *arrays, least, rule == "bmfr")
             share_rows(color, lambda *rows: _differentiate_pixels(*handed, *rows))
             # Pixels of many rows may have a tap in common, planes have nothing: so results are the same in every run.
-            planes = shares.flatten(2)[:, None]
+            planes = spread.flatten(2)[:, None]
             share_rows(planes, lambda *rows: _spread(results[1], results[2], *arrays[-3:], *rows))
         inputs = (color, previous, previous_length, moved)
         own = [each.to(like.dtype) for each, like in zip(found, inputs, strict=True)]
@@ -503,14 +503,14 @@ def _differentiate_pixels(
     of_length: Any,
     weights: Any,
     places: Any,
-    shares: Any,
+    spread: Any,
     alpha_min: float,
     bmfr: bool,
     b: int,
     first: int,
     last: int,
 ) -> None:
-    """What a pixel's color and motion get, and what its history and that one's length are to share out."""
+    """Derivatives in a pixel's color and motion, and those that are spread over the taps of its history and length."""
     _, channels, height, width = color.shape
     number = color.dtype.type
     one, zero = number(1), number(0)
@@ -523,8 +523,8 @@ def _differentiate_pixels(
             if not w0 + w1 + w2 + w3 > zero:
                 for c in range(channels):
                     of_color[b, c, y, x] = gradient[b, c, y, x]
-                    shares[b, c, y, x] = zero
-                shares[b, channels, y, x] = zero
+                    spread[b, c, y, x] = zero
+                spread[b, channels, y, x] = zero
                 continue
             start = b * channels * height * width
             p0, p1 = places[b, y, x, 0] - start, places[b, y, x, 1] - start
@@ -538,21 +538,21 @@ def _differentiate_pixels(
                 history = w0 * own[p0] + w1 * own[p1] + w2 * own[p2] + w3 * own[p3]
                 of_alpha += slope * (color[b, c, y, x] - history)
                 of_color[b, c, y, x] = slope * alpha
-                share = slope * (one - alpha)
-                shares[b, c, y, x] = share
-                values[0] += share * own[p0]
-                values[1] += share * own[p1]
-                values[2] += share * own[p2]
-                values[3] += share * own[p3]
+                slope_of_history = slope * (one - alpha)
+                spread[b, c, y, x] = slope_of_history
+                values[0] += slope_of_history * own[p0]
+                values[1] += slope_of_history * own[p1]
+                values[2] += slope_of_history * own[p2]
+                values[3] += slope_of_history * own[p3]
             # A rounded length has no derivative.
-            share = zero if bmfr else of_length[b, 0, y, x]
+            slope_of_length = zero if bmfr else of_length[b, 0, y, x]
             if newest >= alpha_min:
-                share -= of_alpha * newest * newest
-            shares[b, channels, y, x] = share
+                slope_of_length -= of_alpha * newest * newest
+            spread[b, channels, y, x] = slope_of_length
             if not moves:
                 continue
             for tap in range(4):
-                values[tap] += share * spans[places[b, y, x, tap] - start]
+                values[tap] += slope_of_length * spans[places[b, y, x, tap] - start]
             mean = w0 * values[0] + w1 * values[1] + w2 * values[2] + w3 * values[3]
             qx, qy = number(x) + motion[b, 0, y, x], number(y) + motion[b, 1, y, x]
             left, top = np.int64(math.floor(qx)), np.int64(math.floor(qy))
@@ -560,7 +560,7 @@ def _differentiate_pixels(
             total = across = along = zero
             for tap in range(4):
                 place = places[b, y, x, tap] - start
-                # One that stands once more for a tap that was left out.
+                # An accepted tap that stands in for a rejected one.
                 if tap and place == p0:
                     continue
                 right, below = place % width > left, place // width > top
@@ -573,7 +573,7 @@ def _differentiate_pixels(
 
 @compiled
 def _spread(
-    of_previous: Any, of_length: Any, weights: Any, places: Any, shares: Any, b: int, first: int, last: int
+    of_previous: Any, of_length: Any, weights: Any, places: Any, spread: Any, b: int, first: int, last: int
 ) -> None:
     """What every tap gets of the pixels that have it, for some of the planes; the last is that of the length."""
     _, channels, height, width = of_previous.shape
@@ -583,7 +583,7 @@ def _spread(
         flat = plane.reshape(height * width)
         for y in range(height):
             for x in range(width):
-                share = shares[b, c, y, x]
-                if share != 0:
+                slope = spread[b, c, y, x]
+                if slope != 0:
                     for tap in range(4):
-                        flat[places[b, y, x, tap] - start] += weights[b, y, x, tap] * share
+                        flat[places[b, y, x, tap] - start] += weights[b, y, x, tap] * slope

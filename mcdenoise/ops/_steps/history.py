@@ -195,7 +195,7 @@ def blend(
        than 0.05 pixels, the history is shortened to ``specular_length`` frames and this one. Which pixels those are is
        known in this frame, the history's length in the previous one; so it is shortened after it was blended in:
        ``lerp(color, history, p)`` with a smaller ``p`` lies on the way back to ``color``.
-    3. With a finite ``lag_threshold``, histories are given up for shorter ones as far as
+    3. With a finite ``lag_threshold``, histories are replaced by shorter ones as far as
        :func:`mcdenoise.ops.history_lag` says, of the fourth roots of radiance, in half the resolution: a second
        history of about four frames for the current frame, and the long one for that. The variance of the noise is what
        the root varied by over the history. The decision has no derivative.

@@ -174,9 +174,9 @@ def network_features(
     Returns:
         ``(B, 11, H, W)``: albedo, normal, depth, logarithm of the radiance, and one over the length.
     """
-    share = torch.ones_like(depth) if length is None else 1 / length
+    fraction = torch.ones_like(depth) if length is None else 1 / length
     near = normalized_depth(depth, *scale)
-    return torch.cat([albedo, normal * 0.5 + 0.5, near, torch.log1p(current * exposure), share], 1)
+    return torch.cat([albedo, normal * 0.5 + 0.5, near, torch.log1p(current * exposure), fraction], 1)
 
 
 @op("numba", "triton")

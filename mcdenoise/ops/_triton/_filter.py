@@ -122,7 +122,7 @@ def _normalisation(inputs: _Inputs) -> tuple[Tensor, Tensor]:
 
 
 def _spread(gradient: Tensor, inputs: _Inputs, sums: Tensor) -> Tensor:
-    """Every pixel's share of each neighbour, added up there: the transpose of the filter."""
+    """Every pixel's fraction of each neighbour, added up there: the transpose of the filter."""
     # What is read from beyond the border is first gathered there.
     margin = kernel_size_of(inputs.kernel.shape[1], "kernel") // 2 if inputs.border == "replicate" else 0
     batch, channels, height, width = inputs.image.shape
@@ -205,7 +205,7 @@ def _place(source: tl.tuple, b: tl.tensor, channel: tl.tensor, y: tl.tensor, x: 
 def _read_plane(
     source: tl.tuple, b: tl.tensor, channel: tl.tensor, y: tl.tensor, x: tl.tensor, mask: tl.tensor, SUM: tl.constexpr
 ) -> tl.tensor:
-    """One channel of some pixels; 0 where a pixel is left out."""
+    """One channel of some pixels; 0 where a pixel is masked."""
     return tl.load(_place(source, b, channel, y, x), mask=mask, other=0).to(SUM)
 
 

@@ -225,62 +225,62 @@ def blend(
         longest=specular_length + 1,
     )
     if not math.isinf(lag_threshold):
-        color, length = _give_up_lag(color, length, entering, lag_threshold, lag_kernel_size, recent_alpha)
+        color, length = _discard_lag(color, length, entering, lag_threshold, lag_kernel_size, recent_alpha)
     return Blended(color, length, histories.float().mean((1, 2, 3)))
 
 
 @custom_op(
-    "mcdenoise::triton_give_up_lag",
-    schema="(Tensor past, Tensor length, Tensor color, float threshold, int kernel_size, float recent_alpha) "
+    "mcdenoise::triton_discard_lag",
+    schema="(Tensor history, Tensor length, Tensor color, float threshold, int kernel_size, float recent_alpha) "
     "-> (Tensor, Tensor)",
 )
-def _give_up_lag(
-    past: Tensor, length: Tensor, color: Tensor, threshold: float, kernel_size: int, recent_alpha: float
+def _discard_lag(
+    history: Tensor, length: Tensor, color: Tensor, threshold: float, kernel_size: int, recent_alpha: float
 ) -> tuple[Tensor, Tensor]:
-    """Give up what does not hold any more: of the recent past by the frame, of the long one by the recent one.
+    """Discard outdated history: the recent one where the frame contradicts it, the long one where the recent one does.
 
     Args:
-        past: ``(B, 9, H, W)`` color, root and its square, and the recent color and root.
-        length: ``(B, 1, H, W)`` of the longer past, in frames.
+        history: ``(B, 9, H, W)`` color, root and its square, and the recent color and root.
+        length: ``(B, 1, H, W)`` of the longer history, in frames.
         color: ``(B, 5, H, W)`` of the current frame, as :func:`incoming` has it.
         threshold: see :func:`mcdenoise.ops.history_lag`.
         kernel_size: likewise, in half the resolution.
-        recent_alpha: smallest weight of a frame in the recent past.
+        recent_alpha: smallest weight of a frame in the recent history.
     """
-    batch, _, height, width = past.shape
-    sums = sums_of(past, color)
-    # Of blocks of four pixels: the roots of recent past, frame and past, the variances of the first two's noise.
+    batch, _, height, width = history.shape
+    sums = sums_of(history, color)
+    # Of blocks of four pixels: the roots of recent history, frame and history, the variances of the first two's noise.
     size = (height + 1) // 2, (width + 1) // 2
-    blocks = torch.empty((batch, 5, *size), dtype=sums, device=past.device)
-    # How far the recent past lags behind, and its root without that; and how far the past lags.
-    lags = torch.empty((batch, 3, *size), dtype=sums, device=past.device)
-    longer, shortened = _empty_past(past, length)
-    launch(_halve, blocks, sums, blocks, past, length, color, rows=height, columns=width)
+    blocks = torch.empty((batch, 5, *size), dtype=sums, device=history.device)
+    # How far the recent history lags behind, and its root without that; and how far the history lags.
+    lags = torch.empty((batch, 3, *size), dtype=sums, device=history.device)
+    longer, shortened = _empty_history(history, length)
+    launch(_halve, blocks, sums, blocks, history, length, color, rows=height, columns=width)
     settings: dict[str, Any] = {"THRESHOLD": threshold, "RADIUS": kernel_size // 2}
     launch(_find_lag, blocks, sums, lags, blocks, blocks, RECENT=True, **settings)
     launch(_find_lag, blocks, sums, lags, blocks, lags.clone(), RECENT=False, **settings)
-    launch(_give_up, past, sums, longer, shortened, past, length, color, lags, SHORTEST=1 / recent_alpha)
+    launch(_discard, history, sums, longer, shortened, history, length, color, lags, SHORTEST=1 / recent_alpha)
     return longer, shortened
 
 
-@_give_up_lag.register_fake
-def _empty_past(past: Tensor, length: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
+@_discard_lag.register_fake
+def _empty_history(history: Tensor, length: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
     return (
-        torch.empty(past.shape, dtype=past.dtype, device=past.device),
+        torch.empty(history.shape, dtype=history.dtype, device=history.device),
         torch.empty(length.shape, dtype=length.dtype, device=length.device),
     )
 
 
 @triton.jit
-def _between(a: tl.tensor, b: tl.tensor, share: tl.tensor) -> tl.tensor:
+def _between(a: tl.tensor, b: tl.tensor, fraction: tl.tensor) -> tl.tensor:
     """From the nearer end, as torch.lerp does."""
     change = b - a
-    return tl.where(share < 0.5, a + share * change, b - change * (1 - share))
+    return tl.where(fraction < 0.5, a + fraction * change, b - change * (1 - fraction))
 
 
 @triton.jit
 def _variance(
-    past: tl.tuple,
+    history: tl.tuple,
     length: tl.tensor,
     b: tl.tensor,
     y: tl.tensor,
@@ -289,7 +289,7 @@ def _variance(
     SUM: tl.constexpr,
 ) -> tl.tensor:
     """Of the noise of one frame."""
-    root, square = read_plane(past, b, 3, y, x, inside, SUM), read_plane(past, b, 4, y, x, inside, SUM)
+    root, square = read_plane(history, b, 3, y, x, inside, SUM), read_plane(history, b, 4, y, x, inside, SUM)
     counted = tl.maximum(length, 2)
     return tl.maximum(square - root * root, 0) * (counted / (counted - 1))
 
@@ -297,7 +297,7 @@ def _variance(
 @triton.jit
 def _halve(
     blocks: tl.tuple,
-    past: tl.tuple,
+    history: tl.tuple,
     lengths: tl.tuple,
     color: tl.tuple,
     height: tl.tensor,
@@ -321,11 +321,11 @@ def _halve(
         there_y, there_x = 2 * y + pixel // 2, 2 * x + pixel % 2
         inside = mine & is_inside(there_y, there_x, rows, columns)
         length = read_plane(lengths, b, 0, there_y, there_x, inside, SUM)
-        variance = _variance(past, length, b, there_y, there_x, inside, SUM)
+        variance = _variance(history, length, b, there_y, there_x, inside, SUM)
         count += tl.where(inside, 1, 0).to(SUM)
-        recent += read_plane(past, b, 8, there_y, there_x, inside, SUM)
+        recent += read_plane(history, b, 8, there_y, there_x, inside, SUM)
         now += read_plane(color, b, 3, there_y, there_x, inside, SUM)
-        long += read_plane(past, b, 3, there_y, there_x, inside, SUM)
+        long += read_plane(history, b, 3, there_y, there_x, inside, SUM)
         noise += variance
         less += variance / tl.maximum(tl.minimum(length, _RECENT_FRAMES), 1)
     count = tl.maximum(count, 1)
@@ -352,7 +352,7 @@ def _find_lag(
     WIDE: tl.constexpr,
     SUM: tl.constexpr,
 ) -> None:
-    """:func:`mcdenoise.ops.history_lag` of the recent past and the frame; else of the past and the recent one."""
+    """:func:`mcdenoise.ops.history_lag` of the recent history and the frame; else of the history and the recent one."""
     b, y, x = tile(0, ROWS, COLUMNS, WIDE)
     mine = is_inside(y, x, height, width)
     count = tl.zeros([ROWS * COLUMNS], SUM)
@@ -373,20 +373,20 @@ def _find_lag(
     noise = THRESHOLD * THRESHOLD * (errors * inverse * inverse + least * least)
     some = noise > 0
     ratio = tl.where(some, difference * difference / tl.where(some, noise, 1), 0)
-    share = tl.minimum(tl.maximum((ratio - 1) / 3, 0), 1)
+    fraction = tl.minimum(tl.maximum((ratio - 1) / 3, 0), 1)
     if RECENT:
         before, now = read_plane(blocks, b, 0, y, x, mine, SUM), read_plane(blocks, b, 1, y, x, mine, SUM)
-        write_plane(lags, share, b, 0, y, x, mine)
-        write_plane(lags, _between(before, now, share), b, 1, y, x, mine)
+        write_plane(lags, fraction, b, 0, y, x, mine)
+        write_plane(lags, _between(before, now, fraction), b, 1, y, x, mine)
     else:
-        write_plane(lags, share, b, 2, y, x, mine)
+        write_plane(lags, fraction, b, 2, y, x, mine)
 
 
 @triton.jit
-def _give_up(
+def _discard(
     longer: tl.tuple,
     shortened: tl.tuple,
-    past: tl.tuple,
+    history: tl.tuple,
     lengths: tl.tuple,
     color: tl.tuple,
     lags: tl.tuple,
@@ -405,11 +405,11 @@ def _give_up(
     much = read_plane(lags, b, 2, y // 2, x // 2, mine, SUM)
     for c in tl.static_range(4):
         now = read_plane(color, b, c, y, x, mine, SUM)
-        recent = _between(read_plane(past, b, 5 + c, y, x, mine, SUM), now, little)
+        recent = _between(read_plane(history, b, 5 + c, y, x, mine, SUM), now, little)
         write_plane(longer, recent, b, 5 + c, y, x, mine)
-        write_plane(longer, _between(read_plane(past, b, c, y, x, mine, SUM), recent, much), b, c, y, x, mine)
+        write_plane(longer, _between(read_plane(history, b, c, y, x, mine, SUM), recent, much), b, c, y, x, mine)
         if c == 3:
-            square = recent * recent + _variance(past, length, b, y, x, mine, SUM)
-            before = read_plane(past, b, 4, y, x, mine, SUM)
+            square = recent * recent + _variance(history, length, b, y, x, mine, SUM)
+            before = read_plane(history, b, 4, y, x, mine, SUM)
             write_plane(longer, _between(before, square, much), b, 4, y, x, mine)
     write_plane(shortened, _between(length, tl.minimum(length, SHORTEST), much), b, 0, y, x, mine)

@@ -124,10 +124,10 @@ def _stack_buffers(
         write_plane(out, read_plane(normal, b, c, y, x, mine, SUM) * 0.5 + 0.5, b, 6 + c, y, x, mine)
         write_plane(out, log1p(read_plane(current, b, c, y, x, mine, SUM) * exposed), b, 10 + c, y, x, mine)
     write_plane(out, _normalized(read_plane(depth, b, 0, y, x, mine, SUM), unit, far), b, 9, y, x, mine)
-    share = tl.zeros_like(exposed) + 1
+    fraction = tl.zeros_like(exposed) + 1
     if LENGTH:
-        share = 1 / tl.where(mine, read_plane(length, b, 0, y, x, mine, SUM), 1)
-    write_plane(out, share, b, 13, y, x, mine)
+        fraction = 1 / tl.where(mine, read_plane(length, b, 0, y, x, mine, SUM), 1)
+    write_plane(out, fraction, b, 13, y, x, mine)
 
 
 def network_guides(normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor]) -> Tensor:

@@ -329,7 +329,7 @@ def _accumulate(
         weight = tl.where(enough > _LABEL_WEIGHT, own_weights[tap], weights[tap]) if LABEL else weights[tap]
         used = used + (weight,)
         total += weight
-        # A tap that is left out is not read: it may hold anything.
+        # A rejected tap is not read: it may be NaN.
         length += weight * read_plane(previous_length, b, 0, rows[tap], columns[tap], weight > 0, SUM)
     found = total > 0
     inverse = 1 / tl.where(found, total, 1)
@@ -362,8 +362,8 @@ def _accumulate(
             value = read_plane(previous, b, c, rows[tap], columns[tap], used[tap] > 0, SUM)
             history += (used[tap] * inverse) * value
         new = read_plane(color, b, c if c < FRESH else c - FRESH, y, x, mine, SUM)
-        share = alpha if c < FRESH else recent
+        fraction = alpha if c < FRESH else recent
         # From the nearer end, as torch.lerp does.
         change = new - history
-        mixed = tl.where(share < 0.5, history + share * change, new - change * (1 - share))
-        write_plane(accumulated, tl.where(share < 1, mixed, new), b, c, y, x, mine)
+        mixed = tl.where(fraction < 0.5, history + fraction * change, new - change * (1 - fraction))
+        write_plane(accumulated, tl.where(fraction < 1, mixed, new), b, c, y, x, mine)

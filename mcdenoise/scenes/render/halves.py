@@ -66,7 +66,7 @@ class ReferenceHalves:
             if sums.shape != (2, size[0] * size[1], 3) or sums.dtype != np.float64 or min(first, second, passes) < 0:
                 raise ValueError("other counts, or pixels of another image")
         except Exception as error:  # of zipfile, zlib, numpy, and of Python's tokenizer, which reads numpy's headers
-            raise InputError(f"{path}: expected a reference in the making, found something else; remove it") from error
+            raise InputError(f"{path}: expected an unfinished reference, found something else; remove it") from error
         return cls(sums, (first, second), passes)
 
     def save(self, path: Path) -> None:

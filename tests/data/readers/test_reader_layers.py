@@ -1,4 +1,4 @@
-"""Layers: which channels belong together, which buffer their name says they are, and what somebody asks for instead."""
+"""Layers: groups of channels, which buffer their names denote, and the user's mapping."""
 
 from __future__ import annotations
 
@@ -220,7 +220,7 @@ def test_channels_that_a_buffer_needs(buffer: str, channels: str, does: bool) ->
     assert fits(buffer, layers_of(0, "", [part(f"{channels} other.T")])[0]) is does
 
 
-# What somebody asks for
+# The user's mapping
 
 
 @pytest.fixture
@@ -372,7 +372,7 @@ def test_layers_of_no_known_name_are_told_by_their_values(
     sources = {row.buffer: row.source for row in sequence.table}
     assert sources["normal"] == "a.exr first.XYZ"
     assert sources["position"] == "a.exr second.XYZ"
-    # Somebody who does not want them has the last word.
+    # The user's exclusion takes precedence.
     assert "normal" not in open_sequence(tmp_path / "a.exr", mapping=["normal="]).buffers
 
 

@@ -1,4 +1,4 @@
-"""File names: what somebody means by a folder, a file or a pattern, and which digits count the frames."""
+"""File names: which files a folder, a file or a pattern stands for, and which digits count the frames."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_two_files_of_a_frame_are_refused(refused: Callable[..., str]) -> None:
     assert "shot_1.exr: expected one file a frame, found shot_0001.exr as well" in message
 
 
-# What somebody means
+# Inputs of the user
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_gaps_are_told(image: Callable[..., list[Path]], tmp_path: Path) -> None
     assert sequence.numbers == [3, 4, 6, 10, 11]
     (warning,) = sequence.warnings
     assert warning.startswith("frames: 5, 7-9 missing;")
-    # Those that somebody chooses have gaps on purpose.
+    # Gaps are intended if the user selects frames.
     assert list(open_sequence(tmp_path / "shot", "3,10-11").warnings) == []
     image(*[f"many/a_{number}.exr" for number in range(0, 40, 2)])
     (warning,) = open_sequence(tmp_path / "many").warnings

@@ -72,7 +72,7 @@ def test_one_color_everywhere_tells_nothing(included: bool) -> None:
     color = albedo * irradiance if included else irradiance
     assert albedo_included(color, albedo).included is None
     assert read_radiance(color, albedo, None, None)[0] is True
-    # Neither does what nobody sees.
+    # Neither do pixels without a hit.
     assert albedo_included(color, np.zeros_like(albedo)).included is None
     assert albedo_included(np.zeros_like(color), texture("colored")).included is None
 
@@ -129,7 +129,7 @@ def test_the_data_of_renderers_with_and_without_albedo(
             continue
         assert opened.color_has_albedo is not divided
         assert any("multiplied back" in warning for warning in opened.warnings) is divided
-        # The other way round, if somebody says so.
+        # The other way round, if it is stated.
         assert open_sequence(path, color_has_albedo=divided).color_has_albedo is divided
 
 

@@ -21,7 +21,7 @@ def main():
     parser.add_argument("--samples", type=int, default=4)
     args = parser.parse_args()
 
-    # Whoever collects the tests of this folder need not have LuxCore.
+    # Collecting the tests of this folder must not require LuxCore.
     import pyluxcore
 
     pyluxcore.Init()

@@ -20,7 +20,7 @@ def main():
     parser.add_argument("--samples", type=int, default=4)
     args = parser.parse_args()
 
-    # Whoever collects the tests of this folder need not have Mitsuba.
+    # Collecting the tests of this folder must not require Mitsuba.
     import mitsuba as mi
 
     mi.set_variant("scalar_rgb")
