@@ -104,7 +104,7 @@ def page(entry: ModelOverview) -> str:
     """One method."""
     construct = find_model(entry.name).construct
     module = importlib.import_module(construct.__module__)
-    file = Path(inspect.getsourcefile(module) or "").relative_to(ROOT).as_posix()
+    file = construct.__module__.replace(".", "/") + ".py"
     facts = {
         "what": entry.description,
         "paper": paper(entry),
