@@ -27,6 +27,7 @@ from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import Output, Skipping, Stage, parts_of, summarize
+from mcdenoise.models._spilled import spilled
 
 # Most pixels of a frame, and how much two frames have to correlate to show the same place.
 _MOST, _ALIKE = 0.5, 0.9
@@ -324,7 +325,8 @@ def _read_frames(
         start = time.perf_counter()
         frame = sequence.frame(number, reference=reference, buffers=wanted)
         # A depth may be that of the positions.
-        return frame if streaming else frame.with_depth().without_past(), _since(start)
+        frame = frame if streaming else frame.with_depth().without_past()
+        return frame.map(spilled) if denoiser.spills else frame, _since(start)
 
     with ThreadPoolExecutor(1) as reader:
         # No frame has a name here: whoever gets it decides when it goes.
