@@ -38,6 +38,7 @@ from mcdenoise.models._layers import REST, alpha_of, closed, completed, opened
 from mcdenoise.models._memory import Division, Frames
 from mcdenoise.models._precision import Chosen
 from mcdenoise.models._reads import at_hand
+from mcdenoise.models._spilled import drop_pages, spilled
 
 AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
 
@@ -188,12 +189,16 @@ class Denoiser:
         self._count, self._frames, self._buffers = 0, frames, buffers
         # A single frame has no next one to read.
         self.has_room_ahead = size is not None and frames != 1
+        # Whether frames are best handed over in files, because they do not fit into the memory beside their history.
+        self.spills = False
         if buffers is not None and size is not None:
             streaming = self.has_history(buffers)
             # One more for the remainder.
             carried = layers + (layers > 0) + (self.alpha and "alpha" in buffers)
             shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else MOTION), streaming, carried=carried)
-            self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
+            with torch.set_grad_enabled(self.differentiable):
+                self.spills = self._tiles.spills(shot)
+                self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
 
     @property
     def report(self) -> FrameReport:
@@ -273,6 +278,9 @@ class Denoiser:
                 self._check_layers(frame)
                 report.missing = absent_buffers(self.model, frame)
                 report.tiles = self._tiles.divide(self._shot(frame))
+                # What was repaired is in memory again.
+                frame = frame.map(spilled) if self.spills else frame
+                drop_pages()
             noisy = frame.color
             precision = computing_in(self.precision, self.device)
             with precision, self._explained(dtype), timed("model", self.device, unless_detailed=True):

@@ -6,14 +6,16 @@ import atexit
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
 _WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up"}
+_NO_WARNING = "ignore:resource_tracker:UserWarning"
 # Time in seconds for an orderly shutdown.
 _GRACE = 1.25
 # Incomplete files and folders, to be removed if the process ends early.
@@ -31,11 +33,15 @@ _starts = _Starts()
 
 
 def start_resource_tracker() -> None:
-    """Start the process that removes what pools of an ended process leave, without a stderr to tell it on."""
+    """Start the process that removes the semaphores of pools whose process has ended, without a warning of each."""
     from multiprocessing import resource_tracker
 
-    with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
+    # It is started with the options of this interpreter.
+    sys.warnoptions.append(_NO_WARNING)
+    try:
         resource_tracker.ensure_running()
+    finally:
+        sys.warnoptions.remove(_NO_WARNING)
 
 
 @contextmanager

@@ -42,8 +42,9 @@ def denoise(
         shot: options for reading, denoising and writing the shot.
         json: write the run times to this file too.
     """
-    keep_heap()
     shot.check()
+    # What opening the frames frees would else count as memory in use.
+    (keep_heap if shot.max_memory is None else return_heap)()
     if shot.threads is not None:
         torch.set_num_threads(shot.threads)
     opened = shot.open(inputs)
@@ -66,8 +67,6 @@ def denoise(
                 opened, lambda done, total: progress.update(task, completed=done, total=total)
             )
         say(f"picked {choice}")
-    if shot.max_memory is not None:
-        return_heap()
     denoiser, spelling = resolved.denoiser(), resolved.spelling
     print_sequence(opened)
     began = time.perf_counter()

@@ -197,6 +197,9 @@ def read_records(folder: Path) -> dict[int, FrameRecord]:
 
 def read_journal(path: Path) -> Iterator[FrameRecord]:
     """The records of one journal; none if it cannot be read."""
+    # A pipe of such a name would be waited for.
+    if not path.is_file():
+        return
     with suppress(OSError), path.open(encoding="utf-8", errors="replace") as file:
         for line in file:
             if (record := FrameRecord.of(line)) is not None:

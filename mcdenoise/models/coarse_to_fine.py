@@ -8,6 +8,7 @@ from torch import Tensor
 from mcdenoise.frame import BUFFERS, Frame, Skip
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._reads import at_hand
+from mcdenoise.models._spilled import drop_pages
 from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.models.tiled import TILE, Tiled
 from mcdenoise.ops import downsample
@@ -63,7 +64,11 @@ class CoarseToFine(Wrapper):
 
 def _halved(frame: Frame) -> Frame:
     """The frame at half its size, with the unchanged statistics of the whole image."""
-    images = {name: downsample(image) for name, image in frame.items() if name in _IMAGES}
+    images = {}
+    for name, image in frame.items():
+        if name in _IMAGES:
+            images[name] = downsample(image)
+            drop_pages()
     others = {name: None for name in frame.buffers if name not in images}
     skip = None if frame.skip is None else Skip(_halved_mask(frame.skip.mask), {})
     return frame.replace(**(others | images), extra={}, skip=skip)

@@ -13,6 +13,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Output, State, prepared
 from mcdenoise.models._journal import note
 from mcdenoise.models._reads import at_hand
+from mcdenoise.models._spilled import drop_pages
 from mcdenoise.models._wrapper import Wrapper
 
 # Rectangles begin and end at multiples of this.
@@ -68,6 +69,7 @@ class Tiled(Wrapper):
         frame = frame if frame.statistics else prepared(self.inner, frame)
         results: dict[str, Tensor] = {}
         halo = self.halo or 0
+        drop_pages()
         for part in parts:
             around, kept = part.grown(halo, frame.size), part.grown(self.margin, frame.size)
             output, after = self.inner(frame.crop(*around.slices))
@@ -79,6 +81,7 @@ class Tiled(Wrapper):
                 if name not in results:
                     results[name] = _known(frame, name).to(image.dtype, copy=True)
                 kept.of(results[name]).copy_(kept.within(around).of(image))
+            drop_pages()
         computed = sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1])
         note("network", f"on {computed:.0%} of the pixels", 1 - computed)
         image = results.pop("image") if results else _known(frame, "image")

@@ -619,7 +619,9 @@ def _color_has_albedo(path: Path, albedo_present: bool) -> bool | None:
 
 def _view_depth(matrix: Array, position: Tensor) -> tuple[Array, Tensor]:
     """Clip w of every position, and the matrix with the sign that makes it positive in front of the camera."""
-    w = position[0].double().permute(1, 2, 0) @ torch.from_numpy(matrix[:3, 3]) + matrix[3, 3]
+    factors = torch.from_numpy(matrix[:3, 3])
+    # Row by row, because a large image takes much memory in float64.
+    w = torch.stack([row.double().T @ factors + matrix[3, 3] for row in position[0].unbind(1)])
     # A matrix and its negative give the same projection; visible points lie in front.
     if w.median() < 0:
         matrix, w = -matrix, -w
