@@ -13,6 +13,8 @@ import tyro
 from mcdenoise.benchmark import Settings, benchmark_ops, choose_methods, parse_sizes, run_benchmark
 from mcdenoise.benchmark.sizes import SIZES
 from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows, skipped_rows
+from mcdenoise.check.cases import OPS
+from mcdenoise.check.own import find_ops
 from mcdenoise.cli._options import Json, parse_size
 from mcdenoise.cli._output import print_rows, progress_bar, say, write_json
 from mcdenoise.cli._suite import SHOWN, score_suite
@@ -76,7 +78,7 @@ def benchmark(
         sizes: sizes of synthetic images for measuring run time over pixels, such as 1280x720,3840x2160, or none.
         pictures: number of frames of each scene whose images are stored.
         keep_all: measure each method that skips work a second time without skipping, to see what skipping saves.
-        ops: measure the operators.
+        ops: measure operators: those that are named in place of folders, or all.
         size: size of the images with --ops, WIDTHxHEIGHT.
         suite: render and score the suite of this name.
         data: folder of the suite's frames.
@@ -116,8 +118,8 @@ def benchmark(
         return score_suite(
             data, out, settings, rows, models, precisions or "float32", blender_python, render=render, json=json
         )
-    if ops == bool(sequences):
-        raise InputError("expected the folders of sequences, or --ops, and not both; see `mcdenoise benchmark --help`")
+    if not ops and not sequences:
+        raise InputError("expected folders of sequences, or --ops, found neither; see `mcdenoise benchmark --help`")
     rounds = rounds if rounds is not None else 5 if ops else 3
     if ops:
         with progress_bar() as progress:
@@ -129,8 +131,9 @@ def benchmark(
                 device=device,
                 out=out,
                 command=_command_line(
-                    "benchmark", "--ops", out=out, size=size, rounds=rounds, threads=threads, device=device
+                    "benchmark", "--ops", *sequences, out=out, size=size, rounds=rounds, threads=threads, device=device
                 ),
+                ops=find_ops([str(name) for name in sequences], OPS) if sequences else OPS,
                 on_step=lambda done, total: progress.update(task, completed=done, total=total),
             )
         print_rows(op_rows(costs))
