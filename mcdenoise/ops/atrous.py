@@ -81,8 +81,6 @@ def atrous(
     if sizes["C"] < 3:
         raise ValueError(f"light: expected at least 3 channels, found {sizes['C']}")
     _check_settings(step, sigma_z, sigma_n, sigma_l)
-    if light.numel() == 0:
-        return light, variance
     dtype = accumulator_dtype(light.dtype)
     image, noise = light.to(dtype), variance.to(dtype)
     deviation = sigma_l * torch.sqrt(blurred(noise) + _LEAST_DEVIATION**2)

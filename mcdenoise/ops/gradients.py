@@ -88,8 +88,6 @@ def temporal_gradient(
     images = {name: (image, "B 1 H W") for name, image in given.items() if image is not None}
     check_shapes(current=(current, "B 1 H W"), previous=(previous, "B 1 H W"), **images, **layouts(normal, depth))
     _check_settings(stratum, levels, threshold, sigma_z, sigma_n)
-    if current.numel() == 0:
-        return current
     difference, size, noise = sums_of_strata(
         *(current, previous, weight, variance, normal, depth),
         stratum=stratum,

@@ -92,7 +92,7 @@ def moments_variance(
     check_shapes(moments=(moments, "B 2 H W"), **layouts(normal, depth))
     _check_settings(kernel_size, sigma_z, sigma_n)
     mean, scale = moments.to(accumulator_dtype(moments.dtype)), 1.0
-    if kernel_size > 1 and moments.numel():
+    if kernel_size > 1:
         # A power of two, which rounds nothing, so that no sum of representable moments overflows.
         scale = 2.0 ** -(kernel_size**2).bit_length()
         mean, _ = edge_average(

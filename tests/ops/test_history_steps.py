@@ -385,6 +385,6 @@ def test_they_are_what_their_schemas_say() -> None:
         (temporal.motion_from_position, (frame.position, frame.view_projection)),
         (temporal._blend, (*blended, frame.albedo, 3.0, 0.05)),
         (fast._find_lights, (image[0, :, 3:4], 0.03, 1.2, 9)),
-        (fast._give_up_lag, (image[0], length, image[1, :, :5].contiguous(), 2.0, 5, 0.25, 7.0)),
+        (fast._discard_lag, (image[0], length, image[1, :, :5].contiguous(), 2.0, 5, 0.25, 7.0)),
     ):
         torch.library.opcheck(operator._overload, arguments, test_utils=("test_schema", "test_faketensor"))
