@@ -155,9 +155,11 @@ COMMANDS = {
     ),
     "denoise network": Command(NETWORK, ("shot", "weights.safetensors"), images),
     "denoise again": Command(SHOWN, ("shot", "out"), images),
-    # It says of each shot what failed in it, and ends with 1.
-    "film": Command(FILM, ("film.toml", "shot"), filmed, statuses=(0, 1, 2), out="filmed/wall"),
-    "film again": Command(FILM, ("film.toml", "shot", "filmed"), filmed, statuses=(0, 1, 2), out="filmed/wall"),
+    # It says of each shot what failed in it, and ends with 1; its workers import all that they need.
+    "film": Command(FILM, ("film.toml", "shot"), filmed, statuses=(0, 1, 2), seconds=300, out="filmed/wall"),
+    "film again": Command(
+        FILM, ("film.toml", "shot", "filmed"), filmed, statuses=(0, 1, 2), seconds=300, out="filmed/wall"
+    ),
     "inspect": Command("inspect shot", ("shot",), printed),
     "inspect layers": Command("inspect layers", ("layers",), printed),
     "evaluate": Command("evaluate shot out", ("shot", "out"), printed),
