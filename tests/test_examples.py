@@ -332,6 +332,7 @@ def test_versions_of_a_scene_are_held_out_together() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_paper_tables_of_the_available_runs(dataset: Path, tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     small = ("--steps", "1", "--batch", "1", "--frames", "2", "--crop", "16", "--held-out", "hall-glossy", "yard")

@@ -70,7 +70,13 @@ def test_full_width_at_180x320() -> None:
 
 
 @pytest.mark.parametrize("precision", [torch.float32, pytest.param(torch.bfloat16, marks=pytest.mark.slow)], ids=str)
-@pytest.mark.parametrize("name", [pytest.param("cascaded_v2", marks=pytest.mark.slow), "cascaded_v2_tiny"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("cascaded_v2", "cascaded_v2_tiny")),
+        "cascaded_v2_micro",
+    ],
+)
 def test_weights_and_filter_in_one_give_the_same_image(
     name: str, precision: torch.dtype, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -173,8 +173,7 @@ def test_inputs_are_left_alone(op: Op, case: Case) -> None:
 # Generating code takes five to thirty seconds for an op, and what there is to generate is alike within a family. One of
 # each is generated here, the others where slow tests run; all go through the compiler up to its generator.
 GENERATED = {
-    "kernel_conv",  # taps with borders
-    "cross_bilateral_filter",  # weights of guides, a softmax over taps
+    "cross_bilateral_filter",  # taps with borders, weights of guides, a softmax over taps
     "laplacian_fusion",  # resolutions
     "demodulate",  # pixels alone
     "grid_splat",  # scattered sums
