@@ -678,16 +678,16 @@ def test_generate(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
     # The scene of the first seed has moving objects, that of the second has none.
     command = ["generate", "-o", out, "--seeds", "3,7", "--frames", "2", "--size", "8x8", "--variant", "scalar_rgb"]
-    command += ["--realisations", "2", "--reference-spp", "2"]
+    command += ["--noise-seeds", "2", "--reference-spp", "2"]
     status, text, errors = run(*command)
     assert (status, errors) == (0, "")
     folders = [out / "random0003", out / "random0007"]
     assert text.split() == [str(folder / "inputs") for folder in folders]
     for folder, moves in zip(folders, (True, False), strict=True):
         found = open_sequence(folder)
-        assert (len(found), found.size, found.realisations) == (2, (8, 8), 2)
+        assert (len(found), found.size, found.noise_seeds) == (2, (8, 8), 2)
         for number in range(2):
-            frame, again = (found.frame(number, realisation=k) for k in range(2))
+            frame, again = (found.frame(number, noise_seed=k) for k in range(2))
             frame.validate()
             assert frame.reference is not None
             assert (frame.previous_position is not None) is moves
@@ -702,7 +702,7 @@ def test_generate_wild(run: Callable[..., tuple[int, str, str]], out: Path) -> N
     """One clip and two stills, by their sampling; a second call does not render existing frames again."""
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
     command = ["generate", "-o", out, "--frames", "4", "--size", "8x8", "--variant", "scalar_rgb", "--wild"]
-    command += ["--realisations", "2", "--reference-spp", "1", "--sampling", "filtered", "--seeds"]
+    command += ["--noise-seeds", "2", "--reference-spp", "1", "--sampling", "filtered", "--seeds"]
     for stills, names in (("0", ["random0011"]), ("1", ["random0011_0", "random0011_1"])):
         status, text, errors = run(*command, "11", "--stills", stills)
         assert (status, errors) == (0, "")
@@ -715,7 +715,7 @@ def test_generate_wild(run: Callable[..., tuple[int, str, str]], out: Path) -> N
             assert about["film"]["filter"] in ("box", "gaussian", "tent", "mitchell")
             assert about["reference_spp"]["0"] == 4 * about["noisy_spp"]
             for number in found.numbers:
-                found.frame(number, realisation=1).validate()
+                found.frame(number, noise_seed=1).validate()
     times = {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")}
     assert run(*command, "11", "--stills", "0")[0] == 0
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")} == times
@@ -730,7 +730,7 @@ def test_generate_wild(run: Callable[..., tuple[int, str, str]], out: Path) -> N
         ("--frames", "0", "--frames: expected at least 1, found 0"),
         ("--size", "160", "--size: expected WIDTHxHEIGHT such as 1280x720, found '160'"),
         ("--size", "0x8", "expected width and height between 1 and 16384 pixels, found 0x8"),
-        ("--realisations", "0", "realisations: expected at least 1, found 0"),
+        ("--noise-seeds", "0", "noise_seeds: expected at least 1, found 0"),
         ("--stills", "1.5", "--stills: expected a fraction from 0 to 1, found 1.5"),
         ("--sampling", "left", "centre"),
     ],

@@ -327,7 +327,7 @@ def blender() -> Iterator[Blender]:
 
 def rendered(blender: Blender, folder: Path, scene: dict[str, Any], camera: Camera = CAMERA, **options: Any) -> Any:
     made = RandomScene(scene, [camera])
-    options = {"size": (24, 16), "settings": CENTRE, "realisations": 1, "reference_samples": 64, **options}
+    options = {"size": (24, 16), "settings": CENTRE, "noise_seeds": 1, "reference_samples": 64, **options}
     return open_sequence(render_cycles(made, folder, blender, **options)).frame(0)
 
 
@@ -360,7 +360,7 @@ def test_parts_add_up_to_each_noisy_color(blender: Blender, tmp_path: Path) -> N
     shiny = {"type": "roughconductor", "material": "none", "alpha": 0.1}
     scene = scene_of(ball=ball(shiny), sky={"type": "constant", "radiance": 2.0}) | floor()
     made = RandomScene(scene, [CAMERA])
-    options: dict[str, Any] = {"size": (24, 16), "settings": CENTRE, "realisations": 2, "reference_samples": 0}
+    options: dict[str, Any] = {"size": (24, 16), "settings": CENTRE, "noise_seeds": 2, "reference_samples": 0}
     render_cycles(made, tmp_path, blender, **options)
     before = pixels(tmp_path)
     # What is asked for later is added, and the noise stays what it was.
@@ -368,8 +368,8 @@ def test_parts_add_up_to_each_noisy_color(blender: Blender, tmp_path: Path) -> N
     for name, values in before.items():
         np.testing.assert_array_equal(pixels(tmp_path)[name], values)
     assert {"diffuse", "specular"} <= sequence.buffers & sequence.noisy
-    for realisation in range(2):
-        frame = sequence.frame(0, realisation=realisation)
+    for noise_seed in range(2):
+        frame = sequence.frame(0, noise_seed=noise_seed)
         total = image(frame.diffuse) + image(frame.specular)
         # Each is rounded to half floats.
         np.testing.assert_allclose(total, image(frame.color), rtol=2 * 2.0**-11, atol=3 * 2.0**-24)
@@ -443,7 +443,7 @@ def moving_seed() -> int:
 
 def test_a_sequence_is_resumed_to_the_same_pixels(blender: Blender, tmp_path: Path) -> None:
     made = random_scene(moving_seed(), 2)
-    options: dict[str, Any] = {"size": (24, 16), "realisations": 2, "reference_samples": 8, "seed": 5}
+    options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 2, "reference_samples": 8, "seed": 5}
     options["settings"] = CyclesSettings(2, "blackman_harris", 0.0, (0.5, 0.5), 0.0)
     seen: list[tuple[int, int]] = []
     folder = render_cycles(made, tmp_path, blender, **options, progress=lambda *each: seen.append(each))
@@ -451,14 +451,14 @@ def test_a_sequence_is_resumed_to_the_same_pixels(blender: Blender, tmp_path: Pa
     assert seen[-1] == (24, 24)
     before = pixels(folder)
     sequence = open_sequence(tmp_path)
-    assert sequence.realisations == 2
+    assert sequence.noise_seeds == 2
     assert {"previous_position", "reference", "view_projection"} <= sequence.buffers
     # Through a filter each noisy color has samples of its own, and so have its features; but for what Cycles takes from
     # the first sample alone, which it puts at the pixel centre.
     for name in ("color", "albedo", "shading_normal", "world_position", "depth", "previous_position"):
-        own, other = (before[f"{part}{name}1.exr"] for part in ("", "realisation1/"))
+        own, other = (before[f"{part}{name}1.exr"] for part in ("", "noise_seed1/"))
         assert (own != other).any() == (name in ("color", "albedo", "shading_normal"))
-    for path in (folder / "color1.exr", folder / "realisation1" / "color0.exr", folder / "reference1.exr"):
+    for path in (folder / "color1.exr", folder / "noise_seed1" / "color0.exr", folder / "reference1.exr"):
         path.unlink()
     render_cycles(made, tmp_path, blender, **options)
     after = pixels(folder)
@@ -485,14 +485,14 @@ def test_lens_and_shutter_blur(blender: Blender, tmp_path: Path) -> None:
     spread = []
     for shutter in (0.0, 0.5):
         settings = CyclesSettings(1, "centre", 0.0, (0.5, 0.5), shutter)
-        options: dict[str, Any] = {"size": (24, 16), "realisations": 1, "reference_samples": 0, "settings": settings}
+        options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 1, "reference_samples": 0, "settings": settings}
         folder = render_cycles(RandomScene(scene, cameras), tmp_path / f"shutter{shutter}", blender, **options)
         near = image(open_sequence(folder).frame(0).depth)[..., 0] < 10
         spread.append(np.unique(np.nonzero(near)[1]).size)
     assert spread[0] <= 2 < spread[1]
 
 
-@pytest.mark.parametrize("option", ["samples", "realisations", "reference_samples", "threads", "seed", "view"])
+@pytest.mark.parametrize("option", ["samples", "noise_seeds", "reference_samples", "threads", "seed", "view"])
 def test_numbers_below_the_least_are_told(blender: Blender, tmp_path: Path, option: str) -> None:
     with pytest.raises(InputError, match=f"{option}: expected at least"):
         render_cycles(random_scene(0, 1), tmp_path, blender, **{option: -1})

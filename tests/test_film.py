@@ -54,11 +54,11 @@ AT_WALL = [Camera.look_at((0.1, 0.2, 3), (0, 0, 0), fov_x=30)]
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two frames with two realisations on a film with a Gaussian filter and a lens."""
+    """Two frames with two noise seeds on a film with a Gaussian filter and a lens."""
     pytest.importorskip("mitsuba")
     out = tmp_path_factory.mktemp("film")
     film = Film("gaussian", aperture=0.05, focus=3)
-    return render_sequence(demo_scene(), demo_cameras(2), out, realisations=2, reference_spp=2, film=film, **SCALAR)
+    return render_sequence(demo_scene(), demo_cameras(2), out, noise_seeds=2, reference_spp=2, film=film, **SCALAR)
 
 
 @pytest.mark.parametrize(
@@ -72,9 +72,9 @@ def test_the_mean_of_noisy_colors_and_features_is_that_of_many_samples(tmp_path:
     """
     runs = 30
     folder = render_sequence(
-        wall(), AT_WALL, tmp_path, spp=4, realisations=runs, reference_spp=512, film=Film(name), max_depth=2, **SCALAR
+        wall(), AT_WALL, tmp_path, spp=4, noise_seeds=runs, reference_spp=512, film=Film(name), max_depth=2, **SCALAR
     )
-    places = [folder, *(folder / f"realisation{k}" for k in range(1, runs))]
+    places = [folder, *(folder / f"noise_seed{k}" for k in range(1, runs))]
     colors = np.array([read(place, "color0") for place in places])
     albedos = np.array([read(place, "albedo0") for place in places])
     reference = read(folder, "reference0")
@@ -90,25 +90,25 @@ def test_the_mean_of_noisy_colors_and_features_is_that_of_many_samples(tmp_path:
     np.testing.assert_allclose(albedos.mean(axis=0)[inside], colors.mean(axis=0)[inside], atol=2 * error.max())
 
 
-def test_every_realisation_has_features_of_its_own_samples(sequence: Path) -> None:
+def test_every_noise_seed_has_features_of_its_own_samples(sequence: Path) -> None:
     for name in (*FEATURES, "color"):
-        first, second = read(sequence, f"{name}1"), read(sequence / "realisation1", f"{name}1")
+        first, second = read(sequence, f"{name}1"), read(sequence / "noise_seed1", f"{name}1")
         assert (first != second).any(axis=-1).mean() > 0.5, name
         assert np.isfinite(first).all()
-    assert not (sequence / "realisation1" / "reference0.exr").exists()
+    assert not (sequence / "noise_seed1" / "reference0.exr").exists()
     assert read(sequence, "albedo0").min() >= 0
     assert read(sequence, "albedo0").max() <= 1
     assert np.linalg.norm(read(sequence, "shading_normal0"), axis=-1).max() < 1.001
 
 
-def test_the_reader_gives_each_realisation_its_own(sequence: Path) -> None:
+def test_the_reader_gives_each_noise_seed_its_own(sequence: Path) -> None:
     found = open_sequence(sequence.parent)
-    assert found.realisations == 2
+    assert found.noise_seeds == 2
     assert found.noisy == {"color", "albedo", "normal", "position", "depth"}
-    first, second = (found.frame(1, realisation=k).validate()[0] for k in range(2))
+    first, second = (found.frame(1, noise_seed=k).validate()[0] for k in range(2))
     for name, file in (("albedo", "albedo1"), ("color", "color1"), ("position", "world_position1")):
         for k, frame in enumerate((first, second)):
-            stored = read(sequence / f"realisation{k}" if k else sequence, file)
+            stored = read(sequence / f"noise_seed{k}" if k else sequence, file)
             given = dict(frame.items())[name][0].permute(1, 2, 0).double().numpy()
             np.testing.assert_array_equal(given, stored)
     assert torch.equal(first.reference, second.reference)  # type: ignore[arg-type]
@@ -153,12 +153,12 @@ def test_the_same_seed_gives_the_same_pixels_and_a_stopped_run_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def render(name: str, **settings: Any) -> Path:
-        changed = {"seed": 5, "film": Film("box"), "realisations": 2, "reference_spp": 2} | settings
+        changed = {"seed": 5, "film": Film("box"), "noise_seeds": 2, "reference_spp": 2} | settings
         return render_sequence(demo_scene(), demo_cameras(2), tmp_path / name, **changed, **SCALAR)
 
     whole, other = render("a"), render("c", seed=6)
     render("b", frames=1)
-    (tmp_path / "b" / "inputs" / "realisation1" / "albedo0.exr").unlink()
+    (tmp_path / "b" / "inputs" / "noise_seed1" / "albedo0.exr").unlink()
     again = render("b")
     for path in whole.rglob("*.exr"):
         same = path.relative_to(whole)
@@ -168,7 +168,7 @@ def test_the_same_seed_gives_the_same_pixels_and_a_stopped_run_is_resumed(
     def fail(*_: Any) -> None:
         raise AssertionError("nothing is missing")
 
-    for name in ("write_buffer", "write_realisation", "write_reference"):
+    for name in ("write_buffer", "write_noisy", "write_reference"):
         monkeypatch.setattr(render_frames, name, fail)
     render("a")
     with pytest.raises(InputError, match=r"rendered with film .*'box'.*, now None; choose another output folder"):

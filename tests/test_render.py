@@ -163,11 +163,11 @@ def test_damaged_files_are_rendered_again(tmp_path: Path) -> None:
     """What is empty, cut short, garbage, of another size or elsewhere is none of a finished frame's files."""
 
     def render() -> Path:
-        return render_sequence(demo_scene(), demo_cameras(2), tmp_path, realisations=2, reference_spp=2, **SCALAR)
+        return render_sequence(demo_scene(), demo_cameras(2), tmp_path, noise_seeds=2, reference_spp=2, **SCALAR)
 
     folder = render()
     paths = sorted(path for path in folder.rglob("*.exr") if path.stem[-1] == "1")
-    assert {path.parent.name for path in paths} == {"inputs", "realisation1"}
+    assert {path.parent.name for path in paths} == {"inputs", "noise_seed1"}
     intact = {path: path.read_bytes() for path in folder.rglob("*.exr")}
     shown = {path: read_exr(path)[0] for path in intact}
     other = write_exr_bytes(tmp_path / "other.exr", np.zeros((3, 5, 3)))
@@ -399,7 +399,7 @@ def test_published_flythroughs() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"realisations": 0}, "realisations: expected at least 1"),
+        ({"noise_seeds": 0}, "noise_seeds: expected at least 1"),
         ({"workers": 0}, "workers: expected at least 1"),
         ({"noise_level": 0.0}, "noise_level: expected more than 0 and less than 1, found 0"),
         ({"moves": {"rug": np.eye(4)}}, "object 'rug': expected 1 matrices"),
@@ -458,15 +458,15 @@ def test_passes_of_one_frame_do_not_reuse_the_noise_of_another(tmp_path: Path) -
 TINY: dict[str, Any] = {"size": (16, 9), "variant": "scalar_rgb"}
 
 
-def test_realisations_are_independent_and_have_one_expectation(tmp_path: Path) -> None:
+def test_noise_seeds_are_independent_and_have_one_expectation(tmp_path: Path) -> None:
     camera, count = demo_cameras(1)[0], 48
     settings = {**TINY, "reference_spp": 512}
     alone = render_sequence(demo_scene(), [camera], tmp_path / "alone", **{**settings, "reference_frames": []})
-    folder = render_sequence(demo_scene(), [camera], tmp_path / "many", realisations=count, **settings)
+    folder = render_sequence(demo_scene(), [camera], tmp_path / "many", noise_seeds=count, **settings)
     assert np.array_equal(read(folder, "color0"), read(alone, "color0"))
     sequence = open_sequence(folder)
-    assert sequence.realisations == describe(folder)["realisations"] == count
-    frames = [sequence.frame(0, realisation=k) for k in range(count)]
+    assert sequence.noise_seeds == describe(folder)["noise_seeds"] == count
+    frames = [sequence.frame(0, noise_seed=k) for k in range(count)]
     reference = frames[0].reference
     assert reference is not None
     colors = torch.cat([frame.color for frame in frames]).double().flatten(1)
@@ -477,17 +477,17 @@ def test_realisations_are_independent_and_have_one_expectation(tmp_path: Path) -
     assert ((residual[1:] * residual[:-1]).sum() / residual.square().sum()).abs() < 0.1
 
 
-def test_realisations_are_added_to_what_is_there(tmp_path: Path) -> None:
+def test_noise_seeds_are_added_to_what_is_there(tmp_path: Path) -> None:
     settings = {**TINY, "reference_frames": []}
     folder = render_sequence(demo_scene(), demo_cameras(2), tmp_path, **settings)
     before = images(folder)
-    render_sequence(demo_scene(), demo_cameras(2), tmp_path, realisations=3, **settings)
+    render_sequence(demo_scene(), demo_cameras(2), tmp_path, noise_seeds=3, **settings)
     assert images(folder) == before
-    assert open_sequence(folder).realisations == 3
-    (folder / "realisation2" / "color1.exr").unlink()
-    assert open_sequence(folder).realisations == 2
+    assert open_sequence(folder).noise_seeds == 3
+    (folder / "noise_seed2" / "color1.exr").unlink()
+    assert open_sequence(folder).noise_seeds == 2
     render_sequence(demo_scene(), demo_cameras(1), tmp_path, **settings)
-    assert describe(folder)["realisations"] == 3
+    assert describe(folder)["noise_seeds"] == 3
 
 
 def test_a_reference_is_resumed_in_the_middle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -810,13 +810,13 @@ def test_the_command_line_moves_objects_of_a_scene_file(tmp_path: Path, capsys: 
     content: dict[str, Any] = {"fov": 60, "to_world": [camera] * 2, "objects": objects}
     path.write_text(json.dumps(content))
     command = ["render", str(scene), "--camera-path", str(path), "-o", str(out), "--size", "16x12"]
-    command += ["--variant", "scalar_rgb", "--reference-spp", "32", "--realisations", "2", "--noise-level", "0.5"]
+    command += ["--variant", "scalar_rgb", "--reference-spp", "32", "--noise-seeds", "2", "--noise-level", "0.5"]
     with pytest.raises(SystemExit) as ended:
         main(command)
     assert ended.value.code == 0
     assert capsys.readouterr().out.strip() == str(out / "inputs")
     sequence = open_sequence(out)
-    assert (len(sequence), sequence.realisations) == (2, 2)
+    assert (len(sequence), sequence.noise_seeds) == (2, 2)
     frame = sequence.frame(1)
     assert frame.position is not None
     assert frame.previous_position is not None
@@ -841,13 +841,13 @@ def test_the_command_line_moves_objects_of_a_scene_file(tmp_path: Path, capsys: 
 def test_kept_samples_have_the_color_for_their_mean(tmp_path: Path) -> None:
     cameras = demo_cameras(2)
     folder = render_sequence(
-        demo_scene(), cameras, tmp_path, spp=3, realisations=2, reference_frames=[], keep_samples=True, **SCALAR
+        demo_scene(), cameras, tmp_path, spp=3, noise_seeds=2, reference_frames=[], keep_samples=True, **SCALAR
     )
     sequence = open_sequence(tmp_path)
     assert not sequence.warnings
     assert not sequence.unused
     assert "samples" in sequence.buffers & sequence.noisy
-    first, second = (sequence.frame(1, realisation=k) for k in range(2))
+    first, second = (sequence.frame(1, noise_seed=k) for k in range(2))
     for frame in (first, second):
         assert frame.samples is not None
         assert frame.samples.shape == (1, 3, 3, HEIGHT, WIDTH)
@@ -859,7 +859,7 @@ def test_kept_samples_have_the_color_for_their_mean(tmp_path: Path) -> None:
     # Samples of their own: no two are alike.
     assert not torch.equal(first.samples[:, 0], first.samples[:, 1])
     before = images(folder)
-    again = {"spp": 3, "realisations": 2, "reference_frames": [], **SCALAR}
+    again = {"spp": 3, "noise_seeds": 2, "reference_frames": [], **SCALAR}
     render_sequence(demo_scene(), cameras, tmp_path, keep_samples=True, **again)
     assert images(folder) == before
     with pytest.raises(InputError, match="rendered with samples_kept True, now None"):

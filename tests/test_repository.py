@@ -24,6 +24,8 @@ PRIVATE_WORDS = {
     r"(nobody|somebody|whoever)": "the user, the caller",
     r"(daily bread|in the making|stands? once more)": "say what it is",
     r"extremes": "minimum and maximum",
+    # In quotes it is a key in the headers of older weights.
+    r"(?<!\")realisations?": "noise seed",
 }
 # Tests say what must not be; the changelog quotes former words.
 NOT_READ = ("tests/", "CHANGELOG.md")
@@ -68,7 +70,7 @@ def test_no_file_names_a_path_of_one_machine(files: list[Path]) -> None:
 
 @pytest.mark.parametrize("words", PRIVATE_WORDS)
 def test_no_private_words(files: list[Path], words: str) -> None:
-    pattern = re.compile(rf"\b{words}\b", re.IGNORECASE)
+    pattern = re.compile(rf"\b(?:{words})\b", re.IGNORECASE)
     found = [
         f"{name}:{number}: {line.strip()[:160]}"
         for path in files

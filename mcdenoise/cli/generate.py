@@ -23,7 +23,7 @@ from mcdenoise.scenes.generation import Generation, render_seed
 from mcdenoise.scenes.random.takes import Sampling
 from mcdenoise.scenes.render import choose_variant
 
-_FOR_TRAINING = RenderOptions(realisations=3, reference_spp=64, size="160x160")
+_FOR_TRAINING = RenderOptions(noise_seeds=3, reference_spp=64, size="160x160")
 _WILD_STILLS = 0.5
 
 

@@ -23,7 +23,7 @@ class RenderOptions:
 
     Args:
         spp: samples a pixel of the noisy color.
-        realisations: noisy colors of each frame, each with a noise seed of its own.
+        noise_seeds: noisy colors of each frame, each with a noise seed of its own.
         reference_spp: samples a pixel of the references; 0 renders none. With --noise-level the most.
         noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
         reference_frames: frames that get a reference, such as 8-11; all by default.
@@ -36,7 +36,7 @@ class RenderOptions:
     """
 
     spp: int = 1
-    realisations: int = 1
+    noise_seeds: int = 1
     reference_spp: int = 512
     noise_level: float | None = None
     reference_frames: str | None = None
@@ -54,7 +54,7 @@ class RenderOptions:
         referenced = None if frames is None else parse_frames(frames, name="--reference-frames")
         return {
             "spp": self.spp,
-            "realisations": self.realisations,
+            "noise_seeds": self.noise_seeds,
             "reference_spp": max(self.reference_spp, 1),
             "noise_level": self.noise_level,
             "reference_frames": referenced if self.reference_spp > 0 else [],

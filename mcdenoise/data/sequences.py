@@ -43,7 +43,7 @@ class Sequence:
         buffers: names of the buffers that every frame of the sequence has.
         reference_numbers: frames that have a reference; possibly only some.
         color_has_albedo: whether the color in the files includes the albedo. The color of frames always does.
-        realisations: number of noisy colors per frame, with different noise seeds; usually 1.
+        noise_seeds: number of noisy colors per frame, with different noise seeds; usually 1.
         noisy: names of the buffers that differ between noise seeds: the color, and features that have noise.
         table: the source of each buffer.
         warnings: probable mistakes, one line each.
@@ -60,7 +60,7 @@ class Sequence:
     buffers: frozenset[str]
     reference_numbers: list[int]
     color_has_albedo: bool
-    realisations: int
+    noise_seeds: int
     noisy: frozenset[str]
     table: Sequential[Row] = field(repr=False)
     warnings: Sequential[str]
@@ -99,7 +99,7 @@ class Sequence:
         self,
         number: int,
         reference: bool = True,
-        realisation: int = 0,
+        noise_seed: int = 0,
         buffers: Collection[str] | None = None,
     ) -> Frame:
         """Read one frame: a batch of 1, float32, on the CPU; values are not validated.
@@ -113,7 +113,7 @@ class Sequence:
         Args:
             number: one of ``numbers``.
             reference: whether to read the reference, if there is one.
-            realisation: index of the noise seed, from 0 to ``realisations - 1``: it selects the ``noisy`` buffers; the
+            noise_seed: index of the noise seed, from 0 to ``noise_seeds - 1``: it selects the ``noisy`` buffers; the
                 others are the same for all seeds.
             buffers: names of the buffers in use. Parts of the light and samples (``LIGHT_PARTS``), which are slow to
                 read, are skipped if they are not among them. All by default.
@@ -122,12 +122,12 @@ class Sequence:
             InputError: the frame or the noise seed does not exist, or a file is damaged.
         """
         self._check(number)
-        if not 0 <= realisation < self.realisations:
+        if not 0 <= noise_seed < self.noise_seeds:
             raise InputError(
-                f"{self.root}: expected a realisation of the noise from 0 to {self.realisations - 1}, "
-                f"found {realisation}; render more of them"
+                f"{self.root}: expected a noise seed from 0 to {self.noise_seeds - 1}, "
+                f"found {noise_seed}; render more of them"
             )
-        frame = self._source.frame(number, reference=reference, realisation=realisation, buffers=buffers)
+        frame = self._source.frame(number, reference=reference, noise_seed=noise_seed, buffers=buffers)
         if self.numbers.index(number) == 0 or number - 1 in self.numbers:
             return frame
         # They refer to a frame that was not selected, not to the previous one of this sequence.
@@ -400,7 +400,7 @@ def _wrap(root: Path, layout: str, source: BmfrFolder | NoisebaseFiles | Rendere
         buffers=source.buffers,
         reference_numbers=source.reference_numbers,
         color_has_albedo=source.color_has_albedo,
-        realisations=source.realisations,
+        noise_seeds=source.noise_seeds,
         noisy=source.noisy if isinstance(source, BmfrFolder) else frozenset({"color"}),
         table=source.table,
         warnings=[*gaps, *source.warnings],

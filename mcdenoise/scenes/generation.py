@@ -93,7 +93,7 @@ class Generation:
             seed=noise,
             view=take.view,
             samples=self.cycles_spp,
-            realisations=self.rendering["realisations"],
+            noise_seeds=self.rendering["noise_seeds"],
             reference_samples=self.rendering["reference_spp"] if self.rendering["reference_frames"] != [] else 0,
             parts=self.parts,
             threads=self.threads,

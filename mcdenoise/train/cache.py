@@ -35,7 +35,7 @@ from mcdenoise.train.front import ACCUMULATED, Front
 _CAMERA = frozenset({"position", "view_projection"})
 # Patterns of the files of a sequence, relative to its folder.
 _SUFFIXES = {".exr", ".h", ".json"}
-_PLACES = ("*", "realisation*/*", "inputs/*", "inputs/realisation*/*")
+_PLACES = ("*", "noise_seed*/*", "inputs/*", "inputs/noise_seed*/*")
 _FORMAT = 5
 
 Array: TypeAlias = NDArray[Any]
@@ -83,7 +83,7 @@ class Shot:
         rows: slice = slice(None),
         columns: slice = slice(None),
         *,
-        realisation: int = 0,
+        noise_seed: int = 0,
         channels: Mapping[str, list[int]] = {},
         turn: Callable[[Array], Array] = lambda image: image,
     ) -> dict[str, Tensor]:
@@ -93,11 +93,11 @@ class Shot:
             frames: range of frames.
             rows: range of rows.
             columns: range of columns.
-            realisation: index of the noise seed.
+            noise_seed: index of the noise seed.
             channels: for some buffers, the selection and order of channels.
             turn: returns another view of ``(T, C, H, W)``, flipped or rotated.
         """
-        color = self.colors[realisation]
+        color = self.colors[noise_seed]
         sources: dict[str, Array] = {}
         start = 0
         for name, count in self.parts.items():
@@ -105,7 +105,7 @@ class Shot:
                 sources[name] = color[:, start : start + count]
             start += count
         parts = {}
-        own = self.noisy[realisation] if self.noisy else {}
+        own = self.noisy[noise_seed] if self.noisy else {}
         for name, source in {**sources, **self.features, **own}.items():
             if source.ndim == 3:
                 parts[name] = torch.from_numpy(source[frames].astype(np.float32))
@@ -139,7 +139,7 @@ class _Plan:
     front: Front
     features: tuple[str, ...]
     firsts: tuple[int, ...]
-    realisations: int
+    noise_seeds: int
     keep_fireflies: int
 
     @property
@@ -157,10 +157,10 @@ class _Plan:
 
     @property
     def starts(self) -> list[_Start]:
-        return [(first, realisation) for first in self.firsts for realisation in range(self.realisations)]
+        return [(first, noise_seed) for first in self.firsts for noise_seed in range(self.noise_seeds)]
 
-    def begin(self, realisation: int) -> Callable[[Frame], Frame]:
-        kept = self.keep_fireflies > 0 and (realisation + 1) % self.keep_fireflies == 0
+    def begin(self, noise_seed: int) -> Callable[[Frame], Frame]:
+        kept = self.keep_fireflies > 0 and (noise_seed + 1) % self.keep_fireflies == 0
         return self.front.begin(keep_fireflies=kept)
 
     def color_shape(self, first: int) -> tuple[int, ...]:
@@ -180,7 +180,7 @@ def open_cached(
     front: Front,
     features: Iterable[str],
     firsts: list[int],
-    realisations: int | None = None,
+    noise_seeds: int | None = None,
     keep_fireflies: int = 0,
 ) -> CachedSequence:
     """Open a sequence as the network's input from a cache, and fill the cache if necessary.
@@ -200,19 +200,19 @@ def open_cached(
         front: the wrappers that process the frames.
         features: names of further buffers to store, see :func:`features_of`.
         firsts: indices of the first frames, ascending.
-        realisations: number of noise seeds to use; all by default.
+        noise_seeds: number of noise seeds to use; all by default.
         keep_fireflies: every n-th noise seed keeps its fireflies as if they were caustics; 0 for none.
 
     Raises:
         InputError: a buffer or a reference is missing or damaged, or the cache cannot be written; then no incomplete
             files are left.
     """
-    found = sequence.realisations if realisations is None else min(realisations, sequence.realisations)
+    found = sequence.noise_seeds if noise_seeds is None else min(noise_seeds, sequence.noise_seeds)
     kept = tuple(sorted({*features, "reference"}))
     plan = _Plan(sequence, front, kept, tuple(firsts), found, keep_fireflies)
     # The id does not include the number of noise seeds found, so that arrays of fewer seeds are found stale and
     # removed.
-    settings = [sequence.numbers, front.settings, kept, firsts, realisations, keep_fireflies]
+    settings = [sequence.numbers, front.settings, kept, firsts, noise_seeds, keep_fireflies]
     identity = json.dumps([str(sequence.root.resolve()), *settings])
     place = folder / f"{sequence.name[:100]}-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
     finished = place / _key(sequence.root, [_FORMAT, *settings, found])[:32]
@@ -292,7 +292,7 @@ def _build(folder: Path, plan: _Plan) -> None:
     sequence = plan.sequence
     steps = {start: plan.begin(start[1]) for start in plan.starts}
     features: dict[str, list[Array]] = {_feature_name(name): [] for name in plan.shared}
-    features |= {_feature_name(name, k): [] for name in plan.own for k in range(plan.realisations)}
+    features |= {_feature_name(name, k): [] for name in plan.own for k in range(plan.noise_seeds)}
     camera: Tensor | None = None
     digest = hashlib.sha256()
     with ExitStack() as stack:
@@ -302,19 +302,19 @@ def _build(folder: Path, plan: _Plan) -> None:
         }
         wanted = {*plan.features, *plan.front.parts}
         for i, number in enumerate(sequence.numbers):
-            for realisation in range(plan.realisations):
-                frame = _read(sequence, number, realisation, wanted, digest)
+            for noise_seed in range(plan.noise_seeds):
+                frame = _read(sequence, number, noise_seed, wanted, digest)
                 for first in plan.firsts:
                     if first <= i:
-                        seen = dict(steps[first, realisation](frame).items())
+                        seen = dict(steps[first, noise_seed](frame).items())
                         noisy = torch.cat([seen[name] for name in plan.front.parts], 1)
-                        files[first, realisation].write(noisy.numpy().tobytes())
-                if realisation == 0 or plan.own:
+                        files[first, noise_seed].write(noisy.numpy().tobytes())
+                if noise_seed == 0 or plan.own:
                     found = dict((_with_motion(frame, camera) if "motion" in plan.features else frame).items())
-                    for name in plan.shared if realisation == 0 else ():
+                    for name in plan.shared if noise_seed == 0 else ():
                         features[_feature_name(name)].append(_smallest(found[name].numpy()))
                     for name in plan.own:
-                        features[_feature_name(name, realisation)].append(_smallest(found[name].numpy()))
+                        features[_feature_name(name, noise_seed)].append(_smallest(found[name].numpy()))
             camera = frame.view_projection
     for file in list(features):
         # If half precision is not exact for one frame, all frames are stored in single precision.
@@ -323,9 +323,9 @@ def _build(folder: Path, plan: _Plan) -> None:
     (folder / "about.json").write_text(json.dumps({"sha256": digest.hexdigest(), "files": checksums}) + "\n")
 
 
-def _read(sequence: Sequence, number: int, realisation: int, buffers: Collection[str], digest: Any) -> Frame:
+def _read(sequence: Sequence, number: int, noise_seed: int, buffers: Collection[str], digest: Any) -> Frame:
     """Decode a frame, add noisy color and reference to the checksum, and validate it."""
-    frame = sequence.frame(number, reference=realisation == 0, realisation=realisation, buffers=buffers)
+    frame = sequence.frame(number, reference=noise_seed == 0, noise_seed=noise_seed, buffers=buffers)
     radiance = {"color": frame.color} | ({} if frame.reference is None else {"reference": frame.reference})
     for image in radiance.values():
         digest.update(image.numpy().tobytes())
@@ -363,12 +363,12 @@ def _smallest(values: Array) -> Array:
 
 
 def _color_name(start: _Start) -> str:
-    first, realisation = start
-    return f"color-{first}-{realisation}.npy"
+    first, noise_seed = start
+    return f"color-{first}-{noise_seed}.npy"
 
 
-def _feature_name(name: str, realisation: int | None = None) -> str:
-    return f"{name}.npy" if realisation is None else f"{name}-{realisation}.npy"
+def _feature_name(name: str, noise_seed: int | None = None) -> str:
+    return f"{name}.npy" if noise_seed is None else f"{name}-{noise_seed}.npy"
 
 
 def _checksum(path: Path) -> str:
@@ -384,10 +384,10 @@ def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
         if any(_checksum(folder / name) != checksum for name, checksum in about["files"].items()):
             return None
         features = _map_features(folder, plan.shared, None, sequence)
-        noisy = [_map_features(folder, plan.own, k, sequence) for k in range(plan.realisations)] if plan.own else []
+        noisy = [_map_features(folder, plan.own, k, sequence) for k in range(plan.noise_seeds)] if plan.own else []
         shots = []
         for first in plan.firsts:
-            colors = [_map(folder / _color_name((first, k))) for k in range(plan.realisations)]
+            colors = [_map(folder / _color_name((first, k))) for k in range(plan.noise_seeds)]
             for color in colors:
                 _check(f"color of {first}", color, plan.color_shape(first))
             later = {name: feature[first:] for name, feature in features.items()}
@@ -398,10 +398,8 @@ def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
         return None
 
 
-def _map_features(
-    folder: Path, names: tuple[str, ...], realisation: int | None, sequence: Sequence
-) -> dict[str, Array]:
-    features = {name: _map(folder / _feature_name(name, realisation)) for name in names}
+def _map_features(folder: Path, names: tuple[str, ...], noise_seed: int | None, sequence: Sequence) -> dict[str, Array]:
+    features = {name: _map(folder / _feature_name(name, noise_seed)) for name in names}
     for name, feature in features.items():
         _check(name, feature, (len(sequence), *feature.shape[1:-2], *_size(name, sequence)))
     return features

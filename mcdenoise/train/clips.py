@@ -145,7 +145,7 @@ class ClipSampler:
     def _draw_one(self) -> dict[str, Tensor]:
         shot = self.shots[int(torch.multinomial(self.chances, 1))]
         height, width = shot.size
-        realisation, start = _randint(len(shot.colors)), _randint(len(shot) - self.frames + 1)
+        noise_seed, start = _randint(len(shot.colors)), _randint(len(shot) - self.frames + 1)
         top, left = _randint(height - self.crop + 1), _randint(width - self.crop + 1)
         order, axes = torch.randperm(3).tolist(), torch.randperm(3).tolist()
         turn = self._draw_turn()
@@ -153,7 +153,7 @@ class ClipSampler:
             slice(start, start + self.frames),
             slice(top, top + self.crop),
             slice(left, left + self.crop),
-            realisation=realisation,
+            noise_seed=noise_seed,
             channels=dict.fromkeys(_COLORED, order) | dict.fromkeys(_WORLD, axes),
             turn=turn.image,
         )

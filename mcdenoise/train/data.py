@@ -116,11 +116,11 @@ class DataFolders:
             shots += [shot.cut(slice(length - first)) for first, shot in zip(useful, cached.shots, strict=True)]
             if held:
                 watched.append((sequence.name, cached.shots[0].cut(slice(length, None))))
-            realisations = len(cached.shots[0].colors)
-            entries.append(_describe(sequence, cached.sha256, realisations=realisations, validation=held))
+            noise_seeds = len(cached.shots[0].colors)
+            entries.append(_describe(sequence, cached.sha256, noise_seeds=noise_seeds, validation=held))
         description: dict[str, Any] = {"sequences": entries}
         for sequence in self.validation:
-            cached = open_cached(sequence, cache, front=self.front, features=self.features, firsts=[0], realisations=1)
+            cached = open_cached(sequence, cache, front=self.front, features=self.features, firsts=[0], noise_seeds=1)
             watched.append((sequence.name, cached.shots[0]))
             description.setdefault("validation_sequences", []).append(_describe(sequence, cached.sha256))
         sampler = ClipSampler(

@@ -39,6 +39,8 @@ _CLEAN = "clean_references"
 # A run's name is also the name of its folder.
 _NAME = re.compile(r"[A-Za-z0-9+_-]{1,64}")
 _NO_PIXELS = ("workers", "ray", "threads", "blender_python")
+# Checksums use the first name of an option, so that those in headers of older weights still match their recipes.
+_FIRST_NAMES = {"noise_seeds": "realisations"}
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,8 @@ class Rendering:
     def sha256(self) -> str:
         """Checksum of everything that determines the rendered images."""
         # The number of processes does not change the pixels.
-        return _digest({key: value for key, value in self.options.items() if key not in _NO_PIXELS})
+        options = {key: value for key, value in self.options.items() if key not in _NO_PIXELS}
+        return _digest({_FIRST_NAMES.get(key, key): value for key, value in options.items()})
 
     def make(self, data: Path, generate: Callable[[], object]) -> list[Path]:
         """Render missing sequences, and clean the references if requested.

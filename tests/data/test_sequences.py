@@ -12,7 +12,7 @@ import torch
 
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.camera_matrices import CameraMatrices, read_camera_matrices, write_camera_matrices
-from mcdenoise.data.readers.bmfr import realisation_folder, write_bmfr_frame
+from mcdenoise.data.readers.bmfr import noise_seed_folder, write_bmfr_frame
 from mcdenoise.data.sequences import parse_frames, with_unique_names
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
@@ -169,64 +169,64 @@ def test_references_of_some_frames(small_sequence: Path) -> None:
     assert "reference" in open_sequence(small_sequence, "0-1").buffers
 
 
-def _add_realisation(inputs: Path, realisation: int, numbers: range) -> None:
+def _add_noise_seed(inputs: Path, noise_seed: int, numbers: range) -> None:
     for number in numbers:
-        color = np.full((20, 24, 3), 10.0 * realisation + number)
-        folder = realisation_folder(inputs, realisation)
+        color = np.full((20, 24, 3), 10.0 * noise_seed + number)
+        folder = noise_seed_folder(inputs, noise_seed)
         folder.mkdir(exist_ok=True)
         write_exr(folder / f"color{number}.exr", color, RGB)
 
 
-def test_realisations_of_the_noise(small_sequence: Path) -> None:
+def test_noise_seeds_of_the_noise(small_sequence: Path) -> None:
     inputs = small_sequence / "inputs"
-    assert open_sequence(small_sequence).realisations == 1
-    _add_realisation(inputs, 1, range(4))
-    _add_realisation(inputs, 2, range(2))
-    _add_realisation(inputs, 4, range(4))
+    assert open_sequence(small_sequence).noise_seeds == 1
+    _add_noise_seed(inputs, 1, range(4))
+    _add_noise_seed(inputs, 2, range(2))
+    _add_noise_seed(inputs, 4, range(4))
     sequence = open_sequence(small_sequence)
     # The second one is not complete, and what comes after a gap does not count.
-    assert sequence.realisations == 2
-    assert open_sequence(small_sequence, "0-1").realisations == 3
-    first, second = sequence.frame(3), sequence.frame(3, realisation=1)
+    assert sequence.noise_seeds == 2
+    assert open_sequence(small_sequence, "0-1").noise_seeds == 3
+    first, second = sequence.frame(3), sequence.frame(3, noise_seed=1)
     assert second.color.unique().tolist() == [13]
     for name, value in first.items():
         assert name == "color" or torch.equal(value, getattr(second, name))
-    assert sequence.frame(3, reference=False, realisation=1).reference is None
+    assert sequence.frame(3, reference=False, noise_seed=1).reference is None
     for wrong in (2, -1):
-        message = refused(lambda wrong=wrong: sequence.frame(0, realisation=wrong))
-        assert f"expected a realisation of the noise from 0 to 1, found {wrong}" in message
+        message = refused(lambda wrong=wrong: sequence.frame(0, noise_seed=wrong))
+        assert f"expected a noise seed from 0 to 1, found {wrong}" in message
 
 
-def test_realisations_without_albedo_get_it_back(small_sequence: Path) -> None:
+def test_noise_seeds_without_albedo_get_it_back(small_sequence: Path) -> None:
     inputs = small_sequence / "inputs"
-    _add_realisation(inputs, 1, range(4))
+    _add_noise_seed(inputs, 1, range(4))
     (inputs / "camera.json").write_text('{"color_includes_albedo": false}')
-    frame = open_sequence(small_sequence).frame(2, realisation=1)
+    frame = open_sequence(small_sequence).frame(2, noise_seed=1)
     torch.testing.assert_close(frame.color, 12 * frame.albedo)
 
 
-def test_a_realisation_of_another_size_is_refused(small_sequence: Path) -> None:
-    _add_realisation(small_sequence / "inputs", 1, range(4))
-    path = small_sequence / "inputs" / "realisation1" / "color2.exr"
+def test_a_noise_seed_of_another_size_is_refused(small_sequence: Path) -> None:
+    _add_noise_seed(small_sequence / "inputs", 1, range(4))
+    path = small_sequence / "inputs" / "noise_seed1" / "color2.exr"
     write_exr(path, np.ones((20, 23, 3)), RGB)
     assert f"{path}: expected 24 x 20 pixels" in refused(lambda: open_sequence(small_sequence))
 
 
-def test_features_of_a_realisation_are_read_where_it_has_them(small_sequence: Path) -> None:
+def test_features_of_a_noise_seed_are_read_where_it_has_them(small_sequence: Path) -> None:
     inputs = small_sequence / "inputs"
-    _add_realisation(inputs, 1, range(4))
+    _add_noise_seed(inputs, 1, range(4))
     assert open_sequence(small_sequence).noisy == {"color"}
     for number in range(4):
         for stem in ("albedo", "world_position"):
             image = read_exr(inputs / f"{stem}{number}.exr")[0] + 0.25
-            write_exr(inputs / "realisation1" / f"{stem}{number}.exr", image, ["R", "G", "B"])
+            write_exr(inputs / "noise_seed1" / f"{stem}{number}.exr", image, ["R", "G", "B"])
     (inputs / "depth3.exr").unlink()
     for number in range(3):
         (inputs / f"depth{number}.exr").unlink()
     sequence = open_sequence(small_sequence)
     # Depth is that of the positions where it has no file.
     assert sequence.noisy == {"color", "albedo", "position", "depth"}
-    first, second = (sequence.frame(2, realisation=k) for k in range(2))
+    first, second = (sequence.frame(2, noise_seed=k) for k in range(2))
     assert first.albedo is not None
     assert second.albedo is not None
     assert first.position is not None
@@ -238,12 +238,12 @@ def test_features_of_a_realisation_are_read_where_it_has_them(small_sequence: Pa
         assert torch.equal(dict(first.items())[name], dict(second.items())[name])
 
 
-def test_a_realisation_with_features_of_some_frames_is_refused(small_sequence: Path) -> None:
+def test_a_noise_seed_with_features_of_some_frames_is_refused(small_sequence: Path) -> None:
     inputs = small_sequence / "inputs"
-    _add_realisation(inputs, 1, range(4))
-    shutil.copyfile(inputs / "albedo2.exr", inputs / "realisation1" / "albedo2.exr")
+    _add_noise_seed(inputs, 1, range(4))
+    shutil.copyfile(inputs / "albedo2.exr", inputs / "noise_seed1" / "albedo2.exr")
     message = refused(lambda: open_sequence(small_sequence))
-    missing = inputs / "realisation1" / "albedo0.exr"
+    missing = inputs / "noise_seed1" / "albedo0.exr"
     assert message.startswith(f"{missing}: expected buffer 'albedo' for every frame, found it for some")
     write_exr(missing, np.zeros((4, 4, 3)), ["R", "G", "B"])
     assert "albedo0.exr: expected 24 x 20 pixels" in refused(lambda: open_sequence(small_sequence, "0"))

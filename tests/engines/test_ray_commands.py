@@ -67,7 +67,7 @@ def same(one: Path, other: Path) -> bool:
 
 
 def test_generate(cluster: Any, tmp_path: Path) -> None:
-    options = ["--seeds", "0-3", "--frames", "3", "--reference-spp", "64", "--realisations", "1", *SMALL]
+    options = ["--seeds", "0-3", "--frames", "3", "--reference-spp", "64", "--noise-seeds", "1", *SMALL]
     assert not run("generate", "-o", tmp_path / "quiet", *options)
     lost = lose(cluster, tmp_path / "out", "*/inputs/color0.exr")
     assert not run("generate", "-o", tmp_path / "out", *options, "--ray", cluster[0].address)

@@ -37,25 +37,25 @@ FRONT = Front(((Demodulated, {}), (Accumulated, {})))
 
 @pytest.fixture
 def noisy(small_sequence: Path) -> Path:
-    """The small sequence with two more realisations of its noise."""
+    """The small sequence with two more noise seeds."""
     inputs = small_sequence / "inputs"
-    for realisation in (1, 2):
-        folder = inputs / f"realisation{realisation}"
+    for noise_seed in (1, 2):
+        folder = inputs / f"noise_seed{noise_seed}"
         folder.mkdir()
         for number in range(4):
-            torch.manual_seed(10 * realisation + number)
+            torch.manual_seed(10 * noise_seed + number)
             write_buffer(folder, number, "color", torch.rand(1, 3, 20, 24))
     return small_sequence
 
 
 @pytest.fixture
 def noisy_features(noisy: Path) -> Path:
-    """The same, with albedo and position of each realisation's own samples; normals are the same for all."""
+    """The same, with albedo and position of each noise seed's own samples; normals are the same for all."""
     inputs, positions = noisy / "inputs", [open_sequence(noisy).frame(number).position for number in range(4)]
-    for realisation in (1, 2):
+    for noise_seed in (1, 2):
         for number, position in enumerate(positions):
-            torch.manual_seed(100 * realisation + number)
-            folder = inputs / f"realisation{realisation}"
+            torch.manual_seed(100 * noise_seed + number)
+            folder = inputs / f"noise_seed{noise_seed}"
             write_buffer(folder, number, "albedo", 0.2 + 0.7 * torch.rand(1, 3, 20, 24))
             assert position is not None
             write_buffer(folder, number, "position", position + 0.01 * torch.rand(1, 3, 20, 24))
@@ -64,12 +64,12 @@ def noisy_features(noisy: Path) -> Path:
 
 @pytest.fixture
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
-    """Frame number and realisation of every frame that is decoded."""
+    """Frame number and noise seed of every frame that is decoded."""
     read, seen = Sequence.frame, []
 
-    def spy(sequence: Sequence, number: int, reference: bool = True, realisation: int = 0, **options: Any) -> Any:
-        seen.append((number, realisation))
-        return read(sequence, number, reference, realisation, **options)
+    def spy(sequence: Sequence, number: int, reference: bool = True, noise_seed: int = 0, **options: Any) -> Any:
+        seen.append((number, noise_seed))
+        return read(sequence, number, reference, noise_seed, **options)
 
     monkeypatch.setattr(Sequence, "frame", spy)
     return seen
@@ -94,12 +94,12 @@ def test_shots_start_anew_and_are_accumulated(noisy: Path, tmp_path: Path) -> No
     cached, sequence = opened(noisy, tmp_path / "cache"), open_sequence(noisy)
     assert [(len(shot), len(shot.colors), shot.size) for shot in cached.shots] == [(4, 3, (20, 24)), (2, 3, (20, 24))]
     for first, shot in zip((0, 2), cached.shots, strict=True):
-        for realisation in range(3):
-            clip = shot.read(realisation=realisation)
+        for noise_seed in range(3):
+            clip = shot.read(noise_seed=noise_seed)
             seen: list[Frame] = []
             model, history = Demodulated(Accumulated(Recorder(seen))), None
             for i, number in enumerate(sequence.numbers[first:]):
-                frame = sequence.frame(number, realisation=realisation).validate()[0]
+                frame = sequence.frame(number, noise_seed=noise_seed).validate()[0]
                 _, history = model(frame, history)
                 for name in ("color", "current", "length"):
                     assert torch.equal(clip[name][i], seen[i].buffer(name)[0]), name
@@ -146,8 +146,8 @@ class Recorder:
 def test_noisy_frames_for_a_model_that_begins_with_weights(noisy: Path, tmp_path: Path) -> None:
     shot = opened(noisy, tmp_path / "cache", front=Front(), features=["depth"], firsts=[0]).shots[0]
     assert not shot.demodulated
-    frame = open_sequence(noisy).frame(2, realisation=1).validate()[0]
-    part = shot.read(slice(2, 3), realisation=1)
+    frame = open_sequence(noisy).frame(2, noise_seed=1).validate()[0]
+    part = shot.read(slice(2, 3), noise_seed=1)
     assert part.keys() == {"color", "depth", "reference"}
     assert torch.equal(part["color"], frame.color)
 
@@ -189,8 +189,8 @@ def test_a_pixel_that_is_no_radiance_is_the_mean_of_its_neighbours(
 
 def test_a_part_of_a_shot(noisy: Path, tmp_path: Path) -> None:
     shot = opened(noisy, tmp_path / "cache").shots[0]
-    whole = shot.read(realisation=1)
-    part = shot.read(slice(1, 3), slice(2, 9), slice(5, 24), realisation=1)
+    whole = shot.read(noise_seed=1)
+    part = shot.read(slice(1, 3), slice(2, 9), slice(5, 24), noise_seed=1)
     assert part.keys() == whole.keys() == {"color", "current", "length", *FEATURES, "reference"}
     for name, image in whole.items():
         assert torch.equal(part[name], image[1:3, :, 2:9, 5:24]), name
@@ -235,17 +235,17 @@ def test_features_are_kept_once_and_in_half_precision_where_nothing_is_lost(nois
 
 def test_what_is_cached_is_not_decoded_again(noisy: Path, tmp_path: Path, reads: list[tuple[int, int]]) -> None:
     first = opened(noisy, tmp_path / "cache")
-    assert sorted(reads) == [(number, realisation) for number in range(4) for realisation in range(3)]
+    assert sorted(reads) == [(number, noise_seed) for number in range(4) for noise_seed in range(3)]
     reads.clear()
     started = time.process_time()
     again = opened(noisy, tmp_path / "cache")
     assert time.process_time() - started < 0.5
     assert not reads
     assert again.sha256 == first.sha256
-    assert torch.equal(again.shots[1].read(realisation=2)["color"], first.shots[1].read(realisation=2)["color"])
+    assert torch.equal(again.shots[1].read(noise_seed=2)["color"], first.shots[1].read(noise_seed=2)["color"])
 
 
-def test_features_with_noise_are_those_of_the_realisation(noisy_features: Path, tmp_path: Path) -> None:
+def test_features_with_noise_are_those_of_the_noise_seed(noisy_features: Path, tmp_path: Path) -> None:
     names = ("albedo", "normal", "depth", "motion")
     cached, sequence = opened(noisy_features, tmp_path / "cache", features=names), open_sequence(noisy_features)
     assert sequence.noisy >= {"color", "albedo", "position"}
@@ -254,10 +254,10 @@ def test_features_with_noise_are_those_of_the_realisation(noisy_features: Path, 
     assert {name for own in whole.noisy for name in own} >= {"albedo", "motion"}
     assert {"normal", "reference"} <= set(whole.features)
     for shot, first in ((whole, 0), (cached.shots[1], 2), (whole.cut(slice(1, 3)), 1)):
-        for realisation in range(3):
-            clip = shot.read(realisation=realisation)
+        for noise_seed in range(3):
+            clip = shot.read(noise_seed=noise_seed)
             for i in range(len(shot)):
-                frame = sequence.frame(first + i, realisation=realisation).validate()[0].with_depth()
+                frame = sequence.frame(first + i, noise_seed=noise_seed).validate()[0].with_depth()
                 for name in ("albedo", "normal", "depth"):
                     assert torch.equal(clip[name][i], dict(frame.items())[name][0])
                 if first + i > 0:
@@ -266,7 +266,7 @@ def test_features_with_noise_are_those_of_the_realisation(noisy_features: Path, 
                     assert camera is not None
                     moved = motion_from_position(frame.position, camera)
                     assert torch.equal(clip["motion"][i], moved[0])
-    differ = [not torch.equal(whole.read()[name], whole.read(realisation=1)[name]) for name in names]
+    differ = [not torch.equal(whole.read()[name], whole.read(noise_seed=1)[name]) for name in names]
     assert differ[0]
     assert not differ[1]
     assert differ[3]
@@ -275,10 +275,10 @@ def test_features_with_noise_are_those_of_the_realisation(noisy_features: Path, 
     assert sum("albedo" in name for name in files) == 3
 
 
-def test_fewer_realisations(noisy: Path, tmp_path: Path, reads: list[tuple[int, int]]) -> None:
-    assert len(opened(noisy, tmp_path / "cache", realisations=1).shots[0].colors) == 1
-    assert {realisation for _, realisation in reads} == {0}
-    assert len(opened(noisy, tmp_path / "cache", realisations=9).shots[0].colors) == 3
+def test_fewer_noise_seeds(noisy: Path, tmp_path: Path, reads: list[tuple[int, int]]) -> None:
+    assert len(opened(noisy, tmp_path / "cache", noise_seeds=1).shots[0].colors) == 1
+    assert {noise_seed for _, noise_seed in reads} == {0}
+    assert len(opened(noisy, tmp_path / "cache", noise_seeds=9).shots[0].colors) == 3
 
 
 @pytest.mark.parametrize(
@@ -286,11 +286,11 @@ def test_fewer_realisations(noisy: Path, tmp_path: Path, reads: list[tuple[int, 
     [
         lambda inputs: write_exr(inputs / "color1.exr", np.ones((20, 24, 3), np.float32), ["R", "G", "B"]),
         lambda inputs: os.utime(inputs / "reference0.exr", (1, 1)),
-        lambda inputs: os.utime(inputs / "realisation2" / "color3.exr", (1, 1)),
+        lambda inputs: os.utime(inputs / "noise_seed2" / "color3.exr", (1, 1)),
         lambda inputs: (inputs / "camera.json").write_text('{"color_includes_albedo": false}'),
-        lambda inputs: (inputs / "realisation2" / "color3.exr").unlink(),
+        lambda inputs: (inputs / "noise_seed2" / "color3.exr").unlink(),
     ],
-    ids=["content", "time", "time of a realisation", "description", "a realisation less"],
+    ids=["content", "time", "time of a noise seed", "description", "a noise seed less"],
 )
 def test_a_stale_cache_is_made_again(noisy: Path, tmp_path: Path, reads: list[tuple[int, int]], change: Any) -> None:
     folder = tmp_path / "cache"
@@ -299,7 +299,7 @@ def test_a_stale_cache_is_made_again(noisy: Path, tmp_path: Path, reads: list[tu
     change(noisy / "inputs")
     fresh = opened(noisy, tmp_path / "elsewhere")
     again = opened(noisy, folder)
-    assert len(reads) in (16, 24)  # twice four frames, two or three realisations
+    assert len(reads) in (16, 24)  # twice four frames, two or three noise seeds
     assert again.sha256 == fresh.sha256
     assert torch.equal(again.shots[0].read()["color"], fresh.shots[0].read()["color"])
     # What is stale is removed.
@@ -342,15 +342,15 @@ def test_a_change_of_any_source_makes_it_again(small_sequence: Path, tmp_path: P
     assert made() != before
 
 
-def test_every_nth_realisation_keeps_its_fireflies(noisy: Path, tmp_path: Path) -> None:
-    for realisation in (0, 1):
-        folder = noisy / "inputs" / (f"realisation{realisation}" if realisation else "")
+def test_every_nth_noise_seed_keeps_its_fireflies(noisy: Path, tmp_path: Path) -> None:
+    for noise_seed in (0, 1):
+        folder = noisy / "inputs" / (f"noise_seed{noise_seed}" if noise_seed else "")
         bright = np.ones((20, 24, 3), np.float32)
         bright[10, 10] = 1e4
         write_exr(folder / "color0.exr", bright, ["R", "G", "B"])
     write_exr(noisy / "inputs" / "albedo0.exr", np.ones((20, 24, 3), np.float32), ["R", "G", "B"])
     brightest = [
-        opened(noisy, tmp_path / "cache", keep_fireflies=n).shots[0].read(realisation=k)[name][0].amax((1, 2)).tolist()
+        opened(noisy, tmp_path / "cache", keep_fireflies=n).shots[0].read(noise_seed=k)[name][0].amax((1, 2)).tolist()
         for n in (0, 2)
         for k in (0, 1)
         for name in ("color", "current")
@@ -537,7 +537,7 @@ def test_links_to_nothing_and_names_that_are_no_text_are_no_part_of_a_sequence(n
     """Broken and circular links beside the frames do not prevent training on the frames."""
     settings = {"front": FRONT, "features": FEATURES, "firsts": [0]}
     first = open_cached(open_sequence(noisy), tmp_path / "cache", **settings).sha256
-    for folder in (noisy, noisy / "inputs", noisy / "inputs" / "realisation1"):
+    for folder in (noisy, noisy / "inputs", noisy / "inputs" / "noise_seed1"):
         for suffix in (".exr", ".json", ".h"):
             (folder / f"dangling{suffix}").symlink_to("nothing")
             (folder / f"loop{suffix}").symlink_to(f"loop{suffix}")

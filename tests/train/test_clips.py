@@ -18,7 +18,7 @@ PARTS = {**ACCUMULATED, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
 
 
 def shot_of(stack: Tensor, *more_colors: Tensor) -> Shot:
-    """A shot that lies in memory, from ``(T, 17, H, W)`` and further realisations ``(T, 7, H, W)``."""
+    """A shot that lies in memory, from ``(T, 17, H, W)`` and further noise seeds ``(T, 7, H, W)``."""
     color, *features = (part.numpy() for part in stack.split([7, *list(PARTS.values())[3:]], 1))
     names = list(PARTS)[3:]
     colors = (color, *(more.numpy() for more in more_colors))
@@ -108,7 +108,7 @@ def test_a_clip_depends_on_its_seed_alone() -> None:
     assert not torch.equal(batch["color"][0], batch["color"][1])
 
 
-def test_every_realisation_of_the_noise_is_drawn_with_the_same_features() -> None:
+def test_every_noise_seed_of_the_noise_is_drawn_with_the_same_features() -> None:
     stack = numbered()
     others = [torch.full((3, 7, 6, 7), -1.0), torch.full((3, 7, 6, 7), -2.0)]
     clip = ClipSampler([shot_of(stack, *others)], 2, 4).draw(list(range(60)))

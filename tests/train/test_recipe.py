@@ -21,6 +21,7 @@ from mcdenoise.cli.train import options_of
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.models import compared_models, describe_weights, pretrained_models
+from mcdenoise.models._weights import find_weights
 from mcdenoise.train import Recipe, Rendering, clean_references
 
 RECIPES = Path(__file__).parents[2] / "recipes"
@@ -73,7 +74,7 @@ def test_from_nothing_to_weights(trained: Path, capsys: pytest.CaptureFixture[st
     assert sorted(folders) == ["0-1", "2"]
     said = json.loads((trained / "data.json").read_text())
     assert [each["name"] for each in said["sequences"]] == ["random0000", "random0001"]
-    assert [each["realisations"] for each in said["sequences"]] == [2, 2]
+    assert [each["noise_seeds"] for each in said["sequences"]] == [2, 2]
     assert [each["name"] for each in said["validation_sequences"]] == ["random0002"]
     assert describe_weights(trained / WEIGHTS)["recipe"] == said["recipe"]
 
@@ -137,7 +138,12 @@ def test_the_recipes_can_be_read(recipe: Path) -> None:
     assert found.validation
     # Of what is shipped it is known.
     shipped = {*pretrained_models(), *compared_models()}
-    assert all(run.expected is not None for run in found.runs if (run.name or run.config.model) in shipped)
+    runs = {name: run for run in found.runs if (name := run.name or run.config.model) in shipped}
+    assert all(run.expected is not None for run in runs.values())
+    # kpcn's settings were once defaults, which the recipe did not state.
+    for name in {"cascaded", "oidn_pyramid", *compared_models()} & runs.keys() - {"kpcn"}:
+        assert (path := find_weights(name)) is not None
+        assert describe_weights(path)["recipe"] == runs[name].sha256
 
 
 def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
@@ -172,7 +178,7 @@ def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
         ("frames = 3", "frames = 2.5", "[[data]] 1: "),
         ("frames = 3", "frames = 0", "[[data]] 1: --frames: expected at least 1, found 0"),
         ("frames = 3", "clean_references = 1", "[[data]] 1: clean_references: expected a value of type bool, found 1"),
-        ('size = "48x48"\nrealisations = 2', "size = 48", "[[data]] 1: --size: expected WIDTHxHEIGHT"),
+        ('size = "48x48"\nnoise_seeds = 2', "size = 48", "[[data]] 1: --size: expected WIDTHxHEIGHT"),
         ("tolerance = 0.01", "", "[expected]: expected smape and tolerance, found smape alone"),
         ("tolerance = 0.01", "psnr = 30", "[expected]: unknown key 'psnr'; known are smape, tolerance"),
         ("[expected]", "[run]\n[expected]", "expected tables [[run]], found [run]"),

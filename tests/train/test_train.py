@@ -165,7 +165,7 @@ def test_what_a_run_leaves(small_sequence: Path, tmp_path: Path) -> None:
         assert frame.reference is not None
         digest.update(frame.color.numpy().tobytes() + frame.reference.numpy().tobytes())
     data = json.loads((run / "data.json").read_text())
-    entry = {"name": "plane", "frames": 4, "size": "24x20", "realisations": 1, "validation": [3]}
+    entry = {"name": "plane", "frames": 4, "size": "24x20", "noise_seeds": 1, "validation": [3]}
     entry["sha256"] = digest.hexdigest()
     assert data == {"credits": "A. Painter, CC0", "initial_weights": "none", "sequences": [entry]}
     start, *log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
@@ -233,17 +233,17 @@ def test_frames_held_back_are_not_trained_on(small_sequence: Path, tmp_path: Pat
     assert lengths(frames=3, validation_frames=2) == ([4], [])
 
 
-def test_every_realisation_of_the_noise_is_trained_on(small_sequence: Path, tmp_path: Path) -> None:
+def test_every_noise_seed_of_the_noise_is_trained_on(small_sequence: Path, tmp_path: Path) -> None:
     inputs = small_sequence / "inputs"
-    (inputs / "realisation1").mkdir()
+    (inputs / "noise_seed1").mkdir()
     for number in range(4):
-        shutil.copyfile(inputs / f"color{3 - number}.exr", inputs / "realisation1" / f"color{number}.exr")
+        shutil.copyfile(inputs / f"color{3 - number}.exr", inputs / "noise_seed1" / f"color{number}.exr")
     config = TrainConfig(**SMALL)
     data = data_of(config, small_sequence, validation=[small_sequence], cache=tmp_path / "cache")
     assert [len(shot.colors) for shot in data.sampler.shots] == [2]
-    assert data.description["sequences"][0]["realisations"] == 2
+    assert data.description["sequences"][0]["noise_seeds"] == 2
     # Validation is always on the first.
-    assert "realisations" not in data.description["validation_sequences"][0]
+    assert "noise_seeds" not in data.description["validation_sequences"][0]
     assert len(data.watched[1][1].colors) == 1
 
 

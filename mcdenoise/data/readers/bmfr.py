@@ -76,7 +76,7 @@ _FULL_FLOAT = {"position", "previous_position"}
 class BmfrFolder:
     """A folder in this layout: ``{color,albedo,shading_normal,world_position,...}N.exr`` and ``camera_matrices.h``.
 
-    Further noisy colors of the same frames, with other noise seeds, are ``realisation{1,2,...}/colorN.exr``. If other
+    Further noisy colors of the same frames, with other noise seeds, are ``noise_seed{1,2,...}/colorN.exr``. If other
     buffers lie beside them, these have noise of the same seed; references do not depend on the seed.
 
     Args:
@@ -113,7 +113,7 @@ class BmfrFolder:
         return {self.path}
 
     @property
-    def realisations(self) -> int:
+    def noise_seeds(self) -> int:
         """The number of noisy colors that every frame in use has."""
         return 1 + len(self.more)
 
@@ -148,13 +148,13 @@ class BmfrFolder:
         return read_exr_header(self.files["color"][number]).metadata
 
     def frame(
-        self, number: int, *, reference: bool = True, realisation: int = 0, buffers: Collection[str] | None = None
+        self, number: int, *, reference: bool = True, noise_seed: int = 0, buffers: Collection[str] | None = None
     ) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
         unwanted = frozenset() if buffers is None else LIGHT_PARTS - set(buffers)
         sources: dict[str, Mapping[int, Path]] = dict(self.files)
-        if realisation:
-            sources |= self.more[realisation - 1]
+        if noise_seed:
+            sources |= self.more[noise_seed - 1]
         found: dict[str, Any] = {
             name: self._read(name, files[number])
             for name, files in sources.items()
@@ -232,9 +232,9 @@ def is_bmfr(path: Path) -> bool:
     return not _others(path) and bool(stems & _OWN_STEMS or stems == {"color"})
 
 
-def realisation_folder(folder: Path, realisation: int) -> Path:
-    """The folder of a noise seed's colors: the folder itself for 0, ``realisation{k}`` for k."""
-    return folder / f"realisation{realisation}" if realisation else folder
+def noise_seed_folder(folder: Path, noise_seed: int) -> Path:
+    """The folder of a noise seed's colors: the folder itself for 0, ``noise_seed{k}`` for k."""
+    return folder / f"noise_seed{noise_seed}" if noise_seed else folder
 
 
 def _list_files(path: Path, stems: Mapping[str, str]) -> dict[str, dict[int, Path]]:
@@ -282,7 +282,7 @@ def open_bmfr(
                     f"render it, or remove all {_STEMS[name]} files"
                 )
     cameras = find_camera_matrices(path, numbers[-1])
-    more = _find_realisations(path, numbers, first, used - {"reference"})
+    more = _find_noise_seeds(path, numbers, first, used - {"reference"})
     own = {name: files[name] for name in used}
     stated = _color_has_albedo(path, "albedo" in used) if color_has_albedo is None else color_has_albedo
     folder = BmfrFolder(path, own, numbers, size, cameras, stated is not False, more)
@@ -416,12 +416,12 @@ def _others(path: Path) -> list[str]:
     return list(dict.fromkeys(re.sub("[0-9]+", "#", name) for name in names))
 
 
-def _find_realisations(
+def _find_noise_seeds(
     path: Path, numbers: list[int], first: ExrHeader, used: set[str]
 ) -> list[dict[str, dict[int, Path]]]:
     """Files of the noise seeds 1, 2, ..., up to the first seed that lacks a color and so is still being rendered."""
     found: list[dict[str, dict[int, Path]]] = []
-    while os.path.isdir(folder := realisation_folder(path, 1 + len(found))):
+    while os.path.isdir(folder := noise_seed_folder(path, 1 + len(found))):
         files = _list_files(folder, {name: _STEMS[name] for name in used})
         if not all(number in files["color"] for number in numbers):
             break

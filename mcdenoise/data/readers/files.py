@@ -70,7 +70,7 @@ class RenderedFiles:
     samples: SampleLayers | None = None
     table: list[Row] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    realisations: int = 1
+    noise_seeds: int = 1
 
     @property
     def size(self) -> tuple[int, int]:
@@ -146,7 +146,7 @@ class RenderedFiles:
         return _tensor(self.read(number, {"reference": self.choice.layers["reference"]})["reference"][..., :3])
 
     def frame(
-        self, number: int, *, reference: bool = True, realisation: int = 0, buffers: Collection[str] | None = None
+        self, number: int, *, reference: bool = True, noise_seed: int = 0, buffers: Collection[str] | None = None
     ) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
         split = self.split if buffers is None or self.split is None or self.split.names & set(buffers) else None

@@ -95,7 +95,7 @@ class NoisebaseFiles:
     warnings: Sequence[str] = ()
     unused: Sequence[str] = ()
     color_has_albedo: bool = True
-    realisations: int = 1
+    noise_seeds: int = 1
     samples: int = 1
 
     @property
@@ -133,7 +133,7 @@ class NoisebaseFiles:
             return _tensor(_mean(file, _described(file, "reference"), self._index(number)))
 
     def frame(
-        self, number: int, *, reference: bool = True, realisation: int = 0, buffers: Collection[str] | None = None
+        self, number: int, *, reference: bool = True, noise_seed: int = 0, buffers: Collection[str] | None = None
     ) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`.
 

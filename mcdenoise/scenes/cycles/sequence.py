@@ -25,7 +25,7 @@ from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, v
 from mcdenoise.data.exr import Image
 from mcdenoise.data.files import write_text
 from mcdenoise.data.images import read_channels, read_image_header
-from mcdenoise.data.readers.bmfr import has_buffer, realisation_folder, write_buffer, write_clean_features
+from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.diffuse_specular import find_splits
 from mcdenoise.data.readers.layers import layers_of
 from mcdenoise.data.readers.values import nothing_hit
@@ -60,7 +60,7 @@ _CONVENTIONS: dict[str, Any] = {
     "color_includes_albedo": True,
     "reference_includes_albedo": True,
     "seeds": "numpy.random.SeedSequence((seed, frame, stream)).generate_state(1) % 2**31, of a view but the first "
-    "with spawn_key=(view,); stream 0 for the first noisy color, 1 for the reference, 1 + realisation for the others",
+    "with spawn_key=(view,); stream 0 for the first noisy color, 1 for the reference, 1 + noise seed for the others",
     "parts": "diffuse and specular, where they are there, add up to color: specular is all light that is not diffuse",
     "features": "from the samples of the color beside them: Denoising Albedo clamped to 0..1, Denoising Normal in "
     "world space, Depth, Position",
@@ -82,7 +82,7 @@ def render_cycles(
     seed: int = 0,
     view: int = 0,
     samples: int | None = None,
-    realisations: int = 2,
+    noise_seeds: int = 2,
     reference_samples: int = 128,
     settings: CyclesSettings | None = None,
     parts: bool = False,
@@ -101,8 +101,8 @@ def render_cycles(
         seed: seed of the noise, and of the random settings.
         view: selects other noise and settings, for another take of the same scene.
         samples: samples per pixel of the noisy colors; random by default, see :func:`draw_settings`.
-        realisations: number of noise seeds, each with its own color and features. Those after the first are written to
-            ``out/inputs/realisation{1,2,...}``.
+        noise_seeds: number of noise seeds, each with its own color and features. Those after the first are written to
+            ``out/inputs/noise_seed{1,2,...}``.
         reference_samples: samples per pixel of the references, but at least four times as many as of the noisy colors;
             0 for no references.
         settings: filter, lens and shutter; random by default.
@@ -118,7 +118,7 @@ def render_cycles(
         InputError: a setting is invalid, Cycles does not support a part of the scene, Blender failed, or ``out`` cannot
             be written or holds a sequence with other settings.
     """
-    lowest = {"realisations": (realisations, 1), "reference_samples": (reference_samples, 0), "threads": (threads, 0)}
+    lowest = {"noise_seeds": (noise_seeds, 1), "reference_samples": (reference_samples, 0), "threads": (threads, 0)}
     lowest |= {"seed": (seed, 0), "view": (view, 0), "samples": (1 if samples is None else samples, 1)}
     for name, (value, least) in lowest.items():
         if value < least:
@@ -132,9 +132,9 @@ def render_cycles(
     description = translate(made.scene, movers, seed=seed)
     folder = _Folder(out / "inputs", made, size, chosen, (seed, view), blender.version)
     last = "specular" if parts else "color"
-    noisy = [(n, k) for n in range(count) for k in reversed(range(realisations)) if not folder.has(last, n, k)]
+    noisy = [(n, k) for n in range(count) for k in reversed(range(noise_seeds)) if not folder.has(last, n, k)]
     clean = [n for n in range(count) if clean_samples and not folder.has_reference(n)]
-    total = count * (realisations * chosen.samples + clean_samples)
+    total = count * (noise_seeds * chosen.samples + clean_samples)
     done = total - len(noisy) * chosen.samples - len(clean) * clean_samples
 
     def advance(spent: int) -> None:
@@ -161,11 +161,11 @@ def render_cycles(
 
         # Render images with few samples first: a scene that stays in Cycles keeps the sampling pattern of the largest
         # number of samples so far, and the noise of a frame must not depend on previous renderings.
-        for number, realisation in noisy:
+        for number, noise_seed in noisy:
             back = {index + 1: _back(moves[name], number) for index, name in enumerate(movers)}
             seen = _View(made.cameras[number], size, back)
-            images = shot(number, chosen.samples, 1 + realisation if realisation else 0)
-            folder.write(number, realisation, seen.buffers(images))
+            images = shot(number, chosen.samples, 1 + noise_seed if noise_seed else 0)
+            folder.write(number, noise_seed, seen.buffers(images))
         for number in clean:
             images = shot(number, clean_samples, _REFERENCE_STREAM)
             buffers = _View(made.cameras[number], size, {}).buffers(images)
@@ -248,18 +248,18 @@ class _Folder:
                 f"{described}: rendered with another '{changed[0]}'; choose another output folder, or delete this one"
             )
 
-    def has(self, name: str, number: int, realisation: int) -> bool:
+    def has(self, name: str, number: int, noise_seed: int) -> bool:
         """Whether a frame has a buffer and the color of a noise seed, which is written last."""
-        place = realisation_folder(self.path, realisation)
+        place = noise_seed_folder(self.path, noise_seed)
         return all(has_buffer(place, number, each, self.size) for each in (*_FEATURES, name, "color"))
 
     def has_reference(self, number: int) -> bool:
         """Whether a frame has a reference."""
         return has_buffer(self.path, number, "reference", self.size)
 
-    def write(self, number: int, realisation: int, buffers: Mapping[str, Image]) -> None:
+    def write(self, number: int, noise_seed: int, buffers: Mapping[str, Image]) -> None:
         """Write a noisy color and its features, the color last."""
-        place = realisation_folder(self.path, realisation)
+        place = noise_seed_folder(self.path, noise_seed)
         try:
             place.mkdir(exist_ok=True)
         except OSError as error:

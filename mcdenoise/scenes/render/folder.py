@@ -14,7 +14,7 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.exr import read_exr, read_exr_header
 from mcdenoise.data.files import write_text
-from mcdenoise.data.readers.bmfr import has_buffer, realisation_folder, write_buffer
+from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer
 from mcdenoise.errors import InputError
 from mcdenoise.reading import read_text
 
@@ -23,8 +23,8 @@ _CONVENTIONS: dict[str, Any] = {
     "color_includes_albedo": True,
     "reference_includes_albedo": True,
     "noisy_seed": "numpy.random.SeedSequence((seed, frame, 0, pass)).generate_state(1)",
-    "realisation_seed": "numpy.random.SeedSequence((seed, frame, 1 + realisation, pass)).generate_state(1), for the "
-    "colors in realisation{1,2,...}",
+    "further_noisy_seeds": "numpy.random.SeedSequence((seed, frame, 1 + k, pass)).generate_state(1), for the colors in "
+    "noise_seed{k}, k = 1, 2, ...",
     "reference_seed": "numpy.random.SeedSequence((seed, frame, 1, pass)).generate_state(1)",
     "reference_noise_meaning": "estimated mean(|R - T| / (R + T + 0.01)) of the reference R against the truth T, from "
     "the difference of two halves of its paths",
@@ -51,7 +51,7 @@ _CONVENTIONS: dict[str, Any] = {
 # Differences on a film; see :mod:`mcdenoise.scenes.render.film`.
 _ON_A_FILM: dict[str, Any] = {
     "pixel_sampling": "jittered samples through the pixel filter and the lens of 'film'; features are means over the "
-    "samples of their color, and each folder realisation{1,2,...} has its own",
+    "samples of their color, and each folder noise_seed{1,2,...} has its own",
     "albedo": "Mitsuba's aov, clamped to [0, 1]",
     "alpha_masks": "features are of the first surface, be it see-through",
     "shading_normal": "world space, turned to the side the camera sees, averaged and not normalised",
@@ -214,19 +214,19 @@ def read_reference(folder: Path, number: int) -> np.ndarray[Any, np.dtype[np.flo
     return read_exr(folder / f"reference{number}.exr")[0].astype(np.float64).reshape(-1, 3)
 
 
-def write_realisation(folder: Path, number: int, realisation: int, buffers: Mapping[str, Tensor]) -> None:
+def write_noisy(folder: Path, number: int, noise_seed: int, buffers: Mapping[str, Tensor]) -> None:
     """Write the buffers of one noise seed: its noisy color, and possibly features.
 
     Args:
         folder: ``inputs`` of a sequence.
         number: frame number.
-        realisation: index of the noise seed.
+        noise_seed: index of the noise seed.
         buffers: ``(1, C, H, W)`` by name, in the order of writing.
 
     Raises:
         InputError: a file cannot be written.
     """
-    place = realisation_folder(folder, realisation)
+    place = noise_seed_folder(folder, noise_seed)
     try:
         place.mkdir(exist_ok=True)
     except OSError as error:
@@ -239,4 +239,4 @@ def _merged(before: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
     """Merge descriptions, so that rendering fewer frames or noise seeds than before keeps the others."""
     longer = {key: before[key] for key in _PER_FRAME if key in before} if before else {}
     kept = longer if before and before["frames"] > settings["frames"] else {}
-    return {**settings, **kept, "realisations": max(settings["realisations"], before.get("realisations", 1))}
+    return {**settings, **kept, "noise_seeds": max(settings["noise_seeds"], before.get("noise_seeds", 1))}

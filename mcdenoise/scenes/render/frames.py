@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from mcdenoise.data.camera_path import Array, Camera, PixelRays, pixel_rays
-from mcdenoise.data.readers.bmfr import has_buffer, realisation_folder, write_buffer, write_clean_features
+from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.samples import FEATURES
 from mcdenoise.scenes.render.film import Film, FilmRenderer
-from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write_realisation, write_reference
+from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write_noisy, write_reference
 from mcdenoise.scenes.render.halves import ReferenceHalves
 from mcdenoise.scenes.render.tracer import STRATIFIED_PATHS, Tracer
 
@@ -39,7 +39,7 @@ class FrameJob:
         size: width and height in pixels.
         reach: distance of the background in scene units.
         spp: paths per pixel of the noisy colours.
-        realisations: number of noise seeds.
+        noise_seeds: number of noise seeds.
         reference_spp: paths per pixel of a finished reference.
         noise_level: or its estimated noise.
         references: frames that get a reference.
@@ -55,7 +55,7 @@ class FrameJob:
     size: tuple[int, int]
     reach: float
     spp: int
-    realisations: int
+    noise_seeds: int
     reference_spp: int
     noise_level: float | None
     references: frozenset[int]
@@ -66,18 +66,18 @@ class FrameJob:
 
     def is_finished(self, number: int) -> bool:
         """Whether all files of a frame exist."""
-        colors = all(self.has_color(number, realisation) for realisation in range(self.realisations))
-        folders = {0, *(range(self.realisations) if self.film is not None else ())}
-        features = all(self.has_features(number, realisation) for realisation in folders)
+        colors = all(self.has_color(number, noise_seed) for noise_seed in range(self.noise_seeds))
+        folders = {0, *(range(self.noise_seeds) if self.film is not None else ())}
+        features = all(self.has_features(number, noise_seed) for noise_seed in folders)
         return colors and features and (number not in self.references or self.has_reference(number))
 
-    def has_color(self, number: int, realisation: int) -> bool:
+    def has_color(self, number: int, noise_seed: int) -> bool:
         """Whether a frame has a complete noisy colour of a noise seed."""
-        return has_buffer(realisation_folder(self.folder, realisation), number, "color", self.size)
+        return has_buffer(noise_seed_folder(self.folder, noise_seed), number, "color", self.size)
 
-    def has_features(self, number: int, realisation: int = 0) -> bool:
+    def has_features(self, number: int, noise_seed: int = 0) -> bool:
         """Whether a frame has all features of a noise seed, that is, everything but colours and reference."""
-        folder = realisation_folder(self.folder, realisation)
+        folder = noise_seed_folder(self.folder, noise_seed)
         names = ["albedo", "normal", "position", "depth", *(["previous_position"] if self.moves else [])]
         return all(has_buffer(folder, number, name, self.size) for name in names)
 
@@ -97,7 +97,7 @@ class FrameJob:
     def paths_there(self) -> int:
         """Number of paths per pixel that are already on disk, summed over all frames."""
         frames = range(len(self.cameras))
-        colors = sum(self.has_color(number, k) for number in frames for k in range(self.realisations))
+        colors = sum(self.has_color(number, k) for number in frames for k in range(self.noise_seeds))
         states = [(number, self.started[number]) for number in self.references if number in self.started]
         return colors * self.spp + sum(
             self.reference_spp if self.has_reference(number) else state.spp for number, state in states
@@ -134,11 +134,11 @@ def render_frame(job: FrameJob, tracer: Tracer, number: int, advance: Callable[[
     if wanted:
         trace = partial(tracer.radiance, rays)
         state = _refine_reference(job, lambda n, seed, even: trace(n, seed, stratified=even), number, advance)
-    for realisation in reversed(range(job.realisations)):
-        if not job.has_color(number, realisation):
-            color, samples = _color(job, tracer, rays, (job.seed, number, _stream(realisation)), advance)
+    for noise_seed in reversed(range(job.noise_seeds)):
+        if not job.has_color(number, noise_seed):
+            color, samples = _color(job, tracer, rays, (job.seed, number, _stream(noise_seed)), advance)
             own = {"samples": torch.stack([_image(each, job.size) for each in samples], 1)} if samples else {}
-            write_realisation(job.folder, number, realisation, {**own, "color": _image(color, job.size)})
+            write_noisy(job.folder, number, noise_seed, {**own, "color": _image(color, job.size)})
     return state
 
 
@@ -158,15 +158,15 @@ def _render_filtered(
         clean = film.frame(camera, {}, _CLEAN_PATHS, (job.seed, number, 1, _CLEAN_STREAM))
         write_clean_features(job.folder, number, *(_image(clean[name], job.size) for name in ("albedo", "normal")))
     back = {name: matrix for name, matrix in _moved_back(job, number).items() if name in tracer.movers}
-    for realisation in reversed(range(job.realisations)):
-        if job.has_color(number, realisation) and job.has_features(number, realisation):
+    for noise_seed in reversed(range(job.noise_seeds)):
+        if job.has_color(number, noise_seed) and job.has_features(number, noise_seed):
             continue
         total: dict[str, Array] = {}
         per_pass = 1 if job.keep_samples else film.paths_per_pass()
         kept: list[torch.Tensor] = []
         for index, start in enumerate(range(0, job.spp, per_pass)):
             paths = min(per_pass, job.spp - start)
-            seed = (job.seed, number, _stream(realisation), index)
+            seed = (job.seed, number, _stream(noise_seed), index)
             found = film.frame(camera, back, paths, seed)
             for name, values in found.items():
                 total[name] = total.get(name, 0) + values * (paths / job.spp)
@@ -176,7 +176,7 @@ def _render_filtered(
         images = {name: _image(total[name], job.size) for name in sorted({*total} - {"color"})}
         images |= {"samples": torch.stack(kept, 1)} if kept else {}
         images["color"] = _image(total["color"], job.size)
-        write_realisation(job.folder, number, realisation, images)
+        write_noisy(job.folder, number, noise_seed, images)
     return state
 
 
@@ -184,9 +184,9 @@ def _render_filtered(
 _CLEAN_PATHS, _CLEAN_STREAM = 16, 2**20
 
 
-def _stream(realisation: int) -> int:
+def _stream(noise_seed: int) -> int:
     # The stream 1 belongs to the reference.
-    return 1 + realisation if realisation else 0
+    return 1 + noise_seed if noise_seed else 0
 
 
 def _features(job: FrameJob, tracer: Tracer, number: int, rays: PixelRays) -> dict[str, Array]:

@@ -42,7 +42,7 @@ def render_sequence(
     size: tuple[int, int] = (640, 360),
     frames: int | None = None,
     spp: int = 1,
-    realisations: int = 1,
+    noise_seeds: int = 1,
     reference_spp: int = 512,
     noise_level: float | None = None,
     reference_frames: Collection[int] | None = None,
@@ -71,8 +71,8 @@ def render_sequence(
         size: width and height in pixels.
         frames: number of cameras to render, from the first; all by default.
         spp: paths per pixel of the noisy colour.
-        realisations: number of noise seeds, that is, of independent noisy colours per frame. Those after the first are
-            written to ``out/inputs/realisation{1,2,...}``.
+        noise_seeds: number of noise seeds, that is, of independent noisy colours per frame. Those after the first are
+            written to ``out/inputs/noise_seed{1,2,...}``.
         reference_spp: paths per pixel of the references; with ``noise_level`` the maximum.
         noise_level: a reference is finished early when its estimated SMAPE against the truth is this small; see
             :class:`mcdenoise.scenes.render.halves.ReferenceHalves`. ``camera.json`` records the noise of each frame.
@@ -111,7 +111,7 @@ def render_sequence(
     _check_settings(size, count, references, noise_level)
     _check_lowest(
         spp=(spp, 1),
-        realisations=(realisations, 1),
+        noise_seeds=(noise_seeds, 1),
         reference_spp=(reference_spp, 1),
         seed=(seed, 0),
         max_depth=(max_depth, 1),
@@ -142,7 +142,7 @@ def render_sequence(
         "film": None if film is None else asdict(film),
         # Omitted if unused, as in folders of versions without this setting.
         "samples_kept": True if keep_samples else None,
-        "realisations": realisations,
+        "noise_seeds": noise_seeds,
         "max_depth": max_depth,
         "rr_depth": RR_DEPTH,
         "seed": seed,
@@ -165,7 +165,7 @@ def render_sequence(
         size=size,
         reach=reach,
         spp=spp,
-        realisations=realisations,
+        noise_seeds=noise_seeds,
         reference_spp=reference_spp,
         noise_level=noise_level,
         references=references,
@@ -175,7 +175,7 @@ def render_sequence(
         keep_samples=keep_samples,
     )
 
-    done, total = 0, count * realisations * spp + len(references) * reference_spp
+    done, total = 0, count * noise_seeds * spp + len(references) * reference_spp
 
     def advance(paths: int) -> None:
         nonlocal done
