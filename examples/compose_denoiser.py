@@ -45,7 +45,7 @@ def prepare(color: Tensor, frame: Frame) -> tuple[Tensor, list[Tensor]]:
 def denoise(color: Tensor, length: Tensor, guides: list[Tensor], scales: Tensor, fusion: Tensor) -> Tensor:
     """Filter demodulated, accumulated color; pixels are weighted by their history length `length`."""
     # Where the history is short, relax the falloff: a less similar neighbour is better than noise.
-    falloffs = [scale * (length / 4).clamp_max(1) for scale in scales[0, :-1]]
+    falloffs = [falloff * (length / 4).clamp_max(1) for falloff in scales[0, :-1]]
     if len(scales) > 1:
         coarse_length = downsample(length)
         coarse_color = downsample(color * length) / coarse_length

@@ -23,11 +23,11 @@ PARTS = ["demodulate", "cross_bilateral_weights", "kernel_conv", "remodulate"]
 
 
 def my_filter(
-    color: Tensor, albedo: Tensor, normal: Tensor, logits: Tensor, scale: Tensor, distance_scale: Tensor
+    color: Tensor, albedo: Tensor, normal: Tensor, logits: Tensor, falloff: Tensor, distance_falloff: Tensor
 ) -> Tensor:
     """Filter the demodulated color with predicted kernels that stop at edges of the normal."""
     light = demodulate(color, albedo)
-    weights = cross_bilateral_weights(logits, [normal], [scale], distance_scale, border="renormalize")
+    weights = cross_bilateral_weights(logits, [normal], [falloff], distance_falloff, border="renormalize")
     return remodulate(kernel_conv(light, weights), albedo)
 
 
@@ -44,8 +44,8 @@ def main() -> int:
         "albedo": torch.rand(1, 3, *size) * 0.8 + 0.1,
         "normal": torch.randn(1, 3, *size),
         "logits": torch.randn(1, 9, *size),
-        "scale": torch.rand(1, 1, *size),
-        "distance_scale": torch.rand(1, 1, *size),
+        "falloff": torch.rand(1, 1, *size),
+        "distance_falloff": torch.rand(1, 1, *size),
     }
     # The check converts the inputs to float64, because finite differences need its precision.
     results = gradcheck(my_filter, *inputs.values()) + check(options.ops or PARTS)

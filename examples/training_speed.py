@@ -33,7 +33,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.models import DEFAULT, FloatPrecision, create_model
 from mcdenoise.train import TrainConfig
-from mcdenoise.train.cache import Shot
+from mcdenoise.train.cache import CachedShot
 from mcdenoise.train.clips import ClipSampler
 from mcdenoise.train.config import check_config
 from mcdenoise.train.data import DataFolders
@@ -53,7 +53,7 @@ def noise(config: TrainConfig) -> ClipSampler:
 
     noisy = np.concatenate([uniform(ACCUMULATED["color"] + ACCUMULATED["current"]), np.ceil(8 * uniform(1)).clip(1)], 1)
     features = {"albedo": uniform(3), "normal": 2 * uniform(3) - 1, "depth": 10 * uniform(1), "reference": uniform(3)}
-    return ClipSampler([Shot((noisy,), features, demodulated=True)], config.frames, config.crop)
+    return ClipSampler([CachedShot((noisy,), features, demodulated=True)], config.frames, config.crop)
 
 
 def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:

@@ -758,6 +758,7 @@ def test_a_method_that_hangs_is_given_up(tmp_path: Path) -> None:
     wait_for_end(int((tmp_path / "process").read_text()))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("measures_memory")
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="memory is not measured here")
 def test_a_method_that_hangs_ends_with_the_benchmark(tmp_path: Path) -> None:

@@ -133,7 +133,7 @@ def test_denoise_sequence_writes_every_frame(small_sequence: Path, weights: Path
 
 def test_gradcheck_passes() -> None:
     lines = run("gradcheck_ops.py", "demodulate", "kernel_conv").splitlines()
-    arguments = "color, albedo, normal, logits, scale, distance_scale"
+    arguments = "color, albedo, normal, logits, falloff, distance_falloff"
     assert lines[0].startswith(f"passed  my_filter, example case, in {arguments}")
     assert {line.split()[1].rstrip(",") for line in lines[1:]} == {"demodulate", "kernel_conv"}
     assert all(line.startswith("passed") for line in lines)
@@ -432,7 +432,7 @@ def test_training_speed_measures_fast_backends_and_reference_in_both_precisions(
     pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
     file = tmp_path / "times.json"
     small = ("--model", "cascaded_v2_tiny", "--batch", "1", "--frames", "2", "--crop", "16", "--threads", "1")
-    for sequences in ((), (small_sequence,)):
+    for sequences in ((small_sequence,),):
         lines = run("training_speed.py", *sequences, *small, "--rounds", "2", "--json", file).splitlines()
         assert lines[0] == "cascaded_v2_tiny, 1 clips of 2 frames of 16x16, 2 rounds"
         assert ", 1 threads, mcdenoise " in lines[1]

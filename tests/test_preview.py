@@ -223,6 +223,7 @@ print((peak(180) - before) / frame.numel())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="reads the peak of memory through the POSIX resource usage")
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
     result = subprocess.run([sys.executable, "-c", _MEMORY, str(tmp_path)], capture_output=True, text=True, check=True)

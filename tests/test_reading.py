@@ -14,7 +14,7 @@ import pytest
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.camera_matrices import read_camera_matrices
-from mcdenoise.data.camera_path import load_shot
+from mcdenoise.data.camera_path import load_camera_path
 from mcdenoise.errors import InputError
 from mcdenoise.methods import parse_method
 from mcdenoise.models import create_model, describe_weights
@@ -27,7 +27,7 @@ from mcdenoise.train.run_folder import RunFolder
 # Whatever has a name, by that name. A new reader enters here.
 READERS: dict[str, Callable[[Path], object]] = {
     "camera_matrices.h": read_camera_matrices,
-    "path.json": load_shot,
+    "path.json": load_camera_path,
     "recipe.toml": lambda path: Recipe.read(path, ()),
     "results.json": lambda path: Results.read(path.parent),
     "weights.safetensors": describe_weights,
@@ -141,7 +141,7 @@ def seconds(read: Callable[[Path], object], path: Path, text: str) -> float:
 
 
 @pytest.mark.timeout(120)
-@pytest.mark.parametrize("read", [read_camera_matrices, load_shot])
+@pytest.mark.parametrize("read", [read_camera_matrices, load_camera_path])
 @pytest.mark.parametrize(
     "start", [pytest.param(each, marks=[pytest.mark.slow] if i else []) for i, each in enumerate(STARTS)]
 )

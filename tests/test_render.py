@@ -25,7 +25,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import Journal, create_model, listening
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
-from mcdenoise.scenes.render import Camera, load_shot, render_sequence, view_projection
+from mcdenoise.scenes.render import Camera, load_camera_path, render_sequence, view_projection
 from mcdenoise.scenes.render import frames as render_frames
 from mcdenoise.scenes.render.processes import render_in_processes
 from mcdenoise.scenes.render.tracer import first_working
@@ -312,14 +312,14 @@ def test_bad_camera_paths(tmp_path: Path, content: str, message: str) -> None:
     path = tmp_path / "camera_path.json"
     path.write_text(content)
     with pytest.raises(InputError, match=message) as caught:
-        load_shot(path)
+        load_camera_path(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_camera_paths_of_both_layouts(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="No such file"):
-        load_shot(tmp_path / "nothing.json")
+        load_camera_path(tmp_path / "nothing.json")
     camera = Camera.look_at((1, 2, 3), (0, 1, 0), fov_x=65)
     matrices, looks = tmp_path / "matrices.json", tmp_path / "looks.json"
     matrices.write_text(json.dumps({"fov": 65, "to_world": [camera.to_world.tolist()]}))
@@ -327,11 +327,11 @@ def test_camera_paths_of_both_layouts(tmp_path: Path) -> None:
         json.dumps({"fov": 65, "frames": [{"position": [1, 2, 3], "look_at": [0, 1, 0], "up": [0, 1, 0]}]})
     )
     for path in (matrices, looks):
-        (found,) = load_shot(path).cameras
+        (found,) = load_camera_path(path).cameras
         assert found.fov_x == 65
         np.testing.assert_allclose(found.to_world, camera.to_world)
     matrices.write_text(json.dumps({"fov": 90, "fov_axis": "y", "aspect": "2:1", "to_world": [np.eye(4).tolist()]}))
-    np.testing.assert_allclose(load_shot(matrices).cameras[0].fov_x, 126.8698976)
+    np.testing.assert_allclose(load_camera_path(matrices).cameras[0].fov_x, 126.8698976)
 
 
 MOVED = {"fov": 60, "to_world": [np.eye(4).tolist()] * 2}
@@ -351,7 +351,7 @@ def test_bad_paths_of_objects(tmp_path: Path, objects: Any, message: str) -> Non
     path = tmp_path / "shot.json"
     path.write_text(json.dumps({**MOVED, "objects": objects}))
     with pytest.raises(InputError, match=message) as caught:
-        load_shot(path)
+        load_camera_path(path)
     assert str(caught.value).startswith(str(path))
 
 
@@ -360,11 +360,11 @@ def test_paths_of_objects(tmp_path: Path) -> None:
     moved = np.eye(4)
     moved[:3, 3] = 1, 2, 3
     path.write_text(json.dumps({**MOVED, "objects": {"ball": [np.eye(4)[:3].tolist(), moved[:3].tolist()]}}))
-    shot = load_shot(path)
+    shot = load_camera_path(path)
     assert list(shot.moves) == ["ball"]
     np.testing.assert_array_equal(shot.moves["ball"], [np.eye(4), moved])
     path.write_text(json.dumps(MOVED))
-    assert load_shot(path).moves == {}
+    assert load_camera_path(path).moves == {}
 
 
 TUNGSTEN = """{"bsdfs": [{"name": "odd, ]"},], "camera": {"resolution": [1280, 720], "transform":
@@ -381,10 +381,10 @@ def test_camera_paths_of_tungsten_scenes(tmp_path: Path) -> None:
     together = tmp_path / "together.json"
     together.write_text("[" + ",".join(TUNGSTEN % x for x in (1, 2, 10)) + ",]")
     for path in (scenes, together):
-        cameras = load_shot(path).cameras
+        cameras = load_camera_path(path).cameras
         assert [camera.fov_x for camera in cameras] == [65, 65, 65]
         np.testing.assert_allclose([camera.to_world for camera in cameras], expected)
-    (one,) = load_shot(scenes / "spp_4096_scene_2.json").cameras
+    (one,) = load_camera_path(scenes / "spp_4096_scene_2.json").cameras
     np.testing.assert_allclose(one.to_world, expected[1])
 
 
@@ -393,7 +393,7 @@ def test_published_flythroughs() -> None:
     paths = sorted(SHARED_SCENES.glob("*/tungsten_flythrough.json"))
     assert paths
     for path in paths:
-        assert len(load_shot(path).cameras) > 10
+        assert len(load_camera_path(path).cameras) > 10
 
 
 @pytest.mark.parametrize(

@@ -80,12 +80,12 @@ def scene(seed: int = 0) -> Scene:
     return Scene(*(each[None] for each in (albedo, normal, depth[None], light.expand(3, -1, -1), noisy)))
 
 
-def kernels(scales: tuple[float, float, float] = (8.0, 6.0, 0.03), size: int = 9) -> Tensor:
+def kernels(falloffs: tuple[float, float, float] = (8.0, 6.0, 0.03), size: int = 9) -> Tensor:
     """Cross-bilateral weights of the scene's normals and depths."""
     shown = scene()
-    falloff = [scale * torch.ones_like(shown.depth) for scale in scales]
+    falloffs = [falloff * torch.ones_like(shown.depth) for falloff in falloffs]
     logits = torch.zeros(1, size * size, HEIGHT, WIDTH)
-    return ops.cross_bilateral_weights(logits, [shown.normal, shown.depth], falloff[:2], falloff[2])
+    return ops.cross_bilateral_weights(logits, [shown.normal, shown.depth], falloffs[:2], falloffs[2])
 
 
 def _light() -> Tensor:
@@ -134,9 +134,11 @@ def _weights() -> Panels:
 
 def _filter() -> Panels:
     shown = scene()
-    falloff = [scale * torch.ones_like(shown.depth) for scale in (8.0, 6.0, 0.03)]
+    falloffs = [falloff * torch.ones_like(shown.depth) for falloff in (8.0, 6.0, 0.03)]
     guides = [shown.normal, shown.depth]
-    filtered = ops.cross_bilateral_filter(_light(), torch.zeros(1, 81, HEIGHT, WIDTH), guides, falloff[:2], falloff[2])
+    filtered = ops.cross_bilateral_filter(
+        _light(), torch.zeros(1, 81, HEIGHT, WIDTH), guides, falloffs[:2], falloffs[2]
+    )
     return {"noisy": shown.noisy, "filtered": ops.remodulate(filtered, shown.albedo), "reference": shown.clean}
 
 

@@ -140,25 +140,25 @@ def _bilateral_cases() -> tuple[Case, ...]:
         channels: tuple[int, ...] = (3, 1),
         distance: bool = True,
         contrast: float = 1.0,
-        largest_scale: float = 3.0,
+        largest_falloff: float = 3.0,
         logit: float = 2.0,
     ) -> Case:
         batch, height, width = size
 
-        def scale(g: Generator) -> Tensor:
-            return largest_scale * _uniform(g, batch, 1, height, width)
+        def falloff(g: Generator) -> Tensor:
+            return largest_falloff * _uniform(g, batch, 1, height, width)
 
         def tensors(g: Generator) -> Inputs:
             kernel = logit * _uniform(g, batch, kernel_size**2, height, width, low=-1)
             return {
                 "kernel": kernel,
                 "guides": [contrast * _uniform(g, batch, c, height, width) for c in channels],
-                "scales": [scale(g) for _ in channels],
-                "distance_scale": 0.5 * _uniform(g, batch, 1, height, width) if distance else None,
+                "falloffs": [falloff(g) for _ in channels],
+                "distance_falloff": 0.5 * _uniform(g, batch, 1, height, width) if distance else None,
             }
 
-        differentiable = ("kernel", *(("guides", "scales") if channels else ()))
-        differentiable += ("distance_scale",) if distance else ()
+        differentiable = ("kernel", *(("guides", "falloffs") if channels else ()))
+        differentiable += ("distance_falloff",) if distance else ()
         return Case(name, kind, tensors, differentiable, {"normalize": normalize, "border": border})
 
     return (
@@ -172,11 +172,13 @@ def _bilateral_cases() -> tuple[Case, ...]:
         case("distance only", "ordinary", (1, 3, 2), 3, "softmax", channels=()),
         case("smaller than the kernel", "ordinary", (1, 2, 1), 5, "softmax", "renormalize", channels=(1,)),
         case("one pixel", "ordinary", (1, 1, 1), 3, "softmax"),
-        case("scales up to 1e3", "stiff", (1, 2, 3), 3, "softmax", contrast=0.1, largest_scale=1e3),
-        case("Eq. 5, scales up to 1e3", "stiff", (1, 2, 3), 3, "none", contrast=0.1, largest_scale=1e3, channels=(1,)),
-        case("zero scales", "ordinary", (1, 2, 3), 3, "softmax", largest_scale=0.0),
+        case("falloffs up to 1e3", "stiff", (1, 2, 3), 3, "softmax", contrast=0.1, largest_falloff=1e3),
+        case(
+            "Eq. 5, falloffs up to 1e3", "stiff", (1, 2, 3), 3, "none", contrast=0.1, largest_falloff=1e3, channels=(1,)
+        ),
+        case("zero falloffs", "ordinary", (1, 2, 3), 3, "softmax", largest_falloff=0.0),
         case("logits of 50", "extreme", (1, 2, 3), 3, "softmax", logit=50.0, channels=(1,)),
-        case("all but the centre vanish", "extreme", (1, 2, 3), 3, "softmax", "zeros", largest_scale=6e4),
+        case("all but the centre vanish", "extreme", (1, 2, 3), 3, "softmax", "zeros", largest_falloff=6e4),
     )
 
 

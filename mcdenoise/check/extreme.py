@@ -201,8 +201,8 @@ def bilateral() -> tuple[Case, ...]:
             return {
                 "kernel": logits(g, batch, kernel_size**2, height, width),
                 "guides": [guide(g, batch, channels, height, width)],
-                "scales": [scale * uniform(g, batch, 1, height, width, low=0.5)],
-                "distance_scale": uniform(g, batch, 1, height, width),
+                "falloffs": [scale * uniform(g, batch, 1, height, width, low=0.5)],
+                "distance_falloff": uniform(g, batch, 1, height, width),
             }
 
         settings = {"normalize": normalize, "border": border}
@@ -232,11 +232,11 @@ def bilateral() -> tuple[Case, ...]:
 
         return draw
 
-    everything = ("kernel", "guides", "scales", "distance_scale")
+    everything = ("kernel", "guides", "falloffs", "distance_falloff")
     small, flat = spread(1e-4), _constant(0.5)
     return (
         case("f of 1e6, guides 1e-4 apart", small, 1e6, differentiable=everything),
-        case("f of 1e8, guides 1e-4 apart", small, 1e8, differentiable=("kernel", "distance_scale")),
+        case("f of 1e8, guides 1e-4 apart", small, 1e8, differentiable=("kernel", "distance_falloff")),
         case("logits 1e4 and 1 apart", spread(1.0), 1.0, spread(1.0, 1e4), differentiable=everything),
         case("f of 1e8, guides 1 apart", spread(1.0), 1e8),
         case("f of 1e8, guides of 1e4 and 1e-4 apart", spread(1e-4, 1e4), 1e8),
@@ -268,18 +268,18 @@ def bilateral_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     + f_d |o_t|^2``, however small the inputs and the result are. A weight, ``w exp(exponent)``, has the same relative
     error.
     """
-    kernel, guides, scales, distance = (inputs[name] for name in ("kernel", "guides", "scales", "distance_scale"))
+    kernel, guides, falloffs, distance = (inputs[name] for name in ("kernel", "guides", "falloffs", "distance_falloff"))
     assert isinstance(kernel, Tensor)
     assert isinstance(guides, list)
-    assert isinstance(scales, list)
+    assert isinstance(falloffs, list)
     size = round(kernel.shape[1] ** 0.5)
     height, width = kernel.shape[-2:]
     terms = torch.zeros_like(kernel)
-    for guide, scale in zip(guides, scales, strict=True):
+    for guide, falloff in zip(guides, falloffs, strict=True):
         padded = pad(guide, size // 2, settings["border"])
         for tap, dy, dx in offsets(size):
             difference = shifted(padded, size // 2, dy, dx, height, width) - guide
-            terms[:, tap : tap + 1] += scale.abs() * difference.square().sum(1, keepdim=True)
+            terms[:, tap : tap + 1] += falloff.abs() * difference.square().sum(1, keepdim=True)
     if isinstance(distance, Tensor):
         for tap, dy, dx in offsets(size):
             terms[:, tap : tap + 1] += distance.abs() * (dy * dy + dx * dx)
@@ -337,27 +337,27 @@ def bilateral_filter_rounding(inputs: Inputs, settings: dict[str, Any]) -> Round
 
 def _softmax_gradients(inputs: Inputs, exponent: Tensor, border: Border) -> Inputs:
     """``w (v - sum(w v))`` is a difference of terms of the size of ``w``, and so are the gradients that follow."""
-    guides, scales, distance = inputs["guides"], inputs["scales"], inputs["distance_scale"]
+    guides, falloffs, distance = inputs["guides"], inputs["falloffs"], inputs["distance_falloff"]
     assert isinstance(guides, list)
-    assert isinstance(scales, list)
+    assert isinstance(falloffs, list)
     size = round(exponent.shape[1] ** 0.5)
     height, width = exponent.shape[-2:]
-    of_guides, of_scales = [], []
-    for guide, scale in zip(guides, scales, strict=True):
+    of_guides, of_falloffs = [], []
+    for guide, falloff in zip(guides, falloffs, strict=True):
         padded = pad(guide, size // 2, border)
-        far, near, own = torch.zeros_like(padded), torch.zeros_like(guide), torch.zeros_like(scale)
+        far, near, own = torch.zeros_like(padded), torch.zeros_like(guide), torch.zeros_like(falloff)
         for tap, dy, dx in offsets(size):
             difference = (shifted(padded, size // 2, dy, dx, height, width) - guide).abs()
-            pull = 2 * scale.abs() * difference * exponent[:, tap : tap + 1]
+            pull = 2 * falloff.abs() * difference * exponent[:, tap : tap + 1]
             shifted(far, size // 2, dy, dx, height, width).add_(pull)
             near += pull
             own += difference.square().sum(1, keepdim=True) * exponent[:, tap : tap + 1]
         of_guides.append(near + unpad(far, size // 2, border))
-        of_scales.append(own)
-    gradients: Inputs = {"kernel": exponent, "guides": of_guides, "scales": of_scales}
+        of_falloffs.append(own)
+    gradients: Inputs = {"kernel": exponent, "guides": of_guides, "falloffs": of_falloffs}
     if isinstance(distance, Tensor):
         squares = torch.tensor([dy * dy + dx * dx for _, dy, dx in offsets(size)], dtype=exponent.dtype)
-        gradients["distance_scale"] = (exponent * squares[:, None, None]).sum(1, keepdim=True)
+        gradients["distance_falloff"] = (exponent * squares[:, None, None]).sum(1, keepdim=True)
     return gradients
 
 

@@ -75,8 +75,8 @@ def softmax_splat(image: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
 def cross_bilateral_weights(
     kernel: Tensor,
     guides: Sequence[Tensor] = (),
-    scales: Sequence[Tensor] = (),
-    distance_scale: Tensor | None = None,
+    falloffs: Sequence[Tensor] = (),
+    distance_falloff: Tensor | None = None,
     *,
     normalize: str = "softmax",
     border: str = "replicate",
@@ -87,8 +87,8 @@ def cross_bilateral_weights(
     """
     logits, out = kernel.tolist(), _zeros(kernel.shape)
     images = [guide.tolist() for guide in guides]
-    factors = [scale.tolist() for scale in scales]
-    factor_of_distance = None if distance_scale is None else distance_scale.tolist()
+    factors = [scale.tolist() for scale in falloffs]
+    factor_of_distance = None if distance_falloff is None else distance_falloff.tolist()
     batch, _, height, width = kernel.shape
     for b, y, x in itertools.product(range(batch), range(height), range(width)):
         exponents: dict[int, list[float]] = {}
@@ -132,14 +132,14 @@ def cross_bilateral_filter(
     image: Tensor,
     kernel: Tensor,
     guides: Sequence[Tensor] = (),
-    scales: Sequence[Tensor] = (),
-    distance_scale: Tensor | None = None,
+    falloffs: Sequence[Tensor] = (),
+    distance_falloff: Tensor | None = None,
     *,
     normalize: str = "softmax",
     border: str = "replicate",
 ) -> Tensor:
     """Eqs. 5-8, then Eq. 4."""
-    weights = cross_bilateral_weights(kernel, guides, scales, distance_scale, normalize=normalize, border=border)
+    weights = cross_bilateral_weights(kernel, guides, falloffs, distance_falloff, normalize=normalize, border=border)
     return kernel_conv(image, weights, border=border)
 
 

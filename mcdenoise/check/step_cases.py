@@ -87,7 +87,7 @@ def _fusion(size: Size, g: Generator) -> Inputs:
 
 
 def _low(size: Size, g: Generator) -> Inputs:
-    return {"fine": _positive(size, g), "coarse": _positive(_half(size), g), "top": 20 * _factor(size, g)}
+    return {"fine": _positive(size, g), "coarse": _positive(_half(size), g), "maximum": 20 * _factor(size, g)}
 
 
 def _planes(size: Size, g: Generator) -> Inputs:

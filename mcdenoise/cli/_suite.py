@@ -15,7 +15,7 @@ from mcdenoise.report import check_packages, write_report, write_sample_plots
 from mcdenoise.suite import (
     PEERS,
     SHOWN,
-    Stage,
+    Progress,
     choose_rows,
     error_against_time,
     error_lines,
@@ -54,13 +54,13 @@ def score_suite(
     with progress_bar() as progress:
         task = progress.add_task("render", total=None)
 
-        def show(stage: Stage) -> None:
-            described = f"render {stage.shot}, references to {stage.fraction:.0%}"
-            progress.update(task, description=described, completed=stage.done, total=stage.total)
+        def show(step: Progress) -> None:
+            described = f"render {step.shot}, references to {step.fraction:.0%}"
+            progress.update(task, description=described, completed=step.done, total=step.total)
 
         if render:
             shots = list(dict.fromkeys(row.shot for row in rows))
-            render_suite(shots, data, blender_python=blender_python, threads=settings.threads, on_stage=show)
+            render_suite(shots, data, blender_python=blender_python, threads=settings.threads, on_progress=show)
     if out is None:
         say(data)
         return 0

@@ -14,7 +14,7 @@ from mcdenoise.cli._output import progress_bar, say
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.engines import RayEngine
 from mcdenoise.errors import InputError
-from mcdenoise.scenes.render import choose_variant, load_shot, render_sequence
+from mcdenoise.scenes.render import choose_variant, load_camera_path, render_sequence
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def render(
     arguments = rendering.arguments()
     if rendering.ray is not None and rendering.workers > 1:
         raise InputError("--workers, --ray: expected one of them, found both")
-    shot = load_shot(camera_path)
+    shot = load_camera_path(camera_path)
     engine = None
     if rendering.ray is not None:
         # Workers have other working folders.

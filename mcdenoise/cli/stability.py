@@ -6,7 +6,7 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from mcdenoise.check.stability import FRAMES, Check, LongRun, Summary, as_json, parse_dtypes, stages, summarize
+from mcdenoise.check.stability import FRAMES, Check, LongRun, Summary, as_json, groups, parse_dtypes, summarize
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import progress_bar, show, write_json
 from mcdenoise.errors import InputError
@@ -38,12 +38,12 @@ def stability(
     """
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
-    chosen = stages(ops or None, models or None, parse_dtypes(dtypes), frames)
+    chosen = groups(ops or None, models or None, parse_dtypes(dtypes), frames)
     checks: list[Check] = []
     runs: list[LongRun] = []
     with progress_bar() as progress:
-        for stage in progress.track(chosen, description="stability"):
-            for result in stage.run():
+        for group in progress.track(chosen, description="stability"):
+            for result in group.run():
                 checks.append(result) if isinstance(result, Check) else runs.append(result)
     _print_checks(checks)
     _print_long_runs(runs)

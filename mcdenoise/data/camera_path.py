@@ -62,7 +62,7 @@ class Camera:
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class CameraPath:
     """The values that change from frame to frame.
 
     Args:
@@ -75,7 +75,7 @@ class Shot:
     moves: dict[str, Array] = field(default_factory=dict)
 
 
-def load_shot(path: Path) -> Shot:
+def load_camera_path(path: Path) -> CameraPath:
     """Read a camera path, including the paths of objects.
 
     The following JSON layouts are supported; a trailing comma after the last element is accepted:
@@ -88,7 +88,7 @@ def load_shot(path: Path) -> Shot:
 
     ``fov`` is in degrees and across the image width; with ``"fov_axis": "y"`` it is across the height, and
     ``"aspect": "16:9"`` converts it. Beside the cameras, ``"objects": {"ID": [4x4 or 3x4, ...], ...}`` moves objects:
-    one matrix per frame, as in :class:`Shot`.
+    one matrix per frame, as in :class:`CameraPath`.
 
     Args:
         path: the file, or a folder of ``*.json`` files, which are sorted by the last number in their names.
@@ -134,13 +134,13 @@ def load_shot(path: Path) -> Shot:
     if not isinstance(objects, dict):
         raise InputError(f"{path}: expected 'objects' to map ids to lists of matrices, found {type(objects).__name__}")
     try:
-        return Shot(cameras, check_moves(objects, len(cameras)))
+        return CameraPath(cameras, check_moves(objects, len(cameras)))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
 def check_moves(moves: Mapping[str, Any], frames: int) -> dict[str, Array]:
-    """Check transforms of objects, and convert them to the form in :class:`Shot`.
+    """Check transforms of objects, and convert them to the form in :class:`CameraPath`.
 
     Args:
         moves: for each id, ``frames`` matrices of shape ``(4, 4)`` or ``(3, 4)``.

@@ -73,7 +73,7 @@ def _shown(result: ShotResult) -> dict[str, Any]:
         "strip": [(number, quote(path)) for number, path in sorted(pictures.items()) if number not in shown],
         "curves": [
             ("change from both neighbours", _curve([row["score"] for row in rows])),
-            ("pixels with a history", _curve([row["history"] or 0.0 for row in rows], top=1.0)),
+            ("pixels with a history", _curve([row["history"] or 0.0 for row in rows], highest=1.0)),
             ("milliseconds", _curve([row["milliseconds"] for row in rows])),
         ]
         if len(rows) > 1
@@ -81,9 +81,9 @@ def _shown(result: ShotResult) -> dict[str, Any]:
     }
 
 
-def _curve(values: Sequence[float], top: float = 0.0) -> dict[str, Any]:
+def _curve(values: Sequence[float], highest: float = 0.0) -> dict[str, Any]:
     """The points of an SVG polyline, and the largest value."""
-    top = top or max(values) or 1.0
+    highest = highest or max(values) or 1.0
     step = _WIDTH / (len(values) - 1)
-    points = " ".join(f"{step * i:.1f},{_HEIGHT * (1 - min(v / top, 1)):.1f}" for i, v in enumerate(values))
-    return {"points": html.escape(points), "top": f"{top:.3g}"}
+    points = " ".join(f"{step * i:.1f},{_HEIGHT * (1 - min(v / highest, 1)):.1f}" for i, v in enumerate(values))
+    return {"points": html.escape(points), "highest": f"{highest:.3g}"}

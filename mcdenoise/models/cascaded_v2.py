@@ -66,7 +66,7 @@ class _Network(nn.Module):
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """Exposure, depth scale, and the logarithm of the brightest pixel of this network's own input."""
         found = image_statistics(frame)
-        return found | {"top": torch.log1p(frame.color.amax((1, 2, 3), keepdim=True) * found["exposure"])}
+        return found | {"maximum": torch.log1p(frame.color.amax((1, 2, 3), keepdim=True) * found["exposure"])}
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`; measured per channel of width."""
@@ -94,7 +94,7 @@ class PixelNetwork(_Network):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         statistics = frame.statistics or self.statistics(frame)
-        frame, exposure, top = frame.replace(statistics=statistics), statistics["exposure"], statistics["top"]
+        frame, exposure, maximum = frame.replace(statistics=statistics), statistics["exposure"], statistics["maximum"]
         image = frame.color * exposure
         logs = torch.log1p(image)
         means: list[Tensor] = []
@@ -112,7 +112,7 @@ class PixelNetwork(_Network):
         fused = _at_least_float32(self.heads[-1](levels[-1], scales[-1].shape[-2:])) + scales[-1]
         for scale in (1, 0):
             residual = self.heads[scale](levels[scale], scales[scale].shape[-2:])
-            fused = self.fusions[1 - scale](scales[scale], fused, residual, None if scale else top)
+            fused = self.fusions[1 - scale](scales[scale], fused, residual, None if scale else maximum)
         return Output(fused / exposure), None
 
 
@@ -137,7 +137,7 @@ class KernelNetwork(_Network):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         statistics = frame.statistics or self.statistics(frame)
-        frame, exposure, top = frame.replace(statistics=statistics), statistics["exposure"], statistics["top"]
+        frame, exposure, maximum = frame.replace(statistics=statistics), statistics["exposure"], statistics["maximum"]
         image = frame.color * exposure
         levels = self.unet(input_of(frame, image))
         guides, others = guides_of(frame), carried(frame)
@@ -161,7 +161,7 @@ class KernelNetwork(_Network):
             fine = scales[scale][:, :3]
             if others is not None:
                 others = fusion.mean(scales[scale][:, 3:], others, fusion.weight(torch.log1p(fine), fused))
-            fused = fusion(fine, fused, None, None if scale else top, logarithms=True)
+            fused = fusion(fine, fused, None, None if scale else maximum, logarithms=True)
         return answered(frame, fused / exposure, others), None
 
 

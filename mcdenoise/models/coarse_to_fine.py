@@ -27,7 +27,7 @@ class CoarseToFine(Wrapper):
     pixel their mean is still noisy, and where light is sparse most of them are black.
 
     Args:
-        inner: a method without a state whose statistics contain the ``exposure`` and the logarithm ``top`` of the
+        inner: a method without a state whose statistics contain the ``exposure`` and the logarithm ``maximum`` of the
             largest exposed radiance, such as :class:`mcdenoise.models.cascaded_v2.PixelNetwork`.
         resolutions: number of sizes; with 1 the method is unchanged.
     """
@@ -59,7 +59,7 @@ class CoarseToFine(Wrapper):
         fine = self.inner(frame)[0].image
         if coarse is None:
             return fine
-        return low_frequencies_of(fine, coarse, frame.statistics["top"], frame.statistics["exposure"])
+        return low_frequencies_of(fine, coarse, frame.statistics["maximum"], frame.statistics["exposure"])
 
 
 def _halved(frame: Frame) -> Frame:

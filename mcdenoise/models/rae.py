@@ -131,8 +131,8 @@ class Rae(nn.Module):
             x = torch.cat([upsample(x, (skip.shape[-2], skip.shape[-1])), skip], 1)
             x = second(_leaky(first(x)))
             x = _leaky(x) if found else x
-        top = torch.log1p(color.amax((1, 2, 3), keepdim=True))
-        image = torch.expm1(torch.minimum(x.to(color.dtype).clamp_min(0), top))
+        maximum = torch.log1p(color.amax((1, 2, 3), keepdim=True))
+        image = torch.expm1(torch.minimum(x.to(color.dtype).clamp_min(0), maximum))
         kept = to_be_kept(frame, torch.zeros_like(color[:, :1]))
         return Output(image), None if kept is None else Memory(after, kept)
 

@@ -67,7 +67,7 @@ class LogFusion(_Fusion):
         fine: Tensor,
         coarse: Tensor,
         residual: Tensor | None = None,
-        top: Tensor | None = None,
+        maximum: Tensor | None = None,
         logarithms: bool = False,
     ) -> Tensor:
         """Fuse two scales.
@@ -76,11 +76,11 @@ class LogFusion(_Fusion):
             fine: ``(B, 3, H, W)`` logarithms of radiance.
             coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` logarithms of radiance.
             residual: ``(B, 3, H, W)`` to add to the fine image; none by default.
-            top: ``(B, 1, 1, 1)`` largest logarithm of the result. If it is given, the result is converted to radiance.
+            maximum: ``(B, 1, 1, 1)`` largest logarithm of the result, which is then converted to radiance.
             logarithms: whether the fine image is radiance, whose logarithm is to be taken.
 
         Returns:
             ``(B, 3, H, W)`` logarithms of radiance, or radiance.
         """
         weight, bias = self.conv.parameters()
-        return gated_fusion(fine, coarse, weight, bias, residual=residual, top=top, logarithms=logarithms)
+        return gated_fusion(fine, coarse, weight, bias, residual=residual, maximum=maximum, logarithms=logarithms)

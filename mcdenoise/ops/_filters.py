@@ -19,7 +19,8 @@ Gradients = Callable[..., tuple[Any, ...]]
 
 _KERNEL = "Tensor image, Tensor kernel, str border"
 _FILTER = (
-    "Tensor image, Tensor kernel, Tensor[] guides, Tensor[] scales, Tensor? distance_scale, str normalize, str border"
+    "Tensor image, Tensor kernel, Tensor[] guides, Tensor[] falloffs, Tensor? distance_falloff, str normalize, "
+    "str border"
 )
 
 
@@ -82,13 +83,13 @@ def filter_operator(backend: str, filters: ModuleType) -> tuple[Operator, Gradie
         image: Tensor,
         kernel: Tensor,
         guides: list[Tensor],
-        scales: list[Tensor],
-        distance_scale: Tensor | None,
+        falloffs: list[Tensor],
+        distance_falloff: Tensor | None,
         normalize: str,
         border: str,
     ) -> Tensor:
         in_log_domain = normalize == "softmax"
-        result: Tensor = filters.filtered(image, kernel, guides, scales, distance_scale, in_log_domain, border)
+        result: Tensor = filters.filtered(image, kernel, guides, falloffs, distance_falloff, in_log_domain, border)
         return result
 
     def differentiate(
@@ -96,24 +97,24 @@ def filter_operator(backend: str, filters: ModuleType) -> tuple[Operator, Gradie
         image: Tensor,
         kernel: Tensor,
         guides: list[Tensor],
-        scales: list[Tensor],
-        distance_scale: Tensor | None,
+        falloffs: list[Tensor],
+        distance_falloff: Tensor | None,
         normalize: str,
         border: str,
         of_guides: bool,
     ) -> list[Tensor]:
-        of_image, of_kernel, of_guide, of_scale, of_distance = filters.derivatives(
-            gradient, image, kernel, guides, scales, distance_scale, normalize == "softmax", border, of_guides
+        of_image, of_kernel, of_guide, of_falloff, of_distance = filters.derivatives(
+            gradient, image, kernel, guides, falloffs, distance_falloff, normalize == "softmax", border, of_guides
         )
-        return [of_image, of_kernel, *of_scale, of_distance, *of_guide]
+        return [of_image, of_kernel, *of_falloff, of_distance, *of_guide]
 
     def empty(
         gradient: Tensor,
         image: Tensor,
         kernel: Tensor,
         guides: list[Tensor],
-        scales: list[Tensor],
-        distance_scale: Tensor | None,
+        falloffs: list[Tensor],
+        distance_falloff: Tensor | None,
         normalize: str,
         border: str,
         of_guides: bool,
@@ -122,8 +123,8 @@ def filter_operator(backend: str, filters: ModuleType) -> tuple[Operator, Gradie
         return [
             image.new_empty(image.shape),
             torch.empty_like(kernel),
-            *(scale.new_empty(scale.shape) for scale in scales),
-            nothing if distance_scale is None else distance_scale.new_empty(distance_scale.shape),
+            *(falloff.new_empty(falloff.shape) for falloff in falloffs),
+            nothing if distance_falloff is None else distance_falloff.new_empty(distance_falloff.shape),
             *(guide.new_empty(guide.shape) for guide in guides if of_guides),
         ]
 
@@ -138,10 +139,10 @@ def filter_operator(backend: str, filters: ModuleType) -> tuple[Operator, Gradie
     backward.register_fake(empty)
 
     def gradients(needed: tuple[Any, ...], gradient: Tensor, *arguments: Any) -> tuple[Any, ...]:
-        count, distance_scale = len(arguments[2]), arguments[4]
+        count, distance_falloff = len(arguments[2]), arguments[4]
         of_image, of_kernel, *others = backward(gradient, *arguments, any(needed[2]))
         of_scales, of_distance, of_guides = others[:count], others[count], others[count + 1 :]
-        to_distance = None if distance_scale is None else of_distance
+        to_distance = None if distance_falloff is None else of_distance
         return of_image, of_kernel, of_guides or [None] * count, of_scales, to_distance, None, None
 
     return forward, gradients

@@ -29,8 +29,8 @@ Normalize = Literal["softmax", "none"]
 def cross_bilateral_weights(
     kernel: Tensor,
     guides: Sequence[Tensor] = (),
-    scales: Sequence[Tensor] = (),
-    distance_scale: Tensor | None = None,
+    falloffs: Sequence[Tensor] = (),
+    distance_falloff: Tensor | None = None,
     *,
     normalize: Normalize = "softmax",
     border: Border = "replicate",
@@ -42,15 +42,15 @@ def cross_bilateral_weights(
 
     - ``normalize="none"``: ``w'[t, p] = w[t, p] exp(-E[t, p])``, the paper's Eqs. 5-8 to the letter;
     - ``normalize="softmax"``: ``w'[:, p] = softmax_t(logit[t, p] - E[t, p])``, the same with ``w = exp(logit)``,
-      normalised, and computed in the log domain, where no scale can overflow or leave a sum of zero.
+      normalised, and computed in the log domain, where no falloff can overflow or leave a sum of zero.
 
     Args:
         kernel: ``(B, K*K, H, W)``, odd ``K``, taps row by row from top left: weights ``w`` for ``"none"``, logits
             for ``"softmax"``. A plain cross-bilateral filter has ones, respectively zeros. A logit may be infinite: the
             limit of a large one.
         guides: any number of ``(B, C_g, H, W)`` feature images, any channels and unit, finite, at most 1e15.
-        scales: one ``(B, 1, H, W)`` per guide, the ``f_g >= 0`` (1 / guide unit squared), at most 1e8.
-        distance_scale: ``(B, 1, H, W)``, the ``f_d >= 0`` (1 / pixel squared); ``None`` leaves the term out.
+        falloffs: one ``(B, 1, H, W)`` per guide, the ``f_g >= 0`` (1 / guide unit squared), at most 1e8.
+        distance_falloff: ``(B, 1, H, W)``, the ``f_d >= 0`` (1 / pixel squared); ``None`` omits the term.
         normalize: ``"softmax"`` or ``"none"``.
         border: what a tap outside the image sees: ``"replicate"`` the guide's nearest edge pixel, ``"zeros"`` a guide
             of zeros; ``"renormalize"`` gives such taps the weight 0.
@@ -60,9 +60,9 @@ def cross_bilateral_weights(
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, ``K`` is even, the numbers of guides and scales differ, or a mode is unknown.
+        ValueError: shapes disagree, ``K`` is even, the numbers of guides and falloffs differ, or a mode is unknown.
 
-    Differentiable in ``kernel``, ``guides``, ``scales`` and ``distance_scale``, to any order. Half precision sums
+    Differentiable in ``kernel``, ``guides``, ``falloffs`` and ``distance_falloff``, to any order. Half precision sums
     the exponent in float32. A weight is known to eps times its exponent ``|logit| + E``.
 
     Source: the paper's Eqs. 5-8; Eisemann and Durand 2004, Petschnigg et al. 2004 (cross/joint bilateral filter).
@@ -74,11 +74,11 @@ def cross_bilateral_weights(
         >>> weights[0, 3:6, 0, 1].tolist()  # left, centre, right of the middle pixel
         [0.5, 0.5, 0.0]
     """
-    kernel_size = check_weights(kernel, guides, scales, distance_scale, normalize, border)
+    kernel_size = check_weights(kernel, guides, falloffs, distance_falloff, normalize, border)
     radius = kernel_size // 2
     log_domain = normalize == "softmax"
     start = kernel if log_domain else torch.zeros_like(kernel)
-    exponent = _exponent(start, guides, scales, distance_scale, radius, border)
+    exponent = _exponent(start, guides, falloffs, distance_falloff, radius, border)
     if log_domain:
         if border == "renormalize":
             exponent = torch.where(_inside(kernel, kernel_size), exponent, -torch.inf)
@@ -112,20 +112,20 @@ CrossBilateralWeights = module_of("CrossBilateralWeights", cross_bilateral_weigh
 def check_weights(
     kernel: Tensor,
     guides: Sequence[Tensor],
-    scales: Sequence[Tensor],
-    distance_scale: Tensor | None,
+    falloffs: Sequence[Tensor],
+    distance_falloff: Tensor | None,
     normalize: str,
     border: str,
 ) -> int:
     """The kernel size of arguments that :func:`cross_bilateral_weights` accepts; its errors for others."""
-    if len(guides) != len(scales):
-        raise ValueError(f"scales: expected one for each of the {len(guides)} guides, found {len(scales)}")
+    if len(guides) != len(falloffs):
+        raise ValueError(f"falloffs: expected one for each of the {len(guides)} guides, found {len(falloffs)}")
     arguments = {"kernel": (kernel, "B T H W")}
-    for i, (guide, scale) in enumerate(zip(guides, scales, strict=True)):
+    for i, (guide, falloff) in enumerate(zip(guides, falloffs, strict=True)):
         arguments[f"guides[{i}]"] = (guide, f"B C{i} H W")
-        arguments[f"scales[{i}]"] = (scale, "B 1 H W")
-    if distance_scale is not None:
-        arguments["distance_scale"] = (distance_scale, "B 1 H W")
+        arguments[f"falloffs[{i}]"] = (falloff, "B 1 H W")
+    if distance_falloff is not None:
+        arguments["distance_falloff"] = (distance_falloff, "B 1 H W")
     sizes = check_shapes(**arguments)
     check_normalize(normalize)
     check_border(border)
@@ -135,8 +135,8 @@ def check_weights(
 def _exponent(
     start: Tensor,
     guides: Sequence[Tensor],
-    scales: Sequence[Tensor],
-    distance_scale: Tensor | None,
+    falloffs: Sequence[Tensor],
+    distance_falloff: Tensor | None,
     radius: int,
     border: Border,
 ) -> Tensor:
@@ -145,8 +145,8 @@ def _exponent(
     channels = tuple(guide.shape[1] for guide in guides)
     # One tensor for all guides: torch.compile takes no function with a variable number of arguments.
     margin = pad(torch.cat([guide.to(dtype) for guide in guides], 1), radius, border) if guides else None
-    factors = torch.cat([scale.to(dtype) for scale in scales], 1) if scales else None
-    distance = None if distance_scale is None else distance_scale.to(dtype)
+    factors = torch.cat([falloff.to(dtype) for falloff in falloffs], 1) if falloffs else None
+    distance = None if distance_falloff is None else distance_falloff.to(dtype)
     return _Exponent.of(start, distance, margin, factors, channels, radius)
 
 
@@ -156,9 +156,9 @@ class _Exponent(Function):
     @staticmethod
     def forward(
         start: Tensor,
-        distance_scale: Tensor | None,
+        distance_falloff: Tensor | None,
         guides: Tensor | None,
-        scales: Tensor | None,
+        falloffs: Tensor | None,
         channels: tuple[int, ...],
         radius: int,
     ) -> Tensor:
@@ -172,18 +172,18 @@ class _Exponent(Function):
             out = result[:, tap : tap + 1]
             if dy == 0 and dx == 0:
                 continue
-            for padded, scale in _each(guides, scales, channels):
-                out.addcmul_(scale, squared_distance(padded, radius, dy, dx, height, width), value=-1)
-            if distance_scale is not None:
-                out.sub_(distance_scale, alpha=dy * dy + dx * dx)
+            for padded, falloff in _each(guides, falloffs, channels):
+                out.addcmul_(falloff, squared_distance(padded, radius, dy, dx, height, width), value=-1)
+            if distance_falloff is not None:
+                out.sub_(distance_falloff, alpha=dy * dy + dx * dx)
         return result
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Tensor) -> None:
-        start, _, guides, scales, ctx.channels, ctx.radius = inputs
+        start, _, guides, falloffs, ctx.channels, ctx.radius = inputs
         ctx.dtype = start.dtype
-        ctx.save_for_backward(guides, scales)
-        ctx.save_for_forward(guides, scales)
+        ctx.save_for_backward(guides, falloffs)
+        ctx.save_for_forward(guides, falloffs)
 
     @staticmethod
     def tangent(
@@ -195,11 +195,11 @@ class _Exponent(Function):
         *_: None,
     ) -> Tensor:
         radius = ctx.radius
-        guides, scales = ctx.saved_tensors
+        guides, falloffs = ctx.saved_tensors
         given = next(tangent for tangent in (of_start, of_distance, of_scales, of_guides) if tangent is not None)
         margin = 2 * radius if given is of_guides else 0
         height, width = given.shape[-2] - margin, given.shape[-1] - margin
-        pairs = _each(guides, scales, ctx.channels)
+        pairs = _each(guides, falloffs, ctx.channels)
         tangents = zip(
             [None] * len(pairs) if of_guides is None else torch.split(of_guides, list(ctx.channels), 1),
             [None] * len(pairs) if of_scales is None else torch.split(of_scales, 1, 1),
@@ -213,14 +213,14 @@ class _Exponent(Function):
                 total = total + of_start[:, tap : tap + 1]
             if of_distance is not None:
                 total = total - of_distance * (dy * dy + dx * dx)
-            for (padded, scale), (of_padded, of_scale) in moving:
+            for (padded, falloff), (of_padded, of_falloff) in moving:
                 size = (height, width)
                 difference = shifted(padded, radius, dy, dx, *size) - shifted(padded, radius, 0, 0, *size)
-                if of_scale is not None:
-                    total = total - of_scale * difference.square().sum(1, keepdim=True)
+                if of_falloff is not None:
+                    total = total - of_falloff * difference.square().sum(1, keepdim=True)
                 if of_padded is not None:
                     change = shifted(of_padded, radius, dy, dx, *size) - shifted(of_padded, radius, 0, 0, *size)
-                    total = total - 2 * scale * (difference * change).sum(1, keepdim=True)
+                    total = total - 2 * falloff * (difference * change).sum(1, keepdim=True)
             taps.append(total)
         return torch.cat(taps, 1)
 
@@ -229,25 +229,25 @@ class _Exponent(Function):
         # Plain differentiable torch: recorded only when a second derivative is asked for.
         radius = ctx.radius
         _, need_distance, need_guides, need_scales, *_ = ctx.needs_input_grad
-        guides, scales = ctx.saved_tensors
-        pairs = _each(guides, scales, ctx.channels)
+        guides, falloffs = ctx.saved_tensors
+        pairs = _each(guides, falloffs, ctx.channels)
         to_distance = to_guides = to_scales = None
         if need_distance:
             to_distance = torch.zeros_like(gradient[:, :1])
             for tap, dy, dx in offsets(2 * radius + 1):
                 to_distance = torch.sub(to_distance, gradient[:, tap : tap + 1], alpha=dy * dy + dx * dx)
         if need_guides:
-            to_guides = torch.cat([padded_gradient(gradient, padded, scale, radius) for padded, scale in pairs], 1)
+            to_guides = torch.cat([padded_gradient(gradient, padded, falloff, radius) for padded, falloff in pairs], 1)
         if need_scales:
             to_scales = torch.cat([_scale_gradient(gradient, padded, radius) for padded, _ in pairs], 1)
         return gradient.to(ctx.dtype), to_distance, to_guides, to_scales, None, None
 
 
-def _each(guides: Tensor | None, scales: Tensor | None, channels: tuple[int, ...]) -> list[tuple[Tensor, Tensor]]:
-    """Each guide with its scale."""
-    if guides is None or scales is None:
+def _each(guides: Tensor | None, falloffs: Tensor | None, channels: tuple[int, ...]) -> list[tuple[Tensor, Tensor]]:
+    """Each guide with its falloff."""
+    if guides is None or falloffs is None:
         return []
-    return list(zip(torch.split(guides, list(channels), 1), torch.split(scales, 1, 1), strict=True))
+    return list(zip(torch.split(guides, list(channels), 1), torch.split(falloffs, 1, 1), strict=True))
 
 
 def _scale_gradient(gradient: Tensor, padded: Tensor, radius: int) -> Tensor:

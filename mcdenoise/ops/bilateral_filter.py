@@ -18,14 +18,14 @@ def _check(
     image: Tensor,
     kernel: Tensor,
     guides: Sequence[Tensor] = (),
-    scales: Sequence[Tensor] = (),
-    distance_scale: Tensor | None = None,
+    falloffs: Sequence[Tensor] = (),
+    distance_falloff: Tensor | None = None,
     *,
     normalize: str = "softmax",
     border: str = "replicate",
 ) -> None:
     check_shapes(image=(image, "B C H W"), kernel=(kernel, "B T H W"))
-    check_weights(kernel, guides, scales, distance_scale, normalize, border)
+    check_weights(kernel, guides, falloffs, distance_falloff, normalize, border)
 
 
 @op("numba", "triton", check=_check, differentiable=True)
@@ -33,8 +33,8 @@ def cross_bilateral_filter(
     image: Tensor,
     kernel: Tensor,
     guides: Sequence[Tensor] = (),
-    scales: Sequence[Tensor] = (),
-    distance_scale: Tensor | None = None,
+    falloffs: Sequence[Tensor] = (),
+    distance_falloff: Tensor | None = None,
     *,
     normalize: Normalize = "softmax",
     border: Border = "replicate",
@@ -49,8 +49,8 @@ def cross_bilateral_filter(
         image: ``(B, C, H, W)``, any unit and range.
         kernel: see :func:`cross_bilateral_weights`; any layout in memory, such as channels-last.
         guides: see :func:`cross_bilateral_weights`.
-        scales: see :func:`cross_bilateral_weights`.
-        distance_scale: see :func:`cross_bilateral_weights`.
+        falloffs: see :func:`cross_bilateral_weights`.
+        distance_falloff: see :func:`cross_bilateral_weights`.
         normalize: see :func:`cross_bilateral_weights`.
         border: what a tap outside the image sees: ``"replicate"`` the nearest edge pixel of image and guides,
             ``"zeros"`` zeros; ``"renormalize"`` leaves such taps out and divides by the sum of the weights that are
@@ -61,9 +61,9 @@ def cross_bilateral_filter(
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, ``K`` is even, the numbers of guides and scales differ, or a mode is unknown.
+        ValueError: shapes disagree, ``K`` is even, the numbers of guides and falloffs differ, or a mode is unknown.
 
-    Differentiable in ``image``, ``kernel``, ``guides``, ``scales`` and ``distance_scale``, to any order; second
+    Differentiable in ``image``, ``kernel``, ``guides``, ``falloffs`` and ``distance_falloff``, to any order; second
     derivatives are computed in plain torch.
 
     Source: the paper's Eqs. 4-8; Eisemann and Durand 2004, Petschnigg et al. 2004 (cross/joint bilateral filter).
@@ -78,7 +78,12 @@ def cross_bilateral_filter(
         [3.0, 3.0, 100.0]
     """
     weights = cross_bilateral_weights(
-        kernel.to(accumulator_dtype(kernel.dtype)), guides, scales, distance_scale, normalize=normalize, border=border
+        kernel.to(accumulator_dtype(kernel.dtype)),
+        guides,
+        falloffs,
+        distance_falloff,
+        normalize=normalize,
+        border=border,
     )
     # A tap that the softmax rejects has weight 0, and the weights of the others sum to 1 already.
     left_out = border == "renormalize" and normalize == "softmax"

@@ -66,8 +66,8 @@ def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) ->
         return image
     dtype = torch.promote_types(accumulator_dtype(image.dtype), accumulator_dtype(importance.dtype))
     logarithm = importance.to(dtype)
-    top = logarithm.detach()
-    window = _Window(top, torch.exp(logarithm - top), image.to(dtype))
+    maximum = logarithm.detach()
+    window = _Window(maximum, torch.exp(logarithm - maximum), image.to(dtype))
     for axis in (-1, -2):
         window = _along(window, axis, kernel_size)
     return window.mean.to(image.dtype)
@@ -80,12 +80,12 @@ class _Window(NamedTuple):
     """Of the window at each pixel.
 
     Args:
-        top: ``(B, 1, H, W)`` largest importance ``M``, without a derivative: the result does not depend on it.
+        maximum: ``(B, 1, H, W)`` largest importance ``M``, without a derivative: the result does not depend on it.
         weight: ``(B, 1, H, W)`` sum of ``exp(m - M)``.
         mean: ``(B, C, H, W)`` of the image.
     """
 
-    top: Tensor
+    maximum: Tensor
     weight: Tensor
     mean: Tensor
 
@@ -95,27 +95,27 @@ class _Window(NamedTuple):
 
     def joined(self, other: _Window) -> _Window:
         """With another window that has no pixel in common with it."""
-        top = torch.maximum(self.top, other.top)
-        own, others = self.weight * torch.exp(self.top - top), other.weight * torch.exp(other.top - top)
+        maximum = torch.maximum(self.maximum, other.maximum)
+        own, others = self.weight * torch.exp(self.maximum - maximum), other.weight * torch.exp(other.maximum - maximum)
         weight = own + others
         # Not by the difference of the means: the one with hardly any weight may be a lamp. A sum that is divided in the
         # end would leave the range where a mean does not.
         mean = torch.addcmul(own / weight * self.mean, others / weight, other.mean)
-        return _Window(top, weight, mean)
+        return _Window(maximum, weight, mean)
 
 
 def _along(window: _Window, axis: int, kernel_size: int) -> _Window:
     """Windows of as many pixels along an axis, of those inside the image, by the binary digits of the number."""
-    length, radius = window.top.shape[axis], kernel_size // 2
+    length, radius = window.maximum.shape[axis], kernel_size // 2
     margin = (radius, radius) if axis == -1 else (0, 0, radius, radius)
     # What is outside is worth nothing beside anything, and two such windows something, lest there be a 0 / 0.
-    worthless = torch.finfo(window.top.dtype).min
-    top, weight = F.pad(window.top, margin, value=worthless), F.pad(window.weight, margin, value=1.0)
-    level = _Window(top, weight, F.pad(window.mean, margin))
+    worthless = torch.finfo(window.maximum.dtype).min
+    maximum, weight = F.pad(window.maximum, margin, value=worthless), F.pad(window.weight, margin, value=1.0)
+    level = _Window(maximum, weight, F.pad(window.mean, margin))
     # The number is odd: the windows of one pixel are the first.
     found, covered, size = level.part(axis, 0, length), 1, 1
     while 2 * size <= kernel_size:
-        available = level.top.shape[axis] - size
+        available = level.maximum.shape[axis] - size
         level = level.part(axis, 0, available).joined(level.part(axis, size, available))
         size *= 2
         if kernel_size & size:

@@ -68,7 +68,7 @@ def parlour_cameras(frames: int = 8) -> list[Camera]:
 
 
 def parlour_moves(frames: int = 8) -> dict[str, Array]:
-    """The pillar's motion to the right, 7 centimetres per frame, as in :class:`mcdenoise.data.camera_path.Shot`.
+    """The pillar's motion to the right, 7 centimetres per frame, as in :class:`mcdenoise.data.camera_path.CameraPath`.
 
     Example:
         >>> parlour_moves(3)["pillar"].shape

@@ -1,7 +1,7 @@
 """A test suite of rendered frames that no model was trained on: its list of rows, its rendering, and its tables."""
 
 from mcdenoise.suite.close_ups import write_close_ups
-from mcdenoise.suite.rendering import Stage, open_row, render_suite, rows_there
+from mcdenoise.suite.rendering import Progress, open_row, render_suite, rows_there
 from mcdenoise.suite.rows import SHOTS, Row, Shot, choose_rows
 from mcdenoise.suite.tables import (
     PEERS,
@@ -21,9 +21,9 @@ __all__ = [
     "SHOWN",
     "Line",
     "MethodMean",
+    "Progress",
     "Row",
     "Shot",
-    "Stage",
     "choose_rows",
     "error_against_time",
     "error_lines",

@@ -33,7 +33,7 @@ _SEED, _REFERENCE_SEED = 77, 1_000_000
 _LENS, _FOCUS = 0.03, 3.4
 
 
-class Stage(NamedTuple):
+class Progress(NamedTuple):
     """Progress of the rendering.
 
     Args:
@@ -55,7 +55,7 @@ def render_suite(
     *,
     blender_python: Path | None = None,
     threads: int = 0,
-    on_stage: Callable[[Stage], None] = lambda stage: None,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> None:
     """Render the missing files of shots; a file gets its final name once it is complete.
 
@@ -65,7 +65,7 @@ def render_suite(
         blender_python: a Python interpreter that can import ``bpy``, for the shots of Cycles; by default as in
             :class:`mcdenoise.scenes.cycles.Blender`.
         threads: number of threads for Cycles; 0 uses all processors.
-        on_stage: called before each step.
+        on_progress: called before each step.
 
     Raises:
         InputError: a renderer is missing or failed, or the folder cannot be written or holds other files.
@@ -81,7 +81,7 @@ def render_suite(
         raise InputError(f"{data}: cannot be created ({error.strerror}); choose another folder with --data") from error
     steps = [(fraction, shot) for fraction in _FRACTIONS for shot in shots]
     for number, (fraction, shot) in enumerate(steps):
-        on_stage(Stage(shot.name, fraction, number, len(steps)))
+        on_progress(Progress(shot.name, fraction, number, len(steps)))
         if shot.renderer == "mitsuba":
             _render_mitsuba(shot, data, fraction)
         else:

@@ -44,7 +44,7 @@ _Start: TypeAlias = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Shot:
+class CachedShot:
     """Consecutive frames as the network's input, for one or more noise seeds.
 
     Args:
@@ -71,11 +71,11 @@ class Shot:
         height, width = self.colors[0].shape[-2:]
         return int(height), int(width)
 
-    def cut(self, frames: slice) -> Shot:
+    def cut(self, frames: slice) -> CachedShot:
         """Select consecutive frames; their history is kept."""
         features = {name: feature[frames] for name, feature in self.features.items()}
         noisy = tuple({name: feature[frames] for name, feature in own.items()} for own in self.noisy)
-        return Shot(tuple(color[frames] for color in self.colors), features, self.demodulated, noisy, self.parts)
+        return CachedShot(tuple(color[frames] for color in self.colors), features, self.demodulated, noisy, self.parts)
 
     def read(
         self,
@@ -127,7 +127,7 @@ class CachedSequence:
         sha256: checksum of all decoded noisy colors and references, as bytes of float32.
     """
 
-    shots: list[Shot]
+    shots: list[CachedShot]
     sha256: str
 
 
@@ -392,7 +392,7 @@ def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
                 _check(f"color of {first}", color, plan.color_shape(first))
             later = {name: feature[first:] for name, feature in features.items()}
             own = tuple({name: feature[first:] for name, feature in each.items()} for each in noisy)
-            shots.append(Shot(tuple(colors), later, plan.front.demodulates, own, plan.front.parts))
+            shots.append(CachedShot(tuple(colors), later, plan.front.demodulates, own, plan.front.parts))
         return CachedSequence(shots, str(about["sha256"]))
     except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError):
         return None

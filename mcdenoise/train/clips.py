@@ -18,7 +18,7 @@ from mcdenoise.models.accumulated import ALBEDO_HISTORY
 from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_CLEAN
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.ops import NO_ALBEDO, demodulate
-from mcdenoise.train.cache import Array, Shot
+from mcdenoise.train.cache import Array, CachedShot
 
 _KNOWN = frozenset(field.name for field in fields(Frame))
 
@@ -41,7 +41,7 @@ class Clip:
 
     @staticmethod
     def of(shot: dict[str, Tensor]) -> Clip:
-        """A clip with a batch of one from the result of :meth:`mcdenoise.train.cache.Shot.read`."""
+        """A clip with a batch of one from the result of :meth:`mcdenoise.train.cache.CachedShot.read`."""
         return Clip({name: buffer[None] for name, buffer in shot.items()})
 
     def __getitem__(self, name: str) -> Tensor:
@@ -110,7 +110,7 @@ class ClipSampler:
 
     def __init__(
         self,
-        shots: Iterable[Shot],
+        shots: Iterable[CachedShot],
         frames: int,
         crop: int,
         *,

@@ -11,7 +11,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.models import Needs
-from mcdenoise.train.cache import Shot, features_of, open_cached
+from mcdenoise.train.cache import CachedShot, features_of, open_cached
 from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
 from mcdenoise.train.front import Front
@@ -31,7 +31,7 @@ class TrainingData:
     """
 
     sampler: ClipSampler
-    watched: list[tuple[str, Shot]]
+    watched: list[tuple[str, CachedShot]]
     description: dict[str, Any]
 
 
@@ -95,8 +95,8 @@ class DataFolders:
             InputError: a file is damaged, or the cache cannot be written.
         """
         config = self.config
-        shots: list[Shot] = []
-        watched: list[tuple[str, Shot]] = []
+        shots: list[CachedShot] = []
+        watched: list[tuple[str, CachedShot]] = []
         entries: list[dict[str, Any]] = []
         for sequence in self.training:
             held = self._held_out(sequence)

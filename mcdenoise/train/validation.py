@@ -11,7 +11,7 @@ from torch import Tensor
 from mcdenoise.metrics import displayed, psnr_srgb, smape_linear
 from mcdenoise.models import Model, State
 from mcdenoise.ops import remodulate
-from mcdenoise.train.cache import Shot
+from mcdenoise.train.cache import CachedShot
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.losses import RESULT
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def validate(
     model: Model,
     stages: Iterable[str],
-    watched: list[tuple[str, Shot]],
+    watched: list[tuple[str, CachedShot]],
     fabric: Fabric,
     board: Any,
     step: int,

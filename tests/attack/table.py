@@ -251,9 +251,9 @@ def read_matrices(path: Path) -> object:
 
 
 def read_path(path: Path) -> object:
-    from mcdenoise.data.camera_path import load_shot
+    from mcdenoise.data.camera_path import load_camera_path
 
-    return load_shot(path)
+    return load_camera_path(path)
 
 
 def read_results(path: Path) -> object:

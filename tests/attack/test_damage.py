@@ -17,12 +17,14 @@ FIRST = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "command"), FIRST)
 def test_some_damage(attacker: Attacker, kind: str, command: str) -> None:
     failed = attacker.damaged(kind, command, range(len(PLACES), len(PLACES) + 3), "damaged files, some")
     assert not failed, "\n".join(failed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "command"), READ)
 def test_replaced_files(attacker: Attacker, kind: str, command: str) -> None:
     """Folders, pipes, devices, and links to nothing and to themselves instead of a file do not make a command hang."""

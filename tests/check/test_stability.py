@@ -46,7 +46,7 @@ def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
 # bfloat16 and float16 use the same code in the ops; `mcdenoise stability` checks all dtypes.
 # The check of second derivatives of 25 taps takes half a minute.
 # Ops whose many taps or cases take many seconds.
-LONG = {"atrous", "softmax_splat", "affinity_filter", "importance_filter"}
+LONG = {"atrous", "softmax_splat", "affinity_filter", "importance_filter", "moments_variance", "accumulate"}
 TRIED = [
     pytest.param(op, dtype, marks=[pytest.mark.slow] if op.name in LONG or dtype == torch.float16 else [])
     for op in OPS
@@ -85,9 +85,11 @@ def test_sums_in_half_precision_fail() -> None:
 def test_a_softmax_that_overflows_fails() -> None:
     op = BY_NAME["cross_bilateral_weights"]
 
-    def naive(kernel: Tensor, guides: Any, scales: Any, distance_scale: Any, *, normalize: str, border: str) -> Tensor:
+    def naive(
+        kernel: Tensor, guides: Any, falloffs: Any, distance_falloff: Any, *, normalize: str, border: str
+    ) -> Tensor:
         one = torch.ones_like(kernel)
-        falloff = op.function(one, guides, scales, distance_scale, normalize="none", border=border)
+        falloff = op.function(one, guides, falloffs, distance_falloff, normalize="none", border=border)
         weights = falloff * torch.exp(kernel)
         return weights / weights.sum(1, keepdim=True)
 
@@ -158,8 +160,8 @@ def test_the_reference_of_an_exponent_beyond_float64() -> None:
     logits, guide, scale, distance = (
         inputs["kernel"],
         inputs["guides"][0],
-        inputs["scales"][0],
-        inputs["distance_scale"],
+        inputs["falloffs"][0],
+        inputs["distance_falloff"],
     )
     with mpmath.workdps(60):
         for y, x in ((0, 0), (1, 2), (0, 1)):
@@ -235,7 +237,7 @@ def test_the_worst_check_comes_first() -> None:
 
 
 def test_the_checks_by_default_and_by_name() -> None:
-    names = [stage.name for stage in stability.stages()]
+    names = [group.name for group in stability.groups()]
     known = [op.name for op in op_checks.select()]
     assert names[: len(known)] == known
     models = names[len(known) :]
@@ -246,12 +248,12 @@ def test_the_checks_by_default_and_by_name() -> None:
         *(f"Denoiser, {name}" for name in models if name in list_models()),
         "long runs",
     ]
-    assert [stage.name for stage in stability.stages(["demodulate"])] == ["demodulate"]
-    named = [stage.name for stage in stability.stages(None, ["cascaded_v2_tiny"])]
+    assert [group.name for group in stability.groups(["demodulate"])] == ["demodulate"]
+    named = [group.name for group in stability.groups(None, ["cascaded_v2_tiny"])]
     assert named == ["cascaded_v2_tiny", "Denoiser, cascaded_v2_tiny"]
     for arguments in ((["sharpen"], None), (None, ["unet"])):
         with pytest.raises(InputError, match=r"(expected .* found sharpen|model 'unet': expected one of)"):
-            stability.stages(*arguments)
+            stability.groups(*arguments)
     with pytest.raises(InputError, match="found float8"):
         stability.parse_dtypes(["float32", "float8"])
 

@@ -126,6 +126,7 @@ def wait_for_frames(out: Path, count: int, process: subprocess.Popen[str]) -> No
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
+@pytest.mark.slow
 def test_a_killed_driver_takes_its_workers_along_and_the_next_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -316,8 +316,8 @@ class Constant(nn.Module):
         self.sizes: list[tuple[int, int]] = []
 
     def statistics(self, frame: Frame) -> dict[str, Tensor]:
-        top = torch.log1p(frame.color.amax((1, 2, 3), keepdim=True))
-        return {"exposure": torch.ones_like(top), "top": top}
+        maximum = torch.log1p(frame.color.amax((1, 2, 3), keepdim=True))
+        return {"exposure": torch.ones_like(maximum), "maximum": maximum}
 
     def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
         self.sizes.append(frame.size)
@@ -329,11 +329,11 @@ def test_a_method_sees_the_image_at_each_size_coarsest_first() -> None:
     output, state = CoarseToFine(toy, 3)(frame)
     assert toy.sizes == [(10, 13), (19, 26), (37, 51)]
     assert state is None
-    exposure, top = torch.ones(1, 1, 1, 1), torch.log1p(frame.color.amax((1, 2, 3), keepdim=True))
+    exposure, maximum = torch.ones(1, 1, 1, 1), torch.log1p(frame.color.amax((1, 2, 3), keepdim=True))
     half = downsample(frame.color)
     expected = downsample(half) + 1
-    expected = low_frequencies_of(half + 2, expected, top, exposure)
-    expected = low_frequencies_of(frame.color + 3, expected, top, exposure)
+    expected = low_frequencies_of(half + 2, expected, maximum, exposure)
+    expected = low_frequencies_of(frame.color + 3, expected, maximum, exposure)
     torch.testing.assert_close(output.image, expected)
     toy.sizes.clear()
     output, _ = CoarseToFine(toy, 1)(frame)
@@ -388,7 +388,7 @@ def test_low_frequencies_of_a_lamp_stay_off_the_wall_beside_it() -> None:
 
 def test_low_frequencies_are_differentiable() -> None:
     fine, coarse = (torch.rand(1, 1, side, 9 if side > 5 else 5, dtype=torch.float64) + 0.1 for side in (10, 5))
-    top = torch.full((1, 1, 1, 1), 5.0, dtype=torch.float64)
+    maximum = torch.full((1, 1, 1, 1), 5.0, dtype=torch.float64)
     arguments = (fine.requires_grad_(), coarse.requires_grad_())
-    assert torch.autograd.gradcheck(lambda *images: low_frequencies_of(*images, top), arguments)
-    assert torch.autograd.gradgradcheck(lambda *images: low_frequencies_of(*images, top), arguments)
+    assert torch.autograd.gradcheck(lambda *images: low_frequencies_of(*images, maximum), arguments)
+    assert torch.autograd.gradgradcheck(lambda *images: low_frequencies_of(*images, maximum), arguments)

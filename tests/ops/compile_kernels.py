@@ -46,11 +46,11 @@ def main(capability: int, dtype: torch.dtype) -> None:
     def image(channels: int) -> torch.Tensor:
         return torch.zeros(1, channels, 72, 128, dtype=dtype)
 
-    color, kernel, guides, scales = image(3), image(25), [image(3), image(1)], [image(1), image(1)]
+    color, kernel, guides, falloffs = image(3), image(25), [image(3), image(1)], [image(1), image(1)]
     _triton_filter.derivatives(color, color, kernel, (), (), None, False, "replicate")
     _triton_filter.filtered(color, kernel, (), (), None, False, "replicate")
-    _triton_filter.derivatives(color, color, kernel, guides, scales, image(1), True, "renormalize")
-    _triton_filter.derivatives(color, color, kernel, guides, scales, None, False, "zeros")
+    _triton_filter.derivatives(color, color, kernel, guides, falloffs, image(1), True, "renormalize")
+    _triton_filter.derivatives(color, color, kernel, guides, falloffs, None, False, "zeros")
     steps(image)
 
 

@@ -63,7 +63,16 @@ def is_that_of_the_reference(op: Op, case: Case, dtype: torch.dtype) -> None:
     assert_same(actual, exact, TOLERANCE[dtype])
 
 
-@pytest.mark.parametrize(("op", "case"), [pytest.param(*pair, id=f"{pair[0].name}-{pair[1].name}") for pair in CASES])
+def tried(pairs: list[tuple[Op, Case]]) -> list[Any]:
+    """Parameters of a test; all but the first two cases of an op are slow, as the interpreter is."""
+    return [
+        pytest.param(op, case, id=f"{op.name}-{case.name}", marks=[] if case in seen[:2] else pytest.mark.slow)
+        for op, case in pairs
+        if (seen := [other for each, other in pairs if each is op])
+    ]
+
+
+@pytest.mark.parametrize(("op", "case"), tried(CASES))
 def test_result_and_derivatives(op: Op, case: Case) -> None:
     is_that_of_the_reference(op, case, torch.float64)
 
@@ -129,7 +138,7 @@ def test_other_dtypes_beside_the_image() -> None:
     assert_same([of_kernel[0]], [of_kernel[1]], TOLERANCE[torch.bfloat16])
 
 
-@pytest.mark.parametrize("needed", [("image",), ("kernel",), ("scales",), ("guides",)])
+@pytest.mark.parametrize("needed", [("image",), ("kernel",), ("falloffs",), ("guides",)])
 def test_derivatives_of_some_arguments_only(needed: tuple[str, ...]) -> None:
     op = FAST[-1]
     case = drawn(1, 3, 2, 3, 3, op)
@@ -218,9 +227,7 @@ def test_every_step_of_the_default_model_has_a_form() -> None:
     assert names >= {"gated_fusion", "low_frequencies_of", "motion_from_position", "accumulate"}
 
 
-@pytest.mark.parametrize(
-    ("op", "case"), [pytest.param(*pair, id=f"{pair[0].name}-{pair[1].name}") for pair in STEP_CASES]
-)
+@pytest.mark.parametrize(("op", "case"), tried(STEP_CASES))
 def test_result_of_a_step(op: Op, case: Case) -> None:
     given = case.inputs()
     found: Any = {}
@@ -288,19 +295,29 @@ def test_lights_across_tiles() -> None:
 @pytest.mark.parametrize("logarithms", [True, False])
 def test_a_fusion_with_all_that_it_may_have(logarithms: bool) -> None:
     fine, coarse = draw(3, batch=2), draw(3, 5, 19, batch=2)
-    weight, bias, top = (
+    weight, bias, maximum = (
         torch.randn(1, 6, 3, 3).double(),
         torch.randn(1).double(),
         torch.full((2, 1, 1, 1), 0.4).double(),
     )
     residual = None if logarithms else draw(3, batch=2, dtype=torch.bfloat16)
-    is_plain(network.gated_fusion, 1e-12, fine, coarse, weight, bias, residual=residual, top=top, logarithms=logarithms)
+    is_plain(
+        network.gated_fusion,
+        1e-12,
+        fine,
+        coarse,
+        weight,
+        bias,
+        residual=residual,
+        maximum=maximum,
+        logarithms=logarithms,
+    )
 
 
 def test_low_frequencies_over_many_blocks() -> None:
     fine, coarse = draw(3, 27, 41), draw(3, 14, 21)
-    top, exposure = torch.full((1, 1, 1, 1), 0.9).double(), torch.full((1, 1, 1, 1), 2.0).double()
-    is_plain(network.low_frequencies_of, 1e-12, fine, coarse, top, exposure)
+    maximum, exposure = torch.full((1, 1, 1, 1), 0.9).double(), torch.full((1, 1, 1, 1), 2.0).double()
+    is_plain(network.low_frequencies_of, 1e-12, fine, coarse, maximum, exposure)
 
 
 def test_a_depth_of_more_pixels_than_threads() -> None:

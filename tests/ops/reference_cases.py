@@ -65,10 +65,10 @@ def drawn(batch: int, channels: int, height: int, width: int, kernel_size: int, 
 
         inputs: Inputs = {"image": draw(channels), "kernel": draw(kernel_size**2) + 0.1}
         if op.name == "cross_bilateral_filter":
-            inputs |= {"guides": [draw(3), draw(1)], "scales": [draw(1), 3 * draw(1)], "distance_scale": draw(1)}
+            inputs |= {"guides": [draw(3), draw(1)], "falloffs": [draw(1), 3 * draw(1)], "distance_falloff": draw(1)}
         return inputs
 
-    names = ("image", "kernel", "guides", "scales", "distance_scale")
+    names = ("image", "kernel", "guides", "falloffs", "distance_falloff")
     return Case("drawn", "ordinary", tensors, names if op.name == "cross_bilateral_filter" else names[:2], settings)
 
 

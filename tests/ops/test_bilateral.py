@@ -47,10 +47,10 @@ def test_plain_weights_are_kornias_joint_bilateral_blur(
 def test_eq_5_normalised_is_the_softmax_form(border: Any) -> None:
     logits = 4 * draw(2, 25, 5, 7) - 2
     guides = [draw(2, 3, 5, 7, seed=1), draw(2, 1, 5, 7, seed=2)]
-    scales = [5 * draw(2, 1, 5, 7, seed=3), 9 * draw(2, 1, 5, 7, seed=4)]
+    falloffs = [5 * draw(2, 1, 5, 7, seed=3), 9 * draw(2, 1, 5, 7, seed=4)]
     distance = draw(2, 1, 5, 7, seed=5)
-    letter = cross_bilateral_weights(logits.exp(), guides, scales, distance, normalize="none", border=border)
-    stable = cross_bilateral_weights(logits, guides, scales, distance, normalize="softmax", border=border)
+    letter = cross_bilateral_weights(logits.exp(), guides, falloffs, distance, normalize="none", border=border)
+    stable = cross_bilateral_weights(logits, guides, falloffs, distance, normalize="softmax", border=border)
     torch.testing.assert_close(letter / letter.sum(1, keepdim=True), stable, rtol=1e-10, atol=1e-14)
     torch.testing.assert_close(stable.sum(1), torch.ones(2, 5, 7, dtype=torch.float64), rtol=1e-12, atol=0)
 
@@ -140,7 +140,7 @@ def test_the_derivative_of_the_distance_scale_keeps_its_precision_under_autocast
     scale = torch.rand(1, 1, 6, 7, requires_grad=True)
     gradients = []
     for autocast in (False, True):
-        weights = cross_bilateral_weights(logits, distance_scale=scale)
+        weights = cross_bilateral_weights(logits, distance_falloff=scale)
         with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
             gradients += torch.autograd.grad(weights, scale, upstream)
     assert torch.equal(*gradients)

@@ -176,7 +176,7 @@ def test_is_exported_where_it_is_named() -> None:
         torch.testing.assert_close(program.module()(*arguments), by("torch", _Filter())(*arguments))
 
 
-@pytest.mark.parametrize("needed", [("image",), ("kernel",), ("scales",), ("guides",)])
+@pytest.mark.parametrize("needed", [("image",), ("kernel",), ("falloffs",), ("guides",)])
 def test_derivatives_of_some_arguments_only(needed: tuple[str, ...]) -> None:
     op = FAST[-1]
     case = drawn(1, 3, 5, 7, 3, op)
@@ -423,6 +423,7 @@ def test_without_a_folder_for_compiled_code_it_is_compiled_anew() -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_change_in_any_file_that_a_kernel_has_built_in_compiles_it_again(tmp_path: Path) -> None:
     """Numba itself looks at the file of the kernel alone."""
     shutil.copytree(Path(ops.__file__).parent, tmp_path / "mcdenoise" / "ops", ignore=shutil.ignore_patterns("__py*"))

@@ -53,18 +53,18 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
 
     coarse = layout(draw(1, batch, 3, (height + 1) // 2, (width + 1) // 2, dtype) + 1)
     weight, bias = draw(2, 1, 6, 3, 3, dtype) * 0.3, torch.tensor([0.2], dtype=dtype)
-    top = 1 + torch.arange(1, batch + 1, dtype=dtype).reshape(-1, 1, 1, 1)
+    maximum = 1 + torch.arange(1, batch + 1, dtype=dtype).reshape(-1, 1, 1, 1)
     radiance = layout(draw(3, batch, 3, height, width, dtype).exp())
     depth = draw(4, batch, 1, height, width, dtype).exp() * 20
     depth[..., 0, -1] = torch.inf
     scale = by("torch", network.depth_scale)(depth)
     depth = layout(depth)
-    exposure = top * 0.7
+    exposure = maximum * 0.7
     buffers = [some(5, 3), some(6, 3), depth, radiance]
     calls: list[Call] = [
-        (network.low_frequencies_of, [radiance, coarse.abs(), 2 * top], {}),
+        (network.low_frequencies_of, [radiance, coarse.abs(), 2 * maximum], {}),
         (network.gated_fusion, [some(7, 3), coarse, weight, bias], {}),
-        (network.gated_fusion, [some(7, 3), coarse, weight, bias], {"residual": some(8, 3), "top": top}),
+        (network.gated_fusion, [some(7, 3), coarse, weight, bias], {"residual": some(8, 3), "maximum": maximum}),
         (network.gated_fusion, [some(7, 3).abs(), coarse, weight, bias], {"logarithms": True}),
         (network.softplus, [some(9, 3) * 30, (10.0, 1000.0, 1.0)], {}),
         (network.network_input, [radiance, some(10, 11)], {}),
@@ -78,7 +78,7 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
         (
             network.buffers_input,
             [some(14, 3), *buffers, None, exposure, scale],
-            {"image_factor": top, "logarithms": False},
+            {"image_factor": maximum, "logarithms": False},
         ),
         (downsample, [some(13, 3)], {}),
     ]
@@ -242,9 +242,9 @@ def test_numbers_of_any_size() -> None:
     torch.testing.assert_close(found, torch.log1p(image), rtol=4e-7, atol=0, equal_nan=True)
     # And back again, where a fusion changes nothing: alpha is 0.
     logs = torch.log1p(image.nan_to_num(0, 1e38))
-    weight, bias, top = torch.zeros(1, 6, 3, 3), torch.tensor([-1e4]), torch.full((1, 1, 1, 1), 80.0)
+    weight, bias, maximum = torch.zeros(1, 6, 3, 3), torch.tensor([-1e4]), torch.full((1, 1, 1, 1), 80.0)
     given = (logs, downsample(logs), weight, bias)
-    fast, plain = (by(name, network.gated_fusion)(*given, top=top) for name in ("numba", "torch"))
+    fast, plain = (by(name, network.gated_fusion)(*given, maximum=maximum) for name in ("numba", "torch"))
     torch.testing.assert_close(fast, plain, rtol=1e-5, atol=0)
     torch.testing.assert_close(fast[..., :10], image[..., :10], rtol=1e-5, atol=1e-37)
 
@@ -252,8 +252,8 @@ def test_numbers_of_any_size() -> None:
 def test_nan_stays_where_it_is_and_below_zero_is_zero() -> None:
     fine = torch.full((1, 3, 6, 9), -1.0)
     fine[..., 2, 4] = torch.nan
-    weight, bias, top = torch.zeros(1, 6, 3, 3), torch.tensor([-1e4]), torch.ones(1, 1, 1, 1)
-    fused = by("numba", network.gated_fusion)(fine, torch.zeros(1, 3, 3, 5), weight, bias, top=top)
+    weight, bias, maximum = torch.zeros(1, 6, 3, 3), torch.tensor([-1e4]), torch.ones(1, 1, 1, 1)
+    fused = by("numba", network.gated_fusion)(fine, torch.zeros(1, 3, 3, 5), weight, bias, maximum=maximum)
     assert fused[..., 2, 4].isnan().all()
     assert fused[..., 3:, 6:].unique().tolist() == [0]
 

@@ -188,6 +188,7 @@ def run(folder: Path, before: str = "") -> list[float]:
     return [hits, misses]
 
 
+@pytest.mark.slow
 def test_an_op_outlives_whatever_becomes_of_its_cache(tmp_path: Path) -> None:
     # Every write beyond 4 KB fails, as on a full disk.
     full = "import resource, signal; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"

@@ -111,8 +111,8 @@ def test_a_broken_pixel_reaches_its_window_and_no_further(
 def test_bilateral_weights_are_weights(data: st.DataObject, size: Size, dtype: Any, border: Any, side: int) -> None:
     logits = data.draw(images(size, dtype, st.floats(-1e4, 1e4) | st.just(-math.inf) | st.just(math.inf), side * side))
     guide = data.draw(images(size, dtype, st.floats(-1e10, 1e10)))
-    scales = [data.draw(images(size, dtype, st.floats(0, 1e8), 1)) for _ in range(2)]
-    weights = ops.cross_bilateral_weights(logits, [guide], scales[:1], scales[1], border=border)
+    falloffs = [data.draw(images(size, dtype, st.floats(0, 1e8), 1)) for _ in range(2)]
+    weights = ops.cross_bilateral_weights(logits, [guide], falloffs[:1], falloffs[1], border=border)
     assert weights.dtype == dtype
     assert bool((weights >= 0).all())
     total = weights.double().sum(1)

@@ -126,7 +126,7 @@ def test_rendering_resumes_and_shares_references(tmp_path: Path, two_shots: list
     # Rendering so small an image takes less time than compiling a kernel.
     mitsuba.set_variant("scalar_rgb")
     stages = []
-    render_suite(two_shots, tmp_path, on_stage=stages.append)
+    render_suite(two_shots, tmp_path, on_progress=stages.append)
     assert [(stage.shot, stage.fraction) for stage in stages] == [
         ("tiny-1", 0.25),
         ("tiny-2", 0.25),

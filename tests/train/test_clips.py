@@ -10,19 +10,19 @@ from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.ops import motion_from_position, remodulate
-from mcdenoise.train.cache import Shot
+from mcdenoise.train.cache import CachedShot
 from mcdenoise.train.clips import Clip, ClipSampler
 from mcdenoise.train.front import ACCUMULATED
 
 PARTS = {**ACCUMULATED, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
 
 
-def shot_of(stack: Tensor, *more_colors: Tensor) -> Shot:
+def shot_of(stack: Tensor, *more_colors: Tensor) -> CachedShot:
     """A shot that lies in memory, from ``(T, 17, H, W)`` and further noise seeds ``(T, 7, H, W)``."""
     color, *features = (part.numpy() for part in stack.split([7, *list(PARTS.values())[3:]], 1))
     names = list(PARTS)[3:]
     colors = (color, *(more.numpy() for more in more_colors))
-    return Shot(colors, dict(zip(names, features, strict=True)), demodulated=True)
+    return CachedShot(colors, dict(zip(names, features, strict=True)), demodulated=True)
 
 
 def clip_of(stack: Tensor) -> Clip:
@@ -215,7 +215,7 @@ def test_motion_is_flipped_and_turned_with_the_image() -> None:
     motion = torch.stack([torch.zeros(2, size, size), torch.stack([x - columns, y - rows]).float()])
     motion[1, :, 4, 4] = torch.inf
     features = {"motion": motion.numpy(), "depth": depth.numpy(), "reference": torch.ones(2, 3, size, size).numpy()}
-    shot = Shot((torch.ones(2, 3, size, size).numpy(),), features)
+    shot = CachedShot((torch.ones(2, 3, size, size).numpy(),), features)
     clip = ClipSampler([shot], 2, size).draw(list(range(40)))
     views = {tuple(view[0, 0].flatten().tolist()) for view in clip["depth"]}
     assert len(views) == 8
@@ -239,7 +239,7 @@ def test_the_camera_sees_the_crop_as_the_motion_has_it() -> None:
     features = {"position": position, "motion": motion, "view_projection": views}
     arrays = {name: value.numpy() for name, value in features.items()}
     arrays["reference"] = torch.ones(3, 3, height, width).numpy()
-    shot = Shot((torch.ones(3, 3, height, width).numpy(),), arrays)
+    shot = CachedShot((torch.ones(3, 3, height, width).numpy(),), arrays)
     clip = ClipSampler([shot], 3, crop).draw(list(range(40)))
     found = motion_from_position(clip["position"][:, 1].contiguous(), clip["view_projection"][:, 0].contiguous())
     # Pixel coordinates of some 100, of which float32 knows 1e-5; measured: 2e-5.

@@ -24,8 +24,8 @@ __all__ = [
     "DTYPES",
     "FRAMES",
     "Check",
+    "Group",
     "LongRun",
-    "Stage",
     "Summary",
     "as_json",
     "check_case",
@@ -33,15 +33,15 @@ __all__ = [
     "check_model",
     "check_op",
     "check_stability",
+    "groups",
     "long_runs",
     "parse_dtypes",
-    "stages",
     "summarize",
 ]
 
 
 @dataclass(frozen=True)
-class Stage:
+class Group:
     """A group of checks.
 
     Args:
@@ -53,12 +53,12 @@ class Stage:
     run: Callable[[], Iterable[Check | LongRun]]
 
 
-def stages(
+def groups(
     ops: Sequence[str] | None = None,
     models: Sequence[str] | None = None,
     dtypes: Sequence[torch.dtype] = DTYPES,
     frames: int = FRAMES,
-) -> list[Stage]:
+) -> list[Group]:
     """The groups of checks: ops, then models, then the denoiser, then long runs.
 
     Args:
@@ -77,10 +77,10 @@ def stages(
     chosen_ops = _ops.select(ops) if everything or ops is not None else []
     chosen_models = _available(models) if everything or models is not None else []
     return [
-        *(Stage(op.name, partial(_ops.check_op, op, dtypes)) for op in chosen_ops),
-        *(Stage(name, partial(_models.check_model, name, dtypes)) for name in chosen_models),
-        *(Stage(f"Denoiser, {name}", partial(_denoiser.check_denoiser, name, dtypes)) for name in chosen_models),
-        *([Stage("long runs", partial(_long_runs.long_runs, dtypes, frames))] if everything else []),
+        *(Group(op.name, partial(_ops.check_op, op, dtypes)) for op in chosen_ops),
+        *(Group(name, partial(_models.check_model, name, dtypes)) for name in chosen_models),
+        *(Group(f"Denoiser, {name}", partial(_denoiser.check_denoiser, name, dtypes)) for name in chosen_models),
+        *([Group("long runs", partial(_long_runs.long_runs, dtypes, frames))] if everything else []),
     ]
 
 

@@ -51,7 +51,7 @@ class _Inputs(NamedTuple):
     kernel: Source
     image: Source
     guides: tuple[Source, ...]
-    scales: tuple[Source, ...]
+    falloffs: tuple[Source, ...]
     distance: Source
     height: int
     width: int
@@ -64,8 +64,8 @@ def filtered(
     image: Tensor,
     kernel: Tensor,
     guides: Sequence[Tensor],
-    scales: Sequence[Tensor],
-    distance_scale: Tensor | None,
+    falloffs: Sequence[Tensor],
+    distance_falloff: Tensor | None,
     log_domain: bool,
     border: Border,
 ) -> Tensor:
@@ -73,7 +73,7 @@ def filtered(
     dtype = _compute_dtype(image, kernel)
     out = torch.empty(image.shape, dtype=dtype, device="cpu")
     if out.numel():
-        inputs = _inputs(dtype, image, kernel, guides, scales, distance_scale, log_domain, border)
+        inputs = _inputs(dtype, image, kernel, guides, falloffs, distance_falloff, log_domain, border)
         share_rows(image, lambda *rows: _forward(out.numpy(), inputs, *rows))
     return out.to(image.dtype)
 
@@ -88,22 +88,22 @@ def derivatives(
     image: Tensor,
     kernel: Tensor,
     guides: Sequence[Tensor],
-    scales: Sequence[Tensor],
-    distance_scale: Tensor | None,
+    falloffs: Sequence[Tensor],
+    distance_falloff: Tensor | None,
     log_domain: bool,
     border: Border,
     of_guides: bool = False,
     of_kernel: bool = True,
 ) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], Tensor]:
-    """Of the image, kernel, guides, scales and distance scale, times ``gradient``; those of guides only if asked for.
+    """Of the image, kernel, guides, falloffs and distance scale, times ``gradient``; those of guides only if asked for.
 
     All but the first need the slope of every weight, so that without that of the kernel there is none of them.
     Each has the dtype and shape of what it is the derivative of; what is absent or not asked for is empty.
     """
     dtype = _compute_dtype(image, kernel)
     batch, _, height, width = image.shape
-    of_scales = [torch.empty((batch, 1, height, width), dtype=dtype, device="cpu") for _ in scales]
-    of_distance = torch.empty((batch, 0 if distance_scale is None else 1, height, width), dtype=dtype, device="cpu")
+    of_scales = [torch.empty((batch, 1, height, width), dtype=dtype, device="cpu") for _ in falloffs]
+    of_distance = torch.empty((batch, 0 if distance_falloff is None else 1, height, width), dtype=dtype, device="cpu")
     planes = [image, *(guides if of_guides else ())]
     scattered = torch.empty((batch, sum(plane.shape[1] for plane in planes), height, width), dtype=dtype, device="cpu")
     slopes = torch.empty_like(kernel if of_kernel else kernel[:, :0], dtype=readable(kernel, dtype).dtype)
@@ -111,7 +111,7 @@ def derivatives(
         for result in (scattered, slopes, of_distance, *of_scales):
             result.zero_()
     elif scattered.numel():
-        inputs = _inputs(dtype, image, kernel, guides, scales, distance_scale, log_domain, border)
+        inputs = _inputs(dtype, image, kernel, guides, falloffs, distance_falloff, log_domain, border)
         upstream = source(gradient.to(dtype))
         results = (
             scattered.numpy(),
@@ -135,8 +135,8 @@ def derivatives(
         of_image,
         slopes.to(kernel.dtype),
         guide_gradients,
-        [part.to(scale.dtype) for part, scale in zip(of_scales, scales, strict=True)],
-        of_distance if distance_scale is None else of_distance.to(distance_scale.dtype),
+        [part.to(scale.dtype) for part, scale in zip(of_scales, falloffs, strict=True)],
+        of_distance if distance_falloff is None else of_distance.to(distance_falloff.dtype),
     )
 
 
@@ -149,8 +149,8 @@ def _inputs(
     image: Tensor,
     kernel: Tensor,
     guides: Sequence[Tensor],
-    scales: Sequence[Tensor],
-    distance_scale: Tensor | None,
+    falloffs: Sequence[Tensor],
+    distance_falloff: Tensor | None,
     log_domain: bool,
     border: Border,
 ) -> _Inputs:
@@ -159,8 +159,8 @@ def _inputs(
         source(readable(kernel, dtype)),
         source(image.to(dtype)),
         _filled_up([source(guide.to(dtype)) for guide in guides], nothing),
-        _filled_up([source(scale.to(dtype)) for scale in scales], nothing),
-        nothing if distance_scale is None else source(distance_scale.to(dtype)),
+        _filled_up([source(scale.to(dtype)) for scale in falloffs], nothing),
+        nothing if distance_falloff is None else source(distance_falloff.to(dtype)),
         image.shape[2],
         image.shape[3],
         kernel_size_of(kernel.shape[1], "kernel"),
@@ -259,7 +259,7 @@ def _weigh(
     inverse: Any,
     ring: Any,
     falloff: Any,
-    top: Any,
+    maximum: Any,
     inputs: Any,
     b: int,
     y: int,
@@ -270,7 +270,7 @@ def _weigh(
 
     Where the weights are the kernel, nothing is multiplied, and ``factors`` may have no rows.
     """
-    kernel, image, guides, scales, distance, height, width, kernel_size, log_domain, border = inputs
+    kernel, image, guides, falloffs, distance, height, width, kernel_size, log_domain, border = inputs
     radius = kernel_size // 2
     taps = weights.shape[0]
     guided = _is_guided(inputs)
@@ -283,7 +283,7 @@ def _weigh(
     else:
         factors[:, :n] = 0 if adjusted else 1
     if guided:
-        _read_scales(falloff, scales, distance, b, y, x0, n)
+        _read_falloffs(falloff, falloffs, distance, b, y, x0, n)
         centres = ring[y % kernel_size]
         for t in range(taps):
             dy, dx = t // kernel_size - radius, t % kernel_size - radius
@@ -311,18 +311,18 @@ def _weigh(
                     # An infinite weight times nothing is NaN.
                     weights[t, start:stop] = 0
     if log_domain:
-        top[:] = weights[0, :n]
+        maximum[:] = weights[0, :n]
         for t in range(1, taps):
-            _maximum(top, weights[t, :n])
+            _maximum(maximum, weights[t, :n])
         inverse[:] = 0
         for t in range(taps):
-            _exponential(weights[t, :n], top)
+            _exponential(weights[t, :n], maximum)
             add(inverse, weights[t, :n])
     else:
-        top[:] = 0
+        maximum[:] = 0
         inverse[:] = 0 if border == _RENORMALIZE else 1
         for t in range(taps if adjusted else 0):
-            _exponential(factors[t, :n], top)
+            _exponential(factors[t, :n], maximum)
             multiply(weights[t, :n], factors[t, :n])
             if border == _RENORMALIZE:
                 add(inverse, weights[t, :n])
@@ -333,15 +333,15 @@ def _weigh(
 
 
 @compiled
-def _read_scales(falloff: Any, scales: Any, distance: Any, b: int, y: int, x0: int, n: int) -> None:
-    for g in range(len(scales)):
-        if scales[g][2] > 0:
-            strides = scales[g][1]
-            copy_row(falloff[g, :n], scales[g], b * strides[0] + y * strides[2] + x0 * strides[3], strides[3])
+def _read_falloffs(falloff: Any, falloffs: Any, distance: Any, b: int, y: int, x0: int, n: int) -> None:
+    for g in range(len(falloffs)):
+        if falloffs[g][2] > 0:
+            strides = falloffs[g][1]
+            copy_row(falloff[g, :n], falloffs[g], b * strides[0] + y * strides[2] + x0 * strides[3], strides[3])
     if distance[2] > 0:
         strides = distance[1]
         start = b * strides[0] + y * strides[2] + x0 * strides[3]
-        copy_row(falloff[len(scales), :n], distance, start, strides[3])
+        copy_row(falloff[len(falloffs), :n], distance, start, strides[3])
 
 
 @compiled
@@ -387,8 +387,8 @@ def _forward(out: Any, inputs: Any, b: int, first: int, last: int) -> None:
     weights = np.empty((taps, chunk), out.dtype)
     adjusted = _is_guided(inputs) or inputs.border == _RENORMALIZE
     factors = np.empty((taps if adjusted and not log_domain else 0, chunk), out.dtype)
-    falloff = np.empty((len(inputs.scales) + 1, chunk), out.dtype)
-    inverse, top = np.empty(chunk, out.dtype), np.empty(chunk, out.dtype)
+    falloff = np.empty((len(inputs.falloffs) + 1, chunk), out.dtype)
+    inverse, maximum = np.empty(chunk, out.dtype), np.empty(chunk, out.dtype)
     for row in range(first - radius, last + radius):
         _fetch_all(ring, inputs, b, row)
         y = row - radius
@@ -396,7 +396,7 @@ def _forward(out: Any, inputs: Any, b: int, first: int, last: int) -> None:
             continue
         for x0 in range(0, width, chunk):
             n = min(chunk, width - x0)
-            _weigh(weights, factors, inverse[:n], ring, falloff, top[:n], inputs, b, y, x0, n)
+            _weigh(weights, factors, inverse[:n], ring, falloff, maximum[:n], inputs, b, y, x0, n)
             out[b, :, y, x0 : x0 + n] = 0
             for t in range(taps):
                 start = x0 + t % kernel_size
@@ -424,9 +424,9 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
     sums = np.zeros((kernel_size, scattered.shape[1], width + 2 * radius), dtype)
     weights, slopes = np.empty((taps, chunk), dtype), np.empty((taps, chunk), dtype)
     factors = np.empty((0 if log_domain else taps, chunk), dtype)
-    falloff = np.empty((len(inputs.scales) + 1, chunk), dtype)
+    falloff = np.empty((len(inputs.falloffs) + 1, chunk), dtype)
     upstream = np.empty((channels, chunk), dtype)
-    inverse, top, total = np.empty(chunk, dtype), np.empty(chunk, dtype), np.empty(chunk, dtype)
+    inverse, maximum, total = np.empty(chunk, dtype), np.empty(chunk, dtype), np.empty(chunk, dtype)
     start_row, end_row = max(first - radius, 0), min(last + radius, height)
     normalised = log_domain or border == _RENORMALIZE
     for row in range(start_row - radius, end_row + radius):
@@ -439,7 +439,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
         for x0 in range(0, width, chunk):
             n = min(chunk, width - x0)
             scale, shared = inverse[:n], total[:n]
-            _weigh(weights, factors, scale, ring, falloff, top[:n], inputs, b, y, x0, n)
+            _weigh(weights, factors, scale, ring, falloff, maximum[:n], inputs, b, y, x0, n)
             strides = gradient[1]
             for c in range(channels):
                 start = b * strides[0] + c * strides[1] + y * strides[2] + x0 * strides[3]
@@ -486,7 +486,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
             if mine:
                 _scale_slopes(of_scales, of_distance, exponents, ring, inputs, b, y, x0, n)
             if of_guides:
-                _guide_slopes(sums, exponents, falloff, top[:n], ring, inputs, y, x0, n, first, last)
+                _guide_slopes(sums, exponents, falloff, maximum[:n], ring, inputs, y, x0, n, first, last)
         done = y - radius
         if first <= done < last:
             _finish(scattered, sums, b, done, radius, border)
@@ -508,11 +508,11 @@ def _scale_slopes(
 ) -> None:
     """``-sum_t slope_t |difference_t|^2`` for each guide, and with the offsets for the distance."""
     taps = slopes.shape[0]
-    guides, scales, kernel_size = inputs.guides, inputs.scales, inputs.kernel_size
+    guides, falloffs, kernel_size = inputs.guides, inputs.falloffs, inputs.kernel_size
     radius, channel = kernel_size // 2, inputs.image[2]
     for g in range(len(guides)):
         end = channel + guides[g][2]
-        if scales[g][2] > 0:
+        if falloffs[g][2] > 0:
             result = of_scales[g][b, 0, y, x0 : x0 + n]
             result[:] = 0
             centres = ring[y % kernel_size, channel:end]

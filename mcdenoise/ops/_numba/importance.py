@@ -52,28 +52,28 @@ def _average(out: Any, image: Any, importance: Any, kernel_size: int, b: int, fi
     """Rows ``first`` to ``last`` of the result."""
     _, channels, height, width = out.shape
     radius = kernel_size // 2
-    tops, totals = np.empty((kernel_size, width), out.dtype), np.empty((kernel_size, width), out.dtype)
+    maxima, totals = np.empty((kernel_size, width), out.dtype), np.empty((kernel_size, width), out.dtype)
     means = np.empty((kernel_size, channels, width), out.dtype)
     pixels, weights = np.empty((channels + 1, width), out.dtype), np.empty((kernel_size, width), out.dtype)
-    top, total = np.empty(width, out.dtype), np.empty(width, out.dtype)
+    maximum, total = np.empty(width, out.dtype), np.empty(width, out.dtype)
     for row in range(max(first - radius, 0), last + radius):
         if row < height:
             for c in range(channels):
                 read_row(pixels[c], image, b, c, row, 0)
             read_row(pixels[channels], importance, b, 0, row, 0)
             at = row % kernel_size
-            _average_row(tops[at], totals[at], means[at], pixels, weights, radius)
+            _average_row(maxima[at], totals[at], means[at], pixels, weights, radius)
         y = row - radius
         if y < first:
             continue
         start, end = max(y - radius, 0), min(y + radius + 1, height)
-        top[:] = tops[start % kernel_size]
+        maximum[:] = maxima[start % kernel_size]
         for r in range(start + 1, end):
-            _maximum(top, tops[r % kernel_size])
+            _maximum(maximum, maxima[r % kernel_size])
         total[:] = 0
         for r in range(start, end):
             at = r % kernel_size
-            _weigh(weights[at], tops[at], top)
+            _weigh(weights[at], maxima[at], maximum)
             multiply(weights[at], totals[at])
             add(total, weights[at])
         out[b, :, y] = 0
@@ -85,14 +85,14 @@ def _average(out: Any, image: Any, importance: Any, kernel_size: int, b: int, fi
 
 
 @compiled
-def _average_row(top: Any, total: Any, mean: Any, pixels: Any, weights: Any, radius: int) -> None:
+def _average_row(maximum: Any, total: Any, mean: Any, pixels: Any, weights: Any, radius: int) -> None:
     """Of the window in one row: the largest importance, the sum of the weights beside it, and the mean."""
     channels, width = mean.shape
     importance = pixels[channels]
-    top[:] = importance
+    maximum[:] = importance
     for side in range(1, min(radius, width - 1) + 1):
-        _maximum(top[: width - side], importance[side:])
-        _maximum(top[side:], importance[: width - side])
+        _maximum(maximum[: width - side], importance[side:])
+        _maximum(maximum[side:], importance[: width - side])
     total[:] = 0
     mean[:] = 0
     # Of what is outside of the image there is nothing to add.
@@ -100,7 +100,7 @@ def _average_row(top: Any, total: Any, mean: Any, pixels: Any, weights: Any, rad
     for dx in range(-reach, reach + 1):
         start, end = max(-dx, 0), min(width - dx, width)
         weight = weights[dx + radius, start:end]
-        _weigh(weight, importance[start + dx : end + dx], top[start:end])
+        _weigh(weight, importance[start + dx : end + dx], maximum[start:end])
         add(total[start:end], weight)
     for dx in range(-reach, reach + 1):
         start, end = max(-dx, 0), min(width - dx, width)
@@ -111,15 +111,15 @@ def _average_row(top: Any, total: Any, mean: Any, pixels: Any, weights: Any, rad
 
 
 @compiled
-def _maximum(top: Any, values: Any) -> None:
-    for x in range(top.size):
-        top[x] = max(top[x], values[x])
+def _maximum(maximum: Any, values: Any) -> None:
+    for x in range(maximum.size):
+        maximum[x] = max(maximum[x], values[x])
 
 
 @compiled
-def _weigh(weights: Any, importance: Any, top: Any) -> None:
+def _weigh(weights: Any, importance: Any, maximum: Any) -> None:
     for x in range(weights.size):
-        weights[x] = exp(importance[x] - top[x])
+        weights[x] = exp(importance[x] - maximum[x])
 
 
 @compiled

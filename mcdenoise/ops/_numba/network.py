@@ -455,8 +455,8 @@ def _softplus_rows(out: Any, x: Any, units: Any, b: int, first: int, last: int) 
 @custom_op(
     "mcdenoise::gated_fusion",
     device_types="cpu",
-    schema="(Tensor fine, Tensor coarse, Tensor weight, Tensor bias, Tensor? residual, Tensor? top, bool logarithms) "
-    "-> Tensor",
+    schema="(Tensor fine, Tensor coarse, Tensor weight, Tensor bias, Tensor? residual, Tensor? maximum, "
+    "bool logarithms) -> Tensor",
 )
 def gated_fusion(
     fine: Tensor,
@@ -464,7 +464,7 @@ def gated_fusion(
     weight: Tensor,
     bias: Tensor,
     residual: Tensor | None,
-    top: Tensor | None,
+    maximum: Tensor | None,
     logarithms: bool,
 ) -> Tensor:
     """See :func:`mcdenoise.ops._steps.network.gated_fusion`."""
@@ -474,8 +474,8 @@ def gated_fusion(
         nothing = source(torch.empty((0, 0, 0, 0), dtype=dtype, device="cpu"))
         limits = (
             torch.empty(0, dtype=dtype, device="cpu")
-            if top is None
-            else top.to(dtype).expand(len(fine), 1, 1, 1).flatten()
+            if maximum is None
+            else maximum.to(dtype).expand(len(fine), 1, 1, 1).flatten()
         )
         arguments = (
             result.numpy(),
@@ -504,7 +504,7 @@ def _fuse(
     coarse: Any,
     weight: Any,
     bias: Any,
-    top: Any,
+    maximum: Any,
     logarithms: bool,
     b: int,
     first: int,
@@ -548,8 +548,8 @@ def _fuse(
             for c in range(channels):
                 values = out[b, c, row]
                 _add_share(values, ring[row % 4, c, 1 : width + 1], alpha, change[c])
-                if top.size:
-                    _to_radiance(values, top[b])
+                if maximum.size:
+                    _to_radiance(values, maximum[b])
 
 
 @compiled
@@ -624,17 +624,17 @@ def _add_share(out: Any, values: Any, fraction: Any, change: Any) -> None:
 
 
 @compiled
-def _to_radiance(values: Any, top: Any) -> None:
+def _to_radiance(values: Any, maximum: Any) -> None:
     zero = values.dtype.type(0)
     for x in range(values.size):
         # A comparison with a NaN is false, and the NaN stays.
         value = zero if values[x] < zero else values[x]
-        values[x] = expm1(top if value > top else value)
+        values[x] = expm1(maximum if value > maximum else value)
 
 
-def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor, exposure: Tensor | None) -> Tensor:
+def low_frequencies_of(fine: Tensor, coarse: Tensor, maximum: Tensor, exposure: Tensor | None) -> Tensor:
     """See :func:`mcdenoise.ops._steps.network.low_frequencies_of`."""
-    means, most = downsample(fine), torch.expm1(top)
+    means, most = downsample(fine), torch.expm1(maximum)
     for _ in range(BLOCK.bit_length() - 2):
         means, coarse = downsample(means), downsample(coarse)
     if exposure is not None:

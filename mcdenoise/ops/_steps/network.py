@@ -187,7 +187,7 @@ def gated_fusion(
     bias: Tensor,
     *,
     residual: Tensor | None = None,
-    top: Tensor | None = None,
+    maximum: Tensor | None = None,
     logarithms: bool = False,
 ) -> Tensor:
     """Fuse two scales with an ``alpha`` that a convolution of both predicts.
@@ -198,13 +198,13 @@ def gated_fusion(
     with the fine one changes nothing, as in the paper's Eq. 2.
 
     Args:
-        fine: ``(B, C, H, W)``, any unit; logarithms of radiance if there is a ``top``.
+        fine: ``(B, C, H, W)``, any unit; logarithms of radiance if there is a ``maximum``.
         coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` of the same unit and dtype.
         weight: ``(1, 2 C, 3, 3)``.
         bias: ``(1,)``.
         residual: ``(B, C, H, W)`` to be added to ``fine``, any dtype; none by default, nor with ``logarithms``.
-        top: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result, which is then handed out as radiance:
-            ``expm1`` of what is brought to the range from 0 to ``top``.
+        maximum: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result, which is then handed out as radiance:
+            ``expm1`` of what is brought to the range from 0 to ``maximum``.
         logarithms: whether to take those of ``fine``, which then is radiance: ``log1p``.
 
     Returns:
@@ -226,11 +226,11 @@ def gated_fusion(
         fused = detail + alpha * upsample(coarse - torch.log1p(downsample(fine)), size)
     else:
         fused = laplacian_fusion(detail, coarse, alpha)
-    return fused if top is None else torch.expm1(torch.minimum(fused.clamp_min(0), top))
+    return fused if maximum is None else torch.expm1(torch.minimum(fused.clamp_min(0), maximum))
 
 
 @op("numba", "triton")
-def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor, exposure: Tensor | None = None) -> Tensor:
+def low_frequencies_of(fine: Tensor, coarse: Tensor, maximum: Tensor, exposure: Tensor | None = None) -> Tensor:
     """An image with the means of another in the place of its own, over blocks of 8x8 pixels.
 
     ``fine * (U m(coarse) + e) / (U m(fine) + e)`` with the means ``m`` of blocks, interpolated bilinearly by ``U``.
@@ -239,13 +239,13 @@ def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor, exposure: Tens
     Args:
         fine: ``(B, C, H, W)`` radiance, up to 1e35 in units of a typical one.
         coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` of the same unit and dtype.
-        top: ``(B, 1, 1, 1)`` largest logarithm of the exposed radiance of the result.
+        maximum: ``(B, 1, 1, 1)`` largest logarithm of the exposed radiance of the result.
         exposure: ``(B, 1, 1, 1)`` factor that brings the radiance to units of a typical one; 1 by default.
 
     Returns:
-        ``(B, C, H, W)`` radiance, at most ``expm1(top) / exposure``.
+        ``(B, C, H, W)`` radiance, at most ``expm1(maximum) / exposure``.
     """
-    means, most = downsample(fine), torch.expm1(top)
+    means, most = downsample(fine), torch.expm1(maximum)
     for _ in range(BLOCK.bit_length() - 2):
         means, coarse = downsample(means), downsample(coarse)
     if exposure is not None:

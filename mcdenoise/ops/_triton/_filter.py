@@ -40,8 +40,8 @@ class _Inputs(NamedTuple):
     image: Tensor
     kernel: Tensor
     guides: Sequence[Tensor]
-    scales: Sequence[Tensor]
-    distance_scale: Tensor | None
+    falloffs: Sequence[Tensor]
+    distance_falloff: Tensor | None
     log_domain: bool
     border: Border
 
@@ -60,14 +60,14 @@ def filtered(
     image: Tensor,
     kernel: Tensor,
     guides: Sequence[Tensor],
-    scales: Sequence[Tensor],
-    distance_scale: Tensor | None,
+    falloffs: Sequence[Tensor],
+    distance_falloff: Tensor | None,
     log_domain: bool,
     border: Border,
 ) -> Tensor:
     """The filtered image, contiguous and in the dtype of ``image``."""
     out = _empty(image, image.dtype)
-    inputs = _Inputs(image, kernel, guides, scales, distance_scale, log_domain, border)
+    inputs = _Inputs(image, kernel, guides, falloffs, distance_falloff, log_domain, border)
     _run(_gather, inputs, out, _empty(image[:, :0], inputs.dtype))
     return out
 
@@ -83,27 +83,27 @@ def derivatives(
     image: Tensor,
     kernel: Tensor,
     guides: Sequence[Tensor],
-    scales: Sequence[Tensor],
-    distance_scale: Tensor | None,
+    falloffs: Sequence[Tensor],
+    distance_falloff: Tensor | None,
     log_domain: bool,
     border: Border,
     of_guides: bool = False,
 ) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], Tensor]:
-    """Of the image, kernel, guides, scales and distance scale, times ``gradient``; those of guides only if asked for.
+    """Of the image, kernel, guides, falloffs and distance scale, times ``gradient``; those of guides only if asked for.
 
     Each has the dtype and shape of what it is the derivative of; what is absent or not asked for is empty.
     """
-    inputs = _Inputs(image, kernel, guides, scales, distance_scale, log_domain, border)
+    inputs = _Inputs(image, kernel, guides, falloffs, distance_falloff, log_domain, border)
     mean, sums = _normalisation(inputs)
     of_kernel = torch.empty_like(kernel, dtype=inputs.dtype if of_guides else kernel.dtype)
-    of_scales = [_empty(scale, scale.dtype) for scale in scales]
-    of_distance = _empty(image[:, :0], image.dtype) if distance_scale is None else torch.empty_like(distance_scale)
+    of_scales = [_empty(scale, scale.dtype) for scale in falloffs]
+    of_distance = _empty(image[:, :0], image.dtype) if distance_falloff is None else torch.empty_like(distance_falloff)
     _run(_correlate, inputs, of_kernel, of_scales, of_distance, gradient, mean, sums)
     of_guide = []
     if of_guides:
         # The slope of an exponent is that of its logit, or its weight's times that weight.
         slopes = of_kernel if log_domain else of_kernel * kernel
-        of_guide = [guide_gradient(slopes, guide, scale, border) for guide, scale in zip(guides, scales, strict=True)]
+        of_guide = [guide_gradient(slopes, guide, scale, border) for guide, scale in zip(guides, falloffs, strict=True)]
     return _spread(gradient, inputs, sums), of_kernel.to(kernel.dtype), of_guide, of_scales, of_distance
 
 
@@ -148,12 +148,12 @@ def _is_wide(tensor: Tensor) -> bool:
 
 def _run(kernel: Any, inputs: _Inputs, *others: Tensor | Sequence[Tensor], margin: int = 0) -> None:
     """Run one of the kernels below on all tiles of the image, and of a margin around it."""
-    image, distance_scale = inputs.image, inputs.distance_scale
+    image, distance_falloff = inputs.image, inputs.distance_falloff
     if not image.numel():
         return
     batch, channels, height, width = image.shape
-    distance = image[:, :0] if distance_scale is None else distance_scale
-    arguments = *others, inputs.kernel, image, inputs.guides, inputs.scales, distance
+    distance = image[:, :0] if distance_falloff is None else distance_falloff
+    arguments = *others, inputs.kernel, image, inputs.guides, inputs.falloffs, distance
     tensors = [tensor for one in arguments for tensor in ([one] if isinstance(one, Tensor) else one)]
     grid = triton.cdiv(width + 2 * margin, _COLUMNS), triton.cdiv(height + 2 * margin, _ROWS), batch
     # Triton launches on the current device.
@@ -165,7 +165,7 @@ def _run(kernel: Any, inputs: _Inputs, *others: Tensor | Sequence[Tensor], margi
             KERNEL_SIZE=kernel_size_of(inputs.kernel.shape[1], "kernel"),
             CHANNELS=channels,
             GUIDES=tuple(guide.shape[1] for guide in inputs.guides),
-            DISTANCE=distance_scale is not None,
+            DISTANCE=distance_falloff is not None,
             LOG_DOMAIN=inputs.log_domain,
             NORMALISED=inputs.normalised,
             BORDER=BORDERS.index(inputs.border),
@@ -243,12 +243,12 @@ def _read_guides(
 
 
 @triton.jit
-def _read_scales(
-    scales: tl.tuple, b: tl.tensor, y: tl.tensor, x: tl.tensor, mask: tl.tensor, SUM: tl.constexpr
+def _read_falloffs(
+    falloffs: tl.tuple, b: tl.tensor, y: tl.tensor, x: tl.tensor, mask: tl.tensor, SUM: tl.constexpr
 ) -> tl.tuple:
     values = ()
-    for g in tl.static_range(len(scales)):
-        values = values + (_read_plane(scales[g], b, 0, y, x, mask, SUM),)
+    for g in tl.static_range(len(falloffs)):
+        values = values + (_read_plane(falloffs[g], b, 0, y, x, mask, SUM),)
     return values
 
 
@@ -338,7 +338,7 @@ def _gather(
     kernel: tl.tuple,
     image: tl.tuple,
     guides: tl.tuple,
-    scales: tl.tuple,
+    falloffs: tl.tuple,
     distance: tl.tuple,
     height: tl.tensor,
     width: tl.tensor,
@@ -360,10 +360,10 @@ def _gather(
     b, y, x = _tile(MARGIN, ROWS, COLUMNS, WIDE)
     mine = _is_inside(y, x, height, width)
     here = _read_guides(guides, b, y, x, mine, GUIDES, SUM)
-    falloff = _read_scales(scales, b, y, x, mine, SUM)
+    falloff = _read_falloffs(falloffs, b, y, x, mine, SUM)
     falloff_with_distance = _read_plane(distance, b, 0, y, x, mine, SUM) if DISTANCE else 0
     total = tl.zeros([ROWS * COLUMNS], SUM)
-    top = total - LARGEST if LOG_DOMAIN else total
+    maximum = total - LARGEST if LOG_DOMAIN else total
     result = _zeros(CHANNELS, ROWS * COLUMNS, SUM)
     for row in range(KERNEL_SIZE):
         for column in tl.static_range(KERNEL_SIZE):
@@ -388,9 +388,9 @@ def _gather(
             neighbours = _read(image, b, there_y, there_x, inside, CHANNELS, SUM)
             if LOG_DOMAIN:
                 # What was summed up so far was relative to the largest exponent until here.
-                higher = tl.maximum(top, exponent)
-                rescale, weight = tl.exp(top - higher), tl.exp(exponent - higher)
-                top, total, result = higher, total * rescale, _scaled(result, rescale)
+                higher = tl.maximum(maximum, exponent)
+                rescale, weight = tl.exp(maximum - higher), tl.exp(exponent - higher)
+                maximum, total, result = higher, total * rescale, _scaled(result, rescale)
             else:
                 weight = value * tl.exp(exponent)
             total += weight
@@ -400,7 +400,7 @@ def _gather(
         result = _scaled(result, inverse)
     for c in tl.static_range(CHANNELS):
         _write_plane(out, result[c], b, c, y, x, mine)
-    _write_plane(sums, top, b, 0, y, x, mine)
+    _write_plane(sums, maximum, b, 0, y, x, mine)
     _write_plane(sums, inverse, b, 1, y, x, mine)
 
 
@@ -415,7 +415,7 @@ def _correlate(
     kernel: tl.tuple,
     image: tl.tuple,
     guides: tl.tuple,
-    scales: tl.tuple,
+    falloffs: tl.tuple,
     distance: tl.tuple,
     height: tl.tensor,
     width: tl.tensor,
@@ -433,17 +433,17 @@ def _correlate(
     SUM: tl.constexpr,
     LARGEST: tl.constexpr,
 ) -> None:
-    """The derivatives in what a pixel has of its own: kernel, scales and distance scale."""
+    """The derivatives in what a pixel has of its own: kernel, falloffs and distance scale."""
     b, y, x = _tile(MARGIN, ROWS, COLUMNS, WIDE)
     mine = _is_inside(y, x, height, width)
     here = _read_guides(guides, b, y, x, mine, GUIDES, SUM)
-    falloff = _read_scales(scales, b, y, x, mine, SUM)
+    falloff = _read_falloffs(falloffs, b, y, x, mine, SUM)
     falloff_with_distance = _read_plane(distance, b, 0, y, x, mine, SUM) if DISTANCE else 0
     upstream = _read(gradient, b, y, x, mine, CHANNELS, SUM)
-    top = tl.zeros([ROWS * COLUMNS], SUM)
-    shared = top
+    maximum = tl.zeros([ROWS * COLUMNS], SUM)
+    shared = maximum
     if NORMALISED:
-        top = _read_plane(sums, b, 0, y, x, mine, SUM)
+        maximum = _read_plane(sums, b, 0, y, x, mine, SUM)
         upstream = _scaled(upstream, _read_plane(sums, b, 1, y, x, mine, SUM))
         # What the slopes of all weights have in common, since they are divided by their sum.
         shared = _dot(upstream, _read(mean, b, y, x, mine, CHANNELS, SUM))
@@ -470,7 +470,7 @@ def _correlate(
                 BORDER,
                 LARGEST,
             )
-            factor = tl.exp(exponent - top)
+            factor = tl.exp(exponent - maximum)
             neighbours = _read(image, b, there_y, there_x, inside, CHANNELS, SUM)
             slope = (_dot(upstream, neighbours) - shared) * factor
             _write_plane(of_kernel, slope, b, tap, y, x, mine)
@@ -491,7 +491,7 @@ def _scatter(
     kernel: tl.tuple,
     image: tl.tuple,
     guides: tl.tuple,
-    scales: tl.tuple,
+    falloffs: tl.tuple,
     distance: tl.tuple,
     height: tl.tensor,
     width: tl.tensor,
@@ -521,7 +521,7 @@ def _scatter(
             from_y, from_x = y - dy, x - dx
             inside = mine & _is_inside(from_y, from_x, height, width)
             squares = _squared_distances(guides, here, b, from_y, from_x, inside, GUIDES, SUM)
-            falloff = _read_scales(scales, b, from_y, from_x, inside, SUM)
+            falloff = _read_falloffs(falloffs, b, from_y, from_x, inside, SUM)
             falloff_with_distance = _read_plane(distance, b, 0, from_y, from_x, inside, SUM) if DISTANCE else 0
             value = _read_plane(kernel, b, row * KERNEL_SIZE + column, from_y, from_x, inside, SUM)
             square_offset = tl.cast(dy * dy + dx * dx, SUM)

@@ -262,19 +262,19 @@ def gated_fusion(
     weight: Tensor,
     bias: Tensor,
     residual: Tensor | None,
-    top: Tensor | None,
+    maximum: Tensor | None,
     logarithms: bool,
 ) -> Any:
     """See :func:`mcdenoise.ops._steps.network.gated_fusion`."""
     if logarithms and residual is not None:
         return NotImplemented
-    return _gated_fusion(fine, coarse, weight, bias, residual, top, logarithms)
+    return _gated_fusion(fine, coarse, weight, bias, residual, maximum, logarithms)
 
 
 @custom_op(
     "mcdenoise::triton_gated_fusion",
-    schema="(Tensor fine, Tensor coarse, Tensor weight, Tensor bias, Tensor? residual, Tensor? top, bool logarithms) "
-    "-> Tensor",
+    schema="(Tensor fine, Tensor coarse, Tensor weight, Tensor bias, Tensor? residual, Tensor? maximum, "
+    "bool logarithms) -> Tensor",
 )
 def _gated_fusion(
     fine: Tensor,
@@ -282,7 +282,7 @@ def _gated_fusion(
     weight: Tensor,
     bias: Tensor,
     residual: Tensor | None,
-    top: Tensor | None,
+    maximum: Tensor | None,
     logarithms: bool,
 ) -> Tensor:
     result = _empty_fused(fine, coarse, weight, bias, residual)
@@ -293,10 +293,10 @@ def _gated_fusion(
         _fuse,
         fine,
         sums_of(fine, coarse, residual),
-        *(result, fine, coarse, weights, residual, top),
+        *(result, fine, coarse, weights, residual, maximum),
         CHANNELS=channels,
         RESIDUAL=residual is not None,
-        TOP=top is not None,
+        MAXIMUM=maximum is not None,
         LOGARITHMS=logarithms,
     )
     return result
@@ -335,12 +335,12 @@ def _fuse(
     coarse: tl.tuple,
     weights: tl.tuple,
     residual: tl.tuple,
-    top: tl.tuple,
+    maximum: tl.tuple,
     height: tl.tensor,
     width: tl.tensor,
     CHANNELS: tl.constexpr,
     RESIDUAL: tl.constexpr,
-    TOP: tl.constexpr,
+    MAXIMUM: tl.constexpr,
     LOGARITHMS: tl.constexpr,
     ROWS: tl.constexpr,
     COLUMNS: tl.constexpr,
@@ -373,30 +373,30 @@ def _fuse(
             low = log1p(low)
         here = _detail(fine, residual, b, c, y, x, mine, RESIDUAL, LOGARITHMS, SUM)
         fused = here + alpha * (read_plane(coarse, b, c, y // 2, x // 2, mine, SUM) - low)
-        if TOP:
-            most = read_plane(top, b, 0, y * 0, x * 0, mine, SUM)
+        if MAXIMUM:
+            most = read_plane(maximum, b, 0, y * 0, x * 0, mine, SUM)
             fused = expm1(tl.minimum(tl.maximum(fused, 0), most))
         write_plane(out, fused, b, c, y, x, mine)
 
 
-def low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor, exposure: Tensor | None) -> Tensor:
+def low_frequencies_of(fine: Tensor, coarse: Tensor, maximum: Tensor, exposure: Tensor | None) -> Tensor:
     """See :func:`mcdenoise.ops._steps.network.low_frequencies_of`."""
-    result: Tensor = _low_frequencies_of(fine, coarse, top, exposure)
+    result: Tensor = _low_frequencies_of(fine, coarse, maximum, exposure)
     return result
 
 
 @custom_op(
     "mcdenoise::triton_low_frequencies_of",
-    schema="(Tensor fine, Tensor coarse, Tensor top, Tensor? exposure) -> Tensor",
+    schema="(Tensor fine, Tensor coarse, Tensor maximum, Tensor? exposure) -> Tensor",
 )
-def _low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor, exposure: Tensor | None) -> Tensor:
+def _low_frequencies_of(fine: Tensor, coarse: Tensor, maximum: Tensor, exposure: Tensor | None) -> Tensor:
     result = _empty_like(fine)
     if not fine.numel():
         return result
     means = _halved(fine)
     for _ in range(BLOCK.bit_length() - 2):
         means, coarse = _halved(means), _halved(coarse)
-    most = torch.expm1(top)
+    most = torch.expm1(maximum)
     if exposure is not None:
         means, coarse, most = means * exposure, coarse * exposure, most / exposure
     sums = sums_of(fine, coarse, most)

@@ -55,7 +55,7 @@ class Tracer:
         scene: see :func:`mcdenoise.scenes.render.render_sequence`.
         variant: one of ``VARIANTS``.
         max_depth: longest path, in segments.
-        moves: see :class:`mcdenoise.data.camera_path.Shot`.
+        moves: see :class:`mcdenoise.data.camera_path.CameraPath`.
 
     ``mitsuba`` is its module, ``scene`` and ``path`` are its scene and integrator, ``moving`` the moving shapes by id,
     and ``movers`` the list of these ids.
