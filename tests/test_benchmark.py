@@ -278,12 +278,13 @@ def test_nothing_is_left_of_a_run_that_is_interrupted(small_sequence: Path, out:
 
 
 def _spinning() -> list[str]:
-    """States of the processes that keep a core busy."""
+    """States of the processes of this test that keep a core busy."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             if folder.joinpath("cmdline").read_bytes().split(b"\0")[-2:-1] == [_SPIN.encode()]:
-                found.append(folder.joinpath("stat").read_text().rpartition(")")[2].split()[0])
+                state, parent = folder.joinpath("stat").read_text().rpartition(")")[2].split()[:2]
+                found += [state] if int(parent) == os.getpid() else []
         except OSError:
             continue
     return found

@@ -89,7 +89,7 @@ def in_one_place(frames: list[Frame]) -> Iterator[Frame]:
         yield place
 
 
-@pytest.mark.parametrize("anti_lag", [True, False])
+@pytest.mark.parametrize("anti_lag", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_renderer_may_write_every_frame_into_the_same_buffers(shot: list[Frame], anti_lag: bool) -> None:
     expected = denoised(shot, Denoiser(MODEL, anti_lag=anti_lag))
     denoiser = Denoiser(MODEL, anti_lag=anti_lag)
@@ -164,7 +164,7 @@ def test_an_image_is_an_ordinary_tensor_whatever_the_model_and_the_frame_are(mod
             torch.testing.assert_close(scale.grad, image.mean())
 
 
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+@pytest.mark.parametrize("error", [RuntimeError, pytest.param(KeyboardInterrupt, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["moving", "still", "motion vectors", "without albedo", "color"])
 def test_a_network_that_fails_leaves_the_past_as_it_was(name: str, error: type[BaseException]) -> None:
     shot = [SHOTS[name](number) for number in range(FRAMES)]
@@ -212,7 +212,7 @@ def test_one_absurdly_bright_pixel_is_replaced_and_counted(shot: list[Frame], pr
             assert denoiser.report.replaced_pixels == (number == 1), value
 
 
-@pytest.mark.parametrize("albedo", [None, 0.0, 1e-3, *(pytest.param(a, marks=pytest.mark.slow) for a in (0.04, 1.0))])
+@pytest.mark.parametrize("albedo", [None, 0.0, *(pytest.param(a, marks=pytest.mark.slow) for a in (1e-3, 0.04, 1.0))])
 @pytest.mark.parametrize("where", [slice(10, 11), pytest.param(slice(10, 20), marks=pytest.mark.slow), slice(None)])
 def test_the_largest_radiance_that_is_one_stays_finite(shot: list[Frame], where: slice, albedo: float | None) -> None:
     denoiser = Denoiser(MODEL)

@@ -167,13 +167,13 @@ def _gated_fusion(fine: Tensor, coarse: Tensor, weight: Tensor, bias: Tensor, *,
     return detail + alpha * (wide - (torch.log(1 + low) if logarithms else low))
 
 
-def _low_frequencies_of(fine: Tensor, coarse: Tensor, top: Tensor) -> Tensor:
-    fine, coarse, top = fine.double(), coarse.double(), top.double()
+def _low_frequencies_of(fine: Tensor, coarse: Tensor, maximum: Tensor) -> Tensor:
+    fine, coarse, maximum = fine.double(), coarse.double(), maximum.double()
     means = reference.downsample(reference.downsample(reference.downsample(fine)))
     wanted = reference.downsample(reference.downsample(coarse))
     wide, found = (F.interpolate(each, scale_factor=8.0, mode="bilinear") + 1e-3 for each in (wanted, means))
     rows, columns = slice(fine.shape[-2]), slice(fine.shape[-1])
-    return torch.minimum(fine * wide[..., rows, columns] / found[..., rows, columns], torch.exp(top) - 1)
+    return torch.minimum(fine * wide[..., rows, columns] / found[..., rows, columns], torch.exp(maximum) - 1)
 
 
 def _softplus(x: Tensor, *, units: tuple[float, ...]) -> Tensor:

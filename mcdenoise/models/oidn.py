@@ -77,19 +77,42 @@ class Oidn:
         """See :class:`mcdenoise.models.Model`.
 
         Raises:
+            InputError, RuntimeError: see :meth:`denoised`.
+        """
+        return Output(self.denoised(frame, self.auxiliary)), None
+
+    def denoised(self, frame: Frame, auxiliary: Auxiliary) -> Tensor:
+        """The denoised color ``(B, 3, H, W)``.
+
+        Args:
+            frame: uses color, albedo and normal.
+            auxiliary: in place of that of the object.
+
+        Raises:
             InputError: a derivative in the color is requested; it would silently be zero.
             RuntimeError: the library reports an error; the message is the library's.
         """
         if torch.is_grad_enabled() and frame.color.requires_grad:
             raise InputError("oidn: expected a color without gradients, found one with; the library has no derivatives")
+        if auxiliary == "prefiltered":
+            frame = self.with_clean_features(frame, "high")
         with timed("network", frame.color.device), torch.no_grad():
-            # The library accepts a normal only together with an albedo.
-            given = {"albedo": frame.albedo, "normal": frame.normal if frame.albedo is not None else None}
-            guides = {name: image for name, image in given.items() if image is not None}
-            if self.auxiliary == "prefiltered":
-                guides = {name: self._run({name: image}, "high", clean=False) for name, image in guides.items()}
-            image = self._run({"color": frame.color, **guides}, self.quality, clean=self.auxiliary != "noisy")
-        return Output(image.to(frame.color.dtype)), None
+            image = self._run({"color": frame.color, **_guides(frame)}, self.quality, clean=auxiliary != "noisy")
+        return image.to(frame.color.dtype)
+
+    def with_clean_features(self, frame: Frame, quality: Quality) -> Frame:
+        """The frame with denoised albedo and normal, each denoised by itself.
+
+        Args:
+            frame: any.
+            quality: of these filters; fast and balanced use the same network.
+
+        Raises:
+            RuntimeError: the library reports an error; the message is the library's.
+        """
+        with timed("network", frame.color.device), torch.no_grad():
+            clean = {name: self._run({name: image}, quality, clean=False) for name, image in _guides(frame).items()}
+        return frame.replace(**{name: image.to(getattr(frame, name).dtype) for name, image in clean.items()})
 
     def _run(self, images: dict[str, Tensor], quality: Quality, *, clean: bool) -> Tensor:
         """Run the filter for the given images ``(B, 3, H, W)``, one image of the batch at a time."""
@@ -166,6 +189,12 @@ def oidn(
     if source == "accumulated after":
         return Chain(denoised=denoiser, accumulated=Demodulated(Accumulated(Noisy(), lag_threshold=math.inf)))
     return denoiser
+
+
+def _guides(frame: Frame) -> dict[str, Tensor]:
+    """The features that the library accepts; a normal only together with an albedo."""
+    given = {"albedo": frame.albedo, "normal": frame.normal if frame.albedo is not None else None}
+    return {name: image for name, image in given.items() if image is not None}
 
 
 def _check(name: str, value: str, known: Any) -> None:

@@ -27,7 +27,7 @@ def oidn_pyramid(
     *,
     quality: Quality = "high",
     threads: int | None = None,
-    history: float = 10.0,
+    history: float = 4.0,
 ) -> Model:
     """Combine Open Image Denoise (optional package pyoidn) with a network on the noisy pixels, and stabilize over time.
 

@@ -2,9 +2,9 @@
 
 The library denoises every frame separately: single images are state of the art, but sequences flicker. It also has to
 be told whether albedo and normal have noise, which rarely holds for a whole image: they are exact on a wall, and noisy
-behind glass, in a blurred mirror and out of focus. This method runs the library for noisy and for clean features. The
-mean of both is about as good as the better one, without having to know which one that is. Then the previous result is
-blended in. No weights are learnt.
+behind glass, in a blurred mirror and out of focus. This method runs the library for noisy features and for clean ones,
+which it denoises first unless they are exact. The mean of both images is about as good as the better one, without
+having to know which one that is. Then the previous result is blended in. No weights are learnt.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.models.with_oidn import EXACT, OIDN, OIDN_CLEAN, WithOidn
 
-# Weight of the image for clean features relative to that for noisy ones, if features are noisy and if they are exact.
-_CLEAN_PARTS = (1.0, 3.0)
+# Weight of the image for clean features relative to that for noisy ones, if they were denoised and if they are exact.
+_CLEAN_PARTS = (2.0, 3.0)
 
 
 class Mixed(nn.Module):
     """A weighted mean of Open Image Denoise's images: ``(oidn + a oidn_clean) / (1 + a)``.
 
-    The weight a is 3 if the features are exact, else 1.
+    The weight a is 3 if the features are exact, else 2.
     :class:`mcdenoise.models.with_oidn.WithOidn` provides both images.
     """
 
@@ -49,7 +49,7 @@ class Mixed(nn.Module):
 
 
 @register_model("oidn_temporal", kind="peer", requires="pyoidn")
-def oidn_temporal(*, quality: Quality = "high", threads: int | None = None, history: float = 10.0) -> Model:
+def oidn_temporal(*, quality: Quality = "high", threads: int | None = None, history: float = 4.0) -> Model:
     """Open Image Denoise (optional package pyoidn) for noisy and for clean features, stabilized by the previous result.
 
     Args:

@@ -49,7 +49,7 @@ class Steadied(nn.Module):
         InputError: ``history`` is not above 0.
     """
 
-    def __init__(self, history: float = 10.0) -> None:
+    def __init__(self, history: float = 4.0) -> None:
         super().__init__()
         if not 0 < history < math.inf:
             raise InputError(f"history: expected above 0, found {history}")
