@@ -94,6 +94,13 @@ def test_links_that_leave_the_docs_stay_within_the_site(site) -> None:
     assert within("https://kornia.org", own, "compose.md") == "https://kornia.org"
 
 
+def test_names_in_tables_break_behind_dots(site) -> None:
+    pytest.importorskip("mkdocs", reason="the site is in the extra mcdenoise[docs]")
+    html = "<p><code>a.b</code></p><td>a.b <code>kornia.filters.x</code> <code>0.5</code></td>"
+    found = site("hooks").on_page_content(html, None, None, None)
+    assert found == html.replace("kornia.filters.x", "kornia.<wbr>filters.<wbr>x")
+
+
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning_and_loads_nothing_from_a_network(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="the site is in the extra mcdenoise[docs]")
