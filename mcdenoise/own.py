@@ -5,17 +5,21 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
+from importlib.abc import Loader
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from mcdenoise.errors import InputError
 
+# Modules beside the file that was executed last, which it has imported.
+_beside: list[str] = []
+
 
 def load_own(name: str, kind: str, thing: str) -> tuple[Any, ModuleType]:
     """Import an object from outside the package.
 
-    A file is executed at each call, as a new module.
+    A file is executed at each call, as a new module, and so are the modules beside it that it imports.
 
     Args:
         name: ``path/to/file.py:attribute`` or ``package.module:attribute``.
@@ -58,5 +62,24 @@ def _module_of_file(path: Path, kind: str, thing: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     # Dataclasses look up their module in ``sys.modules``.
     sys.modules[module_name] = module
-    spec.loader.exec_module(module)
+    _execute(module, spec.loader, path.resolve().parent)
     return module
+
+
+def _execute(module: ModuleType, loader: Loader, folder: Path) -> None:
+    """Execute a file that may import modules of its folder, as Python does with a script."""
+    # Files of several folders may import different modules of the same name.
+    for name in _beside:
+        sys.modules.pop(name, None)
+    before = set(sys.modules)
+    sys.path.insert(0, str(folder))
+    try:
+        loader.exec_module(module)
+    finally:
+        sys.path.remove(str(folder))
+        new = {name: name.partition(".")[0] for name in set(sys.modules) - before}
+        _beside[:] = [
+            name
+            for name, top in new.items()
+            if top not in before and ((folder / f"{top}.py").exists() or (folder / top).is_dir())
+        ]

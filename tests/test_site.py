@@ -32,6 +32,11 @@ def test_every_method_has_a_page_with_its_cost_and_its_settings(site) -> None:
     assert "547,673" in own
     # The same figure as in the table that it is taken from.
     assert "| cascaded_v2 | 0.06854 |" in own
+    assert "| run time | 2568 ms at 1280x720 for network and filters, float32, two cores of an Intel Xeon" in own
+    assert (
+        "| run time | 3138 ms at 1280x720 for network and filters, float32, two cores of an AMD"
+        in pages["methods/kp.md"]
+    )
     assert "-0.50 dB" not in own
     assert ":func:" not in "".join(pages.values())
 
@@ -87,6 +92,13 @@ def test_links_that_leave_the_docs_stay_within_the_site(site) -> None:
     assert within("../examples/layers.py", own, "compose.md") == "examples/layers.md"
     assert within("../docs/wild.md", Path("training/README.md"), "training.md") == "wild.md"
     assert within("https://kornia.org", own, "compose.md") == "https://kornia.org"
+
+
+def test_names_in_tables_break_behind_dots(site) -> None:
+    pytest.importorskip("mkdocs", reason="the site is in the extra mcdenoise[docs]")
+    html = "<p><code>a.b</code></p><td>a.b <code>kornia.filters.x</code> <code>0.5</code></td>"
+    found = site("hooks").on_page_content(html, None, None, None)
+    assert found == html.replace("kornia.filters.x", "kornia.<wbr>filters.<wbr>x")
 
 
 @pytest.mark.slow

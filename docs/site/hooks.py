@@ -69,6 +69,15 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
     return re.sub(r"\]\(([^)#\s]+)(#[^)\s]*)?\)", lead, markdown)
 
 
+def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
+    """Let names such as `kornia.filters.filter2d` break behind their dots in tables, and not within words."""
+
+    def breaking(code: re.Match[str]) -> str:
+        return re.sub(r"\.(?=[A-Za-z_])", ".<wbr>", code[0])
+
+    return re.sub(r"<td.*?</td>", lambda cell: re.sub("<code>[^<]*", breaking, cell[0]), html, flags=re.DOTALL)
+
+
 def within_site(target: str, own: Path, page: str) -> str:
     """A link of a text at ``own`` in the repository as one of the page ``page`` of the site."""
     if "://" in target:

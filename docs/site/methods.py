@@ -53,6 +53,11 @@ NAMES = {
 }
 PAPER = "*The paper* is [doi:10.1007/s00371-023-02951-6](https://doi.org/10.1007/s00371-023-02951-6)."
 MEASURED = ("results.md", "unseen_scenes.md", "zoo.md", "layers.md")
+# Tables whose second column is the run time of network and filters: page, heading, anchor and machine.
+RUN_TIMES = (
+    ("zoo.md", "Table 2: time at 1280x720", "table-2-time-at-1280x720", "an AMD EPYC"),
+    ("results.md", "Run time side by side", "run-time-side-by-side", "an Intel Xeon without matrix units"),
+)
 
 
 def pages() -> dict[str, str]:
@@ -100,6 +105,19 @@ def cost(entry: ModelOverview) -> str:
     return "-" if entry.kmacs_per_pixel is None else f"{entry.kmacs_per_pixel:.1f}"
 
 
+def run_time(name: str) -> str:
+    """Milliseconds of a method at 1280x720, from the tables of the docs, or a dash."""
+    for source, title, anchor, machine in RUN_TIMES:
+        for heading, _, rows in tables(ROOT / "docs" / source):
+            for row in rows if heading == title else []:
+                if method_of(row[0]) == name:
+                    return (
+                        f"{row[1]} ms at 1280x720 for network and filters, float32, two cores of {machine} "
+                        f"([how it was measured](../{source}#{anchor}))"
+                    )
+    return "-"
+
+
 def page(entry: ModelOverview) -> str:
     """One method."""
     construct = find_model(entry.name).construct
@@ -113,6 +131,7 @@ def page(entry: ModelOverview) -> str:
         "weights": WEIGHTS[entry.weights],
         "parameters": f"{entry.parameters:,}" if entry.parameters else "-",
         "cost": f"{cost(entry)} thousand multiply-adds a pixel in convolutions" if entry.kmacs_per_pixel else "-",
+        "run time": run_time(entry.name),
         "source": f"`{file}`",
     }
     parts = [f"# {entry.name}", close_up(entry.name), facts_table(facts)]

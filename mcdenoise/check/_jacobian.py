@@ -34,8 +34,9 @@ def first_mismatch(function: Function, arguments: Sequence[Tensor]) -> str:
             if beyond.any():
                 row, column = beyond.nonzero()[0].tolist()
                 return (
-                    f"Jacobian mismatch for output {j} with respect to input {i}, number {row} in number {column}: "
-                    f"difference quotient {expected[row, column]:.6g}, derivative {found[row, column]:.6g}"
+                    f"Jacobian mismatch for output {j} with respect to input {i}: element {row} of the output in "
+                    f"element {column} of the input has the difference quotient {expected[row, column]:.6g} and the "
+                    f"derivative {found[row, column]:.6g}"
                 )
     return ""
 
@@ -61,7 +62,18 @@ def second_mismatch(function: Function, arguments: Sequence[Tensor]) -> str:
             found = torch.autograd.grad(results, leaves, tensors[count:], create_graph=again, allow_unused=True)
         return tuple(gradient for gradient in found if gradient is not None)
 
-    return first_mismatch(gradients, [*arguments, *upstream])
+    message = first_mismatch(gradients, [*arguments, *upstream])
+    return message and f"second derivatives: {message}"
+
+
+def one_by_one(function: Function) -> Function:
+    """The function for arguments with one more axis in front; it is called for each item of that axis separately."""
+
+    def called(*tensors: Tensor) -> tuple[Tensor, ...]:
+        results = [function(*items) for items in zip(*tensors, strict=True)]
+        return tuple(map(torch.stack, zip(*results, strict=True)))
+
+    return called
 
 
 @torch.no_grad()

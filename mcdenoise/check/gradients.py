@@ -10,8 +10,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.gradcheck import GradcheckError
 
-from mcdenoise.check._jacobian import first_mismatch, second_mismatch
+from mcdenoise.check._jacobian import first_mismatch, one_by_one, second_mismatch
 from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.check.own import find_ops, op_of
 from mcdenoise.check.step_cases import STEPS
@@ -31,7 +32,7 @@ class GradcheckResult:
         inputs: the arguments whose derivatives were checked.
         passed: whether all derivatives agree.
         seconds: run time of the check.
-        message: first line of the error message; empty if the check passed.
+        message: the first mismatch, or the first line of another error's message; empty if the check passed.
     """
 
     op: str
@@ -105,7 +106,7 @@ def check_case(op: Op, case: Case, order: int = 2) -> GradcheckResult:
 
 
 def _mismatch(op: Op, case: Case, order: int) -> str:
-    """The first mismatch, or an empty string; torch's own check raises its mismatches instead."""
+    """The first mismatch, or an empty string; other errors that torch's own check finds are raised."""
     function, arguments = _of_differentiable(op, case)
     batched = op.batched and all(len(tensor) for tensor in arguments)
     if batched:
@@ -119,9 +120,17 @@ def _mismatch(op: Op, case: Case, order: int) -> str:
     # torch's own check calls the op for every element, so it is used for users' functions and for the smallest case of
     # an op. It also finds undefined and non-deterministic gradients.
     if not batched or case is _smallest(op):
-        torch.autograd.gradcheck(function, arguments, fast_mode=False)
-        if order > 1:
-            torch.autograd.gradgradcheck(function, arguments, fast_mode=False)
+        try:
+            torch.autograd.gradcheck(function, arguments, fast_mode=False)
+            if order > 1:
+                torch.autograd.gradgradcheck(function, arguments, fast_mode=False)
+        except GradcheckError:
+            # The first line of torch's message does not say where the Jacobians differ.
+            single, copies = one_by_one(function), [each[None] for each in arguments]
+            message = first_mismatch(single, copies) or (second_mismatch(single, copies) if order > 1 else "")
+            if not message:
+                raise
+            return message
     return ""
 
 

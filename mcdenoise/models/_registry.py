@@ -13,6 +13,8 @@ from fnmatch import fnmatch
 from importlib.metadata import entry_points
 from typing import Any, Literal, get_args
 
+from torch import nn
+
 from mcdenoise.errors import InputError
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._defaults import plain_defaults
@@ -20,6 +22,7 @@ from mcdenoise.models._interface import Model
 from mcdenoise.own import in_one_line, load_own
 
 GROUP = "mcdenoise.models"
+_FACTORY = "expected a factory, a function without required arguments that returns a model"
 
 # How a model makes its image, in listing order: predicted kernels; predicted pixels; bilateral grids; a recurrent
 # network; a filter without weights; another denoiser; or unspecified.
@@ -138,8 +141,14 @@ def _build_model(name: str, settings: dict[str, Any]) -> Model:
     try:
         inspect.signature(entry.construct).bind(**{**entry.settings, **settings})
     except TypeError as error:
-        known = ", ".join(inspect.signature(entry.construct).parameters) or "no settings"
-        raise InputError(f"model '{name}': {error}; it takes {known}") from error
+        parameters = inspect.signature(entry.construct).parameters
+        required = [each.name for each in parameters.values() if _is_required(each) and each.name not in settings]
+        if ":" in name and required:
+            raise InputError(
+                f"model '{name}': {_FACTORY}, found one that requires {', '.join(required)}; if it is the model, add "
+                f"a function that returns it, or else default values, or settings: '{name}({required[0]}=...)'"
+            ) from error
+        raise InputError(f"model '{name}': {error}; it takes {', '.join(parameters) or 'no settings'}") from error
     if ":" not in name:
         return as_model(entry.construct(**{**entry.settings, **settings}))
     try:
@@ -152,9 +161,16 @@ def _build_model(name: str, settings: dict[str, Any]) -> Model:
         raise InputError(f"model '{name}': the factory fails: {in_one_line(error)}") from error
 
 
+def _is_required(parameter: inspect.Parameter) -> bool:
+    various = (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+    return parameter.default is parameter.empty and parameter.kind not in various
+
+
 def _of_factory(name: str, factory: Any) -> Entry:
-    if not callable(factory):
-        raise InputError(f"model '{name}': expected a factory that can be called, found {type(factory).__name__}")
+    # A module can be called, but with images.
+    if isinstance(factory, nn.Module) or not callable(factory):
+        found = type(factory).__name__
+        raise InputError(f"model '{name}': {_FACTORY}, found an object of type {found}; add a function that returns it")
     return Entry(factory, {}, (factory.__doc__ or "").strip().partition("\n")[0])
 
 

@@ -175,7 +175,12 @@ def test_a_wrong_derivative_exits_with_1(mine: Path, run: Run, tmp_path: Path) -
     assert out.splitlines()[-1] == "2 checks, 2 failed"
     results = json.loads(path.read_text())
     assert [result["case"] for result in results] == ["dark", "bright"]
-    assert all("Jacobian mismatch" in result["message"] for result in results)
+    # The square of 1e3 has the derivative 2e3, and the wrong one is three quarters of it.
+    assert results[1]["message"] == (
+        "Jacobian mismatch for output 0 with respect to input 0: element 0 of the output in element 0 of the input has "
+        "the difference quotient 2000 and the derivative 1500"
+    )
+    assert results[0]["message"].startswith("Jacobian mismatch for output 0 with respect to input 0: element 0 of ")
 
 
 def test_a_stable_function_passes(mine: Path, run: Run, tmp_path: Path) -> None:
@@ -330,6 +335,7 @@ def test_inputs_may_be_passed() -> None:
     (right,) = gradcheck(lambda image: image * image.detach(), torch.zeros(2, 2))
     (wrong,) = gradcheck(lambda image: image * image.detach(), torch.ones(2, 2))
     assert (right.passed, wrong.passed) == (False, False)
+    assert "has the difference quotient 2 and the derivative 1" in wrong.message
     with pytest.raises(InputError, match="expected a floating-point tensor as example input 1"):
         gradcheck(cube, torch.arange(3))
 

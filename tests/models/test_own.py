@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,6 +49,13 @@ def network(channels: int = 4):
     return Blur(channels)
 
 
+instance = Blur()
+
+
+def denoise(color, albedo, strength=1):
+    return color
+
+
 def nothing():
     return 5
 
@@ -73,7 +81,9 @@ def test_a_factory_of_ones_own_is_a_model(mine: Path) -> None:
     ("name", "message"),
     [
         ("absent", r"expected a factory 'absent' in .*mine\.py, found .*network"),
-        ("number", "expected a factory that can be called, found int"),
+        ("number", "expected a factory, .* returns a model, found an object of type int; add a function"),
+        ("instance", "expected a factory, .* returns a model, found an object of type Blur; add a function"),
+        ("denoise", "expected a factory, .* found one that requires color, albedo; if it is the model, add a function"),
         ("nothing", "expected a model with `needs` .*found int"),
         ("fails", "RuntimeError: no luck today"),
     ],
@@ -93,6 +103,22 @@ def test_a_factory_has_to_be_somewhere(tmp_path: Path) -> None:
         create_model(f"{broken}:network")
     with pytest.raises(InputError, match=r"package\.of\.nobody cannot be imported"):
         create_model("package.of.nobody:network")
+
+
+def test_a_file_may_import_modules_of_its_folder(tmp_path: Path) -> None:
+    """Also if another folder has a module of the same name, and whatever the working folder is."""
+    for folder, factor in (("a", 2), ("b", 3)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "neighbour_of_mine.py").write_text(f"FACTOR = {factor}\n")
+        (tmp_path / folder / "mine.py").write_text(
+            "from neighbour_of_mine import FACTOR\n\ndef network():\n    return lambda color: FACTOR * color\n"
+        )
+    path = sys.path.copy()
+    first, second = (Denoiser(own(tmp_path / folder / "mine.py", "network")) for folder in "ab")
+    shown = frame()
+    torch.testing.assert_close(first(shown), 2 * shown.color)
+    torch.testing.assert_close(second(shown), 3 * shown.color)
+    assert sys.path == path
 
 
 def test_settings_are_those_of_the_factory(mine: Path) -> None:

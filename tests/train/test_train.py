@@ -644,7 +644,7 @@ def test_a_frame_that_is_damaged_leaves_no_run(small_sequence: Path, tmp_path: P
         ("losses", "image=1,image=2", "losses: expected NAME=VALUE,... with each name once"),
         ("losses", "image=much", "losses: expected weights such as image=1,initial=0.5, found image=much"),
         ("model", "noisy.py:factory", "noisy.py: expected a Python file with a factory of a model, found no such file"),
-        ("model", "mcdenoise.ops:demodulate", "model 'mcdenoise.ops:demodulate': missing a required argument: 'color'"),
+        ("model", "mcdenoise.ops:demodulate", "model 'mcdenoise.ops:demodulate': expected a factory, a function "),
         ("schedule", "linear", "schedule: expected one of constant, cosine, found 'linear'"),
         ("loss", "l2", "loss: expected one of smape, l1_display, rae, found 'l2'"),
         ("precision", "fp8", "precision: expected one of float32, bfloat16, found 'fp8'"),

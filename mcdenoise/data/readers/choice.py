@@ -152,7 +152,9 @@ def _color(
         if len(pictures) == 1:
             return pictures[0]
         found = ", ".join(str(layer) for layer in dict.fromkeys([*pictures, *layers][:12])) or "no layers of floats"
-        raise InputError(f"{where}: expected noisy radiance, found {found}; name it with --map color=LAYER")
+        raise InputError(
+            f"{where}: expected noisy radiance, found {found}; give its file too, or name it with --map color=LAYER"
+        )
     least = min(rank for rank, _ in candidates)
     best = [layer for rank, layer in candidates if rank == least]
     if len(best) > 1:

@@ -177,6 +177,13 @@ def _oidn_groups(found: Iterable[tuple[Path, re.Match[str]]]) -> list[FileGroup]
     return [FileGroup(label, files) for label, files in kinds.items()]
 
 
+def files_beside(path: Path) -> dict[str, Path]:
+    """The other images in a file's folder whose names have the same digits, by the rest of their names."""
+    digits = _DIGITS.findall(path.stem)
+    others = [other for other in _listed(path.parent) if _DIGITS.findall(other.stem) == digits and other != path]
+    return {" ".join(_DIGITS.split(other.stem)[::2]).strip(" ._-"): other for other in others}
+
+
 def pattern_of(group: FileGroup) -> str:
     """The file names of a kind, with # for the digits of the frame number."""
     path = next(iter(group.files.values()))

@@ -26,9 +26,9 @@ from mcdenoise.data.readers.diffuse_specular import (
     find_splits,
 )
 from mcdenoise.data.readers.files import RenderedFiles, hit, seen_of, world_to_camera
-from mcdenoise.data.readers.layers import Layer, layers_of
+from mcdenoise.data.readers.layers import Layer, layers_of, recognise
 from mcdenoise.data.readers.lights import find_lights
-from mcdenoise.data.readers.names import FileGroup, pattern_of
+from mcdenoise.data.readers.names import FileGroup, files_beside, pattern_of
 from mcdenoise.data.readers.samples import SampleLayers, mean_is, split_samples
 from mcdenoise.data.readers.values import (
     MOTION_PAIRS,
@@ -45,6 +45,8 @@ from mcdenoise.errors import InputError
 
 # Motion conventions known by layer name: Blender's points to the previous frame, in pixels, y up.
 _MOTION = {"vector": Convention(1, -1, "previous - current, y up, pixels")}
+# Features that make most methods better, of which a frame has at least one where there are any.
+_FEATURES = {"albedo", "normal", "depth"}
 # Smallest motion in pixels that shows a moving camera.
 _MOVED = 0.3
 # Largest distance of a camera from the origin, relative to the distance of visible points, in camera space.
@@ -99,6 +101,8 @@ def open_files(
         _look_at_parts(shot, splits)
     if samples is not None:
         _look_at_samples(shot, samples)
+    if not _FEATURES & {*choice.layers, *mapping}:
+        _look_beside(shot)
     return shot
 
 
@@ -190,6 +194,22 @@ def _check_header(path: Path, header: ImageHeader, layers: Sequence[Layer], main
 def _window(part: Part) -> str:
     (height, width), (top, left) = part.size, part.origin
     return f"{width} x {height} pixels" + (f" at {left}, {top}" if (top, left) != (0, 0) else "")
+
+
+def _look_beside(shot: RenderedFiles) -> None:
+    """Warn if files beside the color, which were not given, have names of features of the same frame."""
+    color = shot.file(shot.choice.layers["color"], shot.numbers[0])
+    given = {path for group in shot.groups for path in group.files.values()}
+    found = []
+    for label, path in files_beside(color).items():
+        denoted = recognise(Layer(0, 0, label, ("R", "G", "B"), ("r", "g", "b"), anonymous=True))
+        if path not in given and denoted is not None and denoted[0] in _FEATURES:
+            found.append(path.name)
+    if found:
+        shot.warnings.append(
+            f"{color.name}: read without {', '.join(sorted(found))} beside it, which look like features of the same "
+            "frame; give these files too, or a pattern or folder with all of them"
+        )
 
 
 def _look(shot: RenderedFiles, color_has_albedo: bool | None) -> None:

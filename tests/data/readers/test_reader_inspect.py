@@ -41,6 +41,24 @@ def test_inspect_warns_on_standard_error(run: Run, others: Any, tmp_path: Path) 
     assert "3 frames, 1 to 4, of 64x36" in text
 
 
+def test_features_that_were_not_given_are_named(run: Run, rendered: Path) -> None:
+    luxcore = rendered / "luxcore"
+    status, text, errors = run("inspect", luxcore / "RGB_0001.exr")
+    assert status == 0
+    assert errors == (
+        "warning: RGB_0001.exr: read without ALBEDO_0001.exr, AVG_SHADING_NORMAL_0001.exr, DEPTH_0001.exr, "
+        "SHADING_NORMAL_0001.exr beside it, which look like features of the same frame; give these files too, or a "
+        "pattern or folder with all of them\n"
+    )
+    assert "ALBEDO" not in text
+    # Several features, or a deliberate choice, are read as they are.
+    for more in ((luxcore / "ALBEDO_0001.exr",), ("--map", "albedo=")):
+        assert run("inspect", luxcore / "RGB_0001.exr", *more)[::2] == (0, "")
+    status, _, errors = run("inspect", luxcore / "ALBEDO_0001.exr")
+    assert status == 2
+    assert "expected noisy radiance, found ALBEDO.RGB; give its file too, or name it with --map" in errors
+
+
 def test_both_flags_of_the_albedo_are_one_too_many(run: Run, rendered: Path) -> None:
     status, _, errors = run("inspect", rendered / "blender", "--color-with-albedo", "--color-without-albedo")
     assert status == 2
