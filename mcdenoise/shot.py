@@ -125,7 +125,7 @@ class ShotSettings:
             opened.check_output_layer(self.output_layer)
         if self.alpha and "alpha" not in opened.buffers:
             raise InputError(
-                f"--alpha: expected an alpha to denoise, found none in {opened.root}; leave the option out"
+                f"--alpha: expected an alpha to denoise, found none in {opened.root}; omit the option"
             )
         return opened
 

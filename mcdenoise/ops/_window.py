@@ -1,4 +1,4 @@
-"""The square window that every per-pixel kernel speaks of: its taps, and what lies beyond the image's border."""
+"""The square window of per-pixel kernels: its taps, and pixels beyond the border of the image."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ def _along(window: _Window, axis: int, kernel_size: int) -> _Window:
     """Windows of as many pixels along an axis, of those inside the image, by the binary digits of the number."""
     length, radius = window.maximum.shape[axis], kernel_size // 2
     margin = (radius, radius) if axis == -1 else (0, 0, radius, radius)
-    # What is outside is worth nothing beside anything, and two such windows something, lest there be a 0 / 0.
+    # Pixels outside the image have the smallest importance, which is finite: two such windows must not give 0 / 0.
     worthless = torch.finfo(window.maximum.dtype).min
     maximum, weight = F.pad(window.maximum, margin, value=worthless), F.pad(window.weight, margin, value=1.0)
     level = _Window(maximum, weight, F.pad(window.mean, margin))

@@ -40,7 +40,7 @@ def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") 
         image: ``(B, C, H, W)``, any unit and range.
         kernel: ``(B, K*K, H, W)`` weights, odd ``K``, taps row by row from top left; used as they are.
         border: what a tap outside the image reads: ``"replicate"`` the nearest edge pixel, ``"zeros"`` zero;
-            ``"renormalize"`` leaves such taps out and divides by the sum of the weights that are left
+            ``"renormalize"`` rejects such taps and divides by the sum of the weights that are left
             (0 where that sum is 0), so that the result is a weighted mean everywhere.
 
     Returns:

@@ -235,7 +235,7 @@ def _front(view: View, metric: str) -> list[str]:
 def _file_name(name: str, place: int) -> str:
     """A name that is safe in a path; the place keeps it unique if characters had to go."""
     safe = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in name)
-    # With what stands before it and behind it a name has at most 255 bytes, four for a letter.
+    # File systems allow 255 bytes a name, including prefix and suffix; a letter has up to four.
     return safe if safe == name and len(name) <= 40 else f"{safe[:40]}-{place}"
 
 
