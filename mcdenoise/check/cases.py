@@ -486,10 +486,10 @@ def _importance_cases() -> tuple[Case, ...]:
         case("7x7, larger than the image", "ordinary", (1, 2, 3, 2), 7),
         case("one pixel, 13x13", "ordinary", (1, 3, 1, 1), 13),
         case("map of zeros", "stiff", (1, 1, 3, 4), 3, spread=0.0),
-        case("map of tens", "stiff", (1, 2, 3, 4), 5, spread=20.0),
+        case("map of about 20", "stiff", (1, 2, 3, 4), 5, spread=20.0),
         # The step of finite differences is too coarse where the weights are nearly those of a maximum.
         case("fireflies", "stiff", (1, 3, 3, 4), 5, image=_radiance, differentiable=("image",)),
-        case("map of ten thousands", "extreme", (1, 1, 3, 4), 3, spread=1e4, differentiable=("image",)),
+        case("map of about 1e4", "extreme", (1, 1, 3, 4), 3, spread=1e4, differentiable=("image",)),
     )
 
 
@@ -688,7 +688,7 @@ def _grid_splat_cases() -> tuple[Case, ...]:
 
     return (
         case("3x4 in cells of 2", "ordinary", (1, 3, 3, 4), 2, 2),
-        case("batch of 2, cells that hang over", "ordinary", (2, 1, 3, 5), 4, 2),
+        case("batch of 2, cells beyond the border", "ordinary", (2, 1, 3, 5), 4, 2),
         case("cells of 3, 4 bins", "ordinary", (1, 1, 4, 3), 3, 4),
         case("one bin", "ordinary", (1, 2, 2, 3), 2, 1),
         case("cells of one pixel", "ordinary", (2, 1, 2, 1), 1, 2),
@@ -727,7 +727,7 @@ def _grid_slice_cases() -> tuple[Case, ...]:
 
     return (
         case("3x4 in cells of 2", "ordinary", (1, 3, 3, 4), 2, 2),
-        case("batch of 2, cells that hang over", "ordinary", (2, 1, 3, 5), 4, 2),
+        case("batch of 2, cells beyond the border", "ordinary", (2, 1, 3, 5), 4, 2),
         case("cells of 3, 4 bins", "ordinary", (1, 1, 4, 3), 3, 4),
         case("one bin, all filled", "ordinary", (1, 2, 2, 3), 2, 1, known=torch.ones_like, differentiable=("grid",)),
         case("cells of one pixel", "ordinary", (2, 1, 2, 1), 1, 2),
@@ -813,7 +813,7 @@ def _gradient_cases() -> tuple[Case, ...]:
         case("a light goes out", "extreme", (1, 6, 6), (*both, "depth"), alter=off, smooth=("depth",), levels=2),
         case("no light", "extreme", (1, 3, 4), alter=dark, smooth=()),
         case("nothing changes", "extreme", (1, 3, 4), alter=still, smooth=()),
-        case("nothing but noise", "extreme", (1, 3, 4), (*both, "variance"), noise=50.0, smooth=()),
+        case("noise only", "extreme", (1, 3, 4), (*both, "variance"), noise=50.0, smooth=()),
     )
 
 
@@ -1015,12 +1015,12 @@ def _history_cases(accumulating: bool) -> tuple[Case, ...]:
         # Zero is a whole pixel, where the derivative in the motion jumps.
         case("still", "ordinary", (1, 3, 2, 3), everything, still, smooth=("color", "previous", "previous_length")),
         case("long history", "ordinary", (1, 1, 3, 3), lengths=(12.0, 40.0)),
-        case("length of a byte", "extreme", (1, 1, 3, 3), **{**bmfr, "lengths": (250.0, 255.0)}),
+        case("history length of a byte", "extreme", (1, 1, 3, 3), **{**bmfr, "lengths": (250.0, 255.0)}),
         case("fireflies", "stiff", (1, 3, 2, 3), everything, draw=_radiance),
         case("out of the image", "extreme", (1, 3, 2, 3), everything, far_out),
         case("motion unknown", "extreme", (1, 1, 2, 4), (), unknown),
         case("sky", "extreme", (1, 1, 3, 4), everything, sky),
-        case("nothing but new surfaces", "extreme", (1, 3, 2, 3), everything, all_new),
+        case("new surfaces only", "extreme", (1, 3, 2, 3), everything, all_new),
         # There are no finite differences of NaN.
         case("NaN on another surface", "extreme", (1, 3, 2, 3), everything, nan_elsewhere, smooth=("color", "motion")),
     )

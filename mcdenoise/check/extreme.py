@@ -161,7 +161,7 @@ def splats() -> tuple[Case, ...]:
         case("logits of 1e4", size, radiance, spread(1.0, 1e4)),
         case("logits of -1e4", size, radiance, spread(1.0, -1e4)),
         case("logits to +-1e4", size, radiance, spread(1e4)),
-        case("all logits alike", size, radiance, _constant(0.0)),
+        case("all logits equal", size, radiance, _constant(0.0)),
         case("7x7 on 1x2", (1, 3, 1, 2), radiance, normal, kernel_size=7),
     )
 
@@ -407,7 +407,7 @@ def partitions() -> tuple[Case, ...]:
 
     return (
         *(case(*tried) for tried in _tried()),
-        case("logits of 1e4, alike", (1, 3, 3, 4), radiance, _constant(1e4)),
+        case("equal logits of 1e4", (1, 3, 3, 4), radiance, _constant(1e4)),
         case("logits of 1e4, of both signs", (1, 3, 3, 4), radiance, _alternating(1e4)),
         case("7 levels of 3x2", (1, 3, 3, 2), radiance, levels=7),
     )
@@ -604,10 +604,10 @@ def affinities() -> tuple[Case, ...]:
         case("7x7 taps, frame before", size, radiance, before=True, kernel_size=7),
         case("taps 64 pixels apart", size, radiance, dilation=64),
         *(case(f"features of {value:g}", size, radiance, _alternating(value)) for value in (1e-30, 6e4, 1e18, 1e30)),
-        case("features alike", size, radiance, _constant(0.3), 1e6),
+        case("equal features", size, radiance, _constant(0.3), 1e6),
         case("bandwidths of 0", size, radiance, normal, 0.0, before=True),
         case("bandwidths of 1e6", size, radiance, normal, 1e6, before=True),
-        case("like no other, no weight of the centre", size, radiance, normal, 1e6, 0.0),
+        case("unlike all neighbours, no weight of the centre", size, radiance, normal, 1e6, 0.0),
         case("no weight of the centre, frame before", size, radiance, center=0.0, before=True),
     )
 

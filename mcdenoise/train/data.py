@@ -162,5 +162,5 @@ def _check_trainable(sequence: Sequence, wanted: frozenset[str]) -> None:
     if without:
         raise InputError(
             f"{sequence.root}: expected a reference for every frame to train on, found none for frame {without[0]}; "
-            "render it or choose other frames"
+            "render it, or train on other sequences"
         )

@@ -19,7 +19,7 @@ ACESCG = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 
-def test_what_is_rec709_or_says_nothing_stays() -> None:
+def test_rec709_and_files_without_primaries_are_unchanged() -> None:
     image = torch.rand(1, 3, 4, 5)
     assert to_rec709(image, {}) is image
     assert to_rec709(image, {"chromaticities": REC709}) is image
@@ -44,7 +44,7 @@ def test_the_attribute_comes_from_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stored", ["wide", (0.64, 0.33), (0.3,) * 8, (0.0,) * 8, (float("nan"),) * 8], ids=str)
-def test_what_is_no_color_space(stored: Any) -> None:
+def test_invalid_color_spaces(stored: Any) -> None:
     with pytest.raises(InputError, match="'chromaticities': expected x and y of red, green, blue and white, found"):
         to_rec709(torch.rand(1, 3, 2, 2), {"chromaticities": stored})
 

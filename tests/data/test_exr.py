@@ -127,7 +127,7 @@ def _patch(content: bytes, name: bytes, kind: bytes, value: bytes) -> bytes:
     return content[:start] + struct.pack("<i", len(value)) + value + content[start + 4 + length :]
 
 
-def test_what_is_no_usable_image_is_refused(tmp_path: Path, image: np.ndarray) -> None:
+def test_unusable_images_are_refused(tmp_path: Path, image: np.ndarray) -> None:
     write_exr(tmp_path / "a.exr", image, RGB)
     content = (tmp_path / "a.exr").read_bytes()
     huge = _patch(content, b"dataWindow", b"box2i", struct.pack("<4i", 0, 0, 2**14, 2**14))

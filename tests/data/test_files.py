@@ -49,7 +49,7 @@ def age(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["atomic_path", "new_folder"])
-def test_what_a_killed_process_left_over_is_removed_by_the_next_and_nothing_else(tmp_path: Path, how: str) -> None:
+def test_only_leftovers_of_a_killed_process_are_removed_by_the_next(tmp_path: Path, how: str) -> None:
     others = [".mcdenoise", ".mcdenoise-mine", ".file.tmp", "file.tmp"]
     for name in others:
         (tmp_path / name).write_text("somebody's")
@@ -72,7 +72,7 @@ def test_what_a_killed_process_left_over_is_removed_by_the_next_and_nothing_else
         end(alive)
 
 
-def test_what_has_only_just_been_made_is_left_alone(tmp_path: Path) -> None:
+def test_new_temporary_files_are_kept(tmp_path: Path) -> None:
     (tmp_path / ".mcdenoise-0123.tmp").write_text("not locked yet")
     files._swept.clear()
     write_text(tmp_path / "whole.txt", "text")
@@ -112,9 +112,7 @@ def test_a_file_has_the_permissions_of_one_that_is_written_plainly(tmp_path: Pat
     assert ours == plain == 0o640
 
 
-def test_what_was_written_is_on_the_disk_before_it_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_synced_before_it_gets_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[str] = []
     fsync, replace = os.fsync, os.replace
     monkeypatch.setattr(os, "fsync", lambda handle: (done.append("fsync"), fsync(handle)))
@@ -123,7 +121,7 @@ def test_what_was_written_is_on_the_disk_before_it_has_its_name(
     assert done == ["fsync", "replace"]
 
 
-def test_what_could_be_written_is_told_and_nothing_changed(tmp_path: Path) -> None:
+def test_checking_whether_a_path_is_writable_changes_nothing(tmp_path: Path) -> None:
     (tmp_path / "there").write_text("before")
     (tmp_path / "folder").mkdir()
     (tmp_path / "loop").symlink_to("loop")
@@ -136,7 +134,7 @@ def test_what_could_be_written_is_told_and_nothing_changed(tmp_path: Path) -> No
     assert (tmp_path / "there").read_text() == "before"
 
 
-def test_a_link_is_followed_and_its_own_suffix_tells_the_format(tmp_path: Path) -> None:
+def test_a_link_is_followed_and_its_own_suffix_decides_the_format(tmp_path: Path) -> None:
     (tmp_path / "video.mp4").symlink_to("latest")
     with atomic_path(tmp_path / "video.mp4") as temporary:
         assert temporary.suffix == ".mp4"
@@ -145,7 +143,7 @@ def test_a_link_is_followed_and_its_own_suffix_tells_the_format(tmp_path: Path) 
     assert (tmp_path / "video.mp4").is_symlink()
 
 
-def test_what_cannot_be_removed_is_told(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_removed_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
     files.remove(tmp_path / "file")

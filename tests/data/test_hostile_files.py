@@ -66,7 +66,7 @@ def subsampled(path: Path) -> None:
     path.write_bytes(content[:start] + struct.pack("<2i", 2, 2) + content[start + 8 :])
 
 
-def test_what_is_no_picture_is_named(tmp_path: Path) -> None:
+def test_a_file_that_is_no_picture_is_named(tmp_path: Path) -> None:
     folder = tmp_path / "files"
     folder.mkdir()
     whole = {each: pixels(kind=np.uint32) for each in "RGB"}
@@ -148,7 +148,7 @@ def test_a_thousand_layers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sequence.frame(0).color[0, 0], pixels())
 
 
-def test_a_text_in_latin_1_stays(tmp_path: Path) -> None:
+def test_a_text_in_latin_1_is_unchanged(tmp_path: Path) -> None:
     """As renderers on old systems write it: the library that writes here knows nothing but UTF-8."""
     content = write(tmp_path / "shot.exr", part("RGB", owner="M?ller", extra=3)).read_bytes()
     (tmp_path / "shot.exr").write_bytes(content.replace(b"M?ller", b"M\xfcller"))
@@ -180,7 +180,7 @@ def bmfr(tmp_path: Path) -> Path:
         ({each: pixels() for each in ("Y", "RY", "BY")}, "found luminance and chroma"),
     ],
 )
-def test_bmfr_refuses_what_is_no_color(bmfr: Path, channels: dict[str, np.ndarray], found: str) -> None:
+def test_bmfr_refuses_files_without_color(bmfr: Path, channels: dict[str, np.ndarray], found: str) -> None:
     write(bmfr / "albedo0.exr", part(channels))
     with pytest.raises(InputError, match=found):
         open_sequence(bmfr)
@@ -200,7 +200,7 @@ def test_bmfr_refuses_a_buffer_of_other_pixels(bmfr: Path) -> None:
 @pytest.mark.parametrize("name", ["camera.json", MATRICES])
 @pytest.mark.parametrize("kind", ["link", "pipe", "device", "folder"])
 @pytest.mark.timeout(60)
-def test_what_is_there_and_cannot_be_read_is_not_missing(bmfr: Path, name: str, kind: str) -> None:
+def test_an_unreadable_file_is_not_reported_as_missing(bmfr: Path, name: str, kind: str) -> None:
     if kind == "pipe":
         os.mkfifo(bmfr / name)
     elif kind == "folder":

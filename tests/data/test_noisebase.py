@@ -130,7 +130,7 @@ def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Sequence:
     return open_sequence(training_set(tmp_path / "scene.zip"))
 
 
-def test_what_is_found(opened: Sequence) -> None:
+def test_buffers_and_frames_that_are_found(opened: Sequence) -> None:
     assert opened.layout == "noisebase"
     assert opened.numbers == opened.reference_numbers == list(range(FRAMES))
     assert opened.size == SIZE
@@ -214,7 +214,7 @@ def test_a_camera_of_something_else_is_told(tmp_path: Path) -> None:
     assert sequence.frame(0).view_projection is None
 
 
-def test_what_is_written(opened: Sequence, tmp_path: Path) -> None:
+def test_frames_are_written_and_read_back(opened: Sequence, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     image = np.random.default_rng(0).random((*SIZE, 3)).astype(np.float16).astype(np.float32)
     path = opened.write(tmp_path / "out", 1, image)
@@ -235,7 +235,7 @@ def test_any_chunks_and_no_compression(tmp_path: Path) -> None:
         np.testing.assert_allclose(values, getattr(expected, name), rtol=1e-6, atol=1e-7, err_msg=name)
 
 
-def test_what_does_not_belong_together(tmp_path: Path) -> None:
+def test_arrays_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
     folder = frames_of(tmp_path / "scene")
     write(folder / "frame0003.zip", {k: v for k, v in arrays(0).items() if k != "normal"})
     with pytest.raises(InputError, match=r"frame0003.zip: expected array 'normal' of shape \(3, 20, 24, 6\)"):
@@ -273,7 +273,7 @@ def described(path: Path, name: str, **values: Any) -> dict[str, bytes | None]:
         return {f"{name}/.zarray": json.dumps(json.loads(file.read(f"{name}/.zarray")) | values).encode()}
 
 
-def test_bombs_and_lies_are_told_before_memory_is_taken(tmp_path: Path) -> None:
+def test_compressed_bombs_and_false_sizes_are_refused_before_memory_is_allocated(tmp_path: Path) -> None:
     path = write(tmp_path / "frame0.zip", arrays(0))
     huge = [4, 2**14, 2**14, 6]
     first = "color/0.0.0.0"

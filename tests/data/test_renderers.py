@@ -208,7 +208,7 @@ def test_luxcore_writes_three_channels_and_infinity() -> None:
 
 
 @pytest.mark.parametrize("renderer", sorted(load_others().RENDERERS))
-def test_files_of_others_hold_what_they_were_made_from(renderer: str, tmp_path: Path) -> None:
+def test_files_with_names_of_other_renderers_have_the_original_pixels(renderer: str, tmp_path: Path) -> None:
     others = load_others()
     written = others.write(renderer, tmp_path, frames=(2,))
     assert sorted(written) == sorted(tmp_path.iterdir())

@@ -43,7 +43,7 @@ def pixel_centres(height: int, width: int) -> torch.Tensor:
     return torch.stack(torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")).double()
 
 
-def test_what_a_sequence_says_about_itself(small_sequence: Path) -> None:
+def test_properties_of_a_sequence(small_sequence: Path) -> None:
     sequence = open_sequence(small_sequence)
     assert (sequence.root, sequence.name, sequence.layout) == (small_sequence, "plane", "bmfr")
     assert (sequence.numbers, sequence.size, len(sequence)) == ([0, 1, 2, 3], (20, 24), 4)

@@ -73,7 +73,7 @@ def test_sizes(tmp_path: Path, size: tuple[int, int], shown: tuple[int, int]) ->
         assert np.abs(frames[0][:45].astype(float) - gradient(*size)).mean() < 3
 
 
-def test_what_cannot_be_written_leaves_the_old_video(tmp_path: Path) -> None:
+def test_a_failed_video_leaves_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     write_video(path, [gradient(16, 16)] * 2)
     before = path.read_bytes()

@@ -101,7 +101,7 @@ def test_a_cut_resets() -> None:
     assert history.update(still(constant(3, 2.0), normal=wall)).length.unique().tolist() == [2]
 
 
-def test_what_was_hidden_starts_anew_without_a_cut() -> None:
+def test_disoccluded_surfaces_start_a_history_without_a_cut() -> None:
     history = Shot()
     near, uncovered = constant(1, 2.0), constant(1, 2.0)
     uncovered[..., : WIDTH // 2] = 9.0
@@ -184,7 +184,7 @@ def test_the_background_has_a_history(small_sequence: Path) -> None:
     torch.testing.assert_close(seen.color * sky, frame.color * sky)
 
 
-def test_what_moves_keeps_its_history() -> None:
+def test_moving_surfaces_keep_their_history() -> None:
     """A wall comes closer, by more than the limit for positions; the camera stands still."""
     matrix = torch.eye(4)[None]
     matrix[:, 2, 3], matrix[:, 3, 3] = 1, 0  # clip w = z
@@ -398,7 +398,7 @@ def test_the_history_of_a_mirror_that_moves_is_short() -> None:
         last = seen
 
 
-def test_what_is_diffuse_keeps_its_history_beside_a_mirror() -> None:
+def test_diffuse_surfaces_keep_their_history_beside_a_mirror() -> None:
     """The mirror moves by its width: where it is now, the history was diffuse, and where it was, the present is."""
     history, everything_alike = Shot(), Shot(specular_length=math.inf)
     for number, frame in enumerate(mirror_in_a_pan(2)):
@@ -650,7 +650,7 @@ def test_the_method_inside_begins_anew_with_the_shot(reset: str) -> None:
     assert history.watching.states[-1] is None
 
 
-def test_what_a_recurrent_method_remembers_ends_with_the_shot() -> None:
+def test_the_state_of_a_recurrent_method_ends_with_the_shot() -> None:
     model, state = Accumulated(Mean(), alpha_min=1.0, lag_threshold=math.inf, firefly_limit=math.inf), None
     floor = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
     for value, normal, expected in ((1, floor, 1), (3, floor, 2), (5, floor, 3), (9, -floor, 9), (11, -floor, 10)):
@@ -695,7 +695,7 @@ def test_a_step_is_pure() -> None:
         state = after
 
 
-def test_what_is_inside_is_handed_the_history_and_hands_out_its_own_images() -> None:
+def test_the_inner_method_gets_the_history_and_its_image_is_the_result() -> None:
     watching = Watching()
     color = torch.rand(1, 3, HEIGHT, WIDTH)
     output, _ = Accumulated(watching)(still(color).replace(hints=Hints(keep_all=True)))
@@ -707,7 +707,7 @@ def test_what_is_inside_is_handed_the_history_and_hands_out_its_own_images() -> 
     assert {"current", "length"} <= frame.buffers
 
 
-def test_what_it_gives_is_not_asked_of_a_frame() -> None:
+def test_buffers_that_accumulation_provides_are_not_needed_of_a_frame() -> None:
     class Wanting(Watching):
         needs = dataclasses.replace(Watching.needs, buffers=frozenset({"color", "current", "length", "roughness"}))
 

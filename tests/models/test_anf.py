@@ -145,7 +145,7 @@ def test_the_albedo_is_divided_out_of_samples() -> None:
 
 
 @torch.no_grad()
-def test_the_result_is_a_mean_of_what_was_seen() -> None:
+def test_the_result_is_between_minimum_and_maximum_of_all_frames() -> None:
     """No pixel is darker or brighter than all of the frames."""
     model, state, low, high = drawn(), None, torch.inf, 0.0
     for frame in shot(5):
@@ -156,7 +156,7 @@ def test_the_result_is_a_mean_of_what_was_seen() -> None:
 
 
 @torch.no_grad()
-def test_what_shows_another_surface_is_not_looked_at() -> None:
+def test_pixels_of_another_surface_have_no_weight() -> None:
     """In a frame of another depth nothing of the one before is left, however bright it was."""
     model = drawn()
     first, second, _ = shot()

@@ -123,7 +123,7 @@ def test_differentiable_through_time() -> None:
     assert torch.autograd.gradcheck(last, (frames[0].color.requires_grad_(),))
 
 
-def test_says_what_it_needs_and_refuses_what_is_out_of_range() -> None:
+def test_needs_and_settings_out_of_range() -> None:
     model = create_model("asvgf")
     assert "gradient" in model.needs.uses
     assert not model.needs.trainable

@@ -68,7 +68,7 @@ def said_to_do(message: str) -> list[str]:
 
 @torch.no_grad()
 @pytest.mark.parametrize("name", DEMANDING)
-def test_what_is_missing_is_said_with_the_methods_that_would_do(name: str) -> None:
+def test_a_missing_buffer_is_named_with_methods_that_do_without(name: str) -> None:
     """By the bare step and by the denoiser, of every buffer that is needed, and of all of them."""
     model = model_of(name)
     whole = whole_frame(model, HEIGHT, WIDE)
@@ -155,7 +155,7 @@ def test_a_state_of_another_method_is_refused(name: str) -> None:
 
 @torch.no_grad()
 @pytest.mark.parametrize("name", KEEPING)
-def test_what_is_no_state_at_all_is_refused(name: str) -> None:
+def test_an_invalid_state_is_refused(name: str) -> None:
     model = model_of(name)
     frame = whole_frame(model, HEIGHT, WIDE)
     for state in (frame.color, {}, {"a": frame.color}, (), (None,), (1, 2), "state", [frame.color, frame.color]):

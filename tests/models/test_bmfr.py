@@ -71,7 +71,7 @@ def test_images_of_a_batch_may_be_at_different_frames() -> None:
     torch.testing.assert_close(model(both, state)[0].image[:1], model(given, one)[0].image)
 
 
-def test_what_the_features_tell_comes_back() -> None:
+def test_light_that_is_a_function_of_the_features_is_reproduced() -> None:
     """A constant; and light that is linear in them, and in squares of positions, through all of it."""
     given = frame()
     whole = (2 + given.position[:, :1] - 0.3 * given.position[:, 1:2].square() + 0.5 * given.normal[:, :1]).repeat(
@@ -163,7 +163,7 @@ def test_extremes_stay_finite() -> None:
         assert image.min() >= 0
 
 
-def test_says_what_it_needs_and_refuses_what_is_out_of_range() -> None:
+def test_needs_and_settings_out_of_range() -> None:
     model = create_model("bmfr")
     assert model.needs.buffers == {"color", "normal", "position"}
     assert not model.needs.trainable

@@ -260,7 +260,7 @@ def test_kernels_keep_a_constant_image() -> None:
     assert not torch.allclose(network(frame)[0].image, frame.color, rtol=0.1)
 
 
-def test_what_it_wears() -> None:
+def test_its_wrappers_and_their_settings() -> None:
     """The published accumulation with alpha 0.2, on demodulated radiance, without what came later."""
     model = create_model("cascaded")
     kinds = [type(part) for part in model.modules() if isinstance(part, Demodulated | Accumulated | Exposed | Chain)]

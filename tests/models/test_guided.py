@@ -69,7 +69,7 @@ def test_never_negative_and_finite_with_fireflies_and_background() -> None:
     assert image.min() >= 0
 
 
-def test_has_nothing_to_train_and_refuses_what_is_no_setting() -> None:
+def test_has_no_weights_and_refuses_invalid_settings() -> None:
     model = create_model("guided")
     assert not list(model.parameters())
     assert not model.needs.trainable

@@ -90,7 +90,7 @@ def test_differentiable() -> None:
     assert torch.autograd.gradcheck(image, leaves)
 
 
-def test_has_nothing_to_train_and_refuses_what_is_no_setting() -> None:
+def test_has_no_weights_and_refuses_invalid_settings() -> None:
     model = create_model("joint_bilateral")
     assert not list(model.parameters())
     assert not model.needs.trainable

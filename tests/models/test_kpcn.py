@@ -215,7 +215,7 @@ def test_the_default_is_small() -> None:
     assert entry.parameters == 2 * (weights + 4 * 24 + 121)
 
 
-def test_what_it_wears() -> None:
+def test_its_wrappers_and_their_settings() -> None:
     model = create_model("kpcn")
     assert [len(list(parts_of(model, kind))) for kind in (Demodulated, Exposed, Tiled)] == [1, 1, 1]
 

@@ -395,7 +395,7 @@ def test_where_all_parts_are_black_they_have_their_proportion_of_the_whole() -> 
 
 
 @torch.no_grad()
-def test_whatever_a_method_wears_its_layers_come_through() -> None:
+def test_layers_pass_through_every_wrapper() -> None:
     """Scaled and back, without albedo and with it again, in tiles."""
     blur = JointBilateral(sigma_space=1.0)
     frames = shot(blur, 1, (64, 96))[0]

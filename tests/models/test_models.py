@@ -167,7 +167,7 @@ def test_hints_change_no_image(name: str) -> None:
 
 @pytest.mark.parametrize("name", MODELS)
 @torch.no_grad()
-def test_what_is_needed_is_enough(name: str) -> None:
+def test_the_declared_needs_suffice(name: str) -> None:
     """Of what is only of use, all or any may be missing."""
     model = small(name)
     whole = whole_frame(model, 17, 20)
@@ -344,7 +344,7 @@ def test_a_factory_that_is_none_is_refused(name: str, expected: str, tmp_path: P
         (lambda frame: 0, "found <lambda>(frame)"),
     ],
 )
-def test_what_is_no_model_is_refused(thing: Any, expected: str) -> None:
+def test_an_object_that_is_no_model_is_refused(thing: Any, expected: str) -> None:
     message = refused(lambda: as_model(thing))
     assert "expected a model with `needs` that takes (frame, state)" in message
     assert expected in message
@@ -549,7 +549,7 @@ def test_the_shipped_weights(file: Path) -> None:
 
 
 @pytest.mark.parametrize("name", FAMILY)
-def test_what_the_cascades_were_trained_on(name: str) -> None:
+def test_training_data_in_the_headers_of_the_cascades(name: str) -> None:
     about = describe_weights(SHIPPED / f"{name}.safetensors")
     for author in ("Mareck", "NovaZeeke", "Jay-Artist", "Wig42"):
         assert author in about["credits"]
@@ -561,7 +561,7 @@ def test_what_the_cascades_were_trained_on(name: str) -> None:
     assert not own & {"random9000", "random9002"}
 
 
-def test_what_is_compared_was_trained_alike() -> None:
+def test_compared_weights_have_equal_training_settings() -> None:
     about = {name: describe_weights(SHIPPED / "compared" / f"{name}.safetensors") for name in compared_models()}
     assert not set(about) & set(pretrained_models())
     own = {"model", "loss", "temporal_weight"}
@@ -620,7 +620,7 @@ def test_weights_in_bfloat16_load(weights: Path) -> None:
     assert torch.equal(parameters[0], expected["final.fusions.0.conv.bias"])
 
 
-def test_weights_fit_with_and_without_what_a_model_wears(weights: Path) -> None:
+def test_weights_fit_with_and_without_wrappers(weights: Path) -> None:
     """A file holds the networks' weights alone: what is around them is not of its business."""
     names = set(load_file(weights))
     assert all(name.startswith(("initial.", "final.")) for name in names)

@@ -148,7 +148,7 @@ def test_tiles_give_the_image(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["mrkp", "kp", "wskp", "wskp_unet"])
-def test_what_it_wears(name: str) -> None:
+def test_its_wrappers_and_their_settings(name: str) -> None:
     """The published accumulation with alpha 0.2, on demodulated radiance."""
     model = create_model(name)
     kinds = [type(part) for part in model.modules() if isinstance(part, Demodulated | Accumulated | Exposed | Tiled)]

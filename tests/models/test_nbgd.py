@@ -83,7 +83,7 @@ def test_less_than_two_layers_are_refused() -> None:
     assert refused(lambda: create_model("nbgd", layers=1)) == "layers: expected at least 2, found 1"
 
 
-def test_what_it_wears() -> None:
+def test_its_wrappers_and_their_settings() -> None:
     model = create_model("nbgd")
     kinds = [type(part) for part in model.modules() if isinstance(part, Demodulated | Accumulated | Exposed | Tiled)]
     assert kinds == [Demodulated, Accumulated, Exposed, Tiled]

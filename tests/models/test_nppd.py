@@ -214,7 +214,7 @@ def test_all_on_the_finest_level_and_splatted_to_itself_is_the_image() -> None:
 
 
 @torch.no_grad()
-def test_what_is_constant_stays_so_but_for_what_leaves_the_image() -> None:
+def test_a_constant_image_stays_constant_away_from_the_border() -> None:
     """Equal weights everywhere.
 
     At level 4 two pixels from the border on lack neighbours, and ``n`` of those make ``2 n + 1`` of the next finer

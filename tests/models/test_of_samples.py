@@ -64,6 +64,6 @@ def test_layers_of_light_and_alpha_go_where_the_samples_go(name: str) -> None:
 
 
 @both
-def test_what_it_wears(name: str) -> None:
+def test_its_wrappers_and_their_settings(name: str) -> None:
     model = create_model(name)
     assert [len(list(parts_of(model, kind))) for kind in (Demodulated, Exposed, Tiled)] == [1, 1, 1]

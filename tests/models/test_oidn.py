@@ -47,7 +47,7 @@ def pyoidn() -> Any:
 
 @pytest.mark.parametrize("auxiliary", ["noisy", "clean"])
 @pytest.mark.parametrize("quality", ["fast", "balanced", "high"])
-def test_is_what_its_package_computes(pyoidn: Any, quality: Any, auxiliary: Any) -> None:
+def test_equals_the_result_of_the_package(pyoidn: Any, quality: Any, auxiliary: Any) -> None:
     given = frame()
     guides = channels_last(given.albedo), channels_last(given.normal)
     clean = auxiliary == "clean"
@@ -135,7 +135,7 @@ def test_says_that_it_has_no_derivatives(pyoidn: Any) -> None:
         assert not Oidn(threads=1)(given)[0].image.requires_grad
 
 
-def test_refuses_what_is_no_setting() -> None:
+def test_refuses_invalid_settings() -> None:
     for name in ("quality", "auxiliary", "source"):
         with pytest.raises(InputError, match=rf"{name}: expected one of .*, found 'best'"):
             create_model("oidn", **{name: "best"})

@@ -41,7 +41,7 @@ def lit(height: int = 45, width: int = 70, seed: int = 0) -> Frame:
 @has_oidn
 @pytest.mark.parametrize("quality", ["fast", "balanced", "high"])
 @pytest.mark.parametrize("auxiliary", ["noisy", "clean"])
-def test_is_what_the_library_computes(quality: Any, auxiliary: Any) -> None:
+def test_equals_the_result_of_the_library(quality: Any, auxiliary: Any) -> None:
     frame = lit()
     with torch.no_grad():
         image = create_model(NAME, quality=quality, auxiliary=auxiliary)(frame)[0].image
@@ -52,7 +52,7 @@ def test_is_what_the_library_computes(quality: Any, auxiliary: Any) -> None:
 
 
 @has_oidn
-def test_its_derivative_is_what_the_library_does_to_a_changed_image() -> None:
+def test_its_derivative_is_the_difference_quotient_of_the_library() -> None:
     # Away from the ends of the scale, where the library clamps.
     frame = lit(32, 48)
     frame = frame.replace(color=0.5 + frame.albedo)
@@ -82,7 +82,7 @@ def test_tiles_are_the_whole_image() -> None:
 
 
 @has_oidn
-def test_refuses_what_it_does_not_do() -> None:
+def test_refuses_unsupported_options() -> None:
     assert "found 'prefiltered'" in refused(lambda: create_model(NAME, auxiliary="prefiltered"))
     model = create_model(NAME)
     assert model.needs.missing(Frame(torch.rand(1, 3, 8, 8))) == ["albedo", "normal"]
@@ -253,7 +253,7 @@ def test_archives_are_found_in_a_library(tmp_path: Path) -> None:
     assert second["b"].shape == (1, 2, 3, 3)
 
 
-def test_refuses_what_is_no_archive(tmp_path: Path) -> None:
+def test_refuses_a_file_that_is_no_archive(tmp_path: Path) -> None:
     path = tmp_path / "mine.tza"
     assert f"{path}: expected an archive of weights" in refused(lambda: read_tza(path))
     path.write_bytes(b"PK\x03\x04")

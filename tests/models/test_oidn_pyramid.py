@@ -91,7 +91,7 @@ def test_a_first_frame_is_the_network_s_image_and_the_next_is_steadied() -> None
 
 
 @has_oidn
-def test_refuses_what_is_no_setting() -> None:
+def test_refuses_invalid_settings() -> None:
     assert "quality: expected one of fast, balanced, high" in refused(
         lambda: create_model("oidn_pyramid", quality="best")
     )

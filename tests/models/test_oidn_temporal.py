@@ -222,6 +222,6 @@ def test_it_is_ahead_of_oidn(small_sequence: Path) -> None:
     assert errors[0] < errors[1:].min()
 
 
-def test_refuses_what_is_no_setting() -> None:
+def test_refuses_invalid_settings() -> None:
     assert "quality: expected one of fast, balanced, high" in refused(lambda: create_model(NAME, quality="best"))
     assert "history: expected above 0, found 0" in refused(lambda: create_model(NAME, history=0))

@@ -88,7 +88,7 @@ def test_a_factory_of_ones_own_is_a_model(mine: Path) -> None:
         ("fails", "RuntimeError: no luck today"),
     ],
 )
-def test_what_is_no_factory_of_a_model_is_refused_in_one_line(mine: Path, name: str, message: str) -> None:
+def test_an_invalid_factory_is_refused_in_one_line(mine: Path, name: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         create_model(own(mine, name))
     assert "\n" not in str(caught.value)
@@ -143,7 +143,7 @@ def test_a_buffer_that_the_frames_have_not(mine: Path) -> None:
         (lambda color: color.to("meta"), "expected an image on cpu, found one on meta"),
     ],
 )
-def test_what_is_no_image_is_refused_in_one_line(function: Any, message: str) -> None:
+def test_an_invalid_image_is_refused_in_one_line(function: Any, message: str) -> None:
     denoiser = Denoiser(function)
     with pytest.raises(InputError, match=message) as caught:
         denoiser(frame())
@@ -186,7 +186,7 @@ def test_a_state_is_carried_from_frame_to_frame() -> None:
         ("device", "expected a state on cpu, found meta in it"),
     ],
 )
-def test_what_is_no_state_is_refused_and_leaves_no_trace(misbehave: str, message: str) -> None:
+def test_an_invalid_state_is_refused_and_the_last_one_kept(misbehave: str, message: str) -> None:
     model = Mean(misbehave)
     denoiser, frames = Denoiser(model), [frame() for _ in range(2)]
     denoiser(frames[0])

@@ -35,7 +35,9 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 @pytest.mark.parametrize(
     ("ratio", "expected"), [(2.0, "bfloat16"), (1.2, "bfloat16"), (1.19, "float32"), (0.3, "float32")]
 )
-def test_what_pays(measured: list[float], ratio: float, expected: str) -> None:
+def test_bfloat16_is_chosen_where_it_is_measured_to_be_faster(
+    measured: list[float], ratio: float, expected: str
+) -> None:
     measured.append(ratio)
     chosen = fastest_precision(CPU)
     assert chosen.precision == expected
@@ -82,7 +84,7 @@ def test_no_room_for_the_cache(tmp_path: Path, measured: list[float], monkeypatc
     assert not measured
 
 
-def test_what_the_user_has_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_environment_variable_chooses_the_precision(monkeypatch: pytest.MonkeyPatch) -> None:
     for precision in ("float32", "bfloat16"):
         monkeypatch.setenv(ENVIRONMENT, precision)
         assert fastest_precision(CPU).precision == precision

@@ -42,7 +42,7 @@ def test_the_ten_channels() -> None:
     torch.testing.assert_close(seen, torch.cat([2 * image, albedo, (normal + 1) / 2, near], 1))
 
 
-def test_what_a_display_shows() -> None:
+def test_displayed_values_and_their_slope_at_black_and_white() -> None:
     albedo, light = torch.full((1, 3, 1, 2), 0.25), torch.tensor([0.0, 4.0]).expand(1, 3, 1, 2).clone()
     light.requires_grad_()
     shown = displayed(Frame(light, albedo=albedo))

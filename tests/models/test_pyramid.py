@@ -69,7 +69,7 @@ def test_the_ratio_of_albedos_leaves_matt_light_alone() -> None:
     assert torch.equal(_ratio(albedo, albedo, 0 * ones), albedo)
 
 
-def test_a_pixel_is_never_worth_nothing() -> None:
+def test_weights_are_never_zero_or_one() -> None:
     worth = _inside(torch.tensor([-1e30, 0.0, 1e30]))
     assert worth.tolist() == pytest.approx([1e-3, 0.5, 1 - 1e-3], rel=1e-6)
 

@@ -161,7 +161,7 @@ def test_it_wears_no_accumulation() -> None:
 
 
 @torch.no_grad()
-def test_what_it_saw_before_changes_what_it_makes_of_a_frame() -> None:
+def test_the_image_depends_on_the_frames_before() -> None:
     model = drawn()
     first, second, third = shot()
     after = [model(second, model(frame)[1])[0].image for frame in (first, third)]

@@ -49,7 +49,7 @@ def test_a_still_camera_gives_the_exponential_mean() -> None:
     torch.testing.assert_close(output.image, expected)
 
 
-def test_what_moves_takes_its_image_along() -> None:
+def test_the_previous_image_follows_the_motion() -> None:
     inner = Shows()
     model = Recurrent(inner)
     first = torch.rand(1, 3, 5, 8)
@@ -62,7 +62,7 @@ def test_what_moves_takes_its_image_along() -> None:
     assert not inner.previous[..., :2].any()
 
 
-def test_what_shows_another_surface_has_none() -> None:
+def test_pixels_of_another_surface_have_no_previous_image() -> None:
     inner = Shows()
     model = Recurrent(inner)
     near, far = torch.ones(1, 1, 5, 8), torch.full((1, 1, 5, 8), 3.0)
@@ -91,7 +91,7 @@ def test_positions_and_cameras_tell_motion_too() -> None:
 
 
 @pytest.mark.parametrize("names", [(), ("depth",), ("position",)])
-def test_where_nothing_tells_motion_every_frame_is_a_first_one(names: tuple[str, ...]) -> None:
+def test_without_motion_every_frame_is_a_first_frame(names: tuple[str, ...]) -> None:
     inner = Shows()
     model, state = Recurrent(inner), None
     for seed in range(2):

@@ -100,7 +100,7 @@ SHOTS: dict[str, tuple[Callable[[int], Frame], dict[str, float]]] = {
 
 @pytest.mark.parametrize("shot", SHOTS)
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-def test_what_is_skipped_exactly_changes_no_pixel(shot: str, precision: Any) -> None:
+def test_exact_skipping_changes_no_pixel(shot: str, precision: Any) -> None:
     make, expected = SHOTS[shot]
     model = small("cascaded_v2", tolerance=0)
     short, whole = Denoiser(model, precision=precision), Denoiser(model, precision=precision, keep_all=True)
@@ -122,7 +122,7 @@ def test_what_is_skipped_exactly_changes_no_pixel(shot: str, precision: Any) -> 
     assert names <= {"noise-free pixels"} | absent
 
 
-def test_the_network_runs_on_what_is_not_sky() -> None:
+def test_the_network_does_not_run_on_the_sky() -> None:
     size = (320, 224)
     short, whole = pair()
     frame = sky(wall(0, size=size), 200)
@@ -135,7 +135,7 @@ def test_the_network_runs_on_what_is_not_sky() -> None:
     assert torch.equal(short(frame)[..., :200, :], frame.color[..., :200, :])
 
 
-def test_a_method_of_unknown_reach_runs_and_what_is_known_stays_as_it_is() -> None:
+def test_a_method_of_unknown_reach_runs_and_known_pixels_are_kept() -> None:
     class Half(nn.Module):
         calls = 0
 
@@ -266,7 +266,7 @@ def edited(number: int, moved: bool) -> Frame:
     return frame.replace(albedo=albedo, color=color)
 
 
-def test_only_what_an_edit_changes_is_computed_again() -> None:
+def test_only_edited_parts_are_computed_again() -> None:
     short, whole = pair(tolerance=1e-3)
     fractions, errors = [], []
     for number in range(20):
@@ -342,7 +342,7 @@ def shot_of(model: Any, frames: list[Frame], **hints: bool) -> tuple[list[Output
     return outputs, journal
 
 
-def test_a_toy_computes_only_what_is_needed() -> None:
+def test_only_tiles_with_noise_are_computed() -> None:
     frame, toy = sky(wall(0), 90), Blur()
     model = Skipping(Tiled(toy))
     expected, _ = Blur()(frame)
@@ -422,7 +422,7 @@ def test_nothing_is_skipped_but_copied_where_all_is_to_be_kept() -> None:
     assert torch.equal(outputs[-1].image[..., :96, :], frames[0].color[..., :96, :])
 
 
-def test_a_recurrent_method_keeps_its_state_beside_what_is_skipped() -> None:
+def test_a_recurrent_method_keeps_its_state_beside_skipped_pixels() -> None:
     """Where nothing is known, it is as it is without; at a cut it begins anew, and so does what is remembered."""
     frames = [wall(number) for number in range(10)]
     frames.append(frames[-1].replace(normal=-frames[-1].normal))
@@ -459,7 +459,7 @@ def test_the_state_has_a_batch() -> None:
 
 
 @pytest.mark.slow
-def test_deciding_costs_less_than_a_hundredth_of_what_it_saves() -> None:
+def test_deciding_costs_less_than_a_hundredth_of_the_saved_time() -> None:
     size = (720, 1280)
     short, whole = (Denoiser("cascaded_v2", keep_all=keep_all) for keep_all in (False, True))
     frame = sky(wall(0, size=size), 400)

@@ -193,7 +193,7 @@ def test_is_pure_and_batches() -> None:
     torch.testing.assert_close(output.image[1:], alone.image)
 
 
-def test_has_nothing_to_train_and_says_what_it_needs() -> None:
+def test_has_no_weights_and_declares_its_needs() -> None:
     model = create_model("svgf")
     assert not list(model.parameters())
     assert not model.needs.trainable

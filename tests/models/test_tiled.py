@@ -132,7 +132,7 @@ def test_a_toy_whose_pixels_depend_on_statistics_is_given_those_of_the_whole_ima
         torch.testing.assert_close(model(frame)[0].image, expected.image, rtol=1e-6, atol=1e-7)
 
 
-def test_what_depends_on_the_whole_image_is_not_divided() -> None:
+def test_a_method_that_needs_the_whole_image_is_not_tiled() -> None:
     frame, seen = frame_of(96, 160), []
 
     def whole(color: Tensor) -> Tensor:
@@ -185,7 +185,7 @@ def test_a_method_with_a_state_is_refused_in_tiles() -> None:
     assert Tiled(toy)(frame.replace(color=3 * frame.color), state)[0].image.equal(2 * frame.color)
 
 
-def test_what_is_known_is_not_computed() -> None:
+def test_known_pixels_are_not_computed() -> None:
     frame, toy = frame_of(237, 331), Blur()
     known = {"image": torch.full_like(frame.color, 7.0)}
     for top, left in ((0, 0), (100, 131), (170, 250)):
@@ -243,7 +243,7 @@ def test_tiles_hold_every_pixel_once() -> None:
     assert [tile.right - tile.left for tile in Region(0, 0, 32, 1056).split(1024)] == [544, 512]
 
 
-def test_rectangles_hold_what_is_needed_once_and_reach_no_other() -> None:
+def test_rectangles_cover_needed_pixels_once_and_do_not_touch() -> None:
     needed = torch.zeros(2, 1, 1000, 1400, dtype=torch.bool)
     for image, top, left in ((0, 3, 5), (0, 40, 70), (1, 500, 900), (0, 999, 1399)):
         needed[image, 0, top, left] = True
@@ -253,7 +253,7 @@ def test_rectangles_hold_what_is_needed_once_and_reach_no_other() -> None:
     assert covered == needed.sum()
 
 
-def test_where_a_part_costs_as_much_as_the_whole_it_is_the_whole() -> None:
+def test_the_whole_image_is_one_tile_where_tiles_would_cost_as_much() -> None:
     needed = torch.zeros(1, 1, 90, 160, dtype=torch.bool)
     assert regions(needed, 64) == []
     needed[..., 40, 80] = True

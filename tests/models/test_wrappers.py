@@ -63,7 +63,7 @@ ROUNDING = {"rtol": 1e-5, "atol": 1e-6}
 
 
 @pytest.mark.parametrize("name", WRAPPERS)
-def test_whoever_changes_nothing_is_not_changed(name: str) -> None:
+def test_a_wrapper_of_the_identity_returns_the_image(name: str) -> None:
     frame = frame_of(24, 40, batch=2)
     output, _ = WRAPPERS[name](Same())(frame)
     torch.testing.assert_close(output.image, frame.color, **ROUNDING)
@@ -81,7 +81,7 @@ def test_a_chain_of_one_method_is_that_method(outer: str, inner: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["nothing", "demodulated", "exposed", "chain"])
-def test_statistics_come_from_the_whole_image_through_what_is_worn(name: str) -> None:
+def test_wrappers_pass_on_statistics_of_the_whole_image(name: str) -> None:
     frame = frame_of(64, 96)
     whole, _ = WRAPPERS[name](Brightest())(frame)
     for model in (Tiled(WRAPPERS[name](Brightest()), 32), WRAPPERS[name](Tiled(Brightest(), 32))):
@@ -90,7 +90,7 @@ def test_statistics_come_from_the_whole_image_through_what_is_worn(name: str) ->
 
 
 @pytest.mark.parametrize("name", ["nothing", "demodulated", "exposed", "skipping", "chain"])
-def test_what_is_inside_keeps_its_state(name: str) -> None:
+def test_a_wrapper_keeps_the_state_of_its_method(name: str) -> None:
     model, state, colors = WRAPPERS[name](Mean()), None, torch.rand(3, 1, 3, 8, 8)
     for number, color in enumerate(colors, start=1):
         # Exposed anew in each frame, a mean is that of exposed ones.
@@ -126,7 +126,7 @@ def test_parts_are_found_outermost_first() -> None:
 # Demodulated
 
 
-def test_what_is_demodulated_sees_no_albedo_in_its_light() -> None:
+def test_demodulated_light_contains_no_albedo() -> None:
     watching, frame = Watching(), frame_of(9, 7, variance=torch.rand(1, 3, 9, 7))
     samples = torch.cat([frame.color, torch.ones(1, 2, 9, 7)], 1)[:, None].repeat(1, 3, 1, 1, 1)
     frame = frame.replace(current=frame.color / 2, diffuse=frame.color / 3, specular=frame.color / 4, samples=samples)
@@ -275,7 +275,7 @@ def test_a_chain_is_tiled_if_no_later_method_depends_on_the_whole_image() -> Non
         torch.testing.assert_close(Tiled(model, 32)(frame)[0].image, model(frame)[0].image, **ROUNDING)
 
 
-def test_after_accumulation_statistics_are_of_what_was_accumulated() -> None:
+def test_statistics_are_those_of_the_accumulated_image() -> None:
     watching, color = Watching(), torch.rand(2, 1, 3, 20, 24)
     model = Accumulated(Chain(first=Brightest(), second=watching), lag_threshold=math.inf)
     _, state = model(still(color[0]))
@@ -286,7 +286,7 @@ def test_after_accumulation_statistics_are_of_what_was_accumulated() -> None:
     assert prepared(model, frame).statistics == {}
 
 
-def test_what_is_known_of_each_stage_stands_in_its_place() -> None:
+def test_known_pixels_of_each_stage_are_kept() -> None:
     frame = frame_of(9, 7)
     mask = torch.rand(1, 1, 9, 7) > 0.5
     known = {"first": torch.full_like(frame.color, 5.0), "image": torch.full_like(frame.color, 9.0)}

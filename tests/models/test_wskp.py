@@ -34,7 +34,7 @@ def branches(layer: Reparameterized, x: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("identity", [True, False])
-def test_the_merged_kernel_does_what_the_branches_do(identity: bool) -> None:
+def test_the_merged_kernel_equals_the_branches(identity: bool) -> None:
     layer = drawn(Reparameterized(6, 6 if identity else 4, identity))
     x = torch.rand(2, 6, 5, 7, dtype=torch.float64)
     found, expected = layer(x), branches(layer, x)

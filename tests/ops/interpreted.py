@@ -275,7 +275,7 @@ def test_all_of_a_blend(rule: str, dtype: torch.dtype) -> None:
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
 @pytest.mark.parametrize("albedo", [True, False])
 @pytest.mark.parametrize("limit", [15.0, 2.0, torch.inf, "of each image"])
-def test_what_enters_a_history(limit: Any, albedo: bool) -> None:
+def test_incoming_color_of_a_history(limit: Any, albedo: bool) -> None:
     limits = torch.tensor([1.5, torch.inf]).double().reshape(2, 1, 1, 1) if isinstance(limit, str) else limit
     color = draw(3, batch=2) * (draw(1, batch=2) > 0.3) * 10 ** (3 * draw(1, batch=2))
     tint = draw(3, batch=2) * (draw(1, batch=2) > 0.2) if albedo else None

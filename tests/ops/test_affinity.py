@@ -46,12 +46,12 @@ def test_features_far_apart_part_the_image() -> None:
 
 
 @pytest.mark.parametrize("center", [0.0, 1e-9, 1e-6])
-def test_what_is_like_none_of_its_neighbours_stays(center: float) -> None:
+def test_a_pixel_unlike_its_neighbours_is_unchanged(center: float) -> None:
     color, apart = image(3), 1e3 * torch.arange(99.0).reshape(1, 1, *SIZE)
     torch.testing.assert_close(affinity_filter(color, apart, ONE, center * ONE), color)
 
 
-def test_alike_everywhere_it_is_the_mean_of_the_window() -> None:
+def test_equal_features_give_the_mean_of_the_window() -> None:
     color = image(3)
     expected = torch.nn.functional.avg_pool2d(color, 7, 1, 3, count_include_pad=False)
     torch.testing.assert_close(affinity_filter(color, 0 * color, ONE, ONE), expected)

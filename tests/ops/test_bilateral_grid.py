@@ -21,7 +21,7 @@ def drawn(*shape: int, seed: int = 0) -> Tensor:
 
 @pytest.mark.parametrize(("cell", "bins"), GRIDS)
 @pytest.mark.parametrize("size", [(32, 48), (31, 45), (3, 2)])
-def test_a_constant_image_stays_what_it_is(cell: int, bins: int, size: tuple[int, int]) -> None:
+def test_a_constant_image_is_unchanged(cell: int, bins: int, size: tuple[int, int]) -> None:
     """Whatever the guide is, also where the last cells hang over the image."""
     image = torch.full((2, 3, *size), 0.7, dtype=torch.float64)
     torch.testing.assert_close(smoothed(image, drawn(2, 1, *size), cell, bins), image, rtol=1e-13, atol=0)
@@ -83,7 +83,7 @@ def test_the_weight_of_a_bin_falls_linearly() -> None:
     torch.testing.assert_close(grid.flatten()[:2], torch.tensor([0.2, 1.0], dtype=torch.float64), rtol=1e-4, atol=0)
 
 
-def test_a_mean_that_was_cut_out_is_not_read() -> None:
+def test_means_of_empty_cells_are_not_read() -> None:
     """Where all cells around a pixel are empty it is 0; where some are, the others count in full."""
     grid, filled = torch.full((1, 1, 2, 2, 1), 3.0), torch.ones(1, 1, 2, 2, 1)
     guide = torch.full((1, 1, 4, 4), 0.5)

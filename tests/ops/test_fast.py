@@ -101,7 +101,7 @@ def test_layout_in_memory_changes_nothing(op: Op, layout: Callable[[Tensor], Ten
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
 @pytest.mark.parametrize("border", ["replicate", "zeros", "renormalize"])
-def test_what_is_spread_is_the_same_without_the_slopes_of_the_kernel(border: Any, dtype: torch.dtype) -> None:
+def test_splatting_is_the_same_without_derivatives_of_the_kernel(border: Any, dtype: torch.dtype) -> None:
     inputs = drawn(2, 3, 9, 300, 5, FAST[1]).inputs(dtype)
     image, kernel = inputs["image"], inputs["kernel"]
     alone, with_slopes = (
@@ -127,7 +127,7 @@ def test_other_dtypes_beside_the_image(op: Op) -> None:
 
 
 @every_op
-def test_first_derivatives_are_difference_quotients_and_second_ones_go_the_plain_way(op: Op) -> None:
+def test_first_derivatives_equal_difference_quotients_and_second_ones_use_the_reference(op: Op) -> None:
     for border in ("replicate", "renormalize"):
         case = drawn(1, 2, 2, 3, 3, op, border=border)
         inputs = case.inputs()
@@ -197,7 +197,7 @@ def chosen(image: Tensor) -> str:
     return _backend.choose_backend(["numba"], [image])
 
 
-def test_what_runs_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     large, small = torch.rand(2, 3, 64, 64), torch.rand(1, 3, 64, 64)
     assert chosen(large) == "numba"
     assert chosen(small) == "torch"
@@ -222,7 +222,7 @@ def test_another_backend_may_be_used_for_a_while() -> None:
     assert chosen(large) == "numba"
 
 
-def test_the_size_of_one_image_may_decide_for_all() -> None:
+def test_the_size_of_one_image_can_choose_the_backend_of_all() -> None:
     large, small = torch.rand(2, 3, 64, 64), torch.rand(1, 3, 4, 4)
     with _backend.one_backend(large):
         assert chosen(small) == "numba"
@@ -371,7 +371,7 @@ def test_large_images_are_accumulated_with_compiled_derivatives() -> None:
 
 
 @pytest.mark.parametrize(("settings", "message"), [({"rule": "svgf"}, "rule: expected"), ({"rule": "bmfr"}, "needs")])
-def test_accumulation_refuses_what_the_reference_refuses(settings: dict[str, Any], message: str) -> None:
+def test_accumulation_refuses_the_same_arguments_as_the_reference(settings: dict[str, Any], message: str) -> None:
     inputs = ACCUMULATE.cases[1].inputs()
     for backend in ("torch", "numba"):
         with pytest.raises(ValueError, match=message):
@@ -395,7 +395,7 @@ def test_motion_is_that_of_the_reference(case: Case, dtype: torch.dtype) -> None
         torch.testing.assert_close(motion, plain, rtol=8 * eps, atol=8 * eps * (largest + sum(plain.shape[2:])))
 
 
-def test_motion_of_what_was_not_seen_is_infinite() -> None:
+def test_motion_of_points_behind_the_previous_camera_is_infinite() -> None:
     matrix = torch.eye(4)[None]
     matrix[:, 2, 3], matrix[:, 3, 3] = 1, 0  # clip w = z
     position = torch.tensor(

@@ -164,7 +164,7 @@ def test_layout_in_memory_changes_nothing(op: Op, layout: Callable[[Tensor], Ten
 
 
 @pytest.mark.parametrize("op", DIFFERENTIABLE, ids=lambda op: op.name)
-def test_first_derivatives_are_difference_quotients_and_second_ones_go_the_plain_way(op: Op) -> None:
+def test_first_derivatives_equal_difference_quotients_and_second_ones_use_the_reference(op: Op) -> None:
     case = op.cases[0]
     inputs = case.inputs()
     leaves = leaves_of(inputs, case)
@@ -214,7 +214,7 @@ def test_a_nan_is_seen(op: Op) -> None:
         assert torch.equal(*seen), name
 
 
-def test_of_a_small_grid_the_size_of_the_image_decides() -> None:
+def test_the_size_of_the_image_chooses_the_backend_of_a_small_grid() -> None:
     grid, guide = torch.rand(1, 3, 2, 2, 4), torch.rand(1, 1, 128, 128)
     assert _backend.choose_backend(["numba"], [grid, guide]) == "numba"
     assert _backend.choose_backend(["numba"], [grid, guide[..., :8, :8]]) == "torch"

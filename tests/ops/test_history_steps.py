@@ -159,7 +159,7 @@ WAYS = {
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("rule", [{}, BMFR, {"alpha_min": 0.4}, {"alpha_min": 1.0}], ids=str)
-def test_the_past_is_that_of_the_reference(way: str, rule: dict[str, Any]) -> None:
+def test_the_history_is_that_of_the_reference(way: str, rule: dict[str, Any]) -> None:
     frames = WAYS[way]
     if "rule" in rule and (frames[0].normal is None or frames[0].position is None):
         with pytest.raises(ValueError, match="needs it in both frames"):
@@ -194,7 +194,7 @@ def test_settings(settings: dict[str, Any], rule: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("way", ["nothing", "motion"])
-def test_some_of_these_pasts_are_short(way: str) -> None:
+def test_some_of_these_histories_are_short(way: str) -> None:
     """Otherwise there would be nothing to compare."""
     lagging, past = passed(WAYS[way], "torch", lag_threshold=math.inf)[-1], passed(WAYS[way], "torch")[-1]
     assert 0.1 < (past.length < lagging.length).double().mean() < 0.9
@@ -256,7 +256,7 @@ def test_frames_with_derivatives_take_the_reference() -> None:
 
 @pytest.mark.parametrize("with_albedo", [True, False])
 @pytest.mark.parametrize("limit", [30.0, 0.5, math.inf])
-def test_what_enters_is_demodulated_and_clamped(limit: float, with_albedo: bool) -> None:
+def test_incoming_color_is_demodulated_and_clamped(limit: float, with_albedo: bool) -> None:
     frame = WAYS["motion"][0]
     assert frame.albedo is not None
     color = demodulate(frame.color, frame.albedo) if with_albedo else frame.color
@@ -375,7 +375,7 @@ def test_pixels_that_found_their_surface_are_counted_image_by_image(backend: Any
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_they_are_what_their_schemas_say() -> None:
+def test_operators_agree_with_their_schemas() -> None:
     frame = WAYS["motion"][0]
     image, length = torch.rand(2, 1, 9, *SIZE), torch.full((1, 1, *SIZE), 5.0)
     surface = [frame.position, frame.normal, frame.depth, length.round()]

@@ -54,7 +54,7 @@ def test_a_change_is_found_where_it_is() -> None:
     assert share[..., 26:].mean() < 0.05
 
 
-def test_light_that_seldom_arrives_is_not_dark() -> None:
+def test_rare_bright_paths_are_no_lag() -> None:
     """One path in 300 brings 300: most windows of a frame see none, but the past knows of the noise."""
     g = torch.Generator().manual_seed(0)
     recent = 300.0 * (torch.rand(1, 1, *SIZE, generator=g) < 1 / 300)
@@ -68,7 +68,7 @@ def test_detail_is_no_lag() -> None:
     assert lag(detail, detail, torch.zeros(1, 1, *SIZE)).max() == 0
 
 
-def test_what_no_eye_sees_is_no_lag() -> None:
+def test_an_invisible_change_is_no_lag() -> None:
     ones, none = torch.ones(1, 3, *SIZE), torch.zeros(1, 1, *SIZE)
     assert lag(ones, 1.001 * ones, none).max() == 0
     assert lag(ones, 1.01 * ones, none).min() == 1

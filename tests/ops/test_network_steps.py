@@ -99,7 +99,7 @@ def assert_same(actual: list[Tensor], expected: list[Tensor], tolerance: float) 
 
 @every_dtype
 @every_size
-def test_fast_is_plain(size: tuple[int, int, int], dtype: torch.dtype) -> None:
+def test_fast_backends_equal_the_reference(size: tuple[int, int, int], dtype: torch.dtype) -> None:
     for call in calls(size, dtype):
         # The plain softplus is the number itself from 20 on.
         tolerance = max(TOLERANCE[dtype], 1e-9 if call[0] is network.softplus else 0)
@@ -322,7 +322,7 @@ def test_the_scale_of_depths_has_a_derivative() -> None:
     assert torch.autograd.grad(normalized(depth).sum(), depth)[0].isfinite().all()
 
 
-def test_where_derivatives_are_asked_for_it_is_plain() -> None:
+def test_the_reference_runs_where_derivatives_are_needed() -> None:
     for function, arguments, settings in calls((1, 96, 96), torch.float32):
         leaf = arguments[0].clone().requires_grad_()
         found = function(leaf, *arguments[1:], **settings)

@@ -94,7 +94,7 @@ class Foreign:
         return os.mkdir, (str(self.mark),)
 
 
-def test_what_is_kept_is_found_by_the_next_run(kernels: dict[str, Callable[..., Any]], folder: Path) -> None:
+def test_compiled_code_is_found_by_the_next_run(kernels: dict[str, Callable[..., Any]], folder: Path) -> None:
     assert [hits(kernels["twice"], 2.0) for _ in range(3)] == [0, 1, 1]
     assert [hits(kernels["twice"], 2) for _ in range(2)] == [0, 1]
     assert hits(kernels["thrice"], 2) == 0
@@ -103,7 +103,7 @@ def test_what_is_kept_is_found_by_the_next_run(kernels: dict[str, Callable[..., 
     assert len(files(folder)) == 1
 
 
-def test_a_file_that_somebody_killed_was_writing_is_removed_later(
+def test_the_half_written_file_of_a_killed_process_is_removed_later(
     kernels: dict[str, Callable[..., Any]], folder: Path
 ) -> None:
     hits(kernels["twice"], 2.0)
@@ -155,7 +155,9 @@ def test_a_damaged_file_is_written_again(kernels: dict[str, Callable[..., Any]],
 
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("what", ["folder", "pipe", "device", "link to nothing", "large", "file for a folder"])
-def test_what_is_no_file_is_not_waited_for(kernels: dict[str, Callable[..., Any]], folder: Path, what: str) -> None:
+def test_a_folder_or_pipe_in_place_of_a_file_is_not_waited_for(
+    kernels: dict[str, Callable[..., Any]], folder: Path, what: str
+) -> None:
     hits(kernels["twice"], 2.0)
     (path,) = files(folder)
     path.unlink()
@@ -189,7 +191,7 @@ def run(folder: Path, before: str = "") -> list[float]:
 
 
 @pytest.mark.slow
-def test_an_op_outlives_whatever_becomes_of_its_cache(tmp_path: Path) -> None:
+def test_an_op_runs_whatever_happens_to_its_cache(tmp_path: Path) -> None:
     # Every write beyond 4 KB fails, as on a full disk.
     full = "import resource, signal; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
     full += "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"

@@ -192,7 +192,7 @@ class TestEachTap:
         "change", [{"position": 5.11}, {"position": 4.89}, {"normal": 1.0}, {"depth": INF}, {"label": 8.0}]
     )
     @pytest.mark.parametrize("content", [100.0, NAN, INF])
-    def test_one_on_another_surface_is_left_out(self, change: dict[str, float], content: float) -> None:
+    def test_one_on_another_surface_is_rejected(self, change: dict[str, float], content: float) -> None:
         previous = self.previous.clone()
         previous[..., 1, 1] = content
         previous.requires_grad_()
@@ -218,7 +218,7 @@ class TestEachTap:
             value, _ = reproject(image([[0.0, 0.0], [1.0, 100.0]]), motion, own, self.other(label=8.0))
             assert value[0, 0, 0, 0].item() == pytest.approx(expected, rel=1e-2)
 
-    def test_another_surface_of_its_own_label_is_left_out(self) -> None:
+    def test_another_surface_of_its_own_label_is_rejected(self) -> None:
         own = self.plane._replace(label=image([[8.0] * 2] * 2))
         value, weight = reproject(self.previous, self.motion, own, self.other(label=8.0, position=50.0))
         assert (value[0, 0, 0, 0].item(), weight[0, 0, 0, 0].item()) == (2.0, 0.75)
@@ -240,7 +240,7 @@ class TestEachTap:
             _, weight = reproject(self.previous, self.motion, Surface(depth=self.plane.depth), there)
             assert weight[0, 0, 0, 0].item() == kept
 
-    def test_what_one_of_them_lacks_is_not_compared(self) -> None:
+    def test_a_buffer_of_only_one_surface_is_not_compared(self) -> None:
         elsewhere = self.other(position=50.0)._replace(normal=None, depth=None)
         _, weight = reproject(self.previous, self.motion, self.plane._replace(position=None), elsewhere)
         assert weight[0, 0, 0, 0].item() == 1.0
@@ -292,7 +292,7 @@ def test_background_matches_background_only(beyond: float) -> None:
     assert weight.flatten().tolist() == [1.0, 0.0, 0.0, 1.0]
 
 
-def test_a_new_frame_of_nan_does_not_hide_in_the_history() -> None:
+def test_nan_of_a_rejected_tap_does_not_reach_the_history() -> None:
     color, previous = draw(1, 1, 1, 2), draw(1, 1, 1, 2, seed=1)
     previous[..., 1] = NAN
     here, there = Surface(depth=image([[5.0, 5.0]])), Surface(depth=image([[5.0, 9.0]]))
@@ -318,7 +318,7 @@ def test_motion_of_a_known_point() -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(5, 7), (1, 1), (8, 3)])
-def test_what_a_still_camera_sees_does_not_move(height: int, width: int) -> None:
+def test_a_still_camera_gives_no_motion(height: int, width: int) -> None:
     centres = [torch.arange(size, dtype=torch.float64) + 0.5 for size in (height, width)]
     rows, columns = torch.meshgrid(*centres, indexing="ij")
     depth = 1 + 9 * draw(2, height, width)

@@ -105,7 +105,7 @@ def test_an_orthographic_camera() -> None:
     np.testing.assert_allclose(found.matrix[:, 0], expected, atol=1e-6)
 
 
-def test_points_of_one_plane_tell_no_camera() -> None:
+def test_no_camera_is_found_from_points_of_one_plane() -> None:
     direction = rays()
     floor = EYE + (0 - EYE[2]) / direction[..., 2:] * direction
     down = direction[..., 2] < -0.05
@@ -115,7 +115,7 @@ def test_points_of_one_plane_tell_no_camera() -> None:
     assert fit_camera(floor.astype(np.float32).astype(np.float64), down) is None
 
 
-def test_what_is_no_image_of_positions_tells_no_camera() -> None:
+def test_no_camera_is_found_in_other_images_than_positions() -> None:
     random = np.random.default_rng(0)
     assert fit_camera(random.standard_normal((HEIGHT, WIDTH, 3)), ALL) is None
     assert fit_camera(np.zeros((HEIGHT, WIDTH, 3)), ALL) is None

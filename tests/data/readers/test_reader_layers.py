@@ -172,7 +172,7 @@ def test_every_spelling_in_the_table_of_names_is_recognised(buffer: str) -> None
         ("光_albedo", "albedo"),
     ],
 )
-def test_a_file_of_one_picture_is_what_its_name_says(label: str, buffer: str | None) -> None:
+def test_the_name_of_a_file_with_one_picture_decides_its_buffer(label: str, buffer: str | None) -> None:
     (layer,) = layers_of(0, label, [part("B G R")])
     assert layer.anonymous
     assert layer.channels == ("R", "G", "B")
@@ -281,7 +281,7 @@ def test_a_buffer_can_be_done_without(layered: Path) -> None:
         (["length=N1"], "expected BUFFER=LAYER"),
     ],
 )
-def test_what_cannot_be_asked_for(
+def test_layers_that_cannot_be_requested(
     texts: list[str], expected: str, layered: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
 ) -> None:
     assert expected in refused(open_sequence, layered, mapping=texts)
@@ -309,7 +309,7 @@ def test_every_buffer_can_be_asked_for() -> None:
         ),
     ],
 )
-def test_two_candidates_are_refused_with_what_decides(
+def test_two_candidates_are_refused_with_the_option_that_decides(
     channels: str, flags: list[str], save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]
 ) -> None:
     path = save(tmp_path / "a.exr", {name: np.ones(SIZE) for name in channels.split()})

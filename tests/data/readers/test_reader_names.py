@@ -154,7 +154,7 @@ def test_several_inputs_are_taken_once(image: Callable[..., list[Path]], tmp_pat
         ([], "found nothing"),
     ],
 )
-def test_what_is_not_there(
+def test_paths_and_patterns_without_files(
     given: Sequence[str], expected: str, image: Callable[..., list[Path]], tmp_path: Path, refused: Callable[..., str]
 ) -> None:
     image("a_0001.exr")
@@ -195,7 +195,7 @@ def test_gaps_are_told(image: Callable[..., list[Path]], tmp_path: Path) -> None
     assert "1, 3, 5, 7, 9, 11, 13, 15 and 11 more missing" in warning
 
 
-def test_two_shots_are_refused_with_what_decides(
+def test_two_shots_are_refused_with_the_option_that_decides(
     image: Callable[..., list[Path]], tmp_path: Path, refused: Callable[..., str]
 ) -> None:
     image(*[f"all/shot{shot:02d}_{number:04d}.exr" for shot in (1, 2) for number in (1, 2)])
@@ -291,7 +291,7 @@ def test_a_shot_may_have_a_letter_for_a_name(letter: str, image: Callable[..., l
     assert meaning is None or taken[meaning] == f"{letter}_1.exr"
 
 
-def test_what_is_no_radiance_is_not_denoised(
+def test_files_without_radiance_are_not_denoised(
     image: Callable[..., list[Path]], tmp_path: Path, refused: Callable[..., str]
 ) -> None:
     image("albedo_1.exr", "normal_1.exr")

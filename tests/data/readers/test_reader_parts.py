@@ -80,7 +80,7 @@ def test_blenders_passes_are_added_with_their_colors(tmp_path: Path, save: Save,
 
 
 @pytest.mark.parametrize("absent", [["Emit"], ["TransInd", "Env"], ["GlossDir"], ["DiffInd"]])
-def test_what_is_missing_is_named_and_nothing_is_used(tmp_path: Path, save: Save, absent: list[str]) -> None:
+def test_missing_passes_are_named_and_no_part_is_used(tmp_path: Path, save: Save, absent: list[str]) -> None:
     channels, _ = blender(*absent)
     sequence = open_sequence(save(tmp_path / "shot_0001.exr", channels, "half"))
     assert not sequence.buffers & {"diffuse", "specular", "specular_albedo"}
@@ -104,14 +104,14 @@ def test_a_color_that_has_been_denoised_is_not_the_sum(tmp_path: Path, save: Sav
     assert not open_sequence(save(tmp_path / "both_0001.exr", both)).warnings
 
 
-def test_diffuse_light_alone_claims_nothing(tmp_path: Path, save: Save) -> None:
+def test_diffuse_light_alone_gives_no_parts_and_no_warning(tmp_path: Path, save: Save) -> None:
     channels, _ = blender(*BLENDER["specular"])
     sequence = open_sequence(save(tmp_path / "shot_0001.exr", channels))
     assert "diffuse" not in sequence.buffers
     assert not sequence.warnings
 
 
-def test_a_file_without_color_is_refused_as_ever(tmp_path: Path, save: Save, refused: Callable[..., str]) -> None:
+def test_a_file_without_color_is_refused(tmp_path: Path, save: Save, refused: Callable[..., str]) -> None:
     channels, _ = blender("Combined")
     path = save(tmp_path / "shot_0001.exr", channels)
     assert "expected noisy radiance" in refused(open_sequence, path)
@@ -119,7 +119,7 @@ def test_a_file_without_color_is_refused_as_ever(tmp_path: Path, save: Save, ref
 
 @pytest.mark.parametrize("layout", ["layers", "files", "files of a shot"])
 @pytest.mark.parametrize("emits", [False, True])
-def test_anybodys_layers_by_their_names(tmp_path: Path, save: Save, layout: str, emits: bool) -> None:
+def test_layers_named_diffuse_and_specular_are_used(tmp_path: Path, save: Save, layout: str, emits: bool) -> None:
     images = {"diffuse": drawn(0), "specular": drawn(1), "specular_albedo": drawn(2) / 2}
     images |= {"emission": drawn(3)} if emits else {}
     images["color"] = sum(
@@ -153,7 +153,7 @@ def test_emission_that_is_in_the_specular_light_already(tmp_path: Path, save: Sa
     assert frame.emission is None
 
 
-def test_layers_that_somebody_chooses(tmp_path: Path, save: Save) -> None:
+def test_layers_can_be_mapped(tmp_path: Path, save: Save) -> None:
     matt, shiny = drawn(0), drawn(1)
     light = {"Combined": matt + shiny, "matt": matt, "shiny": shiny, "other": drawn(2)}
     path = save(
@@ -166,7 +166,7 @@ def test_layers_that_somebody_chooses(tmp_path: Path, save: Save) -> None:
     assert wrong.frame(1).specular is None
 
 
-def test_somebody_may_leave_them_out(tmp_path: Path, save: Save) -> None:
+def test_mapping_diffuse_to_nothing_disables_the_parts(tmp_path: Path, save: Save) -> None:
     channels, _ = blender("Emit")
     path = save(tmp_path / "shot_0001.exr", channels)
     assert open_sequence(path).warnings
@@ -205,7 +205,7 @@ def test_a_frame_without_a_pass_leaves_all_without(tmp_path: Path, save: Save) -
     assert "diffuse" not in open_sequence(tmp_path).buffers
 
 
-def test_they_are_read_only_for_who_wants_them(tmp_path: Path, save: Save) -> None:
+def test_the_parts_are_read_on_request_only(tmp_path: Path, save: Save) -> None:
     sequence = open_sequence(save(tmp_path / "shot_0001.exr", blender()[0]))
     assert sequence.frame(1, buffers={"albedo"}).diffuse is None
     assert sequence.frame(1, buffers={"specular"}).diffuse is not None
@@ -222,7 +222,7 @@ def test_real_files_of_cycles(rendered: Path) -> None:
         torch.testing.assert_close(frame.diffuse + frame.specular, frame.color, rtol=3 * 2.0**-11, atol=1e-6)
 
 
-def test_what_few_methods_use_is_told(run: Run, rendered: Path, tmp_path: Path) -> None:
+def test_inspect_names_the_methods_that_use_the_parts(run: Run, rendered: Path, tmp_path: Path) -> None:
     status, printed, _ = run("inspect", rendered / "blender", "--json", tmp_path / "found.json")
     assert status == 0
     assert "diffuse: of use to kpcn\n" in printed

@@ -151,7 +151,7 @@ def center(position: Image) -> Image:
 
 
 @pytest.mark.parametrize("renderer", RENDERED)
-def test_what_a_real_renderer_wrote_is_read_without_a_flag(renderer: str, rendered: Path) -> None:
+def test_files_of_real_renderers_are_read_without_a_flag(renderer: str, rendered: Path) -> None:
     folder = rendered / renderer
     # Mitsuba's array without names of channels lies beside its frames.
     sequence = open_sequence(folder / "frame.####.exr" if renderer == "mitsuba" else folder)
@@ -167,7 +167,9 @@ def test_what_a_real_renderer_wrote_is_read_without_a_flag(renderer: str, render
 
 
 @pytest.mark.parametrize("renderer", NAMED)
-def test_what_has_the_names_of_another_is_read_without_a_flag(renderer: str, others: Any, tmp_path: Path) -> None:
+def test_files_with_names_of_other_renderers_are_read_without_a_flag(
+    renderer: str, others: Any, tmp_path: Path
+) -> None:
     others.write(renderer, tmp_path)
     sequence = open_sequence(tmp_path)
     assert taken(sequence) == NAMED[renderer]

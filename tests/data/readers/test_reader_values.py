@@ -67,7 +67,7 @@ def test_one_noisy_frame_tells_whether_the_albedo_is_in(kind: str, seed: int) ->
 
 
 @pytest.mark.parametrize("included", [True, False])
-def test_one_color_everywhere_tells_nothing(included: bool) -> None:
+def test_a_constant_albedo_does_not_decide_whether_it_is_included(included: bool) -> None:
     albedo, irradiance = texture("one"), light(0)
     color = albedo * irradiance if included else irradiance
     assert albedo_included(color, albedo).included is None
@@ -247,7 +247,7 @@ def test_the_known_convention_stays_where_nothing_moves() -> None:
     assert match_motion([(now, before, stored)], given)[0][:2] == given[:2]
 
 
-def test_motion_that_contradicts_what_is_seen_is_none() -> None:
+def test_motion_that_contradicts_the_frames_is_not_used() -> None:
     now, before = moving((0, 0))
     random = np.random.default_rng(0)
     stored = random.uniform(-20, 20, (60, 100, 2)).astype(np.float32)

@@ -224,7 +224,7 @@ def test_other_threads_print_while_a_file_is_written(
     assert capsys.readouterr().out.count("here") == count
 
 
-def test_full_floats_are_for_what_is_replaced(save: Callable[..., Path], tmp_path: Path) -> None:
+def test_full_float_applies_to_replaced_channels_only(save: Callable[..., Path], tmp_path: Path) -> None:
     source = save(tmp_path / "a" / "still.exr", {name: noise(*SIZE) for name in "RGBAZ"}, "half")
     (tmp_path / "out").mkdir()
     image = noise(*SIZE, 3, seed=1)
@@ -415,7 +415,9 @@ def test_the_input_folder_is_no_output(rendered: Path, tmp_path: Path, refused: 
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_several_folders_are_no_output_either(rendered: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
+def test_none_of_several_input_folders_may_be_the_output(
+    rendered: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
     """Files of one shot may lie in several folders; none of them is overwritten."""
     for number in (1, 2, 3, 4):
         for kind in ("color", "albedo"):
@@ -429,7 +431,7 @@ def test_several_folders_are_no_output_either(rendered: Path, tmp_path: Path, re
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.exr")} == before
 
 
-def test_what_is_in_the_way_is_told(rendered: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
+def test_a_path_that_cannot_be_written_is_named(rendered: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
     sequence = open_sequence(rendered / "mitsuba" / "frame.####.exr")
     (tmp_path / "frame.0002.exr").mkdir()
     image = rainbow(*sequence.size)
