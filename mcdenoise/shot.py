@@ -124,9 +124,7 @@ class ShotSettings:
         if self.output_layer is not None:
             opened.check_output_layer(self.output_layer)
         if self.alpha and "alpha" not in opened.buffers:
-            raise InputError(
-                f"--alpha: expected an alpha to denoise, found none in {opened.root}; omit the option"
-            )
+            raise InputError(f"--alpha: expected an alpha to denoise, found none in {opened.root}; omit the option")
         return opened
 
     def chosen(

@@ -22,8 +22,9 @@ from torch import Tensor
 
 from mcdenoise.ops._numba._cache import VerifiedCache
 
-# A thread of its own for fewer pixels costs more than it saves.
-PIXELS_A_THREAD = 4096
+# Handing rows to a thread takes as long as filtering some thousand pixels, or this many times as many pixels if there
+# are a few operations for each.
+PIXELS_A_THREAD, LIGHT = 16384, 4
 # What is no larger may be of numbers that are all small.
 _ORDINARY = 1e-15
 
@@ -68,11 +69,18 @@ def readable(tensor: Tensor, dtype: torch.dtype) -> Tensor:
     return tensor if tensor.dtype == torch.bfloat16 and dtype == torch.float32 else tensor.to(dtype)
 
 
-def share_rows(image: Tensor, run: Callable[[int, int, int], None]) -> None:
-    """``run(b, first, last)`` for all rows of all images of the batch, on as many threads as torch uses."""
+def share_rows(image: Tensor, run: Callable[[int, int, int], None], light: bool = False) -> None:
+    """``run(b, first, last)`` for all rows of all images of the batch, on at most as many threads as torch uses.
+
+    Args:
+        image: an image of the same batch and size.
+        run: computes rows of one image.
+        light: whether there are only a few operations for each pixel, and so fewer threads.
+    """
     batch, _, height, width = image.shape
     rows = batch * height
-    threads = max(1, min(torch.get_num_threads(), rows, rows * width // PIXELS_A_THREAD))
+    least = PIXELS_A_THREAD * (LIGHT if light else 1)
+    threads = max(1, min(torch.get_num_threads(), rows, rows * width // least))
 
     def fraction(number: int) -> None:
         row, end = rows * number // threads, rows * (number + 1) // threads

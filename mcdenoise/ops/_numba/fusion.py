@@ -18,7 +18,7 @@ def downsample(image: Tensor) -> Tensor:
     result = _empty_half(image).to(accumulator_dtype(image.dtype))
     if result.numel():
         arguments = (result.numpy(), source(readable(image, result.dtype)), *image.shape[2:])
-        share_rows(result, lambda *rows: _halve(*arguments, *rows))
+        share_rows(result, lambda *rows: _halve(*arguments, *rows), light=True)
     return result.to(image.dtype)
 
 

@@ -89,7 +89,7 @@ def _enter(color: Tensor, albedo: Tensor | None, limits: Tensor, kernel_size: in
     images = (source((nothing if image is None else image).to(dtype)) for image in (color, albedo))
     settings = out.new_tensor([FLOOR, NO_ALBEDO]).numpy()
     arguments = (out.numpy(), *images, *settings, limits.detach().contiguous().numpy(), kernel_size // 2, roots)
-    share_rows(color, lambda *rows: _incoming(*arguments, *rows))
+    share_rows(color, lambda *rows: _incoming(*arguments, *rows), light=True)
     return out
 
 
@@ -231,7 +231,7 @@ def _find_lights(root: Tensor, even: float, brighter: float, window: int) -> Ten
     found = root.new_zeros(root.shape)
     if min(root.shape[-2:]) > 2 and len(root):
         arguments = (found.numpy(), source(root), *root.new_tensor([even, brighter]).numpy(), window // 2)
-        share_rows(root, lambda *rows: _lights(*arguments, *rows))
+        share_rows(root, lambda *rows: _lights(*arguments, *rows), light=True)
     return found
 
 
@@ -313,9 +313,13 @@ def _discard_lag(
     settings = history.new_tensor([threshold, SMALLEST_LAG, recent_alpha, recent_frames]).numpy()
     limits, alpha, frames = settings[:2], settings[2], settings[3]
     blocks, image, lengths, radius = halves.numpy(), history.numpy(), length.numpy(), kernel_size // 2
-    share_rows(halves, lambda *rows: _halve(blocks, image, lengths, color.numpy(), frames, *rows))
-    share_rows(halves, lambda *rows: _find_recent_lag(blocks, *limits, radius, *rows))
-    share_rows(halves, lambda *rows: _find_lag(blocks, image, lengths, color.numpy(), *limits, alpha, radius, *rows))
+    share_rows(halves, lambda *rows: _halve(blocks, image, lengths, color.numpy(), frames, *rows), light=True)
+    share_rows(halves, lambda *rows: _find_recent_lag(blocks, *limits, radius, *rows), light=True)
+    share_rows(
+        halves,
+        lambda *rows: _find_lag(blocks, image, lengths, color.numpy(), *limits, alpha, radius, *rows),
+        light=True,
+    )
 
 
 @_discard_lag.register_fake

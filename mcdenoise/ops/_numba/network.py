@@ -225,7 +225,7 @@ def _network_guides(normal: Tensor, depth: Tensor, near: Tensor, typical: Tensor
         images = tuple(source(image.to(result.dtype)) for image in (normal, depth))
         factors = torch.cat([each.to(result.dtype).expand(len(normal), 1, 1, 1) for each in (near, typical)], 1)
         scales = factors.flatten(1).numpy()
-        share_rows(normal, lambda *rows: _guide(result.numpy(), *images, scales, *rows))
+        share_rows(normal, lambda *rows: _guide(result.numpy(), *images, scales, *rows), light=True)
     return result
 
 
@@ -362,10 +362,10 @@ def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
     image = source(readable(depth, dtype))
     rows = torch.zeros((2, batch, height), dtype=dtype, device="cpu")
     arguments = (rows.numpy(), image, depth.shape[3])
-    share_rows(depth, lambda *fraction: _roots_of_rows(*arguments, *fraction))
+    share_rows(depth, lambda *fraction: _roots_of_rows(*arguments, *fraction), light=True)
     root = _mean(rows)
     near = torch.where(root > 0, 1 / root.square(), 1).to(dtype)
-    share_rows(depth, lambda *fraction: _logarithms_of_rows(*arguments, near.numpy(), *fraction))
+    share_rows(depth, lambda *fraction: _logarithms_of_rows(*arguments, near.numpy(), *fraction), light=True)
     return near.reshape(batch, 1, 1, 1), torch.exp(_mean(rows)).to(dtype).reshape(batch, 1, 1, 1)
 
 
@@ -432,7 +432,7 @@ def softplus(x: Tensor, units: list[float]) -> Tensor:
     result = _empty_planes(x)
     if result.numel():
         arguments = (result.numpy(), source(readable(x, result.dtype)), result.new_tensor(units).numpy())
-        share_rows(x, lambda *rows: _softplus_rows(*arguments, *rows))
+        share_rows(x, lambda *rows: _softplus_rows(*arguments, *rows), light=True)
     return result
 
 
@@ -657,7 +657,7 @@ def _low_frequencies_of(fine: Tensor, means: Tensor, coarse: Tensor, most: Tenso
         limits = most.to(dtype).expand(len(fine), 1, 1, 1).flatten()
         settings = limits.new_tensor([dark]).numpy()
         arguments = (result.numpy(), source(readable(fine, dtype)), *blocks, limits.numpy(), *settings)
-        share_rows(fine, lambda *rows: _replace_means(*arguments, *rows))
+        share_rows(fine, lambda *rows: _replace_means(*arguments, *rows), light=True)
     return result
 
 

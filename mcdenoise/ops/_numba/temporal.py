@@ -39,7 +39,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
             source(position.to(dtype)),
             previous_view_projection.detach().to(dtype).contiguous().numpy(),
         )
-        share_rows(position, lambda *rows: _motion(*arguments, *rows))
+        share_rows(position, lambda *rows: _motion(*arguments, *rows), light=True)
     return motion
 
 
