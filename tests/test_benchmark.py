@@ -278,16 +278,20 @@ def test_nothing_is_left_of_a_run_that_is_interrupted(small_sequence: Path, out:
 
 
 def _spinning() -> list[str]:
-    """States of the processes of this test that keep a core busy."""
+    """States of the processes that keep a core busy for this test: grandchildren, since each is repeated by another."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             if folder.joinpath("cmdline").read_bytes().split(b"\0")[-2:-1] == [_SPIN.encode()]:
-                state, parent = folder.joinpath("stat").read_text().rpartition(")")[2].split()[:2]
-                found += [state] if int(parent) == os.getpid() else []
+                state, parent = _state_and_parent(folder)
+                found += [state] if _state_and_parent(Path("/proc", parent))[1] == str(os.getpid()) else []
         except OSError:
             continue
     return found
+
+
+def _state_and_parent(process: Path) -> list[str]:
+    return process.joinpath("stat").read_text().rpartition(")")[2].split()[:2]
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs the process table of Linux")

@@ -318,7 +318,7 @@ def test_a_model_of_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     ("name", "expected"),
     [
         ("{folder}/mine.py:missing", "expected a factory 'missing' in"),
-        ("{folder}/mine.py:number", "expected a factory that can be called, found int"),
+        ("{folder}/mine.py:number", "found an object of type int"),
         ("{folder}/mine.py:nothing", "found int"),
         ("{folder}/mine.py:", "expected a factory"),
         ("{folder}/none.py:Mine", "found no such file"),

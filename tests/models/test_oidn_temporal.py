@@ -22,7 +22,17 @@ from mcdenoise.models.oidn import Oidn
 from mcdenoise.models.oidn_temporal import Mixed
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
 from mcdenoise.models.steadied import Steadied
-from mcdenoise.models.with_oidn import EXACT, NOISY, OIDN, OIDN_CLEAN, WithOidn, has_exact_features
+from mcdenoise.models.with_oidn import (
+    EXACT,
+    NOISY,
+    OIDN,
+    OIDN_CLEAN,
+    WithOidn,
+    _merged,
+    _phases,
+    _without_pattern,
+    has_exact_features,
+)
 from mcdenoise.nn.oidn import oidn_exposure
 
 if importlib.util.find_spec("pyoidn") is None:
@@ -48,6 +58,47 @@ def test_a_still_is_a_mean_of_two_images() -> None:
     torch.testing.assert_close(output.image, (noisy + 2 * clean) / 3)
     torch.testing.assert_close(output.stages["oidn"], noisy)
     torch.testing.assert_close(output.stages["oidn_clean"], clean)
+
+
+def test_noise_that_neighbours_share_is_removed() -> None:
+    rows, columns = torch.meshgrid(torch.arange(151), torch.arange(201), indexing="ij")
+    albedo = (0.2 + 0.6 * ((rows // 20 + columns // 20) % 2)).expand(1, 3, -1, -1)
+    light = 1 + 0.3 * torch.sin(rows / 30) * torch.cos(columns / 40)
+    noise = torch.empty(1, 1, 151, 201).exponential_(generator=torch.Generator().manual_seed(0))
+    # Mitsuba's default: a Gaussian of half a pixel; samples lie anywhere in their pixel, which widens it.
+    film = torch.exp(-(torch.arange(-2.0, 3) ** 2) / (2 * (0.5**2 + 1 / 12)))
+    film = (film[:, None] * film / film.sum() ** 2).expand(3, 1, 5, 5)
+    color = torch.nn.functional.conv2d(albedo * light * noise, film, groups=3, padding=2)
+    truth = torch.nn.functional.conv2d(albedo * light, film, groups=3, padding=2)
+    frame = Frame(color, albedo=albedo, normal=torch.tensor([0.0, 0, 1]).reshape(1, 3, 1, 1).expand(1, 3, 151, 201))
+    stages, oidn = create_model(NAME, threads=1)(frame)[0].stages, Oidn("high", threads=1)
+    assert stages["oidn"].shape == color.shape
+    whole = oidn.denoised(frame, "noisy")
+    assert smape_linear(stages["oidn"], truth) < smape_linear(whole, truth) / 2
+
+
+@pytest.mark.parametrize("size", [(6, 8), (5, 7)])
+def test_phases_are_every_second_pixel(size: tuple[int, int]) -> None:
+    image = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
+    phases = _phases(image)
+    for phase, (row, column) in enumerate(itertools.product((0, 1), repeat=2)):
+        part = image[..., row::2, column::2]
+        torch.testing.assert_close(phases[phase::4, :, : part.shape[-2], : part.shape[-1]], part)
+    torch.testing.assert_close(_merged(phases, size), image)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e4])
+def test_a_pattern_of_two_by_two_pixels_is_removed_and_an_edge_kept(unit: float) -> None:
+    image = torch.ones(1, 3, 12, 12)
+    image[..., 6:] = 3
+    pattern = torch.tensor([[0.94, 1.02], [0.98, 1.06]]).repeat(6, 6)
+    found = _without_pattern(unit * image * pattern) / unit
+    # The guide of columns 4 to 7 varies, because the binomial kernel covers the edge. Rows at the border are repeated.
+    torch.testing.assert_close(found[..., 2:-2, 2:4], image[..., 2:-2, 2:4])
+    torch.testing.assert_close(found[..., 2:-2, 8:10], image[..., 2:-2, 8:10])
+    # Beside the edge a weight of exp(-30 log(1.5)^2) / 2 is left for one neighbour, and of exp(-30 log(5/3)^2) / 2 for
+    # the other, so that only the mean over two rows is taken.
+    torch.testing.assert_close(found[0, 0, 4, 5:7], torch.tensor([1.04, 3 * 0.96]), rtol=0.01, atol=0)
 
 
 @pytest.mark.parametrize("exact", [0.0, 1.0])

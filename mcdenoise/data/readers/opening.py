@@ -35,13 +35,13 @@ from mcdenoise.data.readers.values import (
     USUAL_MOTION,
     Convention,
     Row,
-    noise_is_spread,
     normal_is_encoded,
     nothing_hit,
     read_motion,
     read_radiance,
 )
 from mcdenoise.errors import InputError
+from mcdenoise.noise import noise_is_spread
 
 # Motion conventions known by layer name: Blender's points to the previous frame, in pixels, y up.
 _MOTION = {"vector": Convention(1, -1, "previous - current, y up, pixels")}
@@ -256,6 +256,11 @@ def _look(shot: RenderedFiles, color_has_albedo: bool | None) -> None:
         shot.table.append(Row("layer", layer.place, f"times {colors[0]}" if colors else "light"))
 
 
+def _as_tensor(image: Image) -> Tensor:
+    """``(1, C, H, W)``, which shares the memory."""
+    return torch.from_numpy(image).permute(2, 0, 1)[None]
+
+
 def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list[str], stated: bool | None) -> None:
     if shot.part(shot.choice.layers["color"]).display_referred:
         words.append("display values, made linear")
@@ -263,10 +268,12 @@ def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
             "'color': 8 or 16 bits of display values: what was brighter than white is lost; render floats"
         )
     albedo = np.clip(np.nan_to_num(images["albedo"]), 0, 1) if "albedo" in images else None
-    if noise_is_spread(np.nan_to_num(images["color"][..., :3]), albedo):
+    color = np.nan_to_num(images["color"][..., :3])
+    if noise_is_spread(_as_tensor(color), None if albedo is None else _as_tensor(albedo)):
         shot.warnings.append(
             "'color': neighbouring pixels share noise, since the film's filter counts each sample in several of them, "
-            "as Mitsuba's default does; denoisers leave such noise in, OIDN most: render with a box filter"
+            "as Mitsuba's default does; many denoisers leave such noise in, OIDN most: render with a box filter, or "
+            "use the model oidn_temporal"
         )
     if albedo is None:
         words.append("radiance")

@@ -22,12 +22,6 @@ _BLOCK = 8
 # Elasticities near 1 and near 0 are distinguished, although gloss and light between colored walls lower both (measured:
 # 0.47 to 1.17 and -0.53 to 0.19). The value must exceed this many standard errors, and errors must be below this limit.
 _THRESHOLD, _SIGMAS, _LARGEST_ERROR = 1 / 3, 3.0, 0.15
-# Ratio of second differences over one pixel and over two, without albedo: 1 if the noise of pixels is independent
-# (measured on 132 shots of Mitsuba and Cycles: 0.82 to 1.14), less if samples are spread over several pixels (0.41 to
-# 0.80 on 34 with Gaussian, Mitchell and tent filters). Smallest relative difference of noisy pixels, which half of the
-# pixels must exceed: edges and textures of references had up to 0.035.
-_SPREAD, _NOISE, _LEAST_NOISY, _TYPICAL_NOISE = 0.78, 0.02, 4000, 0.04
-_MIDDLE = 640  # side of the central region that is examined, in pixels
 # One reading must be closer to the reference than the other by this factor.
 _NEARER = 1.5
 _LARGEST_MOTION = 1e5
@@ -108,25 +102,6 @@ def albedo_included_as_in(reference: Image, color: Image, albedo: Image) -> bool
     """Whether radiance includes the albedo by comparison with its reference; ``None`` if neither is clearly closer."""
     with_it, without = (_distance(image, reference) for image in (color, color * albedo))
     return with_it < without if max(with_it, without) > _NEARER * min(with_it, without) else None
-
-
-def noise_is_spread(color: Image, albedo: Image | None) -> bool:
-    """Whether neighbouring pixels have correlated noise, because the film's filter spreads each sample."""
-    # The centre of a large image suffices.
-    middle = tuple(slice(max(side - _MIDDLE, 0) // 2, (side + _MIDDLE) // 2) for side in color.shape[:2])
-    color, albedo = color[middle], None if albedo is None else albedo[middle]
-    light = (color if albedo is None else color / np.maximum(albedo, 0.02)).mean(-1)
-    ratios = []
-    for x in (light, light.T):
-        two, one, here, other, far = (x[:, i : x.shape[1] - 4 + i] for i in range(5))
-        mean = np.maximum(two + one + 2 * here + other + far, 1e-9)
-        near, wide = np.abs(one - 2 * here + other) / mean, np.abs(two - 2 * here + far) / mean
-        # Pixels without noise are correlated by the image content.
-        noisy = near + wide > _NOISE
-        if noisy.sum() < _LEAST_NOISY or np.median(wide) < _TYPICAL_NOISE:
-            return False
-        ratios.append(np.median(near[noisy]) / np.median(wide[noisy]))
-    return bool(max(ratios) < _SPREAD)
 
 
 def _distance(image: Image, reference: Image) -> float:

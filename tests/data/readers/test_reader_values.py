@@ -19,7 +19,6 @@ from mcdenoise.data.readers.values import (
     is_direction,
     match_cameras,
     match_motion,
-    noise_is_spread,
     normal_is_encoded,
     nothing_hit,
     read_radiance,
@@ -359,27 +358,3 @@ def test_zero_motion_is_dropped_where_the_camera_moves(others: Any, save: Callab
     assert "motion" in still.buffers
     assert list(still.warnings) == []
     assert not still.frame(2).motion.any()
-
-
-@pytest.mark.parametrize("kind", ["colored", "grey", "plain"])
-@pytest.mark.parametrize("seed", range(3))
-def test_noise_that_neighbours_share_is_told_from_noise_of_their_own(kind: str, seed: int) -> None:
-    albedo = texture(kind)
-    color = albedo * light(seed)
-    assert not noise_is_spread(color, albedo)
-    # Mitsuba's default: a Gaussian of half a pixel; samples lie anywhere in their pixel, which widens it.
-    weights = np.exp(-(np.arange(-2, 3) ** 2) / (2 * (0.5**2 + 1 / 12)))
-    spread = color
-    for axis in (0, 1):
-        shifted = [np.roll(spread, shift, axis) for shift in range(-2, 3)]
-        spread = sum(w * each for w, each in zip(weights / weights.sum(), shifted, strict=True))
-    assert noise_is_spread(spread, albedo)
-    assert noise_is_spread(spread * 1e-6, None) or kind != "plain"
-
-
-def test_pixels_without_noise_tell_nothing_of_it() -> None:
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    smooth = (2 + np.sin(rows / 9) * np.cos(columns / 7))[..., None].repeat(3, -1)
-    assert not noise_is_spread(smooth, None)
-    assert not noise_is_spread(np.zeros((HEIGHT, WIDTH, 3)), None)
-    assert not noise_is_spread(np.ones((3, 4, 3)), None)

@@ -1,0 +1,60 @@
+"""Whether the noise of neighbouring pixels is correlated."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.noise import noise_is_spread
+
+HEIGHT, WIDTH = 192, 320
+ROWS, COLUMNS = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+
+
+def texture(kind: str) -> Tensor:
+    """Albedo of checks, in colors or in greys, or of one color everywhere."""
+    colors = {
+        "colored": [[0.8, 0.3, 0.1], [0.2, 0.5, 0.6], [0.6, 0.6, 0.2]],
+        "grey": [[0.8] * 3, [0.15] * 3, [0.4] * 3],
+        "plain": [[0.6, 0.4, 0.3]] * 3,
+    }
+    return torch.tensor(colors[kind])[(ROWS // 5 + COLUMNS // 7) % 3].permute(2, 0, 1)[None]
+
+
+def light(seed: int) -> Tensor:
+    """One sample a pixel of smooth light: most paths find nothing, few find a lamp, and those are bright."""
+    generator = torch.Generator().manual_seed(seed)
+    smooth = 1 + 0.5 * torch.sin(ROWS / 40) * torch.cos(COLUMNS / 50)
+    drawn, bright = torch.rand(2, HEIGHT, WIDTH, generator=generator)
+    # A Pareto distribution, in nearly the same color for the whole path.
+    path = torch.where(drawn < 0.4, 2 * (bright.clamp_min(1e-6) ** (-1 / 2.5) - 1), torch.tensor(0.05))
+    tint = (1 + 0.05 * torch.randn(1, 3, HEIGHT, WIDTH, generator=generator)).clamp(0.5, 1.5)
+    return smooth * path * tint * torch.tensor([1, 0.9, 0.8]).reshape(3, 1, 1)
+
+
+def through_film(color: Tensor) -> Tensor:
+    """Mitsuba's default: a Gaussian of half a pixel; samples lie anywhere in their pixel, which widens it."""
+    weights = torch.exp(-(torch.arange(-2.0, 3) ** 2) / (2 * (0.5**2 + 1 / 12)))
+    weights = (weights[:, None] * weights / weights.sum() ** 2).expand(3, 1, 5, 5)
+    return F.conv2d(F.pad(color, [2] * 4, mode="circular"), weights, groups=3)
+
+
+@pytest.mark.parametrize("kind", ["colored", "grey", "plain"])
+@pytest.mark.parametrize("seed", range(3))
+def test_correlated_noise_is_detected(kind: str, seed: int) -> None:
+    albedo = texture(kind)
+    color = albedo * light(seed)
+    assert not noise_is_spread(color, albedo)
+    assert noise_is_spread(through_film(color), albedo)
+    assert noise_is_spread(through_film(color) * 1e-6, None) or kind != "plain"
+    # Every second pixel of every second row has hardly any noise in common.
+    assert not noise_is_spread(through_film(color)[..., ::2, ::2], albedo[..., ::2, ::2])
+
+
+def test_an_image_without_noise_has_no_correlated_noise() -> None:
+    smooth = (2 + torch.sin(ROWS / 9) * torch.cos(COLUMNS / 7)).expand(1, 3, -1, -1)
+    assert not noise_is_spread(smooth, None)
+    assert not noise_is_spread(torch.zeros(1, 3, HEIGHT, WIDTH), None)
+    assert not noise_is_spread(torch.ones(1, 3, 3, 4), None)
