@@ -25,10 +25,10 @@ KINDS = {
 }
 WEIGHTS = {
     "shipped": "in the package, trained for hours",
-    "compared": "in the package, trained for minutes, to be compared on equal terms",
-    "its own": "found by itself, in another package",
+    "compared": "in the package, trained for minutes, for comparisons on equal terms",
+    "its own": "those of another package",
     "to train": "none; to be trained",
-    "none": "it has none",
+    "none": "none",
 }
 # How the tables of measurements call the methods.
 NAMES = {
@@ -95,7 +95,7 @@ def index(entries: list[ModelOverview]) -> str:
             if entry.kind == kind
         ]
         if rows:
-            head = "| method | what | paper | weights | kMAC a pixel |\n|---|---|---|---|--:|"
+            head = "| method | description | paper | weights | kMAC a pixel |\n|---|---|---|---|--:|"
             parts.append("\n".join([f"## {title}\n", head, *rows]))
     return "\n\n".join(parts) + "\n"
 
@@ -124,10 +124,10 @@ def page(entry: ModelOverview) -> str:
     module = importlib.import_module(construct.__module__)
     file = construct.__module__.replace(".", "/") + ".py"
     facts = {
-        "what": entry.description,
+        "description": entry.description,
         "paper": paper(entry),
-        "needs": code(entry.needs),
-        "is better with": code(entry.uses),
+        "required buffers": code(entry.needs),
+        "optional buffers": code(entry.uses),
         "weights": WEIGHTS[entry.weights],
         "parameters": f"{entry.parameters:,}" if entry.parameters else "-",
         "cost": f"{cost(entry)} thousand multiply-adds a pixel in convolutions" if entry.kmacs_per_pixel else "-",

@@ -17,7 +17,7 @@ from mcdenoise.models.pyramid import PyramidNetwork, widths_of
 from mcdenoise.models.recurrent import Recurrent
 from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.models.with_oidn import OIDN, OIDN_CLEAN, WithOidn
+from mcdenoise.models.with_oidn import OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
 
 
 @register_model("oidn_pyramid", kind="peer", paper="after Zheng et al. 2021", requires="pyoidn")
@@ -42,5 +42,5 @@ def oidn_pyramid(
         InputError: see both classes.
     """
     network = PyramidNetwork(widths_of(width), kernel_size, others=(OIDN, OIDN_CLEAN))
-    corrected, steadied = Demodulated(Tiled(network)), Recurrent(Tiled(Steadied(history)))
+    corrected, steadied = Demodulated(Tiled(network)), Recurrent(Tiled(Steadied(history)), albedo=OIDN_ALBEDO)
     return WithOidn(Chain(corrected=corrected, steadied=steadied), quality=quality, threads=threads)

@@ -9,7 +9,6 @@ having to know which one that is. Then the previous result is blended in. No wei
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
@@ -21,31 +20,29 @@ from mcdenoise.models.oidn import Quality
 from mcdenoise.models.recurrent import Recurrent
 from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.models.with_oidn import EXACT, OIDN, OIDN_CLEAN, WithOidn
+from mcdenoise.models.with_oidn import OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
 
-# Weight of the image for clean features relative to that for noisy ones, if they were denoised and if they are exact.
-_CLEAN_PARTS = (2.0, 3.0)
+# Weight of the image for clean features relative to that for noisy ones. On 74 frames of training data the errors of
+# weights from 2 to 8 differ by at most 1 %.
+_CLEAN_PART = 3.0
 
 
 class Mixed(nn.Module):
-    """A weighted mean of Open Image Denoise's images: ``(oidn + a oidn_clean) / (1 + a)``.
+    """A weighted mean of Open Image Denoise's images: ``(oidn + 3 oidn_clean) / 4``.
 
-    The weight a is 3 if the features are exact, else 2.
     :class:`mcdenoise.models.with_oidn.WithOidn` provides both images.
     """
 
     @property
     def needs(self) -> Needs:
         """Needs color; uses the images that it combines."""
-        return Needs(uses=frozenset({OIDN, OIDN_CLEAN, EXACT}), trainable=False, reach=0)
+        return Needs(uses=frozenset({OIDN, OIDN_CLEAN}), trainable=False, reach=0)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         noisy: Tensor = frame.extra.get(OIDN, frame.color)
         clean = frame.extra.get(OIDN_CLEAN, frame.color)
-        exact = frame.extra.get(EXACT, torch.zeros_like(noisy[:, :1]))
-        part = torch.where(exact > 0, _CLEAN_PARTS[1], _CLEAN_PARTS[0]).to(exact)
-        return answered(frame, (noisy + part * clean) / (1 + part), None), None
+        return answered(frame, (noisy + _CLEAN_PART * clean) / (1 + _CLEAN_PART), None), None
 
 
 @register_model("oidn_temporal", kind="peer", requires="pyoidn")
@@ -60,5 +57,5 @@ def oidn_temporal(*, quality: Quality = "high", threads: int | None = None, hist
     Raises:
         InputError: see both classes.
     """
-    steadied = Recurrent(Tiled(Steadied(history)))
+    steadied = Recurrent(Tiled(Steadied(history)), albedo=OIDN_ALBEDO)
     return WithOidn(Chain(mixed=Mixed(), steadied=steadied), quality=quality, threads=threads)

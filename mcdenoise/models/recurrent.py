@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame
-from mcdenoise.models._interface import Needs, Output, State
+from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import journal, note, tell_history, timed
 from mcdenoise.models._state import own_state
 from mcdenoise.models._wrapper import Wrapper
@@ -52,7 +52,12 @@ class Recurrent(Wrapper):
 
     Args:
         inner: a method without a state.
+        albedo: name of the buffer that images are demodulated with; a frame without it is not demodulated.
     """
+
+    def __init__(self, inner: Model, *, albedo: str = "albedo") -> None:
+        super().__init__(inner)
+        self.albedo = albedo
 
     @property
     def needs(self) -> Needs:
@@ -74,11 +79,12 @@ class Recurrent(Wrapper):
         with timed("accumulate", frame.color.device):
             image, weight = from_before(frame, state, channels=6)
         image, light = image.split(3, 1)
-        light = light if frame.albedo is None else remodulate(light, frame.albedo)
+        albedo = frame.buffer(self.albedo)
+        light = light if albedo is None else remodulate(light, albedo)
         before = {PREVIOUS: image, PREVIOUS_LIGHT: light, PREVIOUS_WEIGHT: weight}
         handed = frame.replace(extra={**frame.extra, **before})
         output, _ = self.inner(handed)
-        light = output.image if frame.albedo is None else demodulate(output.image, frame.albedo)
+        light = output.image if albedo is None else demodulate(output.image, albedo)
         return output, to_be_kept(frame, torch.cat([output.image, light], 1))
 
 

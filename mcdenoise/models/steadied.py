@@ -19,7 +19,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._layers import answered
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
-from mcdenoise.models.with_oidn import EXACT, NOISY
+from mcdenoise.models.with_oidn import CENTRED, NOISY
 from mcdenoise.nn.oidn import oidn_exposure
 
 # Sides of the windows over which the previous result is compared with this frame, and how much a difference equal to
@@ -36,10 +36,13 @@ class Steadied(nn.Module):
 
     ``result = (color + n previous) / (1 + n)`` with ``n = history same exp(-sum_s c_s d_s / noise)``. ``same`` is the
     fraction of the previous frame that shows the same surface; ``d_s`` are the differences of the means over 3x3 and
-    15x15 pixels, and ``noise`` is the mean deviation of single samples over 15x15, all relative to the mean. If the
-    albedo is exact, the previous result is demodulated and multiplied by this frame's albedo.
+    15x15 pixels, and ``noise`` is the mean deviation of single samples over 15x15, all relative to the mean.
 
-    It has to be wrapped in :class:`mcdenoise.models.Recurrent`, and takes ``noisy`` and ``exact`` of
+    The previous result is known in two forms: as it was, which every reprojection blurs; and demodulated and multiplied
+    by this frame's albedo, which is sharp, but has the noise of both albedos. Their mean has a smaller error than
+    either. An albedo from rays through the pixels' centres has no noise, so the second form is taken alone.
+
+    It has to be wrapped in :class:`mcdenoise.models.Recurrent`, and takes ``noisy`` and ``centred`` of
     :class:`mcdenoise.models.with_oidn.WithOidn` from ``frame.extra``.
 
     Args:
@@ -58,7 +61,7 @@ class Steadied(nn.Module):
     @property
     def needs(self) -> Needs:
         """Needs color; uses the images that it blends."""
-        uses = frozenset({NOISY, EXACT, PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
+        uses = frozenset({NOISY, CENTRED, PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
         return Needs(uses=uses, trainable=False, reach=max(_WINDOWS) // 2)
 
     @property
@@ -75,10 +78,10 @@ class Steadied(nn.Module):
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
         image = frame.color
         noisy = frame.extra.get(NOISY, image)
-        exact = frame.extra.get(EXACT, torch.zeros_like(image[:, :1]))
-        same = frame.extra.get(PREVIOUS_WEIGHT, torch.zeros_like(exact))
-        # An exact albedo keeps textures sharp; a noisy one would add its noise.
-        before = torch.where(exact > 0, frame.extra.get(PREVIOUS_LIGHT, image), frame.extra.get(PREVIOUS, image))
+        centred = frame.extra.get(CENTRED, torch.zeros_like(image[:, :1]))
+        same = frame.extra.get(PREVIOUS_WEIGHT, torch.zeros_like(centred))
+        before, light = (frame.extra.get(name, image) for name in (PREVIOUS, PREVIOUS_LIGHT))
+        before = torch.where(centred > 0, light, (before + light) / 2)
 
         # In the image's unit, because scaling it by the exposure would add a rounding error.
         least = _LEAST_MEAN / exposure

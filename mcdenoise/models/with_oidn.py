@@ -15,7 +15,6 @@ from collections.abc import Mapping
 
 import torch
 import torch.nn.functional as F
-from kornia.filters import filter2d_separable
 from torch import Tensor
 
 from mcdenoise.frame import Frame
@@ -25,9 +24,10 @@ from mcdenoise.models.oidn import Oidn, Quality
 from mcdenoise.noise import noise_is_spread
 from mcdenoise.ops import cross_bilateral_filter
 
-# Keys in ``frame.extra``: OIDN's images for the features as they are and for clean ones, and the frame's radiance.
-OIDN, OIDN_CLEAN, NOISY = "oidn", "oidn_clean", "noisy"
-EXACT = "exact"  # 1 in every pixel if all features are exact, else 0
+# Keys in ``frame.extra``: OIDN's images for the features as they are and for clean ones, the clean albedo, and the
+# frame's radiance.
+OIDN, OIDN_CLEAN, OIDN_ALBEDO, NOISY = "oidn", "oidn_clean", "oidn_albedo", "noisy"
+CENTRED = "centred"  # 1 in every pixel if the features come from rays through the pixels' centres, else 0
 # Smallest squared length of a normal that is not a mean of several, and largest fraction of pixels with shorter ones.
 _UNIT, _MOST_MEANS = 0.98, 0.002
 # Smallest relative difference of inverse depths two pixels apart that is no rounding error of half floats, and largest
@@ -46,10 +46,11 @@ class WithOidn(Wrapper):
     """Provides a method with Open Image Denoise's images of each frame.
 
     The method finds them in ``frame.extra``, ``(B, 3, H, W)`` each: ``oidn`` for features treated as noisy;
-    ``oidn_clean`` for features treated as clean, which OIDN denoises first unless they are exact; ``noisy``, the
-    frame's radiance, for later methods of a chain; and ``exact`` ``(B, 1, H, W)``, see :func:`has_exact_features`. Both
-    images are also stages of the output. OIDN always takes the whole image, or, if its noise is correlated
-    (:func:`mcdenoise.noise.noise_is_spread`), four images of half the size.
+    ``oidn_clean`` for features treated as clean, which OIDN denoises first unless they have no noise
+    (:func:`has_centred_features` and not :func:`has_scattered_features`); ``oidn_albedo``, the albedo of these
+    features; ``noisy``, the frame's radiance, for later methods of a chain; and ``centred`` ``(B, 1, H, W)``, 1 or 0,
+    see the former function. Both images are also stages of the output. OIDN always takes the whole image, or, if its
+    noise is correlated (:func:`mcdenoise.noise.noise_is_spread`), four images of half the size.
 
     Args:
         inner: any method.
@@ -69,7 +70,7 @@ class WithOidn(Wrapper):
     def needs(self) -> Needs:
         """The needs of the inner method without the buffers provided here; albedo and normal are used."""
         needs = self.inner.needs
-        given = frozenset({OIDN, OIDN_CLEAN, NOISY, EXACT})
+        given = frozenset({OIDN, OIDN_CLEAN, OIDN_ALBEDO, NOISY, CENTRED})
         return Needs(needs.buffers - given, (needs.uses - given) | self._oidn.needs.uses, needs.trainable, None)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
@@ -89,10 +90,11 @@ class WithOidn(Wrapper):
 
     def before(self, frame: Frame) -> Frame:
         """The frame with OIDN's images added."""
-        exact, spread = has_exact_features(frame), noise_is_spread(frame.color, frame.albedo)
+        centred, spread = has_centred_features(frame), noise_is_spread(frame.color, frame.albedo)
         given = Frame(frame.color, albedo=frame.albedo, normal=frame.normal)
         given = given.map(_phases) if spread else given
         # Features of high quality would take two and a half times as long.
+        exact = centred and frame.normal is not None and not has_scattered_features(frame.normal)
         clean = given if exact else self._oidn.with_clean_features(given, "fast")
         noisy = self._oidn.denoised(given, "noisy")
         images = {
@@ -100,9 +102,11 @@ class WithOidn(Wrapper):
             # The same without features.
             OIDN_CLEAN: noisy if clean.albedo is None else self._oidn.denoised(clean, "clean"),
         }
+        if clean.albedo is not None:
+            images[OIDN_ALBEDO] = clean.albedo
         if spread:
             images = {name: _without_pattern(_merged(image, frame.size)) for name, image in images.items()}
-        images |= {NOISY: frame.color, EXACT: torch.full_like(frame.color[:, :1], float(exact))}
+        images |= {NOISY: frame.color, CENTRED: torch.full_like(frame.color[:, :1], float(centred))}
         return frame.replace(extra={**frame.extra, **images}, skip=None)
 
 
@@ -122,6 +126,9 @@ def _merged(phases: Tensor, size: tuple[int, int]) -> Tensor:
 
 def _without_pattern(image: Tensor) -> Tensor:
     """The image ``(B, 3, H, W)`` without any pattern of two by two pixels, and with its edges."""
+    # All of kornia comes with it, which takes as long to import as a single frame to denoise.
+    from kornia.filters import filter2d_separable
+
     kernel = torch.tensor([_BINOMIAL], dtype=image.dtype, device=image.device)
     blurred = filter2d_separable(image, kernel, kernel, "replicate")
     # The logarithms of what has no pattern, so that the weights have none.
@@ -130,15 +137,13 @@ def _without_pattern(image: Tensor) -> Tensor:
     return cross_bilateral_filter(image, logits, [guide], [torch.full_like(image[:, :1], _FALLOFF)])
 
 
-def has_exact_features(frame: Frame) -> bool:
-    """Whether features come from one ray through the center of each pixel, and so have no noise.
+def has_centred_features(frame: Frame) -> bool:
+    """Whether features come from one ray through the centre of each pixel.
 
     Averages of several normals are shorter than one, so hardly any pixel may have a short normal. Depth must be smooth:
     along a plane its inverse is linear in the image, and on a curved surface nearly so, but not if rays pass through
-    random points of a pixel or a lens. Rays passed through the centers if at least a quarter of the triples of
-    neighbours in a row or a column have ``|a - 2 b + c| < |a - c| / 10``. Finally, few normals may differ from all four
-    neighbours where these agree: rough metal and glass scatter rays, and some renderers write the features of the
-    surface that such a ray hits.
+    random points of a pixel or a lens. Rays passed through the centres if at least a quarter of the triples of
+    neighbours in a row or a column have ``|a - 2 b + c| < |a - c| / 10``.
 
     Args:
         frame: any; without a normal and a depth the answer is no.
@@ -156,15 +161,19 @@ def has_exact_features(frame: Frame) -> bool:
         known = (slope > _LEAST_SLOPE * b) & (torch.minimum(a, c) > 0)
         told += int(known.sum())
         even += int((known & ((a - 2 * b + c).abs() < _EVEN * slope)).sum())
-    return even > told / 4 and _specks(frame.normal) < _MOST_SPECKS
+    return even > told / 4
 
 
-def _specks(normal: Tensor) -> float:
-    """Fraction of the pixels whose normal differs from all four neighbours where opposite neighbours agree."""
-    inside = normal.detach()[..., 1:-1, 1:-1]
+def has_scattered_features(normal: Tensor) -> bool:
+    """Whether features have noise of rays that rough metal and glass scattered.
+
+    Some renderers write the features of the surface that such a ray hits. So few normals ``(B, 3, H, W)`` may differ
+    from all four neighbours where opposite neighbours agree.
+    """
     left, right = normal.detach()[..., 1:-1, :-2], normal.detach()[..., 1:-1, 2:]
     above, below = normal.detach()[..., :-2, 1:-1], normal.detach()[..., 2:, 1:-1]
+    inside = normal.detach()[..., 1:-1, 1:-1]
     nearest = torch.stack([(inside - other).abs().amax(1) for other in (left, right, above, below)]).amin(0)
     around = torch.maximum((left - right).abs().amax(1), (above - below).abs().amax(1))
     count = int(((nearest > _UNLIKE) & (around < nearest / 2)).sum())
-    return count / max(nearest.numel(), 1)
+    return count > _MOST_SPECKS * nearest.numel()

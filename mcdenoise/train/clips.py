@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 from mcdenoise.errors import InputError
 from mcdenoise.frame import RADIANCE, Frame, Hints
 from mcdenoise.models.accumulated import ALBEDO_HISTORY
-from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_CLEAN
+from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.ops import NO_ALBEDO, demodulate
 from mcdenoise.train.cache import Array, CachedShot
@@ -25,7 +25,7 @@ _KNOWN = frozenset(field.name for field in fields(Frame))
 
 # Buffers of radiance, of reflectance, and of world-space vectors, whose channels can be permuted.
 LIGHT = frozenset({*RADIANCE, "reference", NOISY, OIDN, OIDN_CLEAN})
-_COLORED = LIGHT | {"albedo", ALBEDO_HISTORY, "specular_albedo", "variance"}
+_COLORED = LIGHT | {"albedo", OIDN_ALBEDO, ALBEDO_HISTORY, "specular_albedo", "variance"}
 _WORLD = frozenset({"normal", "position", "previous_position"})
 
 

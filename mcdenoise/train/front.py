@@ -11,13 +11,13 @@ from torch import Tensor, nn
 from mcdenoise.frame import RADIANCE, Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Skipping, State, Wrapper
 from mcdenoise.models.accumulated import ALBEDO_HISTORY, CAUSTICS
-from mcdenoise.models.with_oidn import EXACT, NOISY, OIDN, OIDN_CLEAN, WithOidn
+from mcdenoise.models.with_oidn import CENTRED, NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
 from mcdenoise.ops import remodulate
 
 # Buffers that accumulation and Open Image Denoise provide, with their channels.
 ACCUMULATED: Mapping[str, int] = {"color": 3, "current": 3, "length": 1}
 _PARTS = frozenset(RADIANCE) - ACCUMULATED.keys()
-GIVEN: Mapping[str, int] = {OIDN: 3, OIDN_CLEAN: 3, NOISY: 3, EXACT: 1}
+GIVEN: Mapping[str, int] = {OIDN: 3, OIDN_CLEAN: 3, OIDN_ALBEDO: 3, NOISY: 3, CENTRED: 1}
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from toys import frame_of, refused, whole_frame
 from mcdenoise.models import create_model
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.pyramid import PyramidNetwork
-from mcdenoise.models.with_oidn import EXACT, NOISY, OIDN, OIDN_CLEAN, WithOidn
+from mcdenoise.models.with_oidn import CENTRED, NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
 from mcdenoise.train.clips import LIGHT
 from mcdenoise.train.front import split
 
@@ -69,8 +69,8 @@ def test_training_begins_behind_oidn() -> None:
     front, rest = split(create_model("oidn_pyramid", threads=1))
     assert [kind for kind, _ in front.wrappers] == [WithOidn]
     assert (front.accumulates, front.demodulates) == (False, False)
-    assert front.parts == {"color": 3, OIDN: 3, OIDN_CLEAN: 3, NOISY: 3, EXACT: 1}
-    assert front.parts.keys() - {EXACT} <= LIGHT
+    assert front.parts == {"color": 3, OIDN: 3, OIDN_CLEAN: 3, OIDN_ALBEDO: 3, NOISY: 3, CENTRED: 1}
+    assert front.parts.keys() - {OIDN_ALBEDO, CENTRED} <= LIGHT
     frame = frame_of(24, 40)
     seen = front.begin()(frame)
     model = create_model("oidn_pyramid", threads=1)

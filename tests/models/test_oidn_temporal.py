@@ -23,15 +23,17 @@ from mcdenoise.models.oidn_temporal import Mixed
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
 from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.with_oidn import (
-    EXACT,
+    CENTRED,
     NOISY,
     OIDN,
+    OIDN_ALBEDO,
     OIDN_CLEAN,
     WithOidn,
     _merged,
     _phases,
     _without_pattern,
-    has_exact_features,
+    has_centred_features,
+    has_scattered_features,
 )
 from mcdenoise.nn.oidn import oidn_exposure
 
@@ -55,7 +57,7 @@ def test_a_still_is_a_mean_of_two_images() -> None:
     noisy = oidn.denoised(frame, "noisy")
     clean = oidn.denoised(oidn.with_clean_features(frame, "fast"), "clean")
     output, _ = model(frame)
-    torch.testing.assert_close(output.image, (noisy + 2 * clean) / 3)
+    torch.testing.assert_close(output.image, (noisy + 3 * clean) / 4)
     torch.testing.assert_close(output.stages["oidn"], noisy)
     torch.testing.assert_close(output.stages["oidn_clean"], clean)
 
@@ -101,26 +103,25 @@ def test_a_pattern_of_two_by_two_pixels_is_removed_and_an_edge_kept(unit: float)
     torch.testing.assert_close(found[0, 0, 4, 5:7], torch.tensor([1.04, 3 * 0.96]), rtol=0.01, atol=0)
 
 
-@pytest.mark.parametrize("exact", [0.0, 1.0])
-def test_the_weight_of_the_image_for_clean_features(exact: float) -> None:
+def test_the_weight_of_the_image_for_clean_features() -> None:
     frame = frame_of(9, 18)
     noisy, clean = torch.rand(2, 1, 3, 9, 18)
-    extra = {OIDN: noisy, OIDN_CLEAN: clean, EXACT: torch.full((1, 1, 9, 18), exact)}
-    image = Mixed()(frame.replace(extra=extra))[0].image
-    torch.testing.assert_close(image, (noisy + (2 + exact) * clean) / (3 + exact))
+    image = Mixed()(frame.replace(extra={OIDN: noisy, OIDN_CLEAN: clean}))[0].image
+    torch.testing.assert_close(image, (noisy + 3 * clean) / 4)
 
 
-@pytest.mark.parametrize("exact", [0.0, 1.0])
-def test_weights_written_out_in_float64(exact: float) -> None:
+@pytest.mark.parametrize("centred", [0.0, 1.0])
+def test_weights_written_out_in_float64(centred: float) -> None:
     height, width, history = 9, 18, 7.0
     frame = given(height, width).to(torch.float64)
     same = torch.rand(1, 1, height, width, dtype=torch.float64)
-    extra = {**frame.extra, PREVIOUS_WEIGHT: same, EXACT: torch.full_like(same, exact)}
+    extra = {**frame.extra, PREVIOUS_WEIGHT: same, CENTRED: torch.full_like(same, centred)}
     frame = frame.replace(extra=extra)
     image = Steadied(history)(frame)[0].image
     exposure = oidn_exposure(frame.color).item()
     mean, noisy = (each[0] * exposure for each in (frame.color, extra[NOISY]))
-    before = extra[PREVIOUS_LIGHT if exact else PREVIOUS][0] * exposure
+    before, light = (extra[name][0] * exposure for name in (PREVIOUS, PREVIOUS_LIGHT))
+    before = light if centred else (before + light) / 2
 
     def over(image: Tensor, row: int, column: int, window: int) -> Tensor:
         """The sum over the pixels of the window that are in the image, in parts of all of the window's."""
@@ -151,7 +152,7 @@ def test_unchanged_light_has_four_fifths_of_the_previous_result() -> None:
     rows, columns = torch.meshgrid(torch.arange(21), torch.arange(34), indexing="ij")
     before = mean * (1 + 0.001 * (-1) ** (rows + columns))
     noisy = mean * (1 + 0.9 * (-1) ** (rows + columns))
-    extra = {**frame.extra, PREVIOUS: before, NOISY: noisy}
+    extra = {**frame.extra, PREVIOUS: before, PREVIOUS_LIGHT: before, NOISY: noisy}
     image = Steadied()(frame.replace(extra=extra))[0].image
     torch.testing.assert_close((image - mean) / (before - mean), torch.full_like(mean, 4 / 5), rtol=0.02, atol=0)
 
@@ -234,31 +235,55 @@ def plane(offsets: Tensor) -> Frame:
     return Frame(torch.rand(1, 3, 40, 60), normal=normal, depth=(1 / inverse)[None, None])
 
 
-def test_features_are_exact_of_rays_through_the_centers_alone() -> None:
-    exact = plane(torch.zeros(2, 40, 60))
-    assert has_exact_features(exact)
+def test_features_of_rays_through_the_centers() -> None:
+    centred = plane(torch.zeros(2, 40, 60))
+    assert has_centred_features(centred)
     # As files in half precision have it.
-    assert has_exact_features(exact.replace(depth=exact.depth.half().float()))
-    assert not has_exact_features(plane(torch.rand(2, 40, 60)))
-    mixed = exact.normal.clone()
+    assert has_centred_features(centred.replace(depth=centred.depth.half().float()))
+    assert not has_centred_features(plane(torch.rand(2, 40, 60)))
+    mixed = centred.normal.clone()
     mixed[..., ::10] *= 0.8
-    assert not has_exact_features(exact.replace(normal=mixed))
-    specks = exact.normal.clone()
+    assert not has_centred_features(centred.replace(normal=mixed))
+    assert not has_centred_features(centred.replace(depth=None))
+    assert not has_centred_features(centred.replace(normal=None))
+
+
+def test_features_of_scattered_rays() -> None:
+    normal = plane(torch.zeros(2, 40, 60)).normal
+    assert not has_scattered_features(normal)
+    specks = normal.clone()
     specks[..., 5::10, 5::10] *= -1
-    assert not has_exact_features(exact.replace(normal=specks))
-    # The edges of what is in front are none.
-    edges = exact.normal.clone()
+    assert has_scattered_features(specks)
+    # The edges of an object in front have equal neighbours.
+    edges = normal.clone()
     edges[..., 10:30, 20:50] *= -1
-    assert has_exact_features(exact.replace(normal=edges))
-    assert not has_exact_features(exact.replace(depth=None))
-    assert not has_exact_features(exact.replace(normal=None))
+    assert not has_scattered_features(edges)
+    assert not has_scattered_features(normal[..., :2, :2])
 
 
-@pytest.mark.parametrize("exact", [False, True])
-def test_the_last_step_is_told_whether_features_are_exact(exact: bool) -> None:
-    frame = plane(torch.zeros(2, 40, 60) if exact else torch.rand(2, 40, 60)).replace(albedo=torch.rand(1, 3, 40, 60))
-    told = WithOidn(Noisy(), threads=1).before(frame).extra[EXACT]
-    assert torch.equal(told, torch.full_like(told, float(exact)))
+@pytest.mark.parametrize(("offset", "specks"), [(0, 0), (1, 0), (0, 1)])
+def test_features_are_denoised_unless_they_are_exact(offset: int, specks: int) -> None:
+    frame = plane(offset * torch.rand(2, 40, 60)).replace(albedo=torch.rand(1, 3, 40, 60))
+    normal = frame.normal.clone()
+    normal[..., 5::10, 5::10] *= 1 - 2 * specks
+    extra = WithOidn(Noisy(), threads=1).before(frame.replace(normal=normal)).extra
+    assert torch.equal(extra[CENTRED], torch.full((1, 1, 40, 60), 1.0 - offset))
+    assert torch.equal(extra[OIDN_ALBEDO], frame.albedo) == (not offset and not specks)
+
+
+def test_the_texture_of_a_moving_wall_stays_sharp() -> None:
+    """The camera passes a wall by half a pixel a frame, and a bilinear history would blur its checks."""
+    denoiser = Denoiser(create_model(NAME, threads=1))
+    errors = []
+    for number in range(6):
+        frame = plane(torch.zeros(2, 40, 60))
+        columns = (torch.arange(60) + 0.5 * number).floor().long()
+        albedo = (0.1 + 0.8 * ((torch.arange(40)[:, None] + columns) % 2)).expand(1, 3, 40, 60).contiguous()
+        motion = torch.tensor([0.5, 0.0]).reshape(1, 2, 1, 1).expand(1, 2, 40, 60)
+        image = denoiser(frame.replace(color=albedo, albedo=albedo, motion=motion))
+        errors.append(smape_linear(image, albedo).item())
+    assert denoiser.report.history > 0.5
+    assert max(errors) < 1.5 * errors[0]
 
 
 def test_it_is_ahead_of_oidn(small_sequence: Path) -> None:
