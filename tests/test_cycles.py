@@ -135,6 +135,7 @@ def test_random_scenes_are_translated_whole(seed: int, tmp_path: Path) -> None:
         assert set(file) == set(description.arrays)
 
 
+@pytest.mark.slow
 def test_what_shines_in_random_scenes_shines_as_brightly() -> None:
     for seed in range(20):
         made = random_scene(seed, 1)

@@ -267,6 +267,7 @@ def test_run_time_prints_a_line_for_each_method(tmp_path: Path) -> None:
     assert written["machine"]["threads"] == 1
 
 
+@pytest.mark.slow
 def test_error_vs_runtime_plots_the_printed_values(small_sequence: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="plots need the packages of mcdenoise[report]")
     figure = tmp_path / "figure.svg"
@@ -426,6 +427,7 @@ def test_start_up_times_whole_processes(tmp_path: Path) -> None:
         assert re.fullmatch(rf"{re.escape(name)} +{sum(values) / 2:.2f} +.*", line)
 
 
+@pytest.mark.slow
 def test_training_speed_measures_fast_backends_and_reference_in_both_precisions(
     small_sequence: Path, tmp_path: Path
 ) -> None:

@@ -15,7 +15,8 @@ SHOWN = (SMAPE, PSNR, TEMPORAL)
 # With noisy features, OIDN uses the same network for high and balanced quality.
 PEERS = (
     "oidn(quality=fast|balanced, auxiliary=clean|noisy, source=raw|accumulated),"
-    "oidn(quality=high, auxiliary=clean, source=raw|accumulated)"
+    "oidn(quality=high, auxiliary=clean, source=raw|accumulated),"
+    "oidn(quality=high, auxiliary=prefiltered)"
 )
 _PEER = "oidn"
 # If the reference's own noise is more than this fraction of an error, the row is marked as inconclusive.

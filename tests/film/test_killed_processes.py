@@ -99,6 +99,7 @@ def check_killed(tmp_path: Path, shots: int, frames: int, most: int, least: int,
         assert (tmp_path / "out" / name / "denoise.json").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
 def test_killed_workers_lose_nothing(tmp_path: Path) -> None:
     check_killed(tmp_path, shots=3, frames=30, most=12, least=4, model="accumulated")

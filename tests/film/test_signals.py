@@ -51,7 +51,7 @@ def interrupt(tmp_path: Path, phase: str, number: signal.Signals) -> None:
         ("looking", signal.SIGHUP),
         ("first frame", signal.SIGINT),
         ("middle", signal.SIGTERM),
-        ("closing", signal.SIGHUP),
+        pytest.param("closing", signal.SIGHUP, marks=pytest.mark.slow),
     ],
     ids=lambda each: getattr(each, "name", each),
 )
