@@ -9,8 +9,11 @@ having to know which one that is. Then the previous result is blended in. No wei
 
 from __future__ import annotations
 
+from typing import Literal
+
 from torch import Tensor, nn
 
+from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered
@@ -28,34 +31,54 @@ _CLEAN_PART = 3.0
 
 
 class Mixed(nn.Module):
-    """A weighted mean of Open Image Denoise's images: ``(oidn + 3 oidn_clean) / 4``.
+    """A weighted mean of Open Image Denoise's images: ``(oidn + a oidn_clean) / (1 + a)``.
 
     :class:`mcdenoise.models.with_oidn.WithOidn` provides both images.
+
+    Args:
+        clean_part: the weight a, at least 0. With 0, the second image is not used.
     """
+
+    def __init__(self, clean_part: float = _CLEAN_PART) -> None:
+        super().__init__()
+        self.clean_part = clean_part
 
     @property
     def needs(self) -> Needs:
         """Needs color; uses the images that it combines."""
-        return Needs(uses=frozenset({OIDN, OIDN_CLEAN}), trainable=False, reach=0)
+        return Needs(uses=frozenset({OIDN, OIDN_CLEAN} if self.clean_part else {OIDN}), trainable=False, reach=0)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        noisy: Tensor = frame.extra.get(OIDN, frame.color)
-        clean = frame.extra.get(OIDN_CLEAN, frame.color)
-        return answered(frame, (noisy + _CLEAN_PART * clean) / (1 + _CLEAN_PART), None), None
+        image: Tensor = frame.extra.get(OIDN, frame.color)
+        if self.clean_part:
+            clean = frame.extra.get(OIDN_CLEAN, frame.color)
+            image = (image + self.clean_part * clean) / (1 + self.clean_part)
+        return answered(frame, image, None), None
 
 
 @register_model("oidn_temporal", kind="peer", requires="pyoidn")
-def oidn_temporal(*, quality: Quality = "high", threads: int | None = None, history: float = 4.0) -> Model:
+def oidn_temporal(
+    *,
+    quality: Quality = "high",
+    auxiliary: Literal["both", "noisy"] = "both",
+    threads: int | None = None,
+    history: float = 4.0,
+) -> Model:
     """Open Image Denoise (optional package pyoidn) for noisy and for clean features, stabilized by the previous result.
 
     Args:
         quality: see :class:`mcdenoise.models.with_oidn.WithOidn`.
-        threads: likewise.
+        auxiliary: ``"noisy"`` takes only the image for noisy features, in a fifth to a half of the time.
+        threads: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         history: see :class:`mcdenoise.models.steadied.Steadied`.
 
     Raises:
-        InputError: see both classes.
+        InputError: ``auxiliary`` is neither; otherwise see both classes.
     """
+    if auxiliary not in ("both", "noisy"):
+        raise InputError(f"auxiliary: expected both or noisy, found '{auxiliary}'")
+    both = auxiliary == "both"
     steadied = Recurrent(Tiled(Steadied(history)), albedo=OIDN_ALBEDO)
-    return WithOidn(Chain(mixed=Mixed(), steadied=steadied), quality=quality, threads=threads)
+    chain = Chain(mixed=Mixed(_CLEAN_PART if both else 0.0), steadied=steadied)
+    return WithOidn(chain, quality=quality, threads=threads, clean=both)

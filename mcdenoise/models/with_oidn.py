@@ -56,14 +56,18 @@ class WithOidn(Wrapper):
         inner: any method.
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
         threads: likewise.
+        clean: whether to provide ``oidn_clean``, which takes more than half of the time. Without it, ``oidn_albedo`` is
+            provided only if the features have no noise.
 
     Raises:
         InputError: as of :class:`mcdenoise.models.oidn.Oidn`.
     """
 
-    def __init__(self, inner: Model, *, quality: Quality = "high", threads: int | None = None) -> None:
+    def __init__(
+        self, inner: Model, *, quality: Quality = "high", threads: int | None = None, clean: bool = True
+    ) -> None:
         super().__init__(inner)
-        self.quality, self.threads = quality, threads
+        self.quality, self.threads, self.clean = quality, threads, clean
         self._oidn = Oidn(quality, threads=threads)
 
     @property
@@ -85,7 +89,7 @@ class WithOidn(Wrapper):
         """
         handed = self.before(frame)
         output, state = self.inner(handed, state)
-        stages = {name: handed.extra[name] for name in (OIDN, OIDN_CLEAN)}
+        stages = {name: handed.extra[name] for name in (OIDN, OIDN_CLEAN) if name in handed.extra}
         return output._replace(stages={**stages, **output.stages}), state
 
     def before(self, frame: Frame) -> Frame:
@@ -93,17 +97,15 @@ class WithOidn(Wrapper):
         centred, spread = has_centred_features(frame), noise_is_spread(frame.color, frame.albedo)
         given = Frame(frame.color, albedo=frame.albedo, normal=frame.normal)
         given = given.map(_phases) if spread else given
-        # Features of high quality would take two and a half times as long.
         exact = centred and frame.normal is not None and not has_scattered_features(frame.normal)
-        clean = given if exact else self._oidn.with_clean_features(given, "fast")
-        noisy = self._oidn.denoised(given, "noisy")
-        images = {
-            OIDN: noisy,
+        images = {OIDN: (noisy := self._oidn.denoised(given, "noisy"))}
+        # Features of high quality would take two and a half times as long.
+        features = given if exact or not self.clean else self._oidn.with_clean_features(given, "fast")
+        if self.clean:
             # The same without features.
-            OIDN_CLEAN: noisy if clean.albedo is None else self._oidn.denoised(clean, "clean"),
-        }
-        if clean.albedo is not None:
-            images[OIDN_ALBEDO] = clean.albedo
+            images[OIDN_CLEAN] = noisy if features.albedo is None else self._oidn.denoised(features, "clean")
+        if features.albedo is not None and (self.clean or exact):
+            images[OIDN_ALBEDO] = features.albedo
         if spread:
             images = {name: _without_pattern(_merged(image, frame.size)) for name, image in images.items()}
         images |= {NOISY: frame.color, CENTRED: torch.full_like(frame.color[:, :1], float(centred))}

@@ -79,6 +79,22 @@ def test_noise_that_neighbours_share_is_removed() -> None:
     assert smape_linear(stages["oidn"], truth) < smape_linear(whole, truth) / 2
 
 
+@pytest.mark.parametrize("quality", ["fast", "high"])
+def test_the_image_for_noisy_features_alone(quality: str) -> None:
+    model, oidn = create_model(NAME, threads=1, quality=quality, auxiliary="noisy"), Oidn(quality, threads=1)
+    frame = frame_of(24, 40)
+    output, state = model(frame)
+    assert torch.equal(output.image, oidn.denoised(frame, "noisy"))
+    assert "oidn" in output.stages
+    assert "oidn_clean" not in output.stages
+    assert state is not None
+    # Features without noise need no denoising.
+    exact = plane(torch.zeros(2, 40, 60)).replace(albedo=torch.rand(1, 3, 40, 60))
+    extra = model.before(exact).extra
+    assert OIDN_CLEAN not in extra
+    assert torch.equal(extra[OIDN_ALBEDO], exact.albedo)
+
+
 @pytest.mark.parametrize("size", [(6, 8), (5, 7)])
 def test_phases_are_every_second_pixel(size: tuple[int, int]) -> None:
     image = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
@@ -300,4 +316,5 @@ def test_it_is_ahead_of_oidn(small_sequence: Path) -> None:
 
 def test_refuses_invalid_settings() -> None:
     assert "quality: expected one of fast, balanced, high" in refused(lambda: create_model(NAME, quality="best"))
+    assert "auxiliary: expected both or noisy, found 'clean'" in refused(lambda: create_model(NAME, auxiliary="clean"))
     assert "history: expected above 0, found 0" in refused(lambda: create_model(NAME, history=0))
