@@ -26,6 +26,7 @@ from mcdenoise.models._weights import (
     load_weights,
     pretrained_models,
     save_weights,
+    start_with,
 )
 from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.models.accumulated import Accumulated
@@ -89,6 +90,7 @@ __all__ = [
     "quantize",
     "register_model",
     "save_weights",
+    "start_with",
     "summarize",
     "timed",
     "users_of",

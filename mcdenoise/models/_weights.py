@@ -123,6 +123,35 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
     return model.eval() if isinstance(model, nn.Module) else model
 
 
+def start_with(model: Model, name: str) -> str:
+    """Copy the shipped weights of another model to the layers of the same names.
+
+    Args:
+        model: changed in place; its other layers keep their weights.
+        name: a model with shipped weights.
+
+    Returns:
+        The checksum of the other model's weights.
+
+    Raises:
+        InputError: there are no shipped weights of this name, or a layer of theirs is missing or has another shape.
+    """
+    path = find_weights(name)
+    if path is None:
+        raise InputError(f"start_from: expected a model with shipped weights, found '{name}'")
+    own = _named(model)
+    for key, tensor in _named(load_weights(path)).items():
+        # Ranges are of the integer version, which is calibrated after the training.
+        if key.endswith(".ranges"):
+            continue
+        if key not in own or own[key].shape != tensor.shape:
+            found = "no such layer" if key not in own else f"shape {tuple(own[key].shape)}"
+            raise InputError(f"start_from: expected layer '{key}' of '{name}', {tuple(tensor.shape)}, found {found}")
+        with torch.no_grad():
+            own[key].copy_(tensor)
+    return str(describe_weights(path)["sha256"])
+
+
 def describe_weights(path: Path) -> dict[str, Any]:
     """The header of a weights file: architecture, settings, training, data, licence.
 

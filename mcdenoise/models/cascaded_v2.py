@@ -176,6 +176,14 @@ def _at_least_float32(tensor: Tensor) -> Tensor:
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
+def both_networks(width: int, kernel_width: int | None, kernel_size: int, resolutions: int, half: bool) -> Chain:
+    """Both networks, for demodulated radiance with or without a history; for the arguments see :func:`_cascade`."""
+    return Chain(
+        initial=CoarseToFine(Tiled(PixelNetwork(width, half)), resolutions),
+        final=Tiled(KernelNetwork(kernel_width or width, kernel_size, half)),
+    )
+
+
 def _cascade(
     width: int = 40,
     kernel_width: int | None = None,
@@ -199,13 +207,9 @@ def _cascade(
         anti_lag: see :class:`mcdenoise.models.Accumulated`.
         tolerance: see :class:`mcdenoise.models.Skipping`.
     """
-    network = Chain(
-        initial=CoarseToFine(Tiled(PixelNetwork(width, half)), resolutions),
-        final=Tiled(KernelNetwork(kernel_width or width, kernel_size, half)),
-    )
     return Demodulated(
         Accumulated(
-            Skipping(network, tolerance, alpha_min),
+            Skipping(both_networks(width, kernel_width, kernel_size, resolutions, half), tolerance, alpha_min),
             alpha_min=alpha_min,
             lag_threshold=THRESHOLD if anti_lag else math.inf,
         )

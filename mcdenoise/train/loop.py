@@ -20,7 +20,17 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
-from mcdenoise.models import CoarseToFine, Model, Output, State, create_model, describe_weights, parts_of, save_weights
+from mcdenoise.models import (
+    CoarseToFine,
+    Model,
+    Output,
+    State,
+    create_model,
+    describe_weights,
+    parts_of,
+    save_weights,
+    start_with,
+)
 from mcdenoise.models._defaults import plain_defaults
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.config import TrainConfig, check_config
@@ -111,6 +121,10 @@ def train(
     start: dict[str, Any] = describe_weights(initial_weights) if initial_weights else {"settings": {}, "sha256": "none"}
     settings: dict[str, Any] = {**start["settings"], **config.model_settings}
     network = _trainable(config, create_model(config.model, weights=initial_weights, **settings))
+    if config.start_from:
+        if initial_weights is not None:
+            raise InputError("start_from: expected none beside initial weights, found both; leave one out")
+        start["sha256"] = start_with(network, config.start_from)
     front, rest = split(network)
     if config.keep_fireflies and not front.accumulates:
         raise InputError("keep_fireflies: expected a model that begins with Accumulated, found another")
