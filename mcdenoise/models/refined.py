@@ -106,8 +106,8 @@ class Refined(Wrapper):
 
     With the albedo a of the frame, the filtered albedo b and the predicted fraction m, the method sees
     ``color a / (1 + m (a - 1))``, and its result is multiplied by ``(1 + m (b - 1)) / a``. So after the remodulation by
-    a, which an outer :class:`mcdenoise.models.Demodulated` does, the image has the texture of b. A frame without an
-    albedo is not changed.
+    a, which an outer :class:`mcdenoise.models.Demodulated` does, the image has the texture of b. Without an albedo,
+    both are one. The color is the mean of the frame and its history with the predicted weight of the history.
 
     Args:
         inner: any method without a state.
@@ -130,12 +130,9 @@ class Refined(Wrapper):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        if frame.albedo is None:
-            note("refine", "no albedo", 1.0)
-            return self.inner(prepared(self.inner, frame.replace(statistics={})), state)
-        note("refine", "albedo and normal")
+        note("refine", "features and history")
         refined, _ = self.features(frame.replace(skip=None, layers={}))
-        own = modulation(frame.albedo)
+        own = torch.ones_like(frame.color) if frame.albedo is None else modulation(frame.albedo)
         diffuse = refined.stages[DIFFUSE]
         into = own / torch.lerp(torch.ones_like(own), own, diffuse)
         out = torch.lerp(torch.ones_like(own), refined.stages[DIVISOR], diffuse) / own
@@ -145,8 +142,8 @@ class Refined(Wrapper):
             color = torch.lerp(current, color, refined.stages[HISTORY])
         layers = {name: layer * into for name, layer in frame.layers.items()}
         skip = frame.skip and Skip(frame.skip.mask, {name: image / out for name, image in frame.skip.images.items()})
-        normal = None if frame.normal is None else refined.stages[NORMAL]
-        features = {"albedo": refined.image, "normal": normal}
+        features = {"albedo": refined.image, "normal": refined.stages[NORMAL]}
+        features = {name: image for name, image in features.items() if name in frame.buffers}
         changed = frame.replace(color=color, current=current, **features, layers=layers, skip=skip, statistics={})
         output, state = self.inner(prepared(self.inner, changed), state)
         stages = {name: image * out for name, image in output.stages.items()}
