@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame, Skip
 from mcdenoise.models import Needs, Output, State, create_model, start_with
 from mcdenoise.models.refined import _TAPS, Refined
-from tests.models.toys import frame_of, refused
+from toys import frame_of, refused
 
 SIZE = (26, 38)
 
