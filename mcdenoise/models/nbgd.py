@@ -5,8 +5,7 @@ Eurographics Symposium on Rendering. Where paper and public code differ, this fi
 
 - The network of 7 layers has 29,425 parameters: a 5x5 convolution of the 10 input channels to 20; five with 5 output
   channels each, whose inputs are all channels so far, concatenated (20, 25, 30, 35 and 40); and a last one of these 45
-  to
-  5. LeakyReLU of slope 0.2 follows the first convolution and every concatenation, a sigmoid the last. That is
+  to 5. LeakyReLU of slope 0.2 follows the first convolution and every concatenation, a sigmoid the last. That is
   ``25 * (10 * 20 + 5 * (20 + 25 + 30 + 35 + 40) + 5 * 45)`` weights and 50 biases; 2 layers have 7,525. Channels that
   were concatenated before pass LeakyReLU again together with the new ones; the number of parameters does not show
   whether they should.

@@ -9,13 +9,11 @@ Balint et al. 2023, "Neural Partitioning Pyramids for Denoising Monte Carlo Rend
 3. predict all weights from ``log(1 + (c', c) / mean of both)``, ``f'`` and ``f``: 6 + 32 + 32 = 70 channels;
 4. ``c <- lambda c' + (1 - lambda) c`` and ``f <- lambda f' + (1 - lambda) f`` with one sigmoid ``lambda`` per pixel;
 5. partition ``c`` among K = 5 levels by a softmax, average each part down to its level, splat it there by a 5x5
-    softmax,
-   and sum from coarse to fine, upsampling by 4x4 weights that are 4 times a softmax;
+   softmax, and sum from coarse to fine, upsampling by 4x4 weights that are 4 times a softmax;
 6. splat ``o'`` by a 5x5 softmax, and blend by a sigmoid: ``o = mu o' + (1 - mu) d``.
 
 The radiance includes its albedo. Each pixel splats all of its light, but the weights that a pixel receives need not sum
-to
-one: a splat is not a mean. Only training makes a constant image stay constant.
+to one: a splat is not a mean. Only training makes a constant image stay constant.
 
 Choices where the code depends on its data set or its user:
 

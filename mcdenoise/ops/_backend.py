@@ -21,7 +21,7 @@ _FOUND = {name: importlib.util.find_spec(name) is not None for name in ("numba",
 _EXTRAS = {"numba": "fast", "triton": "gpu"}
 # Pixels of a batch below which importing numba and calling it takes longer than the reference implementation does.
 _FEW_PIXELS = 8192
-# What to take, and whether to raise where it cannot run; see `use`.
+# The backend of `use`, and whether an op that cannot run in it raises.
 _used: tuple[Backend, bool] | None = None
 # Triton's interpreter computes with the memory of any device, slowly: for tests.
 _INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -34,20 +34,20 @@ def check_backend(backend: str | None) -> None:
 
 
 def choose_backend(
-    forms: Sequence[Backend], tensors: Sequence[Tensor], *, differentiable: Collection[Backend] = ()
+    backends: Sequence[Backend], tensors: Sequence[Tensor], *, differentiable: Collection[Backend] = ()
 ) -> Backend:
     """The backend to run an op on ``tensors`` with: the fastest that can run and pays, or the one of :func:`use`.
 
     Args:
-        forms: what the op has fast backends in.
+        backends: names of the fast backends that the op has.
         tensors: the arguments of the op, ``(B, C, H, W)`` or with other axes behind the second.
-        differentiable: those of the forms that have derivatives.
+        differentiable: those of the backends that have derivatives.
 
     Raises:
         ValueError: the backend of :func:`use` cannot run; the message says why.
     """
     wanted, strict = _used or (_fastest(tensors), False)
-    obstacle = _obstacle(wanted, tensors, wanted in differentiable, forms)
+    obstacle = _obstacle(wanted, tensors, wanted in differentiable, backends)
     if obstacle and strict:
         raise ValueError(f"backend: expected one that can run here, found {wanted!r}, which {obstacle}")
     return "torch" if obstacle else wanted
@@ -55,7 +55,7 @@ def choose_backend(
 
 @contextmanager
 def use(backend: Backend, *, strict: bool = True) -> Iterator[None]:
-    """Within it, in all threads, all ops that have several forms run in this one.
+    """Run all ops that have this backend in it, in all threads, within the context.
 
     Args:
         backend: ``"torch"`` is plain torch, which runs everywhere and has derivatives of any order. ``"numba"`` is
@@ -82,7 +82,7 @@ def use(backend: Backend, *, strict: bool = True) -> Iterator[None]:
 
 @contextmanager
 def one_backend(image: Tensor) -> Iterator[None]:
-    """Within it the size of this image decides which form all ops run in, not that of their own arguments.
+    """Choose the backend of all ops within the context by the size of this image, not by that of their arguments.
 
     A part of an image, or a coarser scale of it, must not be computed otherwise than the whole.
 
@@ -94,7 +94,7 @@ def one_backend(image: Tensor) -> Iterator[None]:
 
 
 def _fastest(images: Sequence[Tensor]) -> Backend:
-    """What to take for images, of which the largest counts, if nothing is in its way."""
+    """The backend that is fastest for images, of which the largest counts, if it can run."""
     if not images or torch.compiler.is_exporting():
         return "torch"
     if images[0].device.type == "cuda":
@@ -103,11 +103,11 @@ def _fastest(images: Sequence[Tensor]) -> Backend:
     return "torch" if pixels < _FEW_PIXELS else "numba"
 
 
-def _obstacle(backend: Backend, tensors: Sequence[Tensor], differentiable: bool, forms: Sequence[Backend]) -> str:
+def _obstacle(backend: Backend, tensors: Sequence[Tensor], differentiable: bool, backends: Sequence[Backend]) -> str:
     """Why a backend cannot run on these tensors; empty if it can."""
     if backend == "torch":
         return ""
-    if backend not in forms:
+    if backend not in backends:
         return "has no form of this op"
     if _is_transformed():
         return "has no rule for torch.func, vmap or forward mode"

@@ -17,7 +17,7 @@ def check_shapes(**arguments: tuple[Tensor, str]) -> dict[str, int]:
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: a rank or a size does not fit; the message has the argument's name, what is expected and found.
+        ValueError: a rank or a size does not fit; the message names the argument, and the expected and the found shape.
     """
     sizes: dict[str, int] = {}
     owner: dict[str, str] = {}

@@ -1,27 +1,28 @@
-"""Numbers that the reference of an op and its fast backends fraction; compiled kernels have them built in."""
+"""Numbers that the reference of an op and its fast backends share; compiled kernels have them built in."""
 
 from __future__ import annotations
 
-# What a smooth dielectric reflects at normal incidence: on a darker surface most of the light is gloss, which no albedo
-# tints, and dividing it by a smaller number would give sparse, coloured, huge values.
+# Reflectance of a smooth dielectric at normal incidence: on a darker surface most of the light is gloss, which no
+# albedo tints, and dividing it by a smaller number would give sparse, coloured, huge values.
 FLOOR = 4e-2
 # Below this there is no texture: less than half of the darkest 8-bit sRGB step above black.
 NO_ALBEDO = 1e-4
 
-# Of the depth: how far a tap's point may lie off the tangent plane, and (no positions) how far its depth may differ.
+# How far a tap's point may lie off the tangent plane, and (without positions) how far its depth may differ, both as
+# fractions of the depth.
 PLANE_LIMIT = 0.02
 DEPTH_LIMIT = 0.1
-# Of two unit normals: |difference|^2 < 0.5 allows an angle of 41 degrees.
+# Largest |difference|^2 of two unit normals: 0.5 allows an angle of 41 degrees.
 NORMAL_LIMIT_SQUARED = 0.5
-# What taps of a pixel's own label must weigh to be enough; a tap in the pixel itself, which stands still, weighs 1.
+# Taps of a pixel's own label are enough from this weight on; a tap in the pixel itself, which stands still, weighs 1.
 LABEL_WEIGHT = 1e-3
 
-# Of the local mean: a difference that no eye sees is no lag, however little noise there is.
+# Smallest lag as a fraction of the local mean: a difference that no eye sees is no lag, however little noise there is.
 SMALLEST_LAG = 1e-3
-# Of a second, shorter history: the smallest weight of a frame, so that four frames have half the noise of one; and how
+# For a second, shorter history: the smallest weight of a frame, so that four frames have half the noise of one; and how
 # many equally weighted frames have its noise once it is full, (2 - alpha) / alpha.
 RECENT_ALPHA, RECENT_FRAMES = 0.25, 7
-# What moves by no more stands still, in pixels.
+# Largest motion, in pixels, that counts as standing still.
 STILL = 0.05
 # A light that is seen: how far the compressed radiance of 3x3 pixels may differ, and how bright they are beside the
 # mean of a window. Fewer pixels are often alike by chance where one of a few lights is drawn for each, and some of the
@@ -34,14 +35,14 @@ BLOCK, DARK = 8, 1e-3
 # The least number that a depth counts as, and how many near depths away the scene ends.
 SHORTEST, FARTHEST = 1e-30, 1e4
 
-# Of the depth, as much as half-float depths are known to: the epsilon of SVGF's Eq. 3, which the paper leaves open. The
-# others keep quotients and their derivatives finite, where `exp` of them is zero in any precision.
+# The epsilon of SVGF's Eq. 3, which the paper leaves open, as a fraction of the depth: the precision of depths in half
+# floats. The others keep quotients and their derivatives finite, where `exp` of them is zero in any precision.
 DEPTH_EPSILON, LEAST_DEPTH, HIGHEST_QUOTIENT = 1e-3, 1e-30, 1e4
 
-# Weight of a pixel in its own mean, at least: where it is like none of its neighbours it stays as it is, and nothing is
-# divided by 0. Differences of features beyond the other count as that, so that no square overflows.
+# Smallest weight of a pixel in its own mean: where it is like none of its neighbours it stays as it is, and nothing is
+# divided by 0. Larger differences of features than the second number count as that number, so that no square overflows.
 LEAST_CENTER, FARTHEST_FEATURE = 1e-6, 1e15
 
-# A guide of [0, 1] is a value of 0 to 255, whose 256 steps are divided among the bins of a grid. |x| of its tents is
-# sqrt(x^2 + the other): it has a derivative at 0.
+# A guide in [0, 1] is a value from 0 to 255, whose 256 steps are divided among the bins of a grid. The tents use
+# sqrt(x^2 + TENT_ROUNDING) for |x|, which has a derivative at 0.
 GUIDE_STEPS, TENT_ROUNDING = 256, 1e-8

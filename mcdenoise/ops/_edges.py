@@ -17,7 +17,7 @@ SIGMA_Z, SIGMA_N = 1.0, 128.0
 
 
 def layouts(normal: Tensor | None, depth: Tensor | None) -> dict[str, tuple[Tensor, str]]:
-    """What :func:`mcdenoise.ops._check.check_shapes` has to know of the two."""
+    """Normal and depth with their layouts, for :func:`mcdenoise.ops._check.check_shapes`."""
     given = {"normal": (normal, "B 3 H W"), "depth": (depth, "B 1 H W")}
     return {name: (image, layout) for name, (image, layout) in given.items() if image is not None}
 

@@ -14,7 +14,7 @@ def cells_of(side: int, cell: int) -> int:
 
 
 def tent(distance: Tensor) -> Tensor:
-    """How much of what is so many cells away counts: 1 in the centre, 0 from a cell away on."""
+    """The weight of a pixel at a distance in cells: 1 in the centre of the cell, 0 from a distance of 1 on."""
     return torch.relu(1 - torch.sqrt(distance.square() + TENT_ROUNDING))
 
 

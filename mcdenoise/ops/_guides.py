@@ -16,7 +16,7 @@ def squared_distance(padded: Tensor, radius: int, dy: int, dx: int, height: int,
 
 
 def guide_gradient(gradient: Tensor, guide: Tensor, scale: Tensor, border: Border) -> Tensor:
-    """Of one guide, times the gradient of each tap's exponent, in the dtype of ``guide``."""
+    """The derivative in one guide, times the gradient of each tap's exponent, in the dtype of ``guide``."""
     radius = kernel_size_of(gradient.shape[1], "kernel") // 2
     padded = pad(guide.to(gradient.dtype), radius, border)
     return unpad(padded_gradient(gradient, padded, scale.to(gradient.dtype), radius), radius, border).to(guide.dtype)

@@ -1,4 +1,4 @@
-"""The channels of a history, and what a frame becomes with it."""
+"""The channels of a history, and the result of blending a frame with it."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ def module_of(name: str, function: Callable[..., Any], check: Callable[..., None
     Args:
         name: of the class.
         function: its keyword-only arguments become those of the class, in order and with their defaults.
-        check: takes the settings by name, and raises for what the function would refuse.
+        check: takes the settings by name, and raises for those that the function would refuse.
     """
     parameters = list(inspect.signature(function).parameters.values())
     settings = [each for each in parameters if each.kind is inspect.Parameter.KEYWORD_ONLY]

@@ -1,4 +1,4 @@
-"""Constants of a few numbers beside a tensor, made where it is: what comes from the host is waited for by a GPU."""
+"""Small constant tensors, made on the device of another tensor: a GPU would wait for a copy from the host."""
 
 from __future__ import annotations
 

@@ -1,16 +1,17 @@
-"""The one dispatch of all ops: which implementation runs, and what it does to derivatives.
+"""The dispatch of all ops: which implementation runs, and how it is differentiated.
 
-An op is a page with a contract and a reference implementation in torch, which is the truth. ``@op`` takes a fast
-backend of the same name from the file of the same name in ``_numba/`` or ``_triton/`` where one can run and pays. It
-takes the arguments of the op, one after the other, and may return ``NotImplemented`` for what it was not written for.
+An op is a page with a contract and a reference implementation in torch, which is the truth. Where a fast backend can
+run and saves time, ``@op`` calls the function of the same name in the file of the same name in ``_numba/`` or
+``_triton/``. That function takes the arguments of the op by position, and may return ``NotImplemented`` for arguments
+that it does not support.
 
 - Derivatives: a fast backend ``NAME`` beside which there is ``NAME_gradients`` is an operator with derivatives; or it
   calls ``NAME_gradients.operator``, which has them, and whose arguments ``NAME_gradients.adapted(plain)`` takes. Those
   are differentiated again by way of the reference. Any other is chosen only where no derivatives are asked for.
 - Under ``torch.func``, ``vmap`` and forward mode the reference runs: no fast backend has rules for them.
-- While a model is exported the reference runs, so that what is exported needs neither numba nor Triton.
-- Autocast: the reference consists of products and sums in place of matrix products, so that nothing is rounded but
-  what a contract says.
+- While a model is exported the reference runs, so that the exported graph needs neither numba nor Triton.
+- Under autocast nothing is rounded except where a contract says so: the reference consists of products and sums in
+  place of matrix products.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 # The fast backends that have been loaded, by backend and op.
-_forms: dict[tuple[str, str], Callable[..., Any]] = {}
+_loaded: dict[tuple[str, str], Callable[..., Any]] = {}
 
 
 def op(
@@ -41,8 +42,8 @@ def op(
     """Make an op of its reference implementation.
 
     Args:
-        backends: what it has a fast backend in.
-        check: takes the arguments of the op, and raises for what its contract refuses; run before any form.
+        backends: names of its fast backends.
+        check: takes the arguments of the op, and raises for those that its contract refuses; run before any backend.
         differentiable: whether the fast backends have derivatives, or which one of them has.
     """
     of_these = (backends if differentiable else ()) if isinstance(differentiable, bool) else (differentiable,)
@@ -62,7 +63,7 @@ def op(
             if chosen != "torch":
                 given = {**defaults, **dict(zip(names, arguments, strict=False)), **settings}
                 _load(chosen, page, plain)
-                result = _forms[chosen, plain.__name__](*[given[name] for name in names])
+                result = _loaded[chosen, plain.__name__](*[given[name] for name in names])
                 if result is not NotImplemented:
                     return cast(_Result, result)
             return plain(*arguments, **settings)
@@ -88,12 +89,12 @@ def made_of(
 
 def plain(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """The reference implementation of an op."""
-    form: Callable[_Arguments, _Result] = getattr(function, "plain", function)
-    return form
+    reference: Callable[_Arguments, _Result] = getattr(function, "plain", function)
+    return reference
 
 
 def backends_of(function: Callable[..., Any]) -> tuple[Backend, ...]:
-    """What an op has forms in."""
+    """Names of the backends of an op, with the reference."""
     found: tuple[Backend, ...] = getattr(function, "backends", ("torch",))
     return found
 
@@ -109,19 +110,19 @@ def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
 def _load(backend: str, page: str, plain: Callable[..., Any]) -> None:
     """Make sure that the fast backend of an op is there."""
     name = plain.__name__
-    if (backend, name) in _forms:
+    if (backend, name) in _loaded:
         return
     module = importlib.import_module(f"mcdenoise.ops._{backend}.{page}")
-    form: Callable[..., Any] = getattr(module, name)
+    function: Callable[..., Any] = getattr(module, name)
     gradients = getattr(module, f"{name}_gradients", None)
-    operator = getattr(gradients, "operator", form)
+    operator = getattr(gradients, "operator", function)
     if gradients is not None and isinstance(operator, Operator):
         adapted = getattr(gradients, "adapted", _by_position)
         _differentiate(operator, gradients, adapted(plain))
-    _forms[backend, name] = form
+    _loaded[backend, name] = function
 
 
-# What the compiler traces holds the form, not the way to it: this runs while it traces.
+# The compiler calls this while it traces, and does not trace into it.
 _load._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
@@ -163,7 +164,7 @@ def _differentiate(operator: Operator, gradients: Callable[..., Any], plain: Cal
         if not torch.is_grad_enabled():
             return tuple(gradients(needed, *gradient, *arguments(tensors)))
         function = functools.partial(first, arguments=arguments)
-        # Of a list of numbers torch says once that it needs none, and expects none.
+        # For a list of numbers torch says once that it needs no gradient, and expects none.
         counts = [child.num_leaves for child in ctx.structure.children()]
         of_leaves = [own for need, count in zip(needed, counts, strict=True) for own in _spread(need, count)]
         wanted = pytree.tree_unflatten(_plain_gradients(function, tensors, of_leaves, gradient), ctx.structure)
@@ -173,7 +174,7 @@ def _differentiate(operator: Operator, gradients: Callable[..., Any], plain: Cal
 
 
 def _spread(need: bool | Sequence[bool], count: int) -> Sequence[bool]:
-    """Of each leaf of an argument."""
+    """Whether each leaf of an argument needs a gradient."""
     return [need] * count if isinstance(need, bool) else need
 
 
@@ -183,7 +184,7 @@ def _plain_gradients(
     needed: Sequence[bool],
     gradient: Sequence[Tensor],
 ) -> list[Tensor | None]:
-    """Of ``function(*tensors)``, times ``gradient``, for the tensors that need one; on record."""
+    """The derivatives of ``function(*tensors)``, times ``gradient``, in the tensors that need one; with a graph."""
     with torch.enable_grad():
         # An argument may be computed from another one, and only its direct part is asked for: hence the aliases.
         aliases = [None if tensor is None else tensor.view_as(tensor) for tensor in tensors]

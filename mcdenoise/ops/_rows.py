@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-# Of a batch. Images of up to 1280x720 are done at once; more at a time is no faster.
+# Pixels of a batch to compute at a time. Images of up to 1280x720 are computed at once; more is no faster.
 _PIXELS = 1 << 20
 
 
@@ -25,7 +25,7 @@ def by_rows(function: Callable[..., Tensor], *images: Tensor, reach: int = 0) ->
     if torch.compiler.is_compiling() or torch.compiler.is_exporting() or batch * height * width <= _PIXELS:
         return function(*images)
     result: Tensor | None = None
-    # Even, for what halves the resolution on the way.
+    # Even, because the function may halve the resolution on the way.
     step = max(_PIXELS // (batch * width) // 2 * 2, 2)
     for top in range(0, height, step):
         bottom, first = min(top + step, height), max(top - reach, 0)

@@ -1,4 +1,4 @@
-"""What tells one surface from another in two frames, and by which rule."""
+"""The buffers that tell one surface from another in two frames, and the rules to compare them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ Rule = Literal["relative", "bmfr"]
 
 
 class Surface(NamedTuple):
-    """What tells one surface from another; each ``(B, C, H, W)`` or ``None``.
+    """The buffers that tell one surface from another; each ``(B, C, H, W)`` or ``None``.
 
     Args:
         position: ``(B, 3, H, W)`` world-space hit points, scene units.
         normal: ``(B, 3, H, W)`` world-space unit normals.
         depth: ``(B, 1, H, W)`` distance along the view axis, scene units, ``inf`` where nothing was hit.
-        label: ``(B, 1, H, W)`` a number for each kind of what is seen, such as the index of an object.
+        label: ``(B, 1, H, W)`` a number for each object, such as its index.
     """
 
     position: Tensor | None = None
@@ -48,7 +48,7 @@ def check_surfaces(
 ) -> None:
     """``TypeError`` or ``ValueError`` for surfaces that cannot be compared by a rule.
 
-    What a rule cannot do without must not be missing in silence: it would accept everything.
+    A buffer that a rule requires must not be missing silently: the rule would accept everything.
     """
     if rule not in ("relative", "bmfr"):
         raise ValueError(f"rule: expected 'relative' or 'bmfr', found {rule!r}")

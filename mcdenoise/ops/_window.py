@@ -37,7 +37,7 @@ def pad(image: Tensor, radius: int, border: Border) -> Tensor:
 
 
 def unpad(padded: Tensor, radius: int, border: Border) -> Tensor:
-    """The transpose of :func:`pad`: what fell on the margin is added back where it was read from, or dropped."""
+    """The transpose of :func:`pad`: values on the margin are added to the pixels that it repeats, or dropped."""
     height, width = padded.shape[-2] - 2 * radius, padded.shape[-1] - 2 * radius
     if border != "replicate" or radius == 0:
         return shifted(padded, radius, 0, 0, height, width)

@@ -1,4 +1,4 @@
-"""Filter an image by how alike features are that a network has learnt: the affinity of neural features."""
+"""Filter an image by the affinity of neural features: how similar they are at two pixels."""
 
 from __future__ import annotations
 
@@ -78,14 +78,14 @@ def affinity_filter(
     - ``v[p, q] = previous_weight[q] exp(-previous_bandwidth[p] |features[p] - previous_features[q]|^2)``, also for
       ``q = p``; without ``previous`` it is 0.
 
-    Where ``center`` is 0 and no tap is like the pixel, all weights but its own 1e-6 vanish, and it stays as it is.
+    Where ``center`` is 0 and no tap is like the pixel, all weights but its own 1e-6 vanish, and it keeps its value.
 
     Args:
         image: ``(B, C, H, W)`` radiance, or anything up to 1e36 of either sign.
         features: ``(B, F, H, W)``, any unit; each difference counts as at most 1e15.
         bandwidth: ``(B, 1, H, W)`` of each pixel, 0 to 1e6, in one over the unit of the features squared.
-        center: ``(B, 1, H, W)`` weight of the pixel itself, in [0, 1]; that of a tap which is quite like it is 1.
-        previous: ``(B, C, H, W)`` image of the frame before, at the places of this one; with the three that follow.
+        center: ``(B, 1, H, W)`` weight of the pixel itself, in [0, 1]; a tap with the same features has the weight 1.
+        previous: ``(B, C, H, W)`` reprojected image of the frame before; requires the next three arguments.
         previous_features: ``(B, F, H, W)`` likewise.
         previous_bandwidth: ``(B, 1, H, W)``, as ``bandwidth``.
         previous_weight: ``(B, 1, H, W)`` in [0, 1], how much of ``previous`` is known at each of its pixels.
@@ -98,14 +98,14 @@ def affinity_filter(
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, a setting does not fit, or of the frame before something is missing.
+        ValueError: shapes disagree, a setting does not fit, or an argument about the frame before is missing.
 
-    Differentiable in all tensors, to any order, where ``center`` is above 1e-6. What is kept for the derivative are the
-    arguments, and no weight of a tap; it costs about three times the filter.
+    Differentiable in all tensors, to any order, where ``center`` is above 1e-6. The derivative keeps the arguments, but
+    no weights of taps, and costs about three times the filter.
 
     Source: Isik et al. 2021, "Interactive Monte Carlo Denoising using Affinity of Neural Features": the equations of
-    its pairwise affinity, of the dilated filters, and of the temporal one. The weight of what is not known of the frame
-    before, and the least weight of the centre, are added here.
+    its pairwise affinity, of the dilated filters, and of the temporal one. ``previous_weight`` and the smallest weight
+    of the centre are added here.
 
     Example:
         >>> image = torch.tensor([0.0, 1.0, 5.0, 6.0]).reshape(1, 1, 1, 4)
@@ -118,7 +118,7 @@ def affinity_filter(
         return image
     dtype = accumulator_dtype(image.dtype)
     values, here, own = (each.to(dtype) for each in (image, features, center))
-    # The last channel counts: outside of the image it is 0, as all others are.
+    # The last channel sums the weights: outside the image it is 0, like all others.
     values = torch.cat([values, torch.ones_like(own)], 1)
     sums = own.clamp_min(LEAST_CENTER) * values
     sums = sums + _affine(here, here, values, bandwidth, kernel_size, dilation, skip_center=True)
@@ -229,7 +229,7 @@ def tap_of(padded: Tensor, image: Tensor, dy: int, dx: int) -> Tensor:
 
 
 def affinity_of(here: Tensor, there: Tensor, bandwidth: Tensor, dy: int, dx: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the features here and at a tap: their difference, its square, and the weight."""
+    """The difference of the features here and at a tap, its square, and the weight."""
     difference = (here - tap_of(there, here, dy, dx)).clamp(-FARTHEST_FEATURE, FARTHEST_FEATURE)
     distance = difference.square().sum(1, keepdim=True)
     return difference, distance, torch.exp(-bandwidth * distance)

@@ -15,7 +15,7 @@ from mcdenoise.ops.moments import luminance
 SIGMA_L = 4.0
 # h of Eq. 1 and the Gaussian of Eq. 5, each along one axis.
 _KERNEL, _GAUSSIAN = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16), (1 / 4, 1 / 2, 1 / 4)
-# What stands for no deviation: the paper's epsilon of Eq. 5, which it leaves open.
+# The smallest deviation: the epsilon of Eq. 5, which the paper leaves open.
 _LEAST_DEVIATION = 1e-10
 
 
@@ -123,7 +123,7 @@ class Atrous(nn.Module):
 @op("numba", differentiable=True)
 def blurred(variance: Tensor) -> Tensor:
     """``g`` of Eq. 5; the border is repeated."""
-    # All of kornia comes with it, which takes as long to import as a single frame to denoise.
+    # This imports all of kornia, which takes as long as denoising a frame.
     from kornia.filters import filter2d_separable
 
     kernel = numbers_like(variance, _GAUSSIAN)[None]

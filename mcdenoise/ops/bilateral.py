@@ -46,13 +46,13 @@ def cross_bilateral_weights(
 
     Args:
         kernel: ``(B, K*K, H, W)``, odd ``K``, taps row by row from top left: weights ``w`` for ``"none"``, logits
-            for ``"softmax"``. A plain cross-bilateral filter has ones, respectively zeros. A logit may be infinite: the
-            limit of a large one.
+            for ``"softmax"``. A cross-bilateral filter without predicted kernels has ones, respectively zeros. A logit
+            may be infinite, and gives the limit of a large one.
         guides: any number of ``(B, C_g, H, W)`` feature images, any channels and unit, finite, at most 1e15.
         falloffs: one ``(B, 1, H, W)`` per guide, the ``f_g >= 0`` (1 / guide unit squared), at most 1e8.
         distance_falloff: ``(B, 1, H, W)``, the ``f_d >= 0`` (1 / pixel squared); ``None`` omits the term.
         normalize: ``"softmax"`` or ``"none"``.
-        border: what a tap outside the image sees: ``"replicate"`` the guide's nearest edge pixel, ``"zeros"`` a guide
+        border: guide at a tap outside the image: ``"replicate"`` that of the nearest edge pixel, ``"zeros"`` a guide
             of zeros; ``"renormalize"`` gives such taps the weight 0.
 
     Returns:

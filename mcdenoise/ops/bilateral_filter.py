@@ -52,7 +52,7 @@ def cross_bilateral_filter(
         falloffs: see :func:`cross_bilateral_weights`.
         distance_falloff: see :func:`cross_bilateral_weights`.
         normalize: see :func:`cross_bilateral_weights`.
-        border: what a tap outside the image sees: ``"replicate"`` the nearest edge pixel of image and guides,
+        border: image and guides at a tap outside the image: ``"replicate"`` those of the nearest edge pixel,
             ``"zeros"`` zeros; ``"renormalize"`` rejects such taps and divides by the sum of the weights that are
             left (0 where that sum is 0), so that the result is a weighted mean everywhere.
 

@@ -44,14 +44,14 @@ def _check_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CEL
 
 @op("numba", check=_check_splat, differentiable=True)
 def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BINS) -> tuple[Tensor, Tensor]:
-    """Average an image in the cells of a bilateral grid: blocks of pixels, apart by the value of a guide.
+    """Average an image in the cells of a bilateral grid: blocks of pixels, separated by the value of a guide.
 
     ``grid[v, u, w] = sum_p a[p] image[p] / sum_p a[p]`` over the pixels ``p = (x, y)`` with, for ``z = 255 guide[p]``,
 
     ``a[p] = t((x + 0.5) / cell - (u + 0.5)) t((y + 0.5) / cell - (v + 0.5)) t((z + 0.5) bins / 256 - (w + 0.5))``
 
     and the tent ``t(x) = max(1 - sqrt(x^2 + 1e-8), 0)``: every pixel is in up to eight cells. Where the size is no
-    multiple of ``cell``, the last cells hang over the image and hold the pixels that there are.
+    multiple of ``cell``, the last cells extend beyond the image and contain only its pixels.
 
     kornia has no bilateral grid. That of Chen et al. 2007 puts a pixel into the nearest cell and blurs the grid
     afterwards; :func:`mcdenoise.ops.cross_bilateral_filter` compares each pixel with its neighbours at full
@@ -59,13 +59,13 @@ def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BI
 
     Args:
         image: ``(B, C, H, W)``, any unit, from 0 to 1e34 in magnitude.
-        guide: ``(B, 1, H, W)`` in [0, 1]; what is beyond counts as 0 or 1.
+        guide: ``(B, 1, H, W)`` in [0, 1]; values beyond count as 0 or 1.
         cell: side of a cell in pixels, at least 1: the ``s_s`` of the paper.
         bins: cells along the guide's range, at least 1: 256 over the ``s_r`` of the paper.
 
     Returns:
         ``(B, C, ceil(H / cell), ceil(W / cell), bins)`` means, 0 in cells without a pixel, and
-        ``(B, 1, ceil(H / cell), ceil(W / cell), bins)`` whether there is one: 1 or 0. Both in the dtype of ``image``.
+        ``(B, 1, ceil(H / cell), ceil(W / cell), bins)`` whether a cell has one: 1 or 0. Both in the dtype of ``image``.
         Half precision is computed in float32. On the CPU, the same bits each time.
 
     Raises:
@@ -73,8 +73,8 @@ def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BI
         ValueError: a shape or a setting does not fit.
 
     Differentiable in ``image`` and ``guide``, to any order, where no guide is below 0 or above 1 or at the end of a
-    tent: which cells are empty has no derivative. That in a guide is large, where it is the tail of a tent alone that
-    reaches a cell; the authors take those above 100 for 0.
+    tent: which cells are empty has no derivative. The derivative in a guide is large where only the tail of a tent
+    reaches a cell; the authors set derivatives above 100 to 0.
 
     Source: Meng et al. 2020, "Real-Time Monte Carlo Denoising with the Neural Bilateral Grid", Sec. 4, and its public
     code; the grid itself: Chen, Paris and Durand 2007, "Real-time edge-aware image processing with the bilateral grid".
@@ -104,13 +104,12 @@ def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CELL)
 
     ``out[p] = sum_k a_k[p] filled[k] grid[k] / sum_k a_k[p] filled[k]`` with the weights ``a`` of :func:`grid_splat`,
     which are those of trilinear interpolation; 0 where all eight are empty. So an image is smoothed where the guide is
-    constant, and what a guide tells apart by two bins at least does not mix.
+    constant, and pixels whose guides differ by at least two bins do not mix.
 
     Args:
         grid: ``(B, C, ceil(H / cell), ceil(W / cell), bins)``, any unit, from 0 to 1e34 in magnitude.
-        filled: ``(B, 1, ceil(H / cell), ceil(W / cell), bins)`` weight of each cell in [0, 1]: 0 where nothing is known
-            of it.
-        guide: ``(B, 1, H, W)`` in [0, 1], of any resolution; what is beyond counts as 0 or 1.
+        filled: ``(B, 1, ceil(H / cell), ceil(W / cell), bins)`` weight of each cell in [0, 1]: 0 for empty cells.
+        guide: ``(B, 1, H, W)`` in [0, 1], of any resolution; values beyond count as 0 or 1.
         cell: side of a cell in pixels, at least 1.
 
     Returns:
@@ -123,8 +122,8 @@ def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CELL)
     Differentiable in ``grid``, ``filled`` and ``guide``, to any order, where no guide is below 0 or above 1 or at the
     centre of a bin, and not all cells around a pixel are empty.
 
-    Source: Meng et al. 2020, as :func:`grid_splat`. Their code takes cells of the value 0 for empty, which black pixels
-    make, too: at the edge of a black area it is brighter.
+    Source: Meng et al. 2020, as :func:`grid_splat`. Their code treats cells of the value 0 as empty, even if they
+    contain black pixels: at the edge of a black area its result is brighter.
 
     Example:
         >>> image, guide = torch.rand(1, 3, 9, 11), torch.rand(1, 1, 9, 11)

@@ -82,7 +82,7 @@ Remodulate = module_of("Remodulate", remodulate)
 
 
 def modulation(albedo: Tensor, floor: float = FLOOR) -> Tensor:
-    """What :func:`demodulate` divides by."""
+    """The modulation ``m`` by which :func:`demodulate` divides, ``(B, C, H, W)``."""
     if not floor > 0:
         raise ValueError(f"floor: expected a positive number, found {floor}")
     albedo = albedo.to(accumulator_dtype(albedo.dtype))

@@ -1,4 +1,4 @@
-"""How much the light has changed since the frame before, and so which fraction of the history to discard."""
+"""Measure how much the light has changed since the frame before, and which fraction of the history to discard."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
 STRATUM, LEVELS = 3, 5
 # Standard errors up to which a change is taken for noise.
 THRESHOLD = 2.0
-# Of the largest luminance of an image.
+# Luminance that counts as black, as a fraction of the largest one of an image.
 _BLACK = 1e-15
 
 
@@ -46,8 +46,8 @@ def temporal_gradient(
     ``out = sqrt(max(0, (D^2 - threshold^2 V) / M^2))``, at most 1, and 0 where ``M`` is no more than 1e-15 of the
     image's largest luminance,
 
-    which is ``min(1, |D| / M)`` where there is no noise. Noise adds ``V`` to ``D^2`` on average; what is no larger than
-    ``threshold`` standard errors is taken for noise altogether. The weight of the current frame in its history is then
+    which is ``min(1, |D| / M)`` where there is no noise. Noise adds ``V`` to ``D^2`` on average; a change of at most
+    ``threshold`` standard errors counts as noise altogether. The weight of the current frame in its history is then
     ``(1 - out) alpha + out``.
 
     Args:

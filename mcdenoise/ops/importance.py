@@ -1,4 +1,4 @@
-"""Kernels that are decoded from a map of importance: weighted means over a window, without a tensor of weights."""
+"""Filter an image with weights from a map of importance: means over a window, without a tensor of kernels."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) ->
     """Average over a window with weights that one map of importance gives to all pixels: softmax of the map over it.
 
     ``out[p] = sum_q exp(m[q]) image[q] / sum_q exp(m[q])`` over the ``q`` of the ``K x K`` window around ``p`` that are
-    inside the image, with the importance ``m``: the quotient of two box filters. ``m`` plus a constant is the same map.
+    inside the image, with the importance ``m``: the quotient of two box filters. A constant added to ``m`` cancels.
 
     No exponential overflows and no window loses all its weights, whatever the map: a window is put together of pairs of
     disjoint windows, of which each has its largest importance ``M``, its sum of ``exp(m - M)``, which is at least 1,
@@ -38,7 +38,7 @@ def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) ->
 
     Args:
         image: ``(B, C, H, W)``, any unit and range.
-        importance: ``(B, 1, H, W)`` ``m``, the logarithm of what each pixel is worth, finite, up to 1e30.
+        importance: ``(B, 1, H, W)`` ``m``, the logarithm of each pixel's weight, finite, up to 1e30.
         kernel_size: odd ``K``, at least 3.
 
     Returns:
@@ -77,12 +77,12 @@ ImportanceFilter = module_of("ImportanceFilter", importance_filter, _check_size)
 
 
 class _Window(NamedTuple):
-    """Of the window at each pixel.
+    """The sums over the window at each pixel.
 
     Args:
         maximum: ``(B, 1, H, W)`` largest importance ``M``, without a derivative: the result does not depend on it.
         weight: ``(B, 1, H, W)`` sum of ``exp(m - M)``.
-        mean: ``(B, C, H, W)`` of the image.
+        mean: ``(B, C, H, W)`` weighted mean of the image.
     """
 
     maximum: Tensor
@@ -90,16 +90,16 @@ class _Window(NamedTuple):
     mean: Tensor
 
     def part(self, axis: int, start: int, length: int) -> _Window:
-        """From one pixel on along an axis."""
+        """The windows of ``length`` pixels along an axis, from pixel ``start`` on."""
         return _Window(*(each.narrow(axis, start, length) for each in self))
 
     def joined(self, other: _Window) -> _Window:
-        """With another window that has no pixel in common with it."""
+        """The union with another window that has no pixel in common with it."""
         maximum = torch.maximum(self.maximum, other.maximum)
         own, others = self.weight * torch.exp(self.maximum - maximum), other.weight * torch.exp(other.maximum - maximum)
         weight = own + others
-        # Not by the difference of the means: the one with hardly any weight may be a lamp. A sum that is divided in the
-        # end would leave the range where a mean does not.
+        # The difference of the means would lose digits: the one with hardly any weight may be a lamp. A sum that is
+        # divided at the end could overflow where the mean does not.
         mean = torch.addcmul(own / weight * self.mean, others / weight, other.mean)
         return _Window(maximum, weight, mean)
 

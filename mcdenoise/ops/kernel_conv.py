@@ -32,14 +32,14 @@ def _check(image: Tensor, kernel: Tensor, *, border: str = "replicate") -> None:
 
 @op("numba", "triton", check=_check, differentiable=True)
 def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
-    """Filter an image with a kernel of its own at every pixel; all channels fraction the pixel's kernel.
+    """Filter an image with a kernel of its own at every pixel; all channels share the pixel's kernel.
 
     ``out[p] = sum_t kernel[t, p] * image[p + o_t]`` over the offsets ``o_t`` of the ``K x K`` window.
 
     Args:
         image: ``(B, C, H, W)``, any unit and range.
         kernel: ``(B, K*K, H, W)`` weights, odd ``K``, taps row by row from top left; used as they are.
-        border: what a tap outside the image reads: ``"replicate"`` the nearest edge pixel, ``"zeros"`` zero;
+        border: value of a tap outside the image: ``"replicate"`` the nearest edge pixel, ``"zeros"`` zero;
             ``"renormalize"`` rejects such taps and divides by the sum of the weights that are left
             (0 where that sum is 0), so that the result is a weighted mean everywhere.
 
@@ -130,14 +130,14 @@ def _renormalized(values: Tensor, kernel: Tensor, kernel_size: int) -> Tensor:
 
 
 # Gather, splat and correlate are the three bilinear maps of one trilinear form, sum_{t,p,c} k[t,p] y[c,p] x[c,p+o_t]:
-# the derivative of each is the other two, and its tangent that of its arguments in turn. Written as loops over the taps
+# the derivatives of each are the other two, and its tangent is that of its arguments in turn. As loops over the taps
 # with these derivatives, none of them ever holds K*K copies of the image, and gradients of any order come for free.
 
 
 def _tangent(
     function: type[Function], arguments: tuple[Tensor, Tensor], tangents: tuple[Tensor | None, Tensor | None]
 ) -> Tensor:
-    """Of a bilinear map."""
+    """The tangent of a bilinear map."""
     of_first, of_second = tangents
     if of_first is None:
         assert of_second is not None

@@ -23,7 +23,7 @@ def history_lag(
     threshold: float = THRESHOLD,
     kernel_size: int = KERNEL_SIZE,
 ) -> Tensor:
-    """Fraction of a long history to replace by a shorter one, because the light has changed.
+    """The fraction of a long history to replace by a shorter one, because the light has changed.
 
     Noise hides a change of the light in a pixel, but not in the mean of a window. With ``y`` the mean over channels,
     ``m_h`` and ``m_r`` its means over the ``n`` pixels of the window that lie in the image, of ``history`` and of
@@ -71,9 +71,9 @@ def history_lag(
     if history.numel() == 0:
         return history[:, :1]
     dtype = accumulator_dtype(history.dtype)
-    # Squares keep within range of numbers up to 1. Divided before they are summed, which could overflow.
+    # Squares of numbers up to 1 do not overflow. The division comes before the sums, which could.
     largest = torch.maximum(history.detach().abs(), recent.detach().abs()).to(dtype).amax((1, 2, 3), keepdim=True)
-    # Of a power of two, which rounds nothing, but for graphs: in ONNX they have no such number.
+    # A power of two, which rounds nothing; exported graphs take the number itself, as ONNX lacks mantissas.
     power = largest if torch.compiler.is_exporting() else largest / (2 * torch.frexp(largest).mantissa)
     largest = torch.where(largest > 0, power, 1)
     long, short = ((image.to(dtype) / largest).mean(1, keepdim=True) for image in (history, recent))

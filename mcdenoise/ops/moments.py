@@ -1,4 +1,4 @@
-"""Moments of luminance, and the variance that they amount to."""
+"""Moments of luminance, and the variance that follows from them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, check_sigmas, edge_a
 from mcdenoise.ops._op import made_of
 from mcdenoise.ops._window import accumulator_dtype
 
-# Of linear RGB with the primaries of Rec. 709.
+# Weights of linear RGB with the primaries of Rec. 709.
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
@@ -18,7 +18,7 @@ def luminance_moments(light: Tensor) -> Tensor:
     """Luminance of each pixel, and its square: the first two raw moments of one sample.
 
     ``l = 0.2126 R + 0.7152 G + 0.0722 B``, ``out = (l, l^2)``. Accumulated over frames like the light itself
-    (:func:`mcdenoise.ops.accumulate`), they tell the variance (:func:`moments_variance`).
+    (:func:`mcdenoise.ops.accumulate`), they give the variance (:func:`moments_variance`).
 
     Args:
         light: ``(B, 3, H, W)`` scene-linear radiance, linear Rec. 709 RGB.
@@ -57,8 +57,8 @@ def moments_variance(
     """Variance of luminance from its first two moments, in time alone or over a window too.
 
     ``out = max(0, m2 - m1^2)`` with ``m = sum_q w moments[q] / sum_q w`` over the taps inside the image of a square
-    window, and ``w = w_z w_n`` of :func:`mcdenoise.ops.atrous`. Moments of few frames say little of the noise; those
-    of the same surface around the pixel say more, and take detail for noise.
+    window, and ``w = w_z w_n`` of :func:`mcdenoise.ops.atrous`. The moments of few frames hardly determine the noise;
+    with those of the same surface around the pixel it is known better, but detail counts as noise, too.
 
     Args:
         moments: ``(B, 2, H, W)`` accumulated :func:`luminance_moments`, finite.

@@ -104,7 +104,7 @@ def learned_upsample(image: Tensor, kernel: Tensor, size: tuple[int, int], *, bo
 
 
 def _block_means(image: Tensor, side: int) -> Tensor:
-    """Of blocks of ``side x side`` pixels, of those that there are."""
+    """Means over blocks of ``side x side`` pixels; blocks at the border contain only the pixels of the image."""
     if side == 1 or image.numel() == 0:
         return image[..., ::side, ::side]
     return F.avg_pool2d(image, side, ceil_mode=True, count_include_pad=False)

@@ -1,4 +1,4 @@
-"""Least squares of every block of an image on its features."""
+"""Fit every block of an image by its features with least squares."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._module import module_of
 
 BLOCK = 32
-# What the features tell is fitted but for this fraction: less than float32 rounds.
+# The fit changes the part of the image that the features explain by this fraction: less than float32 rounds.
 RIDGE = 1e-8
-# With the ridge, the deviation that counts as none: 1e-7 of a feature, which is as much as float32 rounds.
+# Times sqrt(RIDGE), the deviation that counts as none: 1e-7 of a feature, as much as float32 rounds.
 _FLAT = 1e-3
-# What float64 rounds, and much more: a square is divided by it.
+# Far above the rounding of float64, since a square is divided by it.
 _NOTHING = 1e-9
 
 
@@ -28,7 +28,7 @@ def block_regression(
     squares: int = 0,
     ridge: float = RIDGE,
 ) -> Tensor:
-    """Replace every block of an image by what its features explain of it: their best linear combination.
+    """Replace every block of an image by the linear combination of its features that is nearest to it.
 
     In each block of ``n = block^2`` pixels, with the means ``m`` over it of the image ``y`` and ``m_j`` of its features
     ``x_j``,
@@ -37,15 +37,15 @@ def block_regression(
     ``min sum_p (y[p] - m - sum_j w_j z_j[p])^2 + n ridge sum_j w_j^2`` for each channel, and
     ``z_j = (x_j - m_j) / sqrt(variance(x_j) + 1e-6 mean(x_j^2))``.
 
-    The last ``squares`` features enter once more as ``z_j u_j`` without its mean, ``u_j`` being ``z_j`` with 1e-18 in
-    place of 1e-6: their square, as far as they vary at all. So the unit and the origin of a feature
-    do not matter, the mean of every block stays, and what is linear in the features comes back but for the fraction
-    ``ridge`` of what is not its mean. Features that are combinations of one another, and features without any
-    variation, are no special case: the ridge is what chooses among their weights, and the result hardly depends on it.
-    A feature that deviates by less than ``1e-3 sqrt(ridge)`` of its size counts as constant.
+    The last ``squares`` features enter once more as ``z_j u_j`` minus its mean, where ``u_j`` is ``z_j`` with 1e-18 in
+    place of 1e-6: the square of the feature, as far as it varies. So the unit and the origin of a feature do not
+    matter, the mean of every block stays, and an image that is linear in the features is returned, except that its
+    deviations from the mean shrink by the fraction ``ridge``. Features that are combinations of one another, and
+    features without any variation, are no special case: the ridge chooses among their weights, and the result hardly
+    depends on it. A feature that deviates by less than ``1e-3 sqrt(ridge)`` of its size counts as constant.
 
-    Blocks hang over the borders of the image, where its pixels are mirrored (the last one is there twice), however
-    small it is.
+    Blocks at the borders extend beyond the image, where its pixels are mirrored with the last one repeated, for any
+    size of the image.
 
     Args:
         image: ``(B, C, H, W)`` anything, finite.
@@ -54,7 +54,7 @@ def block_regression(
         block: side of a block in pixels, at least 2.
         offset: how many rows and columns before the image the first block begins, each from 0 to ``block - 1``.
         squares: how many features, the last ones, enter with their squares, from 0 to ``F``.
-        ridge: see above, above 0; the condition of what is solved is at most ``sqrt(1 / ridge)`` times the number of
+        ridge: see above, above 0; the condition of the solved system is at most ``sqrt(1 / ridge)`` times the number of
             features, so that float64 keeps eleven digits of it by default.
 
     Returns:
@@ -66,9 +66,9 @@ def block_regression(
 
     Differentiable in ``image``, to any order, and in ``features``, where none is 0 throughout a block.
 
-    Source: Koskela et al. 2019 (BMFR). There the features are made independent of one another by
-    noise of a uniform distribution of +-0.01 that is drawn for every frame; on average that adds ``n 1e-4 / 3`` to the
-    diagonal of the normal equations. Here it is a ridge, so that the same frame gives the same image.
+    Source: Koskela et al. 2019 (BMFR). There, uniformly distributed noise of +-0.01, drawn for every frame, makes the
+    features independent of one another; on average that adds ``n 1e-4 / 3`` to the diagonal of the normal equations.
+    Here it is a ridge, so that the same frame gives the same image.
 
     Example:
         >>> features = torch.rand(1, 2, 40, 50, generator=torch.Generator().manual_seed(0))
@@ -99,7 +99,7 @@ def block_regression(
     number = z.shape[2]
     penalty = math.sqrt(block * block * ridge) * torch.eye(number, dtype=z.dtype, device=z.device)
     penalties = penalty + torch.zeros_like(z[:, :1, :1])
-    # Of [z; penalty] = Q R the combination of columns nearest to [y; 0] is Q Q^T [y; 0].
+    # With [z; penalty] = Q R, the combination of its columns nearest to [y; 0] is Q Q^T [y; 0].
     orthogonal = torch.linalg.qr(torch.cat([z, penalties], 1)).Q[:, : block * block]
     mean = y.mean(1, keepdim=True)
     fitted = mean + orthogonal @ (orthogonal.mT @ (y - mean))
@@ -123,7 +123,7 @@ BlockRegression = module_of("BlockRegression", block_regression, _check_settings
 
 
 def _mirrored(size: int, block: int, start: int, device: torch.device) -> Tensor:
-    """Of each place of the blocks along an axis, the pixel of the image that is there."""
+    """Index of the pixel at each place of the blocks along an axis."""
     length = -(-(size + start) // block) * block
     place = (torch.arange(length, device=device) - start) % (2 * size)
     return torch.minimum(place, 2 * size - 1 - place)

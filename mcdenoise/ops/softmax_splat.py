@@ -1,4 +1,4 @@
-"""Splats of predicted kernels, divided by the weights that arrive: a mean wherever they come from."""
+"""Splat pixels by predicted kernels, and divide by the sum of the weights that arrive."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mcdenoise.ops.kernel_conv import kernel_splat
 
 
 def softmax_splat(image: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
-    """Spread every pixel over its neighbours by the exponentials of its logits, and divide by what arrives.
+    """Spread every pixel over its neighbours by the exponentials of its logits, and divide by the weights that arrive.
 
     With the offsets ``o_t`` of the ``K x K`` window, over the pixels ``q - o_t`` inside the image,
 
@@ -20,14 +20,14 @@ def softmax_splat(image: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
     - ``out[q] = sum_t exp(logits[t, q - o_t]) image[q - o_t] / weight[q]``.
 
     The largest exponent that arrives at a pixel is subtracted from all that do, so that no exponential overflows and
-    the sum is at least 1. Several splats, such as those of the samples of each pixel, are one by the logarithms of
-    their weights: with ``w = sigmoid(log_weight_2 - log_weight_1)`` the mean of both is ``lerp(out_1, out_2, w)``, of
-    weight ``logaddexp(log_weight_1, log_weight_2)``.
+    the sum is at least 1. Several splats, such as those of the samples of each pixel, are combined by the logarithms of
+    their weights: with ``w = sigmoid(log_weight_2 - log_weight_1)`` the mean of two is ``lerp(out_1, out_2, w)``, and
+    the logarithm of its weight ``logaddexp(log_weight_1, log_weight_2)``.
 
     Args:
         image: ``(B, C, H, W)``, any unit and range.
         logits: ``(B, K*K, H, W)`` finite, odd ``K``: tap ``t`` of pixel ``p`` says how much of ``p`` goes to
-            ``p + o_t``, row by row from top left. What leaves the image is lost.
+            ``p + o_t``, row by row from top left. Light that leaves the image is lost.
 
     Returns:
         ``(B, C, H, W)`` means, in the dtype of ``image``, and ``(B, 1, H, W)`` logarithms of the weights that arrived,
@@ -58,7 +58,7 @@ def softmax_splat(image: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
     dtype = accumulator_dtype(image.dtype)
     exponents = logits.to(accumulator_dtype(logits.dtype))
     largest = _largest_arriving(exponents.detach(), size)
-    # Of each tap, that of the pixel that it goes to; infinite outside, where nothing arrives.
+    # For each tap, the largest logit of the pixel that it goes to; infinite outside, where nothing arrives.
     arriving = F.unfold(F.pad(largest, (size // 2,) * 4, value=torch.inf), size)
     weights = torch.exp(exponents - arriving.reshape(exponents.shape))
     source = torch.cat([image.to(dtype), torch.ones_like(image[:, :1], dtype=dtype)], 1)

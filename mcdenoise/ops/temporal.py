@@ -1,4 +1,4 @@
-"""Reproject the previous frame, test which of it still holds, and accumulate."""
+"""Reproject the previous frame, test which of its pixels show the same surface, and accumulate."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _check_motion(position: Tensor, previous_view_projection: Tensor) -> None:
 
 @op("numba", "triton", check=_check_motion)
 def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
-    """Where each static surface point was in the previous frame, relative to where it is now.
+    """The motion of each point of a static surface: its place in the previous frame minus its place now.
 
     ``clip = [x y z 1] @ M``, ``(u, v) = (clip.xy / clip.w + 1) / 2``, ``motion = (u W, v H) - current pixel centre``.
 
@@ -84,7 +84,7 @@ def reproject(
     position_limit: float | None = None,
     normal_limit: float | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Fetch the previous frame at the place each pixel was, from those bilinear taps that show the same surface.
+    """Fetch the previous frame at the previous place of each pixel, from the bilinear taps that show the same surface.
 
     Around ``q = p + motion[p]`` each of the four pixels ``q_k`` with bilinear weight ``b_k`` is kept if it lies in
     the image and passes the consistency test; then ``weight = sum_kept b_k`` and
@@ -115,7 +115,7 @@ def reproject(
 
     Returns:
         ``(B, C, H, W)`` value in the dtype of ``previous``, and ``(B, 1, H, W)`` kept weight in [0, 1].
-        Holds for any motion, known or not, and whatever is in a rejected tap; a place in the image is known to
+        Correct for any motion, known or not, and any value of rejected taps; a place in the image is known to
         eps times its size.
 
     Raises:
@@ -147,14 +147,14 @@ def reproject(
     known = torch.isfinite(motion).all(1, keepdim=True)
     motion = torch.where(known, motion.to(dtype), 0)
     q = _pixel_grid(height, width, motion.device, dtype) + motion
-    # Far outside is as good as just outside, and stays exact as an integer.
+    # Far outside counts as just outside, which is exact as an integer.
     limit = numbers_like(q, [width + 1, height + 1]).reshape(1, 2, 1, 1)
     base = torch.minimum(torch.maximum(q.detach().floor(), torch.full_like(limit, -2)), limit)
     fraction = q - base
     x0, y0 = base[:, :1].long(), base[:, 1:].long()
     fx, fy = fraction[:, :1], fraction[:, 1:]
 
-    # One gather a tap fetches all there is to compare, and one all there is to sum.
+    # For each tap, one gather fetches all buffers to compare, and one all values to sum.
     tested = [buffer.to(dtype) for buffer in there if buffer is not None]
     stack = torch.cat(tested, 1).flatten(2) if tested else None
     taps: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -206,7 +206,7 @@ def check_accumulate(
     position_limit: float | None = None,
     normal_limit: float | None = None,
 ) -> None:
-    """``TypeError`` or ``ValueError`` for what :func:`accumulate` refuses."""
+    """``TypeError`` or ``ValueError`` for arguments that :func:`accumulate` refuses."""
     _check_images(
         motion,
         color=(color, "B C H W"),
@@ -244,7 +244,7 @@ def accumulate(
         previous: ``(B, C, H, W)`` accumulated radiance of the previous frame.
         previous_length: ``(B, 1, H, W)`` history length of the previous frame, in frames, at least 1.
         motion: ``(B, 2, H, W)`` pixels, ``previous position = current position + motion``; ``None`` where nothing moves
-            in the image, which gives, bit by bit, what a motion of zeros gives, without looking for it.
+            in the image; the result is, bit by bit, that of a motion of zeros, in less time.
         surface: see :func:`reproject`.
         previous_surface: see :func:`reproject`.
         alpha_min: smallest weight of the current frame, in (0, 1].

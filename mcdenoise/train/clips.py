@@ -76,14 +76,14 @@ class Clip:
 class ClipSampler:
     """Draws random clips from shots, with augmentations that are physically exact.
 
-    Random are the position, the frames, the noise seed, flips, 90-degree rotations, and the options below. Each clip
+    The position, the frames, the noise seed, flips, 90-degree rotations and the options below are random. Each clip
     depends only on its own seed: a batch can be drawn in any order, at any time, by any number of processes.
 
     Flips and rotations are kornia's, the same for all buffers and frames of a clip. Motion vectors are transformed with
     the image, and the camera's matrix projects to the transformed crop. World-space normals and positions are not
     transformed: a flipped or rotated image shows a flipped or rotated world with other names of axes. For the same
-        reason, axes are also
-    permuted and reversed at random. Color channels are permuted in the same way in radiance and albedo.
+    reason, axes are also permuted and reversed at random. Color channels are permuted in the same way in radiance and
+    albedo.
 
     Light is linear: scaling all lamps of a scene, also per channel, scales noisy color and reference by the same
     factor. Networks normalize the exposure, so this changes only the loss, whose epsilon is in units of radiance.
@@ -94,15 +94,14 @@ class ClipSampler:
         frames: T, the number of frames of a clip.
         crop: side of the square crop in pixels.
         lamps: probability that a clip gets rectangles of constant radiance without noise, up to 30 times as bright as
-            its
-            mean: directly visible emitters, which few training scenes have.
+            its mean: directly visible emitters, which few training scenes have.
         key: typical radiance to which each clip is first scaled, see :func:`mcdenoise.nn.inputs.auto_exposure`; 0 does
             not scale.
         exposure: the light of a clip is scaled by up to this many stops, up or down.
         tint: each color channel of the light is scaled by up to this many stops, up or down.
         gloss: probability that surfaces without albedo (mirrors, glass, black gloss, and lamps) are darkened by up to
-            six
-            stops: most of these are emitters, and without this a network would learn to treat a black screen as one.
+            six stops: most of these are emitters, and without this a network would learn to treat a black screen as
+            one.
 
     Raises:
         InputError: no shot is long enough, or one is smaller than the crop.

@@ -33,7 +33,7 @@ class VerifiedCache(FunctionCache):
     """
 
     def flush(self) -> None:
-        """Forget what is kept of this function."""
+        """Remove all compiled code of this function from the cache."""
         for path in Path(self._cache_path).glob(f"{self._impl.filename_base}.*.nbc"):
             with suppress(OSError):
                 path.unlink()
@@ -65,7 +65,7 @@ class VerifiedCache(FunctionCache):
         return Path(self._cache_path, f"{self._impl.filename_base}.{name}.nbc")
 
     def _digest(self, path: Path, content: bytes) -> bytes:
-        # With what it was made by and of, so that a file of another version, or of another name, is none.
+        # The digest covers version, source and name, so that a file of any other one does not match.
         made = repr((numba.__version__, self._impl.locator.get_source_stamp(), path.name))
         return _DIGEST(made.encode() + b"\0" + content).digest()
 

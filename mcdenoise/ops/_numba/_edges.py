@@ -1,8 +1,9 @@
 """Averages over windows that stop at edges, as a torch operator with derivatives.
 
-Row by row and tap by tap, a run of pixels at a time, whose weights stay in the first-level cache. All edge-stopping
-functions are exponentials, so that one exponential of the sum of their exponents gives the weight of a tap. Derivatives
-are gathered: what a pixel gets as a tap of others it computes itself, so that no thread writes what is another's.
+The kernels go row by row and tap by tap over a run of pixels, whose weights stay in the first-level cache. All
+edge-stopping functions are exponentials, so that one exponential of the sum of their exponents gives the weight of a
+tap. Derivatives are gathered: each pixel adds up its own contributions as a tap of other pixels, so that no thread
+writes to another one's rows.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def _(image: Tensor, noise: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
 def average_gradients(
     needed: Sequence[Any], of_mean: Tensor, of_variance: Tensor, *arguments: Any
 ) -> tuple[Tensor | None, ...]:
-    """Of each argument, times the gradients of both results."""
+    """The derivatives in each argument, times the gradients of both results."""
     found = iter(_backward(of_mean, of_variance, *arguments))
     return tuple(next(found) if isinstance(each, Tensor) else None for each in arguments)
 
@@ -69,7 +70,7 @@ average_gradients.of_all = True  # type: ignore[attr-defined]
     schema=f"(Tensor of_mean, Tensor of_variance, {_ARGUMENTS}) -> Tensor[]",
 )
 def _backward(of_mean: Tensor, of_variance: Tensor, *arguments: Any) -> list[Tensor]:
-    """Of each tensor there is."""
+    """The derivatives in each tensor among the arguments."""
     inputs, tensors = _inputs(*arguments), [each for each in arguments if isinstance(each, Tensor)]
     results = [torch.zeros(each.shape, dtype=of_mean.dtype, device="cpu") for each in inputs[:6]]
     if of_mean.numel():
@@ -174,7 +175,7 @@ def _smaller(backward: Any, forward: Any) -> Any:
 
 @compiled
 def _gather_slopes(of_depth: Any, of_slope: Any, depth: Any, b: int, first: int, last: int) -> None:
-    """Add what the depths of rows ``first`` to ``last`` get of the gradient of the slopes, which are differences."""
+    """Add the gradient of the slopes, which are differences of depths, to the depths of rows ``first`` to ``last``."""
     _, _, height, width = depth.shape
     for axis in range(2):
         dy, dx = axis, 1 - axis
@@ -257,7 +258,7 @@ def _weigh(weight: Any, inputs: Any, t: int, b: int, y: int, x: int, row: int, s
             u, v, w = tx[i] - nx[i], ty[i] - ny[i], tz[i] - nz[i]
             turn = half * (u * u + v * v + w * w)
             cosine = one - turn
-            # With what the difference lost by rounding, which the exponent multiplies.
+            # The second term is the rounding error of the difference, which the exponent multiplies.
             logarithm = log(cosine) + ((one - cosine) - turn) * (one + turn)
             weight[i] += least if cosine <= zero else sigma * logarithm
     factor = inputs.kernel[t // size] * inputs.kernel[t % size]
@@ -290,11 +291,11 @@ def _gather(results: Any, given: Any, inputs: Any, b: int, first: int, last: int
                     continue
                 start, n = left + dx, right - left
                 weight, slope = buffers[0, :n], buffers[1, :n]
-                # What this pixel gets as the one in the middle.
+                # The gradient of this pixel as the one in the middle.
                 _weigh(weight, inputs, t, b, y, left, row, start)
                 _slope(slope, weight, given, inputs, b, y, left, row, start)
                 _of_exponents(results, slope, inputs, b, y, left, row, start, True)
-                # What it gets as a tap of the other one.
+                # Its gradient as a tap of the other one.
                 _weigh(weight, inputs, size * size - 1 - t, b, row, start, y, left)
                 for c in range(channels):
                     add_product(of_image[b, c, y, left:right], weight, pull[b, c, row, start : start + n])
@@ -308,7 +309,7 @@ def _gather(results: Any, given: Any, inputs: Any, b: int, first: int, last: int
 
 @compiled
 def _slope(slope: Any, weight: Any, given: Any, inputs: Any, b: int, y: int, x: int, row: int, start: int) -> None:
-    """Of the exponents of a run of taps in what is asked for of their pixels."""
+    """The derivative of the results in the exponents of a run of taps."""
     n = slope.size
     pull, pull_noise, mean, variance = given
     slope[:] = 0
@@ -329,7 +330,7 @@ def _slope(slope: Any, weight: Any, given: Any, inputs: Any, b: int, y: int, x: 
 def _of_exponents(
     results: Any, slope: Any, inputs: Any, b: int, y: int, x: int, row: int, start: int, middle: bool
 ) -> None:
-    """What the pixels in the middle, from ``(y, x)`` on, get of the slopes of exponents, or else what the taps get."""
+    """Add the slopes of exponents to the gradients of the pixels in the middle, from ``(y, x)`` on, or of the taps."""
     _, _, of_normal, of_depth, of_bright, of_deviation, of_slope = results
     n, number = slope.size, slope.dtype.type
     zero, one, half = number(0), number(1), number(0.5)

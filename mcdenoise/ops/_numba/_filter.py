@@ -46,7 +46,7 @@ _REPLICATE, _ZEROS, _RENORMALIZE = range(len(BORDERS))
 
 
 class _Inputs(NamedTuple):
-    """What a filter reads; a guide or a scale that is not there has no channels."""
+    """The inputs of a filter; a guide or a falloff that is not given has no channels."""
 
     kernel: Source
     image: Source
@@ -79,7 +79,7 @@ def filtered(
 
 
 def splatted(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
-    """The transpose of the filter without guides: what its derivative spreads over an image."""
+    """The transpose of the filter without guides, which is its derivative in the image."""
     return derivatives(image, image, kernel, (), (), None, False, border, of_kernel=False)[0]
 
 
@@ -95,10 +95,10 @@ def derivatives(
     of_guides: bool = False,
     of_kernel: bool = True,
 ) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], Tensor]:
-    """Of the image, kernel, guides, falloffs and distance scale, times ``gradient``; those of guides only if asked for.
+    """The derivatives in image, kernel, guides, falloffs and distance falloff, times ``gradient``.
 
-    All but the first need the slope of every weight, so that without that of the kernel there is none of them.
-    Each has the dtype and shape of what it is the derivative of; what is absent or not asked for is empty.
+    All but the first need the derivative in every weight, so without ``of_kernel`` they are empty; those in the guides
+    also need ``of_guides``. Each has the dtype and shape of its input, and is empty where that is absent.
     """
     dtype = _compute_dtype(image, kernel)
     batch, _, height, width = image.shape
@@ -266,7 +266,7 @@ def _weigh(
     x0: int,
     n: int,
 ) -> None:
-    """Weights of a run of pixels, not yet normalised; what each was multiplied with; one over what to divide by.
+    """Compute the weights of a run of pixels before normalisation, their factors, and the inverse of their sum.
 
     Where the weights are the kernel, nothing is multiplied, and ``factors`` may have no rows.
     """
@@ -371,7 +371,7 @@ def _is_guided(inputs: Any) -> bool:
 
 @compiled
 def _channels_of(inputs: Any) -> int:
-    """Of the image and all guides."""
+    """The number of channels of the image and all guides."""
     count: int = inputs.image[2]
     for guide in inputs.guides:
         count += guide[2]
@@ -411,8 +411,8 @@ def _forward(out: Any, inputs: Any, b: int, first: int, last: int) -> None:
 def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last: int) -> None:
     """Rows ``first`` to ``last`` of the derivatives.
 
-    What is spread over a window comes from the rows around too: their weights are computed here once more, which
-    leaves nothing to add up between threads.
+    Pixels of the rows around spread into these rows, too: their weights are computed here once more, so that no sums
+    are shared between threads.
     """
     scattered, of_kernel, of_scales, of_distance = results
     height, width, kernel_size, channels = inputs.height, inputs.width, inputs.kernel_size, inputs.image[2]
@@ -445,7 +445,7 @@ def _backward(results: Any, gradient: Any, inputs: Any, b: int, first: int, last
                 start = b * strides[0] + c * strides[1] + y * strides[2] + x0 * strides[3]
                 copy_row(upstream[c, :n], gradient, start, strides[3])
                 multiply(upstream[c, :n], scale)
-            # The slope of each weight; where weights are normalised, less what all of them fraction.
+            # The slope of each weight; where weights are normalised, minus the mean slope, which all of them share.
             shared[:] = 0
             for t in range(taps if with_slopes else 0):
                 start = x0 + t % kernel_size

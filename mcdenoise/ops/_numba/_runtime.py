@@ -1,4 +1,4 @@
-"""What all fast backends fraction: the compiler and its cache, threads, and how kernels read and store numbers."""
+"""Shared by all numba backends: the compiler and its cache, threads, and how kernels read and store numbers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mcdenoise.ops._numba._cache import VerifiedCache
 # Handing rows to a thread takes as long as filtering some thousand pixels, or this many times as many pixels if there
 # are a few operations for each.
 PIXELS_A_THREAD, LIGHT = 16384, 4
-# What is no larger may be of numbers that are all small.
+# If no number of an image is larger, numbers below the smallest normal one may matter.
 _ORDINARY = 1e-15
 
 # A tensor as numba sees it: its memory from the first element on, strides in elements, and number of channels.
@@ -36,7 +36,7 @@ def compiled(function: Callable[..., Any]) -> Any:
     """``function`` compiled, once for all runs: beside its file or, failing that, in the user's cache folder.
 
     Numba looks for changes in the function's own file alone, and functions and constants of other files are compiled
-    into it. So its name, by which numba finds what it has stored, holds what all those files are like.
+    into it. So its name, by which numba finds its stored code, contains a digest of all those files.
     """
     function.__qualname__ = f"{function.__qualname__}_{_digest()}"
     kernel: Any = numba.njit(nogil=True, error_model="numpy", fastmath={"contract"})(function)
@@ -48,7 +48,7 @@ def compiled(function: Callable[..., Any]) -> Any:
 
 @functools.cache
 def _digest() -> str:
-    """Of all that a kernel may have built in: this folder, and the constants of ops."""
+    """A digest of all files that may be compiled into a kernel: this folder, and the constants of ops."""
     folder = Path(__file__).parent
     files = [*sorted(folder.glob("*.py")), folder.parent / "_constants.py", folder.parent / "_window.py"]
     return hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()[:16]
@@ -82,7 +82,7 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None], light: bool 
     least = PIXELS_A_THREAD * (LIGHT if light else 1)
     threads = max(1, min(torch.get_num_threads(), rows, rows * width // least))
 
-    def fraction(number: int) -> None:
+    def compute(number: int) -> None:
         row, end = rows * number // threads, rows * (number + 1) // threads
         while row < end:
             b, first = divmod(row, height)
@@ -91,12 +91,12 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None], light: bool 
             row += last - first
 
     if threads == 1:
-        fraction(0)
+        compute(0)
         return
     pool = _pool(threads - 1, os.getpid())
-    others = [pool.submit(fraction, number) for number in range(1, threads)]
+    others = [pool.submit(compute, number) for number in range(1, threads)]
     try:
-        fraction(0)
+        compute(0)
     finally:
         # No thread may write to a caller's arrays after this returns, even after an error.
         wait(others)
@@ -111,10 +111,10 @@ def _pool(workers: int, process: int) -> ThreadPoolExecutor:
 
 
 def flushing(*images: Tensor) -> Callable[[], AbstractContextManager[None]]:
-    """Within what it makes, numbers below the smallest normal one are 0 in this thread, if all images are ordinary.
+    """Make contexts in which this thread computes denormal numbers as 0, if all images have ordinary numbers.
 
-    Small weights of small gradients take far longer than other numbers. Beside ordinary numbers they are nothing; of
-    numbers that are all small they may be all there is.
+    Denormal numbers, such as small weights of small gradients, take far longer than others. Beside ordinary numbers
+    they do not matter; in an image of only small numbers they may be all there is.
     """
     ordinary = all(float(torch.stack(torch.aminmax(image)).abs().amax()) > _ORDINARY for image in images)
     return _denormals_flushed if ordinary else nullcontext
@@ -273,7 +273,7 @@ def _log_overload(value: Any) -> Any:
 
 
 def log1p(value: Any) -> Any:
-    """``log1p`` of what is not negative, which LLVM vectorises for float32 in this form only."""
+    """``log1p`` of a non-negative number, which LLVM vectorises for float32 in this form only."""
 
 
 def _math_log1p(value: Any) -> Any:
@@ -288,7 +288,7 @@ def _log1p_overload(value: Any) -> Any:
 
     def log1p(value: Any) -> Any:
         u = value + one
-        # With what the sum lost by rounding.
+        # The second term is the rounding error of the sum.
         return log(u) + (value - (u - one)) / u if value < infinity else value
 
     return log1p

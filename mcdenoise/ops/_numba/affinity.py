@@ -1,8 +1,8 @@
 """The affinity filter as a torch operator with derivatives.
 
-Row by row and tap by tap, a run of pixels at a time, whose distances and weights stay in the first-level cache. Of a
-tap beyond the image there is nothing to compute. Derivatives are gathered: what a pixel gets as a tap of others it
-computes itself, by their bandwidths and with the same distance, so that no thread writes what is another's.
+The kernels go row by row and tap by tap over a run of pixels, whose distances and weights stay in the first-level
+cache. Taps beyond the image are not computed. Derivatives are gathered: each pixel adds up its own contributions as a
+tap of other pixels, by their bandwidths and with the same distance, so that no thread writes to another one's rows.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _(image: Tensor, *_: Any) -> Tensor:
 
 
 def affinity_filter_gradients(needed: tuple[Any, ...], gradient: Tensor, *arguments: Any) -> tuple[Any, ...]:
-    """Of each argument, times ``gradient``."""
+    """The derivatives in each argument, times ``gradient``."""
     found = iter(_backward(gradient, *arguments))
     return tuple(next(found) if isinstance(each, Tensor) else None for each in arguments)
 
@@ -63,13 +63,13 @@ def affinity_filter_gradients(needed: tuple[Any, ...], gradient: Tensor, *argume
     "mcdenoise::affinity_filter_backward", device_types="cpu", schema=f"(Tensor gradient, {_ARGUMENTS}) -> Tensor[]"
 )
 def _backward(gradient: Tensor, *arguments: Any) -> list[Tensor]:
-    """Of each tensor there is."""
+    """The derivatives in each tensor among the arguments."""
     tensors = [each for each in arguments if isinstance(each, Tensor)]
     inputs = _inputs(*arguments)
     if not gradient.numel():
         return [torch.zeros_like(tensor) for tensor in tensors]
     mean, total = _filtered(gradient, inputs)
-    # Of the sum of weights times values, and of that of the weights but for its sign.
+    # The derivatives in the sum of weights times values, and in that of the weights with the opposite sign.
     pull = (gradient.to(mean.dtype) / total).contiguous()
     shared = (pull * mean).sum(1, keepdim=True)
     results = [torch.zeros(each.shape, dtype=mean.dtype, device="cpu") for each in inputs[:8]]
@@ -185,14 +185,14 @@ def _gather(results: Any, pull: Any, shared: Any, inputs: Any, b: int, first: in
                 square, weight, slope, factor = buffers[0, :n], buffers[1, :n], buffers[2, :n], buffers[3, :n]
                 if dy != 0 or dx != 0:
                     _square(square, features, features, b, y, left, row, start)
-                    # Of this pixel's mean, with the tap in it.
+                    # The derivatives of this pixel's mean, which contains the tap.
                     _weigh(weight, square, bandwidth[b, 0, y, left:right])
                     _slope(slope, pull, shared, image, b, y, left, row, start)
                     multiply(slope, weight)
                     _subtract_product(of_bandwidth[b, 0, y, left:right], slope, square)
                     factor[:] = 0
                     add_product(factor, slope, bandwidth[b, 0, y, left:right])
-                    # Of the tap's mean, with this pixel in it.
+                    # The derivatives of the tap's mean, which contains this pixel.
                     _weigh(weight, square, bandwidth[b, 0, row, start:end])
                     _slope(slope, pull, shared, image, b, row, start, y, left)
                     multiply(slope, weight)
@@ -264,7 +264,7 @@ def _weigh(weight: Any, square: Any, bandwidth: Any) -> None:
 
 @compiled
 def _slope(slope: Any, pull: Any, shared: Any, image: Any, b: int, y: int, x: int, row: int, start: int) -> None:
-    """Of the weights of a run of taps in the means of their pixels."""
+    """The derivatives of the means of a run of pixels in the weights of their taps."""
     n = slope.size
     of_all = shared[b, 0, y, x : x + n]
     for i in range(n):

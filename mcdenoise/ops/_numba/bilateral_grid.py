@@ -1,8 +1,9 @@
 """The bilateral grid as torch operators with derivatives: pixels are added up in cells, or read out of them.
 
-Each is the derivative of the other. A thread has rows of cells, or of pixels, of its own, so that none writes what is
-another's and each sum has the same order whatever their number. Two rows of cells are held at a time, four channels
-side by side, with a cell more on each side of the grid and of the bins, which takes what is beyond and is nothing.
+Each is the derivative of the other. Every thread has rows of cells, or of pixels, of its own, so that none writes to
+another one's rows, and each sum has the same order for any number of threads. Two rows of cells are held at a time,
+four channels side by side, with an additional cell on each side of the grid and of the bins, which takes all values
+beyond and is discarded.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ _SIDE_BY_SIDE = 4
 
 
 class _Guide(NamedTuple):
-    """Where pixels are among cells of ``cell`` pixels and ``bins``: the first of two in each direction, from -1 on."""
+    """The places of pixels among cells of ``cell`` pixels and ``bins``: the first of two cells per axis, from -1 on."""
 
     guide: Source
     rows: Any
     row_weights: Any
     columns: Any
     column_weights: Any
-    # Of the guide, and from it to a position among the bins.
+    # Factor and offset from the guide to a position among the bins.
     scale: Any
     offset: Any
     cell: int
@@ -58,7 +59,7 @@ def _(image: Tensor, guide: Tensor, cell: int, bins: int) -> tuple[Tensor, Tenso
 def grid_splat_gradients(
     needed: tuple[Any, ...], gradient: Tensor, image: Tensor, guide: Tensor, cell: int, bins: int
 ) -> tuple[Any, ...]:
-    """Of the image and the guide, times ``gradient``."""
+    """The derivatives in the image and in the guide, times ``gradient``."""
     return (*_splat_backward(gradient, image, guide, cell, bins), None, None)
 
 
@@ -71,7 +72,7 @@ def _splat_backward(gradient: Tensor, image: Tensor, guide: Tensor, cell: int, b
     sums, weight = _splatted(image, True, guide, cell, bins, means=False)
     inverse = torch.where(weight > 0, 1 / weight, 0)
     of_sums = gradient.to(sums.dtype) * inverse
-    # Of the weight: the mean is a sum times its inverse.
+    # The derivative in the weight: the mean is a sum times the inverse of the weight.
     of_weight = -(of_sums * sums.mul_(inverse)).sum(1, keepdim=True)
     of_image = torch.zeros(image.shape, dtype=sums.dtype, device="cpu")
     of_guide = _read(of_image, torch.cat([of_sums, of_weight], 1), None, guide, cell, image, of_guide=True)
@@ -103,7 +104,7 @@ def _(grid: Tensor, filled: Tensor, guide: Tensor, cell: int) -> Tensor:
 def grid_slice_gradients(
     needed: tuple[Any, ...], gradient: Tensor, grid: Tensor, filled: Tensor, guide: Tensor, cell: int
 ) -> tuple[Any, ...]:
-    """Of the grid, of what is filled and of the guide, times ``gradient``."""
+    """The derivatives in ``grid``, ``filled`` and ``guide``, times ``gradient``."""
     return (*_slice_backward(gradient, grid, filled, guide, cell), None)
 
 
@@ -117,7 +118,7 @@ def _slice_backward(
 ) -> tuple[Tensor, Tensor, Tensor]:
     dtype = accumulator_dtype(grid.dtype)
     batch, channels, *_, bins = grid.shape
-    # Of the sums of values and of weights at each pixel.
+    # The derivatives in the sums of values and of weights at each pixel.
     pull = torch.zeros((batch, channels + 1, *guide.shape[2:]), dtype=dtype, device="cpu")
     of_guide = _read(pull, grid, filled, guide, cell, gradient, of_guide=True)
     of_values, of_weight = _splatted(pull, False, guide, cell, bins, means=False)
@@ -245,7 +246,7 @@ def _hand_out(sums: Any, last: Any, cells: Any, means: bool, b: int, v: int) -> 
 
 @compiled
 def _place(places: Any, weights: Any, slopes: Any, where: Any, b: int, y: int) -> None:
-    """Of each pixel of a row its first cell, the weights of that bin and of the next, and their slopes if asked for."""
+    """Find each pixel's first cell in a row, the weights of that bin and the next, and their slopes if asked for."""
     zero, one, rounding = weights.dtype.type(0), weights.dtype.type(1), weights.dtype.type(TENT_ROUNDING)
     guide = weights[0]
     read_row(guide, where.guide, b, 0, y, 0)

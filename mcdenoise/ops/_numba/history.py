@@ -1,6 +1,6 @@
-"""What happens to a history before and after accumulation, as torch operators without derivatives.
+"""The steps of a history before and after accumulation, as torch operators without derivatives.
 
-What takes plain torch dozens of passes over the image takes one row after the other here, while it is in the cache.
+Plain torch makes dozens of passes over the image; here each row is finished while it is in the cache.
 """
 
 from __future__ import annotations
@@ -220,13 +220,13 @@ def _incoming(
     schema="(Tensor root, float even, float brighter, int window) -> Tensor",
 )
 def _find_lights(root: Tensor, even: float, brighter: float, window: int) -> Tensor:
-    """Of what a light is seen by.
+    """Find lights: blocks of 3x3 pixels that are alike and brighter than the window around them.
 
     Args:
-        root: ``(B, 1, H, W)``, float32 or float64.
+        root: ``(B, 1, H, W)`` fourth root of the radiance, float32 or float64.
         even: how far the pixels of a block may differ, relative to the brightest of them.
-        brighter: how bright a pixel is beside the mean of its window.
-        window: its side in pixels, odd, at least 5.
+        brighter: a light is brighter than this many times the mean of its window.
+        window: side of the window in pixels, odd, at least 5.
     """
     found = root.new_zeros(root.shape)
     if min(root.shape[-2:]) > 2 and len(root):
@@ -246,7 +246,7 @@ def _lights(found: Any, root: Any, even: float, brighter: float, radius: int, b:
     number, strides = found.dtype.type, root[1]
     one, zero = number(1), number(0)
     size = 2 * radius + 1
-    # The rows of the window, and what is brightest and darkest of three pixels of them, by the last of these.
+    # The rows of the window, and the maximum and minimum of three successive pixels, at the last of them.
     ring, brightest, darkest = np.empty((3, size, width), found.dtype)
     alike, column = np.zeros(width + 2, found.dtype), np.zeros(width + 2 * radius, found.dtype)
     middle, total = column[radius : radius + width], np.empty(width, found.dtype)
@@ -336,7 +336,7 @@ def _between(a: float, b: float, fraction: float) -> float:
 
 @compiled
 def _variance(variance: Any, root: Any, square: Any, length: Any) -> None:
-    """Of the noise of one frame, in a row."""
+    """The variance of the noise of one frame, in a row."""
     zero, one, two = variance.dtype.type(0), variance.dtype.type(1), variance.dtype.type(2)
     for x in range(variance.size):
         counted = max(length[x], two)
@@ -456,7 +456,7 @@ def _find_lag(
         for row in range(2 * y, min(2 * y + 2, height)):
             length = lengths[b, 0, row]
             _variance(variance, history[b, 3, row], history[b, 4, row], length)
-            # Most pixels keep what they have.
+            # Most pixels keep their history.
             for x in range(width):
                 little, much = recent_fraction[x >> 1], fraction[x >> 1]
                 if not (little > zero or much > zero):

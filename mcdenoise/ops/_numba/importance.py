@@ -86,7 +86,7 @@ def _average(out: Any, image: Any, importance: Any, kernel_size: int, b: int, fi
 
 @compiled
 def _average_row(maximum: Any, total: Any, mean: Any, pixels: Any, weights: Any, radius: int) -> None:
-    """Of the window in one row: the largest importance, the sum of the weights beside it, and the mean."""
+    """Find the largest importance of a window in one row, the sum of the weights relative to it, and the mean."""
     channels, width = mean.shape
     importance = pixels[channels]
     maximum[:] = importance
@@ -95,7 +95,7 @@ def _average_row(maximum: Any, total: Any, mean: Any, pixels: Any, weights: Any,
         _maximum(maximum[side:], importance[: width - side])
     total[:] = 0
     mean[:] = 0
-    # Of what is outside of the image there is nothing to add.
+    # Pixels outside the image add nothing.
     reach = min(radius, width - 1)
     for dx in range(-reach, reach + 1):
         start, end = max(-dx, 0), min(width - dx, width)

@@ -1,7 +1,7 @@
-"""The fast backends of what networks do between their convolutions as torch operators, without derivatives.
+"""The numba backends of the steps between the convolutions of networks, as torch operators without derivatives.
 
-Row by row, each a run of loops that are vectorised: no argument is copied as a whole, whatever its layout and
-precision, and nothing that is on the way to a result is stored but for a few rows.
+They go row by row, each by a few vectorised loops: no argument is copied as a whole, whatever its layout and
+precision, and of intermediate results only a few rows are stored.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _CHUNK = 1024
 
 
 def _precision(image: Tensor) -> torch.dtype:
-    """Of a convolution's input."""
+    """The dtype of a convolution's input."""
     return torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else image.dtype
 
 
@@ -370,7 +370,7 @@ def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _mean(rows: Tensor) -> Tensor:
-    """Of each image, from the sums and the numbers of summands of its rows."""
+    """The mean of each image, from the sums and the numbers of summands of its rows."""
     totals = rows.double().sum(2)
     return totals[0] / totals[1].clamp_min(1)
 
@@ -510,7 +510,7 @@ def _fuse(
     first: int,
     last: int,
 ) -> None:
-    """Rows ``first`` to ``last`` of the result, two at a time: they fraction the blocks whose mean is exchanged."""
+    """Rows ``first`` to ``last`` of the result, two at a time: they share the blocks whose mean is exchanged."""
     _, channels, height, width = out.shape
     dtype = out.dtype
     # Four rows of both images, the coarse one upsampled, with the zeros of the convolution around them.
@@ -527,7 +527,7 @@ def _fuse(
             lower = ring[(y + 1 if y + 1 < height else y) % 4, c, 1 : width + 1]
             low = ring[y % 4, channels + c, 1 : width + 1]
             if logarithms:
-                # Of the means of radiance, which is read once more.
+                # The logarithms are those of means of radiance, which is read once more.
                 read_row(above, fine, b, c, y, 0)
                 read_row(below, fine, b, c, min(y + 1, height - 1), 0)
                 _mean_of_blocks(half, above, below)
@@ -595,7 +595,7 @@ def _double(row: Any, half: Any) -> None:
 
 @compiled
 def _mean_of_blocks(mean: Any, upper: Any, lower: Any) -> None:
-    """Of 2x2 pixels of two rows; of two where the width is odd."""
+    """Means of 2x2 pixels of two rows; of two pixels in the last column where the width is odd."""
     quarter, half, width = mean.dtype.type(0.25), mean.dtype.type(0.5), upper.size
     for x in range(width // 2):
         mean[x] = (upper[2 * x] + upper[2 * x + 1] + lower[2 * x] + lower[2 * x + 1]) * quarter

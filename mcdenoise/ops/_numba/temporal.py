@@ -66,7 +66,7 @@ def _motion(motion: Any, position: Any, matrices: Any, b: int, first: int, last:
             at = start + i * strides[3]
             px, py, pz = memory[at], memory[at + strides[1]], memory[at + 2 * strides[1]]
             w = px * m03 + py * m13 + pz * m23 + m33
-            # A NaN is what infinity times zero and the difference of two infinities are.
+            # Infinity times zero and the difference of two infinities are NaN.
             in_front = w > 0 and (px - px) + (py - py) + (pz - pz) == 0
             u, v = (px * m00 + py * m10 + pz * m20 + m30) / w, (px * m01 + py * m11 + pz * m21 + m31) / w
             across[i] = (u + one) * wide - (number(i) + half) if in_front else infinite
@@ -79,8 +79,8 @@ class Shorter(NamedTuple):
     Args:
         recent_alpha: smallest weight of the current frame in a second, shorter history of the first channels.
         albedo: ``(B, 3, H, W)``, which says where a mirror or glass is seen.
-        longest: the longest history of what is seen there while it moves, in frames.
-        still: what moves by no more does not move, in pixels.
+        longest: the longest history of mirrors and glass while the image moves, in frames.
+        still: largest motion, in pixels, that counts as standing still.
     """
 
     recent_alpha: float = 1.0
@@ -347,7 +347,7 @@ def _accumulate(
                 alpha = max(newest, alpha_min)
                 excess = one
                 if bmfr:
-                    # What is shortened goes by the rounded length, which was not blended with.
+                    # The history is shortened from the rounded length, while it was blended with the unrounded one.
                     length = min(np.rint(length - one) + one, number(255))
                     newest = one / length
                     excess = (one - alpha) / max(one - max(newest, alpha_min), least)
@@ -449,7 +449,7 @@ def _by_name(plain: Callable[..., Any], arguments: Sequence[Any]) -> Any:
 
 
 class _Gradients:
-    """Of both results: taps are found once more, then each pixel's own gradients, then what its taps get of them."""
+    """The derivatives of both results: find the taps again, then each pixel's gradients, then those of its taps."""
 
     operator, of_all = _accumulate_pair, True
 
@@ -472,7 +472,7 @@ class _Gradients:
             taps = weights, torch.empty(weights.shape, dtype=torch.int64, device="cpu")
             settings = (alpha_min, *_limits(surface, *limits), 1.0, None, math.inf, 0.0, rule == "bmfr")
             _pass(images[0], images[1], images[2], motion, surface, previous_surface, *settings, taps)
-            # What each pixel's history and its length get.
+            # The gradients of each pixel's history and of its length.
             spread = images[0].new_empty((batch, channels + 1, height, width))
             given = [each.to(dtype).contiguous() for each in (gradient, of_length)]
             arrays = [each.numpy() for each in (*images, moved.to(dtype).contiguous(), *given, *taps, spread)]
@@ -575,7 +575,7 @@ def _differentiate_pixels(
 def _spread(
     of_previous: Any, of_length: Any, weights: Any, places: Any, spread: Any, b: int, first: int, last: int
 ) -> None:
-    """What every tap gets of the pixels that have it, for some of the planes; the last is that of the length."""
+    """Add the gradients of pixels to those of their taps, for some of the planes; the last plane is the length."""
     _, channels, height, width = of_previous.shape
     start = b * channels * height * width
     for c in range(first, last):

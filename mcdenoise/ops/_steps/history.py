@@ -1,4 +1,4 @@
-"""What happens to a history from frame to frame: what enters it, where lights are seen, and the blend."""
+"""The steps of a history from frame to frame: the color that enters it, where lights are seen, and the blend."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _check_lights(root: Tensor) -> None:
 
 @op("numba", "triton", check=_check_lights)
 def lights(root: Tensor) -> Tensor:
-    """Where, by one frame, a light is seen: in blocks of 3x3 pixels that are alike and brighter than what is around.
+    """Find the lights in one frame: blocks of 3x3 pixels that are alike and brighter than the window around them.
 
     A block is alike if its fourth roots of radiance differ by at most 3 % of the largest; a pixel is bright if its own
     is above 1.2 times the mean of the 9x9 window around it (twice, in radiance).
@@ -197,8 +197,8 @@ def blend(
        ``lerp(color, history, p)`` with a smaller ``p`` lies on the way back to ``color``.
     3. With a finite ``lag_threshold``, histories are replaced by shorter ones as far as
        :func:`mcdenoise.ops.history_lag` says, of the fourth roots of radiance, in half the resolution: a second
-       history of about four frames for the current frame, and the long one for that. The variance of the noise is what
-       the root varied by over the history. The decision has no derivative.
+       history of about four frames for the current frame, and the long one for that. The variance of the noise is the
+       variance of the root over the history. The decision has no derivative.
 
     Args:
         entering: ``(B, 5, H, W)`` of :func:`incoming`; any number of channels without a test for lag.
@@ -277,7 +277,7 @@ def _without_lag(
     blended: Tensor,
     length: Tensor,
 ) -> Tensor:
-    """Color and length of what still holds: of the recent history by the frame, of the long one by the recent one."""
+    """Color and length without lag: the frame corrects the recent history, and the recent history the long one."""
     mean, square = blended[:, MEAN], blended[:, SQUARE]
     counted = length.clamp_min(2)
     variance = (square - mean.square()).clamp_min(0) * (counted / (counted - 1))

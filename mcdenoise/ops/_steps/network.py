@@ -1,4 +1,4 @@
-"""What networks do between their convolutions."""
+"""The steps between the convolutions of networks."""
 
 from __future__ import annotations
 
@@ -99,11 +99,11 @@ def network_guides(normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor]) 
 
 @op("numba", "triton")
 def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
-    """A near depth to count depths in, and the typical one in that unit: the geometric mean of what was hit.
+    """A near depth as the unit of depths, and the typical depth in that unit: the geometric mean of all hits.
 
-    The near depth is ``1 / mean(1 / sqrt(d))^2``, which far depths hardly change. What is 10,000 times as far is no
-    part of the scene, but a sky that the renderer gave a large finite depth (Blender 1e10, others 1e30), and does not
-    count: its logarithm would hide all differences of what is near.
+    The near depth is ``1 / mean(1 / sqrt(d))^2``, which far depths hardly change. Depths 10,000 times as large are no
+    part of the scene, but a sky to which the renderer gave a large finite depth (Blender 1e10, others 1e30), and do not
+    count: their logarithm would hide all differences of near depths.
 
     Args:
         depth: ``(B, 1, H, W)`` distance, any unit, ``inf`` where nothing was hit.
@@ -116,7 +116,7 @@ def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
     dtype = accumulator_dtype(depth.dtype)
 
     def totals(values: Tensor, count: Tensor) -> Tensor:
-        """Of rows: sums of values, and how many there are."""
+        """Sums of the values of each row, and how many they are."""
         return torch.cat([values.sum(-1, keepdim=True), count.sum(-1, keepdim=True).to(values.dtype)], 1)
 
     def mean(rows: Tensor) -> Tensor:
@@ -204,7 +204,7 @@ def gated_fusion(
         bias: ``(1,)``.
         residual: ``(B, C, H, W)`` to be added to ``fine``, any dtype; none by default, nor with ``logarithms``.
         maximum: ``(B, 1, 1, 1)`` largest logarithm of the radiance of the result, which is then handed out as radiance:
-            ``expm1`` of what is brought to the range from 0 to ``maximum``.
+            ``expm1`` of the logarithm clamped to the range from 0 to ``maximum``.
         logarithms: whether to take those of ``fine``, which then is radiance: ``log1p``.
 
     Returns:

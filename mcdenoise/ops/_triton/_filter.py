@@ -3,8 +3,8 @@
 Every program has a tile of pixels, one for each thread, and goes through the taps of the window: neighbours of a tile
 lie in the cache, and kernels are read once, in whatever layout and precision they have. Only sums are held, so that the
 ``K*K`` weights exist for one tap at a time; the derivatives compute them once more. Channels and guides are tuples, not
-an axis of a tensor: nothing moves between threads. What is spread over a window is gathered instead, by the
-pixel that it arrives at: no two programs add to the same number, and results are the same bit by bit in every run.
+an axis of a tensor: nothing moves between threads. Each pixel gathers the values that its neighbours spread to it:
+no two programs add to the same number, and results are the same bit by bit in every run.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Source = tuple[Tensor, tuple[int, ...], int]
 
 
 class _Inputs(NamedTuple):
-    """What a filter reads."""
+    """The inputs of a filter."""
 
     image: Tensor
     kernel: Tensor
@@ -47,7 +47,7 @@ class _Inputs(NamedTuple):
 
     @property
     def dtype(self) -> torch.dtype:
-        """In which sums are kept."""
+        """The dtype of sums."""
         return accumulator_dtype(torch.promote_types(self.image.dtype, self.kernel.dtype))
 
     @property
@@ -89,9 +89,10 @@ def derivatives(
     border: Border,
     of_guides: bool = False,
 ) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor], Tensor]:
-    """Of the image, kernel, guides, falloffs and distance scale, times ``gradient``; those of guides only if asked for.
+    """The derivatives in image, kernel, guides, falloffs and distance falloff, times ``gradient``.
 
-    Each has the dtype and shape of what it is the derivative of; what is absent or not asked for is empty.
+    Each has the dtype and shape of its input, and is empty where that is absent; those in the guides are also empty
+    without ``of_guides``.
     """
     inputs = _Inputs(image, kernel, guides, falloffs, distance_falloff, log_domain, border)
     mean, sums = _normalisation(inputs)
@@ -123,7 +124,7 @@ def _normalisation(inputs: _Inputs) -> tuple[Tensor, Tensor]:
 
 def _spread(gradient: Tensor, inputs: _Inputs, sums: Tensor) -> Tensor:
     """Every pixel's fraction of each neighbour, added up there: the transpose of the filter."""
-    # What is read from beyond the border is first gathered there.
+    # Gradients of pixels read from beyond the border are first gathered there.
     margin = kernel_size_of(inputs.kernel.shape[1], "kernel") // 2 if inputs.border == "replicate" else 0
     batch, channels, height, width = inputs.image.shape
     shape = batch, channels, height + 2 * margin, width + 2 * margin
@@ -317,7 +318,7 @@ def _exponent(
     BORDER: tl.constexpr,
     LARGEST: tl.constexpr,
 ) -> tl.tensor:
-    """Of the weight in the log domain, else of what the kernel's ``value`` is multiplied with."""
+    """The exponent of a weight in the log domain, else of the factor of the kernel's ``value``."""
     exponent = tl.zeros_like(value)
     if LOG_DOMAIN:
         # Infinity as the largest number: the weight of each of two infinite logits is not NaN, but half.
@@ -387,7 +388,7 @@ def _gather(
             )
             neighbours = _read(image, b, there_y, there_x, inside, CHANNELS, SUM)
             if LOG_DOMAIN:
-                # What was summed up so far was relative to the largest exponent until here.
+                # The sums so far are relative to the largest exponent so far.
                 higher = tl.maximum(maximum, exponent)
                 rescale, weight = tl.exp(maximum - higher), tl.exp(exponent - higher)
                 maximum, total, result = higher, total * rescale, _scaled(result, rescale)
@@ -433,7 +434,7 @@ def _correlate(
     SUM: tl.constexpr,
     LARGEST: tl.constexpr,
 ) -> None:
-    """The derivatives in what a pixel has of its own: kernel, falloffs and distance scale."""
+    """The derivatives in the inputs of a single pixel: kernel, falloffs and distance falloff."""
     b, y, x = _tile(MARGIN, ROWS, COLUMNS, WIDE)
     mine = _is_inside(y, x, height, width)
     here = _read_guides(guides, b, y, x, mine, GUIDES, SUM)
@@ -445,7 +446,7 @@ def _correlate(
     if NORMALISED:
         maximum = _read_plane(sums, b, 0, y, x, mine, SUM)
         upstream = _scaled(upstream, _read_plane(sums, b, 1, y, x, mine, SUM))
-        # What the slopes of all weights have in common, since they are divided by their sum.
+        # The mean slope, which all weights share, since they are divided by their sum.
         shared = _dot(upstream, _read(mean, b, y, x, mine, CHANNELS, SUM))
     to_distance = tl.zeros([ROWS * COLUMNS], SUM)
     to_scales = _zeros(len(GUIDES), ROWS * COLUMNS, SUM)
@@ -509,7 +510,7 @@ def _scatter(
     SUM: tl.constexpr,
     LARGEST: tl.constexpr,
 ) -> None:
-    """What arrives at each pixel of the image and of a margin around it, from the pixels whose windows it is in."""
+    """Gather at each pixel of the image and of a margin from the pixels in whose windows it lies."""
     b, y, x = _tile(MARGIN, ROWS, COLUMNS, WIDE)
     mine = _is_inside(y + MARGIN, x + MARGIN, height + 2 * MARGIN, width + 2 * MARGIN)
     seen_y, seen_x, _ = _neighbour(y, x, mine, height, width, BORDER)
@@ -551,7 +552,7 @@ def _scatter(
 def _neighbour(
     y: tl.tensor, x: tl.tensor, mine: tl.tensor, height: tl.tensor, width: tl.tensor, BORDER: tl.constexpr
 ) -> tl.tensor:
-    """Where a tap reads, and whether it reads anything."""
+    """The place that a tap reads, and whether it reads anything."""
     if BORDER == _REPLICATE:
         y, x = tl.minimum(tl.maximum(y, 0), height - 1), tl.minimum(tl.maximum(x, 0), width - 1)
     return y, x, mine & _is_inside(y, x, height, width)

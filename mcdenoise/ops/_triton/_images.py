@@ -1,7 +1,7 @@
-"""What kernels over images share: how they are launched, how they read and write, and functions that Triton lacks.
+"""Shared by kernels over images: how they are launched, how they read and write, and functions that Triton lacks.
 
 A program has a tile of pixels, one for each thread. Images are read in whatever layout and precision they have, and
-what is computed of them is in the precision of the sums.
+computed with in the precision of the sums.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["expm1", "is_finite", "is_inside", "launch", "log1p", "read_plane", "
 
 
 def sums_of(*tensors: Tensor | None) -> torch.dtype:
-    """In which sums over such tensors are kept."""
+    """The dtype of sums over such tensors."""
     dtype = torch.float32
     for tensor in tensors:
         dtype = dtype if tensor is None else torch.promote_types(dtype, accumulator_dtype(tensor.dtype))
@@ -39,7 +39,7 @@ def launch(kernel: Any, like: Tensor, dtype: torch.dtype, *given: Tensor | None,
         like: ``(B, C, H, W)`` that has the pixels.
         dtype: of the sums.
         given: ``(B, C, H, W)`` each, or of one pixel: results and images.
-        settings: what the kernel is compiled for.
+        settings: constants that the kernel is compiled for.
     """
     batch, _, height, width = like.shape
     if not batch * height * width:
@@ -69,7 +69,7 @@ def is_finite(x: tl.tensor) -> tl.tensor:
 
 @triton.jit
 def log1p(x: tl.tensor) -> tl.tensor:
-    """Kahan's: what rounding takes from the sum, it takes from the difference, too."""
+    """Kahan's formula: rounding of the sum cancels with that of the difference."""
     u = 1 + x
     difference = u - 1
     exact = difference == 0

@@ -1,4 +1,4 @@
-"""What happens to a history before and after accumulation, in a few passes, without derivatives."""
+"""The steps of a history before and after accumulation, in a few passes, without derivatives."""
 
 from __future__ import annotations
 
@@ -249,7 +249,7 @@ def _discard_lag(
     """
     batch, _, height, width = history.shape
     sums = sums_of(history, color)
-    # Of blocks of four pixels: the roots of recent history, frame and history, the variances of the first two's noise.
+    # Means over 2x2 pixels: roots of recent history, frame and history; variances of the noise of the first two.
     size = (height + 1) // 2, (width + 1) // 2
     blocks = torch.empty((batch, 5, *size), dtype=sums, device=history.device)
     # How far the recent history lags behind, and its root without that; and how far the history lags.
@@ -288,7 +288,7 @@ def _variance(
     inside: tl.tensor,
     SUM: tl.constexpr,
 ) -> tl.tensor:
-    """Of the noise of one frame."""
+    """The variance of the noise of one frame."""
     root, square = read_plane(history, b, 3, y, x, inside, SUM), read_plane(history, b, 4, y, x, inside, SUM)
     counted = tl.maximum(length, 2)
     return tl.maximum(square - root * root, 0) * (counted / (counted - 1))

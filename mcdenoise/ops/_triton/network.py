@@ -1,4 +1,4 @@
-"""What networks do between their convolutions, one pass each, without derivatives."""
+"""The steps between the convolutions of networks, one pass each, without derivatives."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from mcdenoise.ops._window import accumulator_dtype
 
 _SHORTEST, _FARTHEST = tl.constexpr(SHORTEST), tl.constexpr(FARTHEST)
 _BLOCK, _DARK = tl.constexpr(BLOCK), tl.constexpr(DARK)
-# Programs of an image whose threads each add up what they meet, and pixels that one has at a time.
+# Programs of an image, whose threads each add up their pixels, and pixels that a program has at a time.
 _PROGRAMS, _LANES = 64, 128
 
 
@@ -195,10 +195,10 @@ def _(depth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _mean(depth: Tensor, near: Tensor, *, logarithms: bool) -> Tensor:
-    """Of ``1 / sqrt(d)``, or of the logarithms of depths in units of the near one; of each image, of what counts."""
+    """The mean of ``1 / sqrt(d)``, or of the logarithms of depths in units of the near one, over each image's hits."""
     batch, _, height, width = depth.shape
     programs = max(min(_PROGRAMS, triton.cdiv(height * width, _LANES)), 1)
-    # Each thread's own sums: what threads would add up together depends on which comes first.
+    # Each thread has its own sums: a shared sum would depend on the order of the threads.
     parts = near.new_zeros((batch, 2, programs * _LANES))
     if depth.numel():
         strides = depth.stride()
@@ -365,7 +365,7 @@ def _fuse(
         for place in tl.static_range(4):
             there_y, there_x = y // 2 * 2 + place // 2, x // 2 * 2 + place % 2
             inside = mine & is_inside(there_y, there_x, height, width)
-            # Of logarithms the mean is that of the radiance.
+            # The mean is one of radiance, also where the detail is logarithms.
             total += _detail(fine, residual, b, c, there_y, there_x, inside, RESIDUAL, False, SUM)
             count += inside.to(SUM)
         low = total / tl.maximum(count, 1)
@@ -416,7 +416,7 @@ def _halved(image: Tensor) -> Tensor:
 
 @triton.jit
 def _between(place: tl.tensor, count: tl.tensor, SUM: tl.constexpr) -> tl.tuple:
-    """Of a pixel, the two blocks whose centers it lies between, and how near to the second."""
+    """The two blocks between whose centres a pixel lies, and how near it is to the second, in [0, 1]."""
     at = tl.maximum((place.to(SUM) + 0.5) / _BLOCK - 0.5, 0)
     first = at.to(tl.int32)
     return first, tl.minimum(first + 1, count - 1), at - first.to(SUM)

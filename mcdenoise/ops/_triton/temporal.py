@@ -1,4 +1,4 @@
-"""Motion and accumulation, one pass each, without derivatives; also what a history's blend asks of that pass."""
+"""Motion and accumulation, one pass each, without derivatives; also with the options of a history's blend."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def blended(
         normal_limit: likewise.
         recent_alpha: smallest weight of the current frame in the second history.
         albedo: ``(B, 3, H, W)``, which says where a mirror or glass is seen.
-        longest: the longest history of what is seen there while it moves, in frames.
+        longest: the longest history of mirrors and glass while the image moves, in frames.
     """
     here, there = comparable(surface, previous_surface)
     if position_limit is None:
@@ -340,7 +340,7 @@ def _accumulate(
     alpha = tl.where(found, tl.maximum(newest, least), 1)
     excess = tl.zeros([ROWS * COLUMNS], SUM) + 1
     if BMFR:
-        # What is shortened goes by the rounded length, which was not blended with. Halves go to the even number.
+        # The rounded length is shortened, while the blend used the unrounded one. Halves are rounded to even.
         whole = tl.floor(length - 0.5)
         tie = (length - 0.5 == whole) & (whole - 2 * tl.floor(whole / 2) == 1)
         length = tl.where(found, tl.minimum(tl.where(tie, whole - 1, whole) + 1, 255), 1)
