@@ -36,7 +36,7 @@ _CLOSE_UP = (0.42, 0.40, 0.25, 0.25)
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demonstration made.
+    """The results of the demonstration.
 
     Args:
         scores: errors of the noisy and the accumulated image, those on the way and the result, over the frames with
@@ -66,7 +66,7 @@ def run_demo(
 ) -> DemoResult:
     """Render 16 frames at one sample a pixel, denoise them, and compare the last ones with references.
 
-    What an earlier run has rendered into the same folder is used again; its report is replaced.
+    Frames that an earlier run rendered into the same folder are used again; its report is replaced.
 
     Args:
         out: folder to write to: ``sequence/``, ``denoised/``, ``demo.png`` and ``report/``.

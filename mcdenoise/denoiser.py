@@ -278,7 +278,7 @@ class Denoiser:
                 self._check_layers(frame)
                 report.missing = absent_buffers(self.model, frame)
                 report.tiles = self._tiles.divide(self._shot(frame))
-                # What was repaired is in memory again.
+                # Repaired buffers are in memory again.
                 frame = frame.map(spilled) if self.spills else frame
                 drop_pages()
             noisy = frame.color

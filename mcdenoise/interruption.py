@@ -87,9 +87,10 @@ def deaf_children() -> Iterator[None]:
 
 
 def prepare_worker() -> None:
-    """In a worker process, first of all: SIGINT is for the driver, SIGTERM and SIGHUP end it, as does the driver's end.
+    """Set up the signals of a worker process: it ignores SIGINT, and ends at SIGTERM, SIGHUP or the end of its driver.
 
-    Before it ends it removes the files that it is writing. What it was told to ignore it ignores.
+    Before it ends it removes the files that it is writing. It must be called first. Signals that were ignored before
+    stay ignored.
     """
     # Not every system can start a process with signals blocked.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -23,8 +23,8 @@ def load_own(name: str, kind: str, thing: str) -> tuple[Any, ModuleType]:
 
     Args:
         name: ``path/to/file.py:attribute`` or ``package.module:attribute``.
-        kind: what the object is used as, such as ``"model"``; for messages.
-        thing: what the attribute should be, such as ``"factory"``; for messages.
+        kind: use of the object, such as ``"model"``; for messages.
+        thing: kind of attribute that is expected, such as ``"factory"``; for messages.
 
     Returns:
         The attribute, and the module that defines it.

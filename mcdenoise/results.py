@@ -149,9 +149,9 @@ class Cell:
         failure: why the method failed on this scene; then all other values are unknown.
         computing: milliseconds per frame in memory, without reading and writing files; measured as a whole, so that the
             stages may add up to slightly less.
-        plan: what was skipped of the scene and why, see :func:`mcdenoise.models.summarize`.
+        plan: the skipped stages and the reasons, see :func:`mcdenoise.models.summarize`.
         on_the_way: errors of the intermediate images, by stage, if they were requested.
-        lacking: whether the method failed because the scene lacks buffers that it needs, which is no error of either.
+        lacking: whether the method failed because the scene lacks buffers that it needs; then the run has not failed.
     """
 
     scene: str

@@ -1,4 +1,4 @@
-"""What each op costs in each backend and dtype, how exact it is, and how near to the speed of a copy."""
+"""The cost of each op in each backend and dtype, its error, and its time in units of a copy."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class _Entry:
         return [gradient for gradient in found if gradient is not None]
 
     def cost(self, bandwidth: float) -> OpCost:
-        """What was found out; ``bandwidth`` in bytes a second."""
+        """The measured cost; ``bandwidth`` in bytes a second."""
         about = self.op.name, self.backend, str(self.dtype).removeprefix("torch."), self.case.name
         if self.failure:
             return OpCost(*about, failure=self.failure)
@@ -232,7 +232,7 @@ def largest_case(op: Op) -> Case:
 def enlarged(
     case: Case, width: int, height: int, *, dtype: torch.dtype = torch.float32, device: str = "cpu"
 ) -> tuple[Inputs, dict[str, Any]]:
-    """The inputs and settings of a case, repeated to a size; what has half the case's size gets half of the size.
+    """The inputs and settings of a case, repeated to a size; inputs of half the case's size get half of the size.
 
     A grid of cells, which has five axes, gets as many of them as the size takes.
     """

@@ -43,7 +43,7 @@ def denoise(
         json: write the run times to this file too.
     """
     shot.check()
-    # What opening the frames frees would else count as memory in use.
+    # Otherwise memory that is freed after opening the frames would count as memory in use.
     (keep_heap if shot.max_memory is None else return_heap)()
     if shot.threads is not None:
         torch.set_num_threads(shot.threads)

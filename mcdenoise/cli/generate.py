@@ -126,7 +126,7 @@ def generate(
 def _on_ray(plan: Generation, seeds: list[int], address: str, out: Path) -> int | None:
     """Render the seeds on a Ray cluster, a task each."""
     threads = plan.threads or 1
-    # Of one kind, whatever each machine would choose: it is part of what a sequence is identified by.
+    # One variant for all machines, because it is part of the identity of a sequence.
     variant = "" if plan.cycles else choose_variant(plan.rendering["variant"])
     plan = replace(plan, threads=threads, rendering={**plan.rendering, "variant": variant or None})
     engine = RayEngine(address, cpus=threads, gpus=float(variant.startswith("cuda")))

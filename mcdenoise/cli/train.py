@@ -46,7 +46,7 @@ def train(
         recipe: TOML file that says all this, and how the sequences are generated, which are rendered first.
         runs: names of the runs to train, of a recipe that has several; each has a folder of its name in the output. All
             by default.
-        data: folder of what a recipe renders, which several may share; OUT/data by default.
+        data: folder of the sequences that a recipe renders, which recipes may share; OUT/data by default.
         validation: folders of sequences that are used for nothing but validation.
         cache: folder of the decoded sequences, which several runs may share; OUT/cache by default.
         initial_weights: safetensors file of weights to start from.
@@ -141,7 +141,7 @@ def _generator(rendering: Rendering, data: Path, ray: str | None) -> Callable[[]
         command = parse("generate", arguments)
 
     def generate() -> None:
-        # What is printed is what this command makes.
+        # Standard output is for the result of this command.
         with naming(rendering.where), contextlib.redirect_stdout(sys.stderr):
             if command():
                 raise InputError("expected all scenes to be rendered, found some that failed; run the command again")
@@ -150,7 +150,7 @@ def _generator(rendering: Rendering, data: Path, ray: str | None) -> Callable[[]
 
 
 def _print_errors(errors: Mapping[str, float], expected: tuple[float, float] | None) -> None:
-    """Print how good the weights are, and whether that is what the recipe says."""
+    """Print the errors of the weights, and whether they are as the recipe expects."""
     scores = "".join(f"  {name} {value:.4f}" for name, value in errors.items())
     print(f"validation{scores or ': no frames to validate on'}")
     if expected is None:

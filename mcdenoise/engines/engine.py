@@ -18,8 +18,8 @@ class Done:
     """How a task ended.
 
     Args:
-        answer: what the function returned.
-        error: what it raised.
+        answer: value that the function returned.
+        error: exception that it raised.
         lost: why there is neither: the worker died.
     """
 

@@ -59,7 +59,7 @@ class ShotResult:
 
     Args:
         shot: the shot.
-        found: what the scan found; ``None`` before it.
+        found: result of the scan; ``None`` before it.
         made: number of frames that were denoised in this run.
         failed: for each failed frame, by number, the reason.
         reason: why the whole shot failed; empty if it did not.

@@ -86,11 +86,11 @@ class Order:
 
 @dataclass(frozen=True)
 class Found:
-    """What :func:`scan` found.
+    """The result of :func:`scan`.
 
     Args:
         shot: the shot, with the model that was chosen, if a measurement chooses it.
-        numbers: of all frames.
+        numbers: numbers of all frames.
         done: numbers of the finished frames.
         unreadable: for each frame that cannot be opened, by number, the reason.
         overlap: number of frames that the history needs, see :func:`mcdenoise.models.frames_remembered`.
@@ -109,7 +109,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Made:
-    """What failed in :func:`make`.
+    """The failures of :func:`make`.
 
     Args:
         failed: for each failed frame, by number, the reason.

@@ -20,20 +20,21 @@ from mcdenoise.models.tiled import Region, Tiled
 GB = 1e9
 LEAST_SIDE = 64
 MULTIPLE = 32
-# Smaller tiles cost more time, for what they share, than reading meanwhile can save.
+# Smaller tiles cost more time, because of their margins, than reading at the same time can save.
 _WORTHWHILE_SIDE = 512
-# Features of a network, by default: a frame of 1920x1080 is one piece for every model of the package, and the margins
-# of larger ones cost no more than a seventh. Not what happens to be free: the same frames give the same images.
+# Default memory for the features of a network: a frame of 1920x1080 is one piece for every model of the package, and
+# the margins of larger ones cost at most a seventh. It does not depend on the free memory, so that the same frames give
+# the same images.
 _FEATURES = 2 * GB
-# Of a GPU's memory, in which the largest pieces are the fastest.
-_SHARE_OF_GPU = 0.4
-# What comes with the first frame: compiled kernels, the library of convolutions, its buffers, and what freed pieces
-# leave between them.
+# Fraction of a GPU's memory, on which the largest pieces are the fastest.
+_GPU_FRACTION = 0.4
+# Memory that the first frame takes once: compiled kernels, the library of convolutions, its buffers, and gaps between
+# freed pieces.
 _LOADED_LATER = 0.45 * GB
 _BYTES = 4
-# Channels of a history: a long and a recent past, what they are compared by, and the length.
+# Channels of a history: a long and a recent one, the moments by which they are compared, and the length.
 _KEPT = 10
-# Of a layer, measured: as given, without albedo, two histories of six, filtered at each scale, and what is on the way.
+# Channels of a layer, measured: as given, without albedo, two histories of six, each scale, and temporary results.
 _PER_CARRIED = 56
 # Buffers of a frame that are kept beside them.
 _SURFACE = ("position", "normal", "depth")
@@ -78,7 +79,7 @@ class Division:
                 raise InputError("tile, max_memory: expected one of them, found both; max_memory chooses the tiles")
         if not self._tiled and (side, max_memory) != (None, None):
             raise InputError("tile, max_memory: expected a model that computes tiles of an image, found one without")
-        # What has a history of another kind keeps it in memory.
+        # Methods with a history of another kind keep it in memory.
         self._accumulated = parts_of(model, Accumulated)
         self._side, self._bfloat16 = side, bfloat16
         self._memory = Memory(None if max_memory is None else max_memory * GB, device)
@@ -134,10 +135,10 @@ class Division:
 
 
 class Memory:
-    """What a denoiser may hold, and what it does.
+    """The memory that a denoiser may take, and the memory that it takes.
 
     Args:
-        cap: bytes of the whole process (of the device, where that is no CPU), at most; ``None`` for no promise.
+        cap: maximum of bytes of the whole process (of the device, where that is no CPU); ``None`` for no limit.
         device: where the network runs.
 
     Raises:
@@ -171,7 +172,7 @@ class Memory:
         if self.cap is None:
             limit = _FEATURES
             if self._device.type == "cuda":
-                limit = _SHARE_OF_GPU * torch.cuda.get_device_properties(self._device).total_memory
+                limit = _GPU_FRACTION * torch.cuda.get_device_properties(self._device).total_memory
             why = f"features of the network within {limit / GB:.3g} GB"
         else:
             least = self._least(frames, network)
@@ -201,11 +202,11 @@ class Memory:
 
 
 class Network(NamedTuple):
-    """What matters of a network.
+    """The properties of a network that its memory depends on.
 
     Args:
-        halo: what a tile has around it, in pixels.
-        bytes_per_pixel: that it takes for each of them.
+        halo: width of the margin around a tile in pixels.
+        bytes_per_pixel: memory that it takes for each pixel of a tile and its margin.
     """
 
     halo: int
@@ -213,15 +214,15 @@ class Network(NamedTuple):
 
 
 class Frames(NamedTuple):
-    """What matters of frames.
+    """The properties of frames that their memory depends on.
 
     Args:
         size: height and width in pixels.
-        buffers: their names.
-        streaming: a frame has a past, or will be one.
+        buffers: names of their buffers.
+        streaming: a frame has a history, or will be part of one.
         ahead: the next frame is read, and the last one written, at the same time.
         batch: number of images.
-        carried: number of layers, with what is in none of them, and of alphas that are denoised.
+        carried: number of layers, with the rest that is in none of them, and of denoised alphas.
         spilled: frames and history are in files, see :mod:`mcdenoise.models._spilled`.
     """
 
@@ -238,8 +239,8 @@ class Frames(NamedTuple):
         """Bytes of whole images while a network runs."""
         if self.spilled:
             return self._bytes(_IN_MEMORY)
-        # Color, demodulated, and what is kept of it and of the frame before, to which a failure leads back; the results
-        # of both networks.
+        # Demodulated color; its history and that of the frame before, to which a failure returns; the results of both
+        # networks.
         kept = 2 * (_KEPT + self._channels(*_SURFACE)) if self.streaming else 1
         return self._bytes(self._channels() + 3 + kept + 6)
 

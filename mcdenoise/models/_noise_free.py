@@ -16,7 +16,7 @@ from mcdenoise.ops._window import corner, up_to_multiple
 # Relative difference of two pixels. Consecutive samples of a path tracer differ by ten times as much or more.
 _SMOOTH = 0.02
 _CELL = 8
-# Of the 576 pixels of 3x3 cells.
+# Numbers among the 576 pixels of 3x3 cells.
 _LEAST_WITNESSES, _MANY = 100, 1000
 
 

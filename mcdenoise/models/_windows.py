@@ -13,7 +13,7 @@ from mcdenoise.ops import Surface
 from mcdenoise.ops._steps.history import SQUARE, Blended, blend
 from mcdenoise.ops.lag import KERNEL_SIZE
 
-# Of a window; more at a time takes more memory, fewer compute more rows twice.
+# Pixels of a window: larger ones take more memory, smaller ones compute more rows twice.
 _PIXELS = 1 << 21
 # Rows around a row that its test for lag looks at, in half the resolution.
 _REACH = 2 * (KERNEL_SIZE // 2) + 2
@@ -75,7 +75,7 @@ def first_in_file(entering: Tensor) -> Tensor:
 
 
 def _window(motion: Tensor | None, top: int, bottom: int, height: int) -> tuple[int, int]:
-    """The rows that hold rows of a frame, what is around them, and all that their motion leads to in the image."""
+    """The range of rows that contains rows of a frame, their neighbours, and the places to which their motion leads."""
     first, end = max(top - _REACH, 0), min(bottom + _REACH, height)
     if motion is not None:
         numbers = torch.arange(first, end, dtype=motion.dtype)[:, None]

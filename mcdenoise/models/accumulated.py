@@ -1,4 +1,4 @@
-"""A method on accumulated radiance: the history of a shot, what is kept of it from frame to frame, and when it ends."""
+"""A method on accumulated radiance: the history of a shot, its state from frame to frame, and when it ends."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ from mcdenoise.ops.temporal import Rule
 
 # A cut leaves a few accidental matches; a fast pan keeps far more than this fraction of the image.
 CUT_FRACTION = 0.05
-# What a mirror or glass shows does not move as its surface does: a long history would smear it.
+# Longest history of mirrors and glass: an image in them does not move with their surface, and would be smeared.
 SPECULAR_LENGTH = 2.0
 # Where clamping would take more than this fraction of the light of the median block, the shot's light is caustics,
 # which have another limit.
 _LOST, CAUSTICS = 0.1, 120.0
-# Side of a block in pixels; rows of blocks that are looked at; and how few blocks say nothing.
+# Side of a block in pixels; number of rows of blocks that are examined; and the least number of lit blocks.
 _BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
-# A light has hardly varied over the history: its compressed radiance by less than this fraction.
+# A light is steady if its compressed radiance varied by less than this fraction over the history.
 _STEADY = 0.1
 ALBEDO_HISTORY = "albedo_history"
 _NO_WAY = "no motion, and no position with a previous camera"
@@ -56,20 +56,20 @@ _Carried: TypeAlias = tuple[Tensor | None, ...]
 
 
 class History(NamedTuple):
-    """What is kept of a shot.
+    """The history of a shot.
 
-    All of it zeros is the history of no frame, so that a graph that takes a history can begin with that. It is of the
-    radiance alone: methods that accumulate by the same settings may go on with one another's.
+    A history of zeros only is that of no frame, so that an exported graph can begin with it. A history depends on the
+    radiance alone: methods that accumulate by the same settings may exchange theirs.
 
     Args:
         color: ``(B, 3, H, W)``; where lag is looked for ``(B, 9, H, W)``, see
             :func:`mcdenoise.ops._steps.history.blend`.
         length: ``(B, 1, H, W)`` in frames.
-        surface: what was seen.
-        view_projection: ``(B, 4, 4)`` by which camera.
-        limit: ``(B, 1, 1, 1)`` of the fireflies of this shot, see :func:`mcdenoise.ops.clamp_fireflies`.
-        carried: of each layer, then of the alpha, then of each buffer that is accumulated as well, the channels of
-            ``color`` that are no compressed radiance; ``None`` of a buffer that the frame had not.
+        surface: the surfaces that the last frame shows.
+        view_projection: ``(B, 4, 4)`` camera of the last frame.
+        limit: ``(B, 1, 1, 1)`` limit of fireflies in this shot, see :func:`mcdenoise.ops.clamp_fireflies`.
+        carried: for each layer, then for the alpha, then for each buffer of ``also``, the channels of ``color`` that
+            are no compressed radiance; ``None`` for a buffer that the frame lacked.
     """
 
     color: Tensor
@@ -81,34 +81,34 @@ class History(NamedTuple):
 
 
 class Accumulated(Wrapper):
-    """Blends each frame with the reprojected history of its shot, and hands the method what came of it.
+    """Blends each frame with the reprojected history of its shot, and passes the result to a method.
 
     The method sees the accumulated radiance as ``color``, that of the frame alone as ``current``, and the ``length`` of
     the history; whether nothing moves, as ``hints.still``; and no state at the beginning of a shot. A shot ends at a
     cut (less than 5 % of the pixels find their surface in the previous frame), when the image's size changes, where a
-    frame says nothing of motion, and where it lacks a buffer of ``also`` that the one before has, or the other way
-    round. The accumulated image is the stage ``accumulated``.
+    frame has no motion, and where a buffer of ``also`` is in only one of two successive frames. The accumulated image
+    is the stage ``accumulated``.
 
     Motion is the frame's own where it has one, else that of its previous positions (its positions, where it has none)
     seen from the previous camera. Where positions and cameras say that nothing moved, the motion is zero, not the
     rounding of a projection, which would blur a still image a little more with every frame. The consistency test
-    compares the previous frame's positions with the previous positions too, so that what moves keeps its history. It
-    compares the normals as they are: what turns by more than the normal limit from one frame to the next starts anew.
+    compares the previous frame's positions with the previous positions too, so that moving surfaces keep their history.
+    It compares the normals of both frames: a surface that turns by more than the normal limit starts a new history.
 
     Fireflies are clamped before accumulation. Where clamping would remove more than 10 % of the light of the median
-    32x32 block of a shot's first frame (of each image of a batch by itself), the shot has caustics, and the limit is
-    120. How histories of mirrors and of changing light are shortened: :func:`mcdenoise.ops._steps.history.blend`.
+    32x32 block of a shot's first frame (separately for each image of a batch), the shot has caustics, and the limit is
+    120. :func:`mcdenoise.ops._steps.history.blend` shortens the histories of mirrors and of changing light.
 
-    A lamp in the plane of a ceiling, with its albedo, is the same surface by all tests, and bilinear taps would carry
-    its light over its edge, a little further with every frame. So pixels that see a light take their history from
-    pixels that saw one, and all others from the others, where both are among the taps. A light is seen where
-    :func:`mcdenoise.ops._steps.history.lights` says so, and its compressed radiance varied by less than a tenth over
-    the history. A light that is narrower than three pixels bleeds still. This needs the test for lag.
+    A lamp in the plane of a ceiling, with the albedo of the ceiling, is the same surface by all tests, and bilinear
+    taps would carry its light over its edge, a little further with every frame. So pixels that see a light take their
+    history from pixels that saw one, and all others from the others, where both are among the taps. A pixel sees a
+    light if :func:`mcdenoise.ops._steps.history.lights` finds one there, and its compressed radiance varied by less
+    than a tenth over the history. A light that is narrower than three pixels still bleeds. This needs the test for lag.
 
-    Half-precision frames are accumulated in float32, which holds 10,000 frames as well as ten.
+    Half-precision frames are accumulated in float32, which is as exact after 10,000 frames as after ten.
 
-    Layers and alpha have histories of the same places, weights and cuts, which the color alone decides on; where a
-    firefly is scaled down, all of its layers are.
+    Layers and alpha have histories with the same motion, weights and cuts, which depend on the color alone; where a
+    firefly is scaled down, its layers are, too.
 
     Args:
         inner: any method.
@@ -117,14 +117,14 @@ class Accumulated(Wrapper):
         position_limit: see :func:`mcdenoise.ops.reproject`.
         normal_limit: likewise.
         firefly_limit: see :func:`mcdenoise.ops.clamp_fireflies`, infinity for none; by default chosen as above.
-        specular_length: the longest history of what is seen in mirrors and through glass while the image moves, in
-            frames, at least 0; infinity treats them as everything else.
+        specular_length: the longest history of mirrors and glass while the image moves, in frames, at least 0; infinity
+            treats them as everything else.
         lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test for changes of light.
-        clamp_current: whether fireflies are clamped in what the method sees as ``current``, too.
-        also: names of buffers ``(B, 3, H, W)`` of ``frame.extra`` that are accumulated as the color is, where a frame
-            has them: with its weights, and with what they have of fireflies; or ``"diffuse"`` and ``"specular"``, which
-            the method sees accumulated in their place. With ``"albedo"``, the method finds the history of the albedo,
-            anti-aliased by all its frames, as ``albedo_history`` in ``frame.extra``.
+        clamp_current: whether fireflies are also clamped in ``current``.
+        also: names of further buffers to accumulate with the weights of the color, where a frame has them: buffers
+            ``(B, 3, H, W)`` of ``frame.extra``, whose fireflies are kept; or ``"diffuse"`` and ``"specular"``, which
+            the method sees accumulated. With ``"albedo"``, the method finds the history of the albedo, anti-aliased by
+            all its frames, as ``albedo_history`` in ``frame.extra``.
 
     Raises:
         InputError: a setting is out of its range.
@@ -157,7 +157,7 @@ class Accumulated(Wrapper):
 
     @property
     def needs(self) -> Needs:
-        """As those inside but for what is handed to it; whatever tells motion is of use."""
+        """The needs of the method inside, except for the buffers made here; buffers that tell motion are of use."""
         needs = self.inner.needs
         given = frozenset({"current", "length", ALBEDO_HISTORY})
         uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth", "albedo"}
@@ -169,7 +169,7 @@ class Accumulated(Wrapper):
 
     @property
     def persistence(self) -> float:
-        """What one more frame leaves of the history, see :func:`mcdenoise.models.frames_remembered`."""
+        """The fraction of the history that each frame keeps, see :func:`mcdenoise.models.frames_remembered`."""
         return 1 - self.alpha_min
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
@@ -192,7 +192,7 @@ class Accumulated(Wrapper):
 
     def _accumulate(self, frame: Frame, history: History | None, inner: State) -> tuple[Frame, History | None, State]:
         """The frame with its history, the history for the next one, and the state that the method inside may have."""
-        # Of a graph, and on a GPU, no value is looked at: both ways of a decision are computed.
+        # In a graph and on a GPU no value is read: both branches of each decision are computed.
         blind = not at_hand(frame.color.device)
         can_move = tells_motion(frame.buffers)
         reset = "" if history is None else _misfit(history, frame) or self._other_buffers(history, frame)
@@ -201,7 +201,7 @@ class Accumulated(Wrapper):
             reset = reset or "no position and normal, which the rule compares"
         reset = reset or (_NO_WAY if not can_move else "first frame" if history is None else "")
         keeps = frame.hints.keep_all or not frame.hints.last
-        # What has no history and will be none is compared with nothing.
+        # A frame without a history, which will not be part of one, needs no test for lag.
         compared = math.isfinite(self.lag_threshold) and (keeps or not reset)
         limit = self._chosen(frame.color) if reset or history is None else history.limit
         if blind and not reset:
@@ -230,7 +230,7 @@ class Accumulated(Wrapper):
                 self._tell_cut(cut)
             elif cut:
                 reset = "cut"
-                # Another shot may be of another light, which is seen only now.
+                # The light of the new shot may differ, and the cut is found only here.
                 chosen = self._chosen(frame.color)
                 if not torch.equal(chosen, limit):
                     limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
@@ -254,23 +254,23 @@ class Accumulated(Wrapper):
             surface = Surface(frame.position, frame.normal, frame.depth, label)
             after = History(color, length, surface, frame.view_projection, limit, carried)
         hints = frame.hints._replace(still=still_for_sure)
-        # What was found of another image is not handed on.
+        # Statistics of the noisy image are not passed on.
         seen_inside = {"color": color[:, COLOR], "current": current, "length": length, "statistics": {}}
         return self._with_carried(frame.replace(**seen_inside, hints=hints), carried), after, inner
 
     def _first(self, frame: Frame, entering: Tensor) -> _Carried:
-        """Layers and alpha of the frame, and what is accumulated as well, without histories."""
+        """Layers, alpha and the buffers of ``also`` of a frame without a history."""
         parts = self._entering(frame, entering)
-        # With what is compared for lag, each has its recent mean behind it.
+        # With the test for lag, each has its recent mean behind it.
         twice = entering.shape[1] > COLOR.stop
         return tuple(torch.cat([part, part], 1) if twice and part is not None else part for part in parts)
 
     def _blend_carried(
         self, frame: Frame, entering: Tensor, seen: Tensor | None, history: History, still: bool | Tensor
     ) -> _Carried:
-        """Layers and alpha of the frame, and what is accumulated as well, with their histories.
+        """Layers, alpha and the buffers of ``also`` of a frame, with their histories.
 
-        Each goes through the blend in the place of the color, which decides nothing: its compressed radiance does.
+        Each takes the place of the color in the blend, whose decisions depend on the compressed radiance only.
         """
         decisive = entering[:, COLOR.stop :]
         blended: list[Tensor | None] = []
@@ -313,7 +313,7 @@ class Accumulated(Wrapper):
         )
 
     def _entering(self, frame: Frame, entering: Tensor) -> list[Tensor | None]:
-        """What has a history beside the color, ``(B, 3, H, W)`` each, as it enters it: layers without fireflies."""
+        """Layers (without fireflies), alpha and the buffers of ``also`` as they enter the history: ``(B, 3, H, W)``."""
         parts: list[Tensor | None] = list(frame.layers.values())
         if parts:
             lit = frame.color > 0
@@ -339,10 +339,10 @@ class Accumulated(Wrapper):
         return frame.replace(layers=layers, alpha=alpha, extra={**frame.extra, **also}, **own)
 
     def _other_buffers(self, history: History, frame: Frame) -> str:
-        """Why what has a history beside the color cannot go on; empty if it can.
+        """The reason why the histories beside the color cannot be continued; empty if they can.
 
         Raises:
-            InputError: that is of another method, or of other layers.
+            InputError: they are of another method, or of other layers.
         """
         before, now = len(history.carried), len(frame.layers) + (alpha_of(frame) is not None) + len(self.also)
         if before != now:
@@ -381,13 +381,13 @@ class Accumulated(Wrapper):
 
 
 def surface_before(frame: Frame) -> Surface:
-    """What a frame shows, at the positions that it had in the frame before; its normals and depths are the current."""
+    """The surfaces of a frame at their positions in the frame before, with the current normals and depths."""
     before = frame.position if frame.previous_position is None else frame.previous_position
     return Surface(before, frame.normal, frame.depth)
 
 
 def motion_to_previous(frame: Frame, previous_view_projection: Tensor | None) -> Tensor | None:
-    """Where each pixel's surface point was in the frame before, relative to where it is now.
+    """The motion of each pixel's surface point: its place in the frame before minus its place now.
 
     Args:
         frame: the current frame.
@@ -418,7 +418,7 @@ def motion_unless_still(
     Args:
         frame: the current frame.
         previous_view_projection: see :func:`motion_to_previous`.
-        still: what :func:`is_still` says, if that is known already.
+        still: result of :func:`is_still`, if that is known already.
     """
     still = is_still(frame, previous_view_projection) if still is None else still
     if isinstance(still, Tensor):
@@ -437,7 +437,7 @@ def comparable(surface: Surface, previous: Surface) -> tuple[Surface, Surface]:
 
 
 def is_still(frame: Frame, previous_view_projection: Tensor | None) -> bool | Tensor:
-    """Whether every pixel of a frame shows what it showed in the frame before, as far as the frame tells.
+    """Whether nothing moved in the image since the frame before, as far as the frame tells.
 
     Returns:
         Whether its motion is zero everywhere, or else the camera is the same and no position differs from its previous
@@ -464,7 +464,7 @@ def _equal(a: Tensor, b: Tensor) -> bool:
 
 
 def _thinned(image: Tensor) -> Tensor:
-    """One pixel in 64: enough to see most of what moves."""
+    """One pixel in 64: enough to detect most motion."""
     return image[..., ::8, ::8]
 
 
@@ -476,13 +476,13 @@ def _misfit(history: History, frame: Frame) -> str:
 
 
 def _steady(color: Tensor) -> Tensor:
-    """Where the compressed radiance of a history has hardly varied."""
+    """The pixels in which the compressed radiance of a history has hardly varied."""
     mean = color[:, MEAN]
     return color[:, SQUARE] - mean.square() <= (_STEADY * mean).square()
 
 
 def _takes_light(color: Tensor) -> Tensor:
-    """Of each image, whether clamping takes much of the light of most of it; not told of images of a few lit blocks."""
+    """Whether clamping takes much light from most blocks of each image; false for images with few lit blocks."""
     color = color.detach()
     height = color.shape[-2]
     step = _BLOCK * -(-height // (_BLOCK * _STRIPS))
@@ -502,7 +502,7 @@ def _takes_light(color: Tensor) -> Tensor:
         # Not a number where there is no light to lose.
         fractions.append((1 - after / before).flatten(1))
     lost = torch.cat(fractions, 1)
-    # The lower median of those that are numbers, as nanmedian, which graphs in ONNX do not have.
+    # The lower median of all numbers, like nanmedian, which ONNX lacks.
     known = (~lost.isnan()).sum(1, keepdim=True)
     ascending = torch.where(lost.isnan(), torch.inf, lost).sort(1).values
     median = ascending.gather(1, (known - 1).clamp_min(0) // 2)

@@ -1,40 +1,36 @@
 """A-SVGF: SVGF that discards the history in proportion to how much the light has changed.
 
 Schied et al. 2018, "Gradient Estimation for Real-Time Adaptive Temporal Filtering", Proceedings of the ACM on Computer
-Graphics and Interactive Techniques 1(2). What it has in common with SVGF is :class:`mcdenoise.models.svgf.Svgf`: it
-differs in the weight of the current frame,
+Graphics and Interactive Techniques 1(2). It differs from :class:`mcdenoise.models.svgf.Svgf` in the weight of the
+current frame,
 
 ``alpha' = (1 - lambda) alpha + lambda`` with ``lambda = min(1, |Delta| / max(l))`` of
 :func:`mcdenoise.ops.temporal_gradient`.
 
 The paper's renderer projects one sample of every 3x3 stratum of the frame before forward, and shades it once more with
-the random numbers that it had then. Its change ``Delta`` has no noise but that of the light itself. No file of a
-renderer holds such samples; one that streams may hand them over in ``frame.extra["gradient"]``, ``(B, 3, H, W)`` of its
-color's unit:
+the random numbers that it had then. So its change ``Delta`` is free of sampling noise. Renderers write no such samples
+to files; one that streams may pass them in ``frame.extra["gradient"]``, ``(B, 3, H, W)`` in the unit of the color:
 
 - the luminance of the sample now,
 - the luminance of the same sample in the frame before,
-- 1 where there is one, and 0 elsewhere.
+- 1 where there is a sample, and 0 elsewhere.
 
-They may be with or without the albedo, as long as both are alike: ``lambda`` is a quotient.
+Both luminances are either with or without the albedo: ``lambda`` is a quotient.
 
-Without them, the frame's luminance is compared with that of the reprojected history. This difference is noisy, so that
-lambda is taken of what exceeds two standard errors of it. Its variance where nothing changes is
+Without them, the frame's luminance is compared with that of the reprojected history. This difference is noisy, so
+lambda only counts its excess over two standard errors. Where nothing changes, the variance of the difference is
+``variance(l) (1 + 1 / n)``. Here ``n`` is the number of frames to which the history is equivalent: its length, up to
+``2 / alpha - 1`` for an exponential window. ``variance(l)``, that of a sample, is the maximum of SVGF's estimate from
+the history and of the variance of the frame over 7x7 pixels, since a firefly that is not in the history is no change of
+the light. Compared with the paper's samples, a change that is smaller than the noise of a neighbourhood is found later,
+and so is one at sharp edges of light.
 
-``variance(l) (1 + 1 / n)``, ``n`` being the frames that the history amounts to: its length, up to the ``2 / alpha - 1``
-of an exponential window;
-
-``variance(l)``, of a sample, is the larger one of SVGF's estimate from the history, and of the frame's own moments over
-7x7 pixels: a firefly that the history knows nothing of is no change of the light. What this costs against the
-paper's samples: a change that is smaller than the noise of a neighbourhood is not seen at once, and sharp edges of
-light delay it.
-
-What the paper leaves open: the length of a history that is partly discarded. A history in which the current frame
-has the weight ``alpha'`` counts as ``1 / alpha'`` frames, so that light that went on or off begins with an average
-anew. The transform of the strata (five levels of 3x3 taps, as many as the published code has) has the edge-stopping
-functions of SVGF without that of the luminance, which is what may have changed. The published code then takes the
-largest of the 5x5 strata around a pixel, which is not done here: of noise, that is the largest noise. ``alpha`` is that
-of the published code, 0.1, for light and for moments.
+The paper leaves open the length of a history that is partly discarded. Here a history in which the current frame has
+the weight ``alpha'`` counts as ``1 / alpha'`` frames, so that light that went on or off begins with a new average. The
+transform of the strata (five levels of 3x3 taps, as many as in the published code) has the edge-stopping functions of
+SVGF except that of the luminance, which may have changed. The published code then takes the maximum of the 5x5 strata
+around a pixel; here this is omitted, because the maximum of noise is the largest noise. ``alpha`` is that of the
+published code, 0.1, for light and for moments.
 """
 
 from __future__ import annotations
@@ -53,7 +49,7 @@ from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.svgf import BRIGHTEST, WINDOW, History, Svgf, variance_of
 from mcdenoise.ops import luminance_moments, moments_variance, reproject, temporal_gradient
 
-# Of `frame.extra`: samples of the frame before, shaded once more.
+# Name in `frame.extra` of the samples of the frame before, shaded once more.
 GRADIENT = "gradient"
 
 

@@ -23,21 +23,21 @@ from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import scale_of_depth
 
 DEPTH_SCALE = 10.0
-# Of a tile's pixel: its covariance matrix of seven guides, and what solving for it takes, measured.
+# Memory for each pixel of a tile, measured: its covariance matrix of seven guides, and the solver.
 _BYTES_PER_PIXEL = 4 * 6 * 7**2
 
 
 class Guided(nn.Module):
-    """``kornia.filters.guided_blur`` with all of albedo, normal and depth for a guide, as far as the frame has them.
+    """``kornia.filters.guided_blur`` with the albedo, normal and depth of the frame, as far as it has them, as guides.
 
     In each window the light is a linear function of the guides (He et al. 2010, Eqs. 4 to 6), and each pixel takes the
-    mean of those of all windows that it lies in (Eq. 8); so edges of the guides stay, in what light they have. A
-    linear function may leave the range of the light, and is cut off at 0. A frame without features guides itself.
+    mean of the functions of all windows in which it lies (Eq. 8), so that the light keeps the edges of the guides. A
+    linear function may be negative, and is clamped to 0. Without features the light is its own guide.
 
     Args:
-        radius: of the windows in pixels, at least 1.
-        eps: variance of a guide below which it says little, in the guides' unit squared (Eq. 5), above 0; albedos and
-            normals have their own unit, depths are 10 times :func:`mcdenoise.nn.normalize_depth`.
+        radius: radius of the windows in pixels, at least 1.
+        eps: variance of a guide below which it has little effect, in the guides' unit squared (Eq. 5), above 0; albedos
+            and normals have their own unit, depths are 10 times :func:`mcdenoise.nn.normalize_depth`.
 
     Raises:
         InputError: a setting is out of its range.

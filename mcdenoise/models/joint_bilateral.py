@@ -60,7 +60,7 @@ class JointBilateral(nn.Module):
 
     @property
     def side(self) -> int:
-        """Of tiles that keep kornia's unfolded windows within memory, in pixels."""
+        """Side of tiles that keep kornia's unfolded windows within memory, in pixels."""
         pixels = math.isqrt(_UNFOLDED_VALUES // (_CHANNELS * (2 * self.radius + 1) ** 2))
         return max((pixels - 2 * self.radius) // TILE, 2) * TILE
 

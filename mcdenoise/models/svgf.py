@@ -1,11 +1,11 @@
 """SVGF, a filter without weights that follows the variance of the light.
 
 Schied et al. 2017, "Spatiotemporal Variance-Guided Filtering: Real-Time Reconstruction for Path-Traced Global
-Illumination", High Performance Graphics. What the paper leaves open: the epsilons of its edge-stopping functions
-(:func:`mcdenoise.ops.atrous`), the test of surfaces (that of :func:`mcdenoise.ops.reproject`), and how a history
-begins: with an average, ``alpha = 1 / n`` until that is less than ``alpha``. The authors' published code, not the
-paper, counts the spatial estimate of the variance ``4 / n`` times at a history of ``n`` frames. Direct and indirect
-light are one here, and there is no antialiasing afterwards.
+Illumination", High Performance Graphics. The paper leaves open the epsilons of its edge-stopping functions (see
+:func:`mcdenoise.ops.atrous`), the test of surfaces (here that of :func:`mcdenoise.ops.reproject`), and how a history
+begins (here with an average, ``alpha = 1 / n`` until that is less than ``alpha``). As in the authors' published code,
+but not in the paper, the spatial estimate of the variance is multiplied by ``4 / n`` for a history of ``n`` frames.
+Direct and indirect light are not separated here, and there is no antialiasing afterwards.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from mcdenoise.models.accumulated import motion_to_previous, surface_before
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.ops import Surface, accumulate, atrous, luminance_moments, moments_variance
 
-# With fewer frames than these, moments in time say little.
+# With fewer frames, moments over time hardly determine the variance.
 _FEW_FRAMES, WINDOW = 4, 7
-# Brighter light counts as this in the moments: float32 holds the square.
+# Brighter light counts as this in the moments, so that float32 can represent the square.
 BRIGHTEST = 1e18
 
 
 class History(NamedTuple):
-    """What is kept of a shot.
+    """The history of a shot.
 
     Args:
-        light: ``(B, 3 + C, H, W)`` accumulated and filtered once, with layers and alpha behind it.
-        moments: ``(B, 2, H, W)`` of the luminance, accumulated.
+        light: ``(B, 3 + C, H, W)`` light, accumulated and filtered once, then layers and alpha.
+        moments: ``(B, 2, H, W)`` accumulated moments of the luminance.
         length: ``(B, 1, H, W)`` in frames.
-        surface: what was seen.
-        view_projection: ``(B, 4, 4)`` by which camera.
+        surface: the surfaces that the last frame shows.
+        view_projection: ``(B, 4, 4)`` camera of the last frame.
     """
 
     light: Tensor
@@ -92,7 +92,7 @@ class Svgf(nn.Module):
 
     @property
     def persistence(self) -> float:
-        """What one more frame leaves of the history, see :func:`mcdenoise.models.frames_remembered`."""
+        """The fraction of the history that each frame keeps, see :func:`mcdenoise.models.frames_remembered`."""
         return 1 - self.alpha
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:

@@ -20,14 +20,14 @@ from mcdenoise.models._wrapper import Wrapper
 TILE = 32
 # A method on more than this fraction of the image costs as much as on all of it.
 _WORTHWHILE = 0.9
-# Of a method that does not say: some 64 feature channels in float32.
+# Default for methods without this figure: some 64 feature channels in float32.
 _BYTES_PER_PIXEL = 4 * 64 + 4 * 54
-# What is put together of tiles beside the image and its stages, whose names have no colon.
+# Prefixes of results other than the image and its stages, whose names have no colon.
 _LAYER, _ALPHA = "layer:", "alpha:"
 
 
 class Tiled(Wrapper):
-    """A method on parts of the image, each with as much around it as its pixels depend on.
+    """Runs a method on tiles of the image, each with a margin of the pixels on which it depends.
 
     The result is that of the whole image, up to the rounding of convolutions, whose order of summation may depend on
     the size of the image. Without a reason to divide the image, the method runs once on all of it.
@@ -36,7 +36,7 @@ class Tiled(Wrapper):
         inner: a method without a state. One that depends on the whole image (``needs.reach`` is ``None``) is never
             divided.
         side: longest side of a tile in pixels, a multiple of 32; ``None`` for no limit.
-        margin: how many pixels around those that are asked for have to be right, too.
+        margin: number of pixels around a tile that have to be right, too.
     """
 
     def __init__(self, inner: Model, side: int | None = None, margin: int = 0) -> None:
@@ -52,7 +52,7 @@ class Tiled(Wrapper):
         return -(-(needs.reach + self.margin) // needs.stride) * needs.stride
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes while it is computed, for each of its pixels with those around it.
+        """Memory that a tile takes while it is computed, for each pixel of the tile and its margin.
 
         Args:
             bfloat16: whether convolutions are in bfloat16, else in float32.
@@ -102,7 +102,7 @@ class Tiled(Wrapper):
 
 
 def _known(frame: Frame, stage: str) -> Tensor:
-    """What stands where nothing is computed: the known result, or the input."""
+    """The values of pixels that are not computed: the known result, or the input."""
     if stage.startswith(_LAYER):
         return frame.layers[stage.removeprefix(_LAYER)]
     if stage == _ALPHA and frame.alpha is not None:

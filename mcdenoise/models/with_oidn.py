@@ -128,12 +128,12 @@ def _merged(phases: Tensor, size: tuple[int, int]) -> Tensor:
 
 def _without_pattern(image: Tensor) -> Tensor:
     """The image ``(B, 3, H, W)`` without any pattern of two by two pixels, and with its edges."""
-    # All of kornia comes with it, which takes as long to import as a single frame to denoise.
+    # This imports all of kornia, which takes as long as denoising a frame.
     from kornia.filters import filter2d_separable
 
     kernel = torch.tensor([_BINOMIAL], dtype=image.dtype, device=image.device)
     blurred = filter2d_separable(image, kernel, kernel, "replicate")
-    # The logarithms of what has no pattern, so that the weights have none.
+    # The guide is the logarithm of the blurred image, so that the weights have no pattern.
     guide = (blurred + _DARKEST * blurred.mean(dim=(1, 2, 3), keepdim=True) + 1e-9).log()
     logits = (kernel.mT * kernel).log().reshape(1, 9, 1, 1).expand(len(image), -1, *image.shape[-2:])
     return cross_bilateral_filter(image, logits, [guide], [torch.full_like(image[:, :1], _FALLOFF)])

@@ -1,4 +1,4 @@
-"""The pictures of one scene: what the comparer shows, close-ups, and temporal profiles."""
+"""The pictures of one scene for the comparer, the close-ups and the temporal profiles."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ class CloseUp:
 
 @dataclass(frozen=True)
 class Stripe:
-    """What temporal profiles are cut from.
+    """The part of the frames that temporal profiles show.
 
     Args:
-        row: of the frame.
+        row: row of the frame.
         left: first column.
-        width: columns.
+        width: number of columns.
         frames: numbers of the frames.
     """
 
@@ -132,7 +132,7 @@ def picture_pixels(folder: Path, results: Results) -> int:
 
 
 def _files(folder: Path, results: Results, scene: Scene) -> dict[str, dict[int, Path]]:
-    """Files by method and frame, the reference last; what was not kept is not in it."""
+    """The files of kept pictures by method and frame, the reference last."""
     sources = {method.name: method.folder for method in results.methods if _ran(results, scene, method)}
     found = {
         name: {number: folder / IMAGES / scene.name / place / f"{number}.exr" for number in scene.pictures}

@@ -63,14 +63,14 @@ def place_labels(
 ) -> list[Box]:
     """Place a label beside each point; the same input gives the same places.
 
-    Each label in turn takes the candidate that covers least and lies nearest, given where the others are, until
-    nothing moves any more, or six times.
+    Each label in turn takes the candidate that covers least and lies nearest, given the places of the others, until
+    no label moves, but at most six times.
 
     Args:
         anchors: the points.
         sizes: width and height of each point's label, in the unit of the points.
-        bounds: what no label leaves.
-        obstacles: what labels should not cover, such as the markers of the points.
+        bounds: area that no label leaves.
+        obstacles: areas that labels should not cover, such as the markers of the points.
 
     Returns:
         The box of each label.
@@ -131,7 +131,7 @@ def _cheapest(
 ) -> Box:
     best, least = candidates[0], math.inf
     for box in candidates:
-        # What it covers or crosses only adds to the distance.
+        # Covered areas and crossed lines can only add to the cost of the distance.
         if _distance(anchor, box) < least:
             cost = _cost(anchor, box, others, obstacles)
             if cost < least:

@@ -18,7 +18,7 @@ from mcdenoise.metrics import display_codes, psnr_srgb, smape_linear
 Image = NDArray[np.float32]
 Codes = NDArray[np.uint8]
 
-# Radiance that the largest code stands for; what is brighter looks the same in the page.
+# Radiance of the largest code; brighter pixels look the same in the page.
 BRIGHTEST = 64.0
 _GAMMA = 2.2
 # Lossless as long as that fits, then ever coarser; chroma is never subsampled, for colours are compared.
@@ -89,7 +89,7 @@ def data_uris(pictures: Iterable[Codes], budget: int) -> tuple[list[str], str] |
         budget: characters.
 
     Returns:
-        The files and what format it is, in words; ``None`` if none of :data:`FORMATS` is small enough.
+        The files and the name of their format; ``None`` if none of :data:`FORMATS` is small enough.
     """
     pictures = list(pictures)
     for image_format, options in FORMATS:

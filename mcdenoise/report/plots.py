@@ -35,9 +35,9 @@ _VARIABLES |= {color: f"hue-{index}" for index, color in enumerate(_COLORS)}
 _VARIABLES |= {_STAGES["read"]: "stage-read", _STAGES["write"]: "stage-write"}
 _MARKERS = {"trainable": "o", "fixed": "s", "baseline": "D"}
 _SIZES = {"wide": (10.4, 5.6), "narrow": (4.9, 4.9)}
-# What the names beside the last points of the cost plot take, in parts of the axis.
+# Room for the names beside the last points of the cost plot, as a fraction of the axis.
 _ROOM = {"wide": 0.3, "narrow": 0.04}
-# What the labels of the vertical ticks take, in points.
+# Room for the labels of the vertical ticks, in points.
 _TICK_ROOM = 46.0
 # A label farther than this from its point, in points, is tied to it by a line.
 _LEADER = 10.0
@@ -213,8 +213,8 @@ def error_over_samples(curves: dict[str, list[tuple[int, float]]], title: str, l
 
     Args:
         curves: by name, samples and error, at least one point each; the input is the one called ``input``.
-        title: what the error is.
-        layout: of the figure.
+        title: name of the error.
+        layout: layout of the figure.
     """
     figure, axes = _figure(layout)
     axes.set_xlabel("samples a pixel")
@@ -254,7 +254,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     Args:
         figure: to draw.
         name: unique in the page.
-        description: what a screen reader says.
+        description: text for screen readers.
     """
     file = io.StringIO()
     figure.savefig(file, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
@@ -355,14 +355,14 @@ def _mark(axes: Axes, method: Method, x: float, y: float, color: str) -> None:
 
 
 def _draw_front(axes: Axes, front: Sequence[tuple[float, float]]) -> None:
-    """From each point of the front at its error to the time of the next: what can be had for that time."""
+    """Draw the least error for each run time: steps from each point of the front to the time of the next."""
     x, y = [value for value, _ in front], [value for _, value in front]
     far, worst = axes.get_xlim()[1], axes.get_ylim()[axes.get_ylim()[1] > 0 and y[0] >= y[-1]]
     axes.step([x[0], *x, far], [worst, *y, y[-1]], where="post", color=_MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
 
 
 def _draw_idle(axes: Axes, rows: Sequence[Row], metric: str) -> None:
-    """What takes no time has no place on a logarithmic axis: a line across, or a note where it lies far off."""
+    """Draw methods without a run time, which a logarithmic axis lacks: a line across, or a note if it is far off."""
     low, high = axes.get_ylim()
     for row in rows:
         value = row.errors[metric].value

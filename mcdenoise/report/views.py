@@ -1,4 +1,4 @@
-"""What the plots and tables show: every method on one scene, or in the mean over the scenes."""
+"""The rows of plots and tables: every method on one scene, or in the mean over the scenes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FILE_STAGES = ("read", "write")
 
 @dataclass(frozen=True)
 class Range:
-    """A value with the quartiles of what it summarises; the mean of skewed values may lie outside of them.
+    """A mean or median with the quartiles of its values; the mean of skewed values may lie outside of them.
 
     Args:
         value: mean or median.
@@ -154,7 +154,7 @@ def _row(results: Results, number: int, method: Method, scene: str) -> Row:
         failed = cell.reason if cell and cell.failure else "not measured"
         return Row(method, number, reason=f"missing: {method.missing}" if method.missing else failed)
     milliseconds = None if cell.computing is None else _range(cell.computing)
-    # What only hands its input on takes no time worth a place on a logarithmic axis.
+    # A method that returns its input has no run time to show on a logarithmic axis.
     if milliseconds and not cell.stages.keys() - set(FILE_STAGES):
         milliseconds = Range(0.0, 0.0, 0.0)
     size = next((one.width * one.height for one in results.scenes if one.name == scene), 0)

@@ -26,7 +26,7 @@ PLOTS = "plots"
 _PICTURE_BUDGET = 20_000_000
 # Beyond this many pixels even coarse JPEG does not fit: then the pictures are made smaller.
 _MOST_PIXELS = 60_000_000
-# Where the heat map of SMAPE ends; what is worse looks the same.
+# Where the heat map of SMAPE ends; larger errors look the same.
 _HEAT_END = 0.5
 # In place of a figure that is not known.
 _UNKNOWN = "\N{EN DASH}"
@@ -89,7 +89,7 @@ def write_error_plot(results: Results, metric: str, path: Path) -> list[Row]:
         path: of the figure; its ending says which kind, such as ``.svg`` or ``.png``.
 
     Returns:
-        What is drawn, by method.
+        The points that are drawn, by method.
 
     Raises:
         InputError: the metric was not computed, the ending is unknown, or the file cannot be written.
@@ -151,7 +151,7 @@ def render_page(template: str, content: dict[str, Any]) -> str:
 
     Args:
         template: name of a file in ``report/page``.
-        content: what it shows; names that it uses and that are not there are errors.
+        content: values for the template by name; a name that the template uses and that is missing is an error.
 
     Raises:
         InputError: a package of ``mcdenoise[report]`` is not installed.
@@ -247,7 +247,7 @@ def _galleries(folder: Path, results: Results) -> list[Gallery]:
 
 
 def _comparer(results: Results, galleries: list[Gallery], shown: list[View], names: list[str]) -> dict[str, Any]:
-    """What the comparer's script needs, in what format the pictures are, and with what it begins."""
+    """The data of the comparer's script: the pictures, their format, and the two to begin with."""
     pictures = [codes for gallery in galleries for own in gallery.codes.values() for codes in own.values()]
     encoded = data_uris(pictures, _PICTURE_BUDGET)
     if encoded is None:
@@ -287,7 +287,7 @@ def _comparer(results: Results, galleries: list[Gallery], shown: list[View], nam
 
 
 def _first_pair(results: Results, shown: list[View], names: list[str]) -> list[str]:
-    """What the comparer begins with: Open Image Denoise at its best (or else the best filter), and the best network."""
+    """The pictures to begin with: Open Image Denoise at its best (or else the best filter), and the best network."""
     if not results.methods:
         return []
     rows = [row for row in shown[0].rows if names and names[0] in row.errors]
@@ -302,7 +302,7 @@ def _first_pair(results: Results, shown: list[View], names: list[str]) -> list[s
 
 
 def _featured(results: Results, shown: list[View], names: list[str]) -> set[str]:
-    """What is shown at once in close-ups and profiles: the first method, the first pair, and the reference."""
+    """The methods shown at first in close-ups and profiles: the first one, the first pair, and the reference."""
     return {*(method.name for method in results.methods[:1]), *_first_pair(results, shown, names), REFERENCE}
 
 
@@ -313,7 +313,7 @@ def _metric(name: str) -> dict[str, Any]:
 
 
 def _column(shown: list[View], name: str) -> dict[str, Any]:
-    """How a metric's column is printed, and what is best in it in each view."""
+    """How a metric's column is printed, and the best value in it for each view."""
     higher = METRICS[name].higher_is_better
     values = [[row.errors[name].value for row in view.rows if name in row.errors] for view in shown]
     finite = [abs(value) for own in values for value in own if math.isfinite(value) and value != 0]
@@ -323,7 +323,7 @@ def _column(shown: list[View], name: str) -> dict[str, Any]:
 
 
 def _number(value: Range | float | None, decimals: int | None = None) -> str:
-    """A figure of a table: a fixed number of decimals, or three digits; a dash for what is not known."""
+    """A figure of a table: a fixed number of decimals, or three digits; a dash for an unknown one."""
     if value is None:
         return _UNKNOWN
     figure = value.value if isinstance(value, Range) else value
@@ -335,7 +335,7 @@ def _number(value: Range | float | None, decimals: int | None = None) -> str:
 
 
 def _date(text: str) -> str:
-    """Such as ``21 October 2026, 12:00 UTC``; what is no ISO time is shown as it is."""
+    """A date such as ``21 October 2026, 12:00 UTC``; text that is no ISO time is returned unchanged."""
     try:
         return f"{datetime.fromisoformat(text):%-d %B %Y, %H:%M} UTC"
     except ValueError:

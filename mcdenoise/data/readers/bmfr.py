@@ -266,7 +266,7 @@ def open_bmfr(
             determined from the values.
 
     Raises:
-        InputError: a file is missing or unreadable, or sizes or channels differ from what is expected.
+        InputError: a file is missing or unreadable, or has other sizes or channels than expected.
     """
     first = read_exr_header(files["color"][numbers[0]])
     size = first.size
@@ -333,7 +333,7 @@ def _read_samples(path: Path, size: tuple[int, int]) -> Image:
 
 
 def _look(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
-    """Determine from the values of the first frame what is not stated."""
+    """Determine properties that are not stated from the values of the first frame."""
     number = folder.numbers[0]
     # Skip stated properties, and do not read the pixels of a file twice.
     looked_at = {"position", "normal"} | ({"color", "albedo", "reference"} if stated is None else set())

@@ -70,7 +70,7 @@ class Layer:
         name: such as ``ViewLayer.Denoising Albedo``; for a file with one picture the file's own name; or empty.
         channels: names in the file: R, G, B, A or X, Y, Z, W.
         components: last words of the channel names, in lower case.
-        anonymous: whether only the name of the file tells what the layer is.
+        anonymous: whether only the name of the file identifies the layer.
         files: name of the files, for messages.
     """
 
@@ -88,7 +88,7 @@ class Layer:
 
     @property
     def place(self) -> str:
-        """Files and layer name, for messages; only the files if their name tells what it is."""
+        """Files and layer name, for messages; only the files if their name identifies it."""
         return self.files if self.anonymous and self.files else f"{self.files} {self}".strip()
 
     @property

@@ -64,7 +64,7 @@ class Light:
 
 
 def keeps(color: Image | None) -> Mask | bool:
-    """Where a layer can store light: not where the color by which it is divided is nearly 0."""
+    """The pixels in which a layer can store light: those where the color by which it is divided is not nearly 0."""
     return True if color is None else np.greater(color, _DARKEST)
 
 

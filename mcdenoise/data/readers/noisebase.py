@@ -296,7 +296,7 @@ def _look(shot: NoisebaseFiles) -> None:
 
 
 def _seen(means: Mapping[str, Array]) -> Mask:
-    """Where something was hit: a pixel with neither normal nor reflectance in any sample was not."""
+    """The pixels that hit something: those with a normal or a reflectance in any sample."""
     told = [means[name] for name in ("normal", "diffuse") if name in means]
     seen: Mask = np.all(np.isfinite(means["position"]), axis=0)
     if told:

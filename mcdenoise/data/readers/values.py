@@ -200,7 +200,7 @@ def is_direction(vectors: Image) -> bool:
 
 
 def nothing_hit(depth: Image) -> Mask:
-    """Where a depth is a placeholder for no hit: 0 or less, 1e9 or more, the largest half float, or NaN."""
+    """The pixels whose depth means that nothing was hit: 0 or less, 1e9 or more, the largest half float, or NaN."""
     with np.errstate(invalid="ignore"):
         nothing: Mask = ~((depth > 0) & (depth < _FARTHEST) & (depth != LARGEST_HALF))
     return nothing

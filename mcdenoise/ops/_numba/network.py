@@ -547,7 +547,7 @@ def _fuse(
             _sigmoid(alpha)
             for c in range(channels):
                 values = out[b, c, row]
-                _add_share(values, ring[row % 4, c, 1 : width + 1], alpha, change[c])
+                _add_fraction(values, ring[row % 4, c, 1 : width + 1], alpha, change[c])
                 if maximum.size:
                     _to_radiance(values, maximum[b])
 
@@ -618,7 +618,7 @@ def _sigmoid(values: Any) -> None:
 
 
 @compiled
-def _add_share(out: Any, values: Any, fraction: Any, change: Any) -> None:
+def _add_fraction(out: Any, values: Any, fraction: Any, change: Any) -> None:
     for x in range(out.size):
         out[x] = values[x] + fraction[x] * change[x]
 
