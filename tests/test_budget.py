@@ -88,7 +88,7 @@ def test_the_choice(sequence: Sequence, results: Path, limits: dict[str, float],
     assert choice.error <= limits.get("max_error", 1)
 
 
-def test_what_nothing_meets_is_told_in_one_line(sequence: Sequence, results: Path) -> None:
+def test_limits_that_no_model_meets_are_told_in_one_line(sequence: Sequence, results: Path) -> None:
     message = refused(lambda: choose_model(sequence, budget=10))
     assert message == (
         "--budget-ms: expected a model that takes at most 10 ms, "

@@ -101,7 +101,7 @@ def edit(path: Path, change: Callable[[np.ndarray[Any, Any]], object]) -> None:
     """Change the pixels of an EXR in place."""
     pixels, channels, _ = read_exr(path)
     change(pixels)
-    write_exr(path, pixels, channels, half=False)
+    write_exr(path, pixels, channels, full_float=True)
 
 
 def whole_images(folder: Path) -> list[str]:

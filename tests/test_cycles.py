@@ -136,7 +136,7 @@ def test_random_scenes_are_translated_whole(seed: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_shines_in_random_scenes_shines_as_brightly() -> None:
+def test_lamps_of_random_scenes_keep_their_radiance() -> None:
     for seed in range(20):
         made = random_scene(seed, 1)
         expected = {
@@ -211,7 +211,7 @@ def test_textures_are_kept_once_and_even_ones_are_colors() -> None:
         (scene_of(thing={**ball(GRAY), "to_world": np.eye(3)}), "4x4 matrix"),
     ],
 )
-def test_what_is_not_known_is_told(scene: dict[str, Any], expected: str) -> None:
+def test_unknown_plugins_are_named(scene: dict[str, Any], expected: str) -> None:
     with pytest.raises(InputError, match=expected):
         translate(scene)
 
@@ -238,7 +238,7 @@ def test_settings_are_drawn_as_users_have_them() -> None:
     assert {each.samples for each in drawn} == {1, 2, 4, 8, 16, 32}
 
 
-def test_what_is_given_changes_nothing_else_that_is_drawn() -> None:
+def test_given_settings_change_no_others_that_are_drawn() -> None:
     for seed in range(50):
         free, fixed, still = draw_settings(seed), draw_settings(seed, samples=7), draw_settings(seed, moving=False)
         assert fixed == CyclesSettings(7, free.pixel_filter, free.aperture, free.focus, free.shutter)
@@ -288,7 +288,7 @@ def test_normals_are_turned_to_the_world() -> None:
     np.testing.assert_allclose(normal[0], (-forward, -left, up), atol=1e-12)
 
 
-def test_what_moves_is_led_back_by_its_index() -> None:
+def test_moving_objects_are_led_back_by_their_index() -> None:
     images = passes(1, 3)
     images["Depth"][:] = 1
     images["Position"][0] = (1, 0, 0), (2, 0, 0), (3, 0, 0)

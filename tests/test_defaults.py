@@ -166,7 +166,7 @@ def test_an_argument_of_another_kind_is_told_by_its_name(wrong: dict[str, Any]) 
 
 
 @pytest.mark.parametrize("given", [torch.zeros(1, 3, 4, 4), None, 5, "x", [], {}, Frame], ids=str)
-def test_what_is_no_frame_is_told(given: Any) -> None:
+def test_objects_that_are_no_frame_are_named(given: Any) -> None:
     denoiser = Denoiser("noisy")
     for call in (denoiser, denoiser.output):
         assert told(lambda call=call: call(given)).startswith(
@@ -175,5 +175,5 @@ def test_what_is_no_frame_is_told(given: Any) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"frames": "3"}, {"frames": True}, {"layers": "x"}, {"layers": None}], ids=str)
-def test_what_a_shot_cannot_be_is_told(wrong: dict[str, Any]) -> None:
+def test_invalid_options_of_a_shot_are_named(wrong: dict[str, Any]) -> None:
     assert told(lambda: Denoiser("noisy").reset(**wrong)).startswith(f"{next(iter(wrong))}: expected a whole number")

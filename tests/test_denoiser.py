@@ -97,7 +97,7 @@ def test_the_same_frames_give_the_same_images(frames: list[Frame]) -> None:
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
 
 
-def test_the_past_matters_until_it_is_reset(frames: list[Frame]) -> None:
+def test_the_history_matters_until_it_is_reset(frames: list[Frame]) -> None:
     denoiser = Denoiser(small_model())
     alone = denoiser(frames[1])
     denoiser.reset()
@@ -174,7 +174,7 @@ def test_an_invalid_pixel_is_replaced_and_counted(frames: list[Frame], value: fl
 
 
 @pytest.mark.parametrize("name", ["albedo", "normal", "depth", "position"])
-def test_an_invalid_feature_is_refused_and_leaves_the_past_alone(frames: list[Frame], name: str) -> None:
+def test_an_invalid_feature_is_refused_and_leaves_the_history_unchanged(frames: list[Frame], name: str) -> None:
     denoiser = Denoiser(small_model())
     denoiser(frames[0])
     broken = getattr(frames[1], name).clone()
@@ -294,7 +294,7 @@ def test_a_recurrent_method_gets_its_state_back(frames: list[Frame]) -> None:
     assert model.states[-1] is None
 
 
-def test_what_is_handed_out_and_what_is_kept_share_no_memory() -> None:
+def test_images_and_states_share_no_memory() -> None:
     """A method's state may hold the frame and the image themselves."""
 
     class Last(nn.Module):

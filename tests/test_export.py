@@ -124,7 +124,7 @@ def mine(tmp_path: Path) -> str:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
-def test_a_model_of_ones_own_is_exported_with_all_that_it_wears(mine: str, tmp_path: Path) -> None:
+def test_a_users_model_is_exported_with_its_wrappers(mine: str, tmp_path: Path) -> None:
     model = create_model(mine)
     exported = export_model(model, tmp_path / "mine.onnx", name="mine")
     assert exported.inputs == (
@@ -275,7 +275,7 @@ class Fixed(nn.Module):
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_what_is_no_graph_is_refused_in_one_line_and_nothing_is_written(
+def test_models_without_a_graph_are_refused_in_one_line_and_nothing_is_written(
     model: Model, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match=message) as caught:

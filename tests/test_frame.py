@@ -294,7 +294,7 @@ def test_every_buffer_of_the_vocabulary_has_a_field_and_a_meaning() -> None:
         assert spec.channels in (1, 2, 3)
 
 
-def test_buffers_are_found_by_name_also_those_that_nobody_foresaw() -> None:
+def test_buffers_are_found_by_name_also_unknown_ones() -> None:
     crypto, samples = plane(5), torch.rand(2, 4, 3, *SIZE)
     frame = Frame(color=plane(3), samples=samples, extra={"crypto": crypto})
     assert frame.buffers == {"color", "samples", "crypto"}
@@ -357,12 +357,12 @@ def test_depth_is_the_clip_w_of_positions() -> None:
         assert other.with_depth() is other
 
 
-def test_what_tells_motion_can_be_left_behind() -> None:
+def test_buffers_of_motion_can_be_omitted() -> None:
     frame = full_frame().without_history()
     assert frame.buffers == {*BUFFERS, "view_projection"} - MOTION
 
 
-def test_what_is_known_of_a_stage_or_else_of_the_last() -> None:
+def test_known_results_are_those_of_the_stage_or_of_the_last_one() -> None:
     first, last = plane(3, 1.0), plane(3, 2.0)
     skip = Skip(torch.ones(2, 1, *SIZE, dtype=torch.bool), {"initial": first, "image": last})
     assert skip.of("initial") is first

@@ -149,7 +149,7 @@ def test_memory_is_shared_where_that_is_possible() -> None:
         ("image.exr", "HWC", "expected a float dtype"),
     ],
 )  # fmt: skip
-def test_what_is_no_color_is_told_in_one_line(color: Any, layout: Layout, message: str) -> None:
+def test_arrays_that_are_no_color_are_refused_in_one_line(color: Any, layout: Layout, message: str) -> None:
     for function in (Frame.from_numpy, denoise):
         with pytest.raises(InputError) as caught:
             function(color, layout=layout)
@@ -172,7 +172,7 @@ def test_what_is_no_color_is_told_in_one_line(color: Any, layout: Layout, messag
         ("depth", image(1).astype(bool), "expected a float dtype"),
     ],
 )
-def test_what_is_no_buffer_of_the_color_is_told_in_one_line(name: str, value: Any, message: str) -> None:
+def test_buffers_that_do_not_fit_the_color_are_refused_in_one_line(name: str, value: Any, message: str) -> None:
     for function in (Frame.from_numpy, denoise):
         with pytest.raises(InputError) as caught:
             function(image(3), **{name: value})

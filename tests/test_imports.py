@@ -169,7 +169,7 @@ def test_circles_are_recognised() -> None:
 
 
 @pytest.mark.parametrize("module", [module for module in MODULES if module.startswith(FAST_FORMS)])
-def test_a_fast_form_has_the_name_of_its_page_and_imports_none(module: str) -> None:
+def test_a_fast_backend_has_the_name_of_its_op_and_imports_none(module: str) -> None:
     source = MODULES[module].read_text()
     assert not [name for name in imported(module, source) if is_page(name) or name == "mcdenoise.ops"]
     name = module.rpartition(".")[2]

@@ -198,7 +198,7 @@ def test_other_signals_end_it_alike(moment: str, number: signal.Signals, tmp_pat
     interrupt(tmp_path, MOMENTS[moment], number)
 
 
-def test_what_the_process_was_told_to_ignore_it_ignores(tmp_path: Path) -> None:
+def test_signals_that_were_ignored_stay_ignored(tmp_path: Path) -> None:
     before = "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
     process = started(before + OWN.replace("{moment}", "time.sleep(1)"), "wait", folder=tmp_path)
     assert process.stdout is not None

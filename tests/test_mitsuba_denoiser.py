@@ -197,7 +197,7 @@ def test_tensors_are_denoised_as_arrays_are(variant: str, request: pytest.Fixtur
     np.testing.assert_allclose(clean.numpy()[..., :3], expected[0].permute(1, 2, 0).numpy(), rtol=1e-3, atol=1e-3)
 
 
-def test_what_is_given_without_having_been_announced_is_not_looked_at(mi: Any) -> None:
+def test_features_that_were_not_announced_are_ignored(mi: Any) -> None:
     color, broken = mi.TensorXf(noise(3)), mi.TensorXf(noise(3) * np.nan)
     denoiser = MitsubaDenoiser((WIDTH, HEIGHT), model=MODEL)
     assert np.array_equal(denoiser(color, broken, broken).numpy(), denoiser(color).numpy())

@@ -110,7 +110,7 @@ def test_a_still_has_no_video_and_an_old_one_goes(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["preview", "still.png"]
 
 
-def test_what_stops_on_the_way_leaves_whole_pictures_and_no_video(tmp_path: Path) -> None:
+def test_an_interrupted_preview_leaves_whole_pictures_and_no_video(tmp_path: Path) -> None:
     preview = Preview(tmp_path)
     preview.add("0", constant(1.0))
     preview.add("1", constant(1.0, width=30))

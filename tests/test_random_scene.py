@@ -121,7 +121,7 @@ def test_making_a_scene_needs_no_mitsuba() -> None:
 
 
 @pytest.mark.slow
-def test_shares_of_static_cameras_and_of_moving_objects() -> None:
+def test_fractions_of_static_cameras_and_of_moving_objects() -> None:
     """A fifth and 0.15 are meant; of 150 seeds, the bounds are four standard deviations away."""
     seeds = range(150)
     static = sum(len({camera.to_world.tobytes() for camera in made.cameras}) == 1 for made in survey(seeds))

@@ -66,7 +66,7 @@ def check_refused(action: Callable[[], object], path: Path) -> None:
 @pytest.mark.timeout(30)
 @pytest.mark.parametrize("what", NO_FILES)
 @pytest.mark.parametrize("name", READERS)
-def test_what_is_no_file_is_refused_in_one_line(name: str, what: str, tmp_path: Path) -> None:
+def test_paths_that_are_no_files_are_refused_in_one_line(name: str, what: str, tmp_path: Path) -> None:
     path = tmp_path / name
     put(what, path)
     check_refused(functools.partial(READERS[name], path), path)
@@ -75,7 +75,7 @@ def test_what_is_no_file_is_refused_in_one_line(name: str, what: str, tmp_path: 
 @pytest.mark.timeout(30)
 @pytest.mark.parametrize("what", NO_FILES)
 @pytest.mark.parametrize("name", ["camera_matrices.h", "camera.json"])
-def test_what_is_no_file_in_a_sequence_is_refused_in_one_line(name: str, what: str, small_sequence: Path) -> None:
+def test_paths_in_a_sequence_that_are_no_files_are_refused(name: str, what: str, small_sequence: Path) -> None:
     path = small_sequence / "inputs" / name
     put(what, path)
     check_refused(lambda: open_sequence(small_sequence), path)

@@ -641,7 +641,7 @@ def _render_moving(out: Path, **settings: Any) -> Path:
     return render_sequence(_moving_scene(), cameras, out, moves=_moves(), **{**size, **settings})
 
 
-def test_what_stands_still_was_where_it_is(moving: Path) -> None:
+def test_static_points_have_no_motion(moving: Path) -> None:
     for frame in range(FLIGHT):
         now, before = read(moving, f"world_position{frame}"), read(moving, f"previous_position{frame}")
         still = (now == before).all(axis=-1)
@@ -652,7 +652,7 @@ def test_what_stands_still_was_where_it_is(moving: Path) -> None:
     assert describe(moving)["moves"]["box"] == _moves()["box"].tolist()
 
 
-def test_what_moves_stays_on_its_surface(moving: Path) -> None:
+def test_moving_points_stay_on_their_surface(moving: Path) -> None:
     moves = _moves()["ball"]
     for frame in range(1, FLIGHT):
         now, before = (
@@ -786,7 +786,7 @@ def test_workers_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
     assert time.monotonic() - killed < 30
 
 
-def test_what_cannot_be_sent_to_workers_is_refused(tmp_path: Path) -> None:
+def test_tasks_that_cannot_be_sent_to_workers_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected plain Python and numpy for more than one worker"):
         render_sequence({**demo_scene(), "x": lambda: 0}, demo_cameras(1), tmp_path, workers=2, **TINY)
 

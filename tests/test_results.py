@@ -58,7 +58,7 @@ def test_a_spread_has_the_quartiles_of_its_values() -> None:
     assert Spread.of([7.0]) == Spread(7.0, 7.0, 7.0, 1)
 
 
-def test_what_is_written_is_read_again(results: Results, tmp_path: Path) -> None:
+def test_written_files_are_read_back(results: Results, tmp_path: Path) -> None:
     results.write(tmp_path)
     assert Results.read(tmp_path) == results
 
@@ -74,7 +74,7 @@ def test_results_of_before_are_read_too(results: Results, tmp_path: Path) -> Non
     assert Results.read(tmp_path) == replace(results, cells=cells, notes=[])
 
 
-def test_what_is_no_json_is_not_written(results: Results, tmp_path: Path) -> None:
+def test_infinite_results_are_not_written(results: Results, tmp_path: Path) -> None:
     broken = replace(results, cells=[Cell("plane", "ours", {"PSNR": float("inf")})])
     with pytest.raises(ValueError, match="not JSON compliant"):
         broken.write(tmp_path)
@@ -202,7 +202,7 @@ def test_no_text_is_too_much(results: Results, tmp_path: Path) -> None:
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("command", [["report"], ["models", "--results"]], ids=lambda words: words[0])
 @pytest.mark.parametrize("what", ["pipe", "device", "folder", "link to nothing", "large"])
-def test_what_is_no_file_is_refused_at_once(
+def test_paths_that_are_no_files_are_refused_at_once(
     what: str, command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "results.json"

@@ -166,7 +166,7 @@ def test_an_image_is_an_ordinary_tensor_whatever_the_model_and_the_frame_are(mod
 
 @pytest.mark.parametrize("error", [RuntimeError, pytest.param(KeyboardInterrupt, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["moving", "still", "motion vectors", "without albedo", "color"])
-def test_a_network_that_fails_leaves_the_past_as_it_was(name: str, error: type[BaseException]) -> None:
+def test_a_network_that_fails_leaves_the_history_unchanged(name: str, error: type[BaseException]) -> None:
     shot = [SHOTS[name](number) for number in range(FRAMES)]
     expected, model = denoised(shot), create_model(MODEL, pretrained=True)
     denoiser, fails = Denoiser(model), False
@@ -229,7 +229,7 @@ def test_the_largest_radiance_that_is_one_stays_finite(shot: list[Frame], where:
 
 
 @pytest.mark.parametrize("name", ["moving", "still", "motion vectors", "without albedo", "color"])
-def test_what_is_not_finite_is_neither_handed_out_nor_remembered(name: str) -> None:
+def test_images_that_are_not_finite_are_neither_returned_nor_remembered(name: str) -> None:
     shot = [SHOTS[name](number) for number in range(FRAMES)]
     expected, model = denoised(shot), create_model(MODEL, pretrained=True)
     denoiser, weight = Denoiser(model), [*model.parameters()][-1].data.view(-1)[:1]

@@ -67,7 +67,7 @@ def test_one_option_does_not_change_what_another_draws() -> None:
         ]
 
 
-def test_shares_of_what_is_drawn(survey: list[Take]) -> None:
+def test_fractions_of_the_options_that_are_drawn(survey: list[Take]) -> None:
     """Every fraction within four deviations of what it is drawn with."""
 
     def within(found: list[bool], fraction: float) -> bool:

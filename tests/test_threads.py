@@ -29,7 +29,7 @@ def test_the_threads_of_commands_wait_without_spinning() -> None:
     assert found.get("GOMP_SPINCOUNT", "0") == "0"
 
 
-def test_what_the_user_has_said_of_it_is_kept() -> None:
+def test_settings_of_the_user_are_kept() -> None:
     if not (found := policies(OMP_WAIT_POLICY="ACTIVE", GOMP_SPINCOUNT="7")):
         pytest.skip("this torch has an OpenMP that does not tell its settings")
     assert found["OMP_WAIT_POLICY"] == "ACTIVE"

@@ -98,7 +98,7 @@ def test_memory_that_is_too_short_is_told_before_a_frame_is_read(
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_what_only_serves_a_past_is_not_kept_without_one(
+def test_buffers_for_the_history_are_not_kept_without_one(
     small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[set[str]] = []

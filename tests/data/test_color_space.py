@@ -68,7 +68,7 @@ def test_frames_of_acescg_are_denoised_in_it_and_come_back_in_it(
     wide = shutil.copytree(small_sequence, tmp_path / "wide")
     for path in [*wide.glob("inputs/color*.exr"), *wide.glob("inputs/albedo*.exr")]:
         pixels, channels, _ = read_exr(path)
-        write_exr(path, pixels @ matrix.T, channels, half=False, metadata={"chromaticities": ACESCG})
+        write_exr(path, pixels @ matrix.T, channels, full_float=True, metadata={"chromaticities": ACESCG})
     shown = []
     for root in (small_sequence, wide):
         out = tmp_path / f"clean_{root.name}"

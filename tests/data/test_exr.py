@@ -29,7 +29,7 @@ def one_line(error: pytest.ExceptionInfo[InputError]) -> str:
 
 
 def test_round_trip_float(tmp_path: Path, image: np.ndarray) -> None:
-    write_exr(tmp_path / "a.exr", image, RGB, half=False)
+    write_exr(tmp_path / "a.exr", image, RGB, full_float=True)
     pixels, channels, _ = read_exr(tmp_path / "a.exr")
     assert pixels.dtype == np.float32
     assert channels == RGB
@@ -58,7 +58,7 @@ def test_half_clamps_to_its_largest_value(tmp_path: Path) -> None:
     image = np.array([[[65504, 65519, 65520], [1e30, np.inf, -np.inf]]], dtype=np.float32)
     write_exr(tmp_path / "a.exr", image, RGB)
     assert read_exr(tmp_path / "a.exr")[0].tolist() == [[[65504] * 3, [65504, 65504, -65504]]]
-    write_exr(tmp_path / "a.exr", image, RGB, half=False)
+    write_exr(tmp_path / "a.exr", image, RGB, full_float=True)
     np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0], image)
 
 

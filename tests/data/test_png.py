@@ -14,7 +14,7 @@ from mcdenoise.errors import InputError
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (90, 160)])
-def test_what_is_written_is_read(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_written_files_are_read(tmp_path: Path, size: tuple[int, int]) -> None:
     picture = np.random.default_rng(0).integers(0, 256, (*size, 3), dtype=np.uint8)
     write_png(tmp_path / "a.png", picture.transpose(1, 0, 2))
     assert (read_png(tmp_path / "a.png").transpose(1, 0, 2) == picture).all()

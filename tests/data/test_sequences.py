@@ -146,7 +146,7 @@ def test_published_data_gets_its_albedo_back(small_sequence: Path) -> None:
     inputs = small_sequence / "inputs"
     for number in range(4):
         color, albedo = (read_exr(inputs / f"{name}{number}.exr")[0] for name in ("color", "albedo"))
-        write_exr(inputs / f"color{number}.exr", color / np.maximum(albedo, 1e-3), RGB, half=False)
+        write_exr(inputs / f"color{number}.exr", color / np.maximum(albedo, 1e-3), RGB, full_float=True)
     for content in (None, {"color_includes_albedo": False}):
         (inputs / "camera.json").unlink()
         if content is not None:

@@ -20,7 +20,7 @@ def test_the_whole_comes_before_its_halves_and_the_rest_is_named(tmp_path: Path,
             count = 1 if buffer == "depth" else 3
             written[buffer + suffix] = image = g.random((*SIZE, count)).astype(np.float32)
             channels = ["Y"] if count == 1 else ["R", "G", "B"]
-            write_exr(tmp_path / pattern.format(buffer + suffix), image, channels, half=False)
+            write_exr(tmp_path / pattern.format(buffer + suffix), image, channels, full_float=True)
     sequence = open_sequence(tmp_path)
     assert sequence.buffers == {"color", "albedo", "normal", "depth", "variance"}
     frame = sequence.frame(sequence.numbers[0])

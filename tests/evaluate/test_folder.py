@@ -45,7 +45,7 @@ def images(small_sequence: Path, tmp_path: Path) -> Path:
 def changed(path: Path, change: Callable[[np.ndarray[Any, Any]], object]) -> None:
     pixels, channels, _ = read_exr(path)
     change(pixels)
-    write_exr(path, pixels, channels, half=False)
+    write_exr(path, pixels, channels, full_float=True)
 
 
 # Finding files
@@ -262,7 +262,7 @@ def test_alpha_is_ignored(small_sequence: Path, images: Path) -> None:
     plain = evaluate_folder(open_sequence(small_sequence), images).tables["strict"].mean
     for path in images.iterdir():
         pixels, _, _ = read_exr(path)
-        write_exr(path, np.concatenate([pixels, np.zeros_like(pixels[..., :1])], -1), [*RGB, "A"], half=False)
+        write_exr(path, np.concatenate([pixels, np.zeros_like(pixels[..., :1])], -1), [*RGB, "A"], full_float=True)
     assert evaluate_folder(open_sequence(small_sequence), images).tables["strict"].mean == pytest.approx(plain)
 
 
@@ -274,7 +274,7 @@ def test_primaries_of_the_images_are_converted(small_sequence: Path, images: Pat
     for number in range(4):
         pixels, _, _ = read_exr(small_sequence / "inputs" / f"reference{number}.exr")
         path = images / f"denoised{number}.exr"
-        write_exr(path, pixels @ matrix.T, RGB, half=False, metadata={"chromaticities": primaries})
+        write_exr(path, pixels @ matrix.T, RGB, full_float=True, metadata={"chromaticities": primaries})
     assert evaluate_folder(open_sequence(small_sequence), images).tables["strict"].mean["SMAPE"] < 1e-3
 
 

@@ -89,6 +89,6 @@ def test_a_bad_frame_is_named(small_sequence: Path) -> None:
     path = small_sequence / "inputs" / "albedo1.exr"
     pixels: Any = read_exr(path)[0]
     pixels[3, 4] = float("nan")
-    write_exr(path, pixels, ["R", "G", "B"], half=False)
+    write_exr(path, pixels, ["R", "G", "B"], full_float=True)
     with pytest.raises(InputError, match="frame 1: buffer 'albedo'"):
         evaluate_method(open_sequence(small_sequence), Denoiser(same), "nothing")

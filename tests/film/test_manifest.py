@@ -52,7 +52,7 @@ def test_a_manifest_says_what_to_denoise_and_how(tmp_path: Path) -> None:
     assert second.settings.anti_lag is False
 
 
-def test_a_model_of_ones_own_lies_beside_the_manifest(tmp_path: Path) -> None:
+def test_a_users_model_is_found_beside_the_manifest(tmp_path: Path) -> None:
     text = '[[shot]]\nname="a"\ninput="b"\nmodel="mine.py:make(gain=2)"'
     assert read_film(write(tmp_path, text))[0].settings.model == f"{tmp_path}/mine.py:make(gain=2)"
 
@@ -108,7 +108,7 @@ SHOT = '[[shot]]\nname = "a"\ninput = "b"\n'
         (SHOT + "preview_fps = 5.0", "expected together with --preview"),
     ],
 )
-def test_what_nobody_understands_is_told_in_one_line(
+def test_invalid_manifests_are_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, expected: str
 ) -> None:
     path, out = write(tmp_path, text), tmp_path / "out"

@@ -45,7 +45,7 @@ def test_every_missing_frame_is_made_once_with_the_frames_before_it(seed: int) -
         assert piece.joint == (numbers[first - 1] if first > places[0] else None)
 
 
-def test_what_was_begun_goes_on_from_its_beginning_where_that_is_near() -> None:
+def test_a_piece_resumes_at_its_beginning_where_that_is_near() -> None:
     (near,) = cut(range(100), range(7, 100), length=0, overlap=4)
     assert near.numbers[0] == 0
     (far,) = cut(range(100), range(50, 100), length=0, overlap=4)
@@ -81,7 +81,7 @@ def test_a_tolerance_that_is_none(tolerance: float) -> None:
         frames_remembered(create_model("noisy"), tolerance)
 
 
-def test_nobody_knows_what_others_remember() -> None:
+def test_unknown_methods_remember_an_unknown_number_of_frames() -> None:
     class Own(nn.Module):
         needs = create_model("noisy").needs
 

@@ -68,7 +68,7 @@ def run(shots: dict[str, Path], out: Path, engine: Inline | None = None, piece: 
 
 def edit(path: Path) -> None:
     image, channels, _ = read_exr(path)
-    write_exr(path, image * 1.5, channels, half=False)
+    write_exr(path, image * 1.5, channels, full_float=True)
 
 
 def test_it_gives_what_denoise_gives(shots: dict[str, Path], tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_finished_frames_are_not_made_again(shots: dict[str, Path], tmp_path: Pa
     ],
     ids=["color", "albedo", "gone", "edited", "record", "reference"],
 )
-def test_what_has_changed_is_made_again(
+def test_changed_frames_are_made_again(
     shots: dict[str, Path], tmp_path: Path, change: Callable[[dict[str, Path], Path], object], made: list[int]
 ) -> None:
     run(shots, tmp_path / "out")

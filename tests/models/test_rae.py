@@ -152,7 +152,7 @@ def test_a_world_that_is_turned_looks_the_same() -> None:
     torch.testing.assert_close(input_of(moved), input_of(frame))
 
 
-def test_it_wears_no_accumulation() -> None:
+def test_it_has_no_accumulation_of_its_own() -> None:
     model = small("rae")
     assert [type(part) for part in (model, model.inner, model.inner.inner)] == [Demodulated, Exposed, Rae]
 

@@ -144,7 +144,7 @@ def test_state_survives_a_cut_and_a_resize() -> None:
     assert denoiser.report.reset == "size change"
 
 
-def test_a_frame_that_says_nothing_of_motion_stands_alone() -> None:
+def test_a_frame_without_motion_has_no_history() -> None:
     denoiser = Denoiser("svgf")
     for seed in (0, 1):
         given = frame(seed=seed).replace(motion=None)

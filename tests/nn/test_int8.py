@@ -190,7 +190,7 @@ def test_shipped_weights_are_calibrated(name: str) -> None:
     assert torch.equal(image, Denoiser(name, precision="int8")(frame))
 
 
-def test_what_cannot_be_computed_in_integers() -> None:
+def test_methods_that_integers_cannot_compute_are_refused() -> None:
     for settings, message in (
         ({"model": "svgf"}, "without a U-Net" if has_int8() else "VNNI"),
         ({"model": "cascaded_v2_micro", "differentiable": True}, "expected float32 or bfloat16 with differentiable"),

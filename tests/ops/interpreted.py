@@ -220,7 +220,7 @@ def is_plain(function: Callable[..., Any], tolerance: float, *given: Any, **sett
         torch.testing.assert_close(one.double(), other.double(), rtol=tolerance, atol=tolerance)
 
 
-def test_every_step_of_the_default_model_has_a_form() -> None:
+def test_every_step_of_the_default_model_has_a_triton_backend() -> None:
     # Torch itself has one for what is not among them: the mean of 2x2 pixels, the product with the albedo.
     names = {op.name for op in WITHOUT}
     assert names >= {"incoming", "lights", "blend", "depth_scale", "buffers_input", "network_guides", "softplus"}

@@ -152,7 +152,7 @@ def test_downsampling_undoes_upsampling(data: st.DataObject, size: Size, dtype: 
 
 
 @given(st.data(), sizes, dtypes, st.sampled_from([1e-6, 0.1, 1.0]))
-def test_accumulating_stays_between_past_and_present(
+def test_accumulating_stays_between_history_and_frame(
     data: st.DataObject, size: Size, dtype: Any, alpha_min: float
 ) -> None:
     color, previous = data.draw(images(size, dtype)), data.draw(images(size, dtype))
@@ -176,7 +176,7 @@ def test_an_unknown_place_has_no_motion_but_no_nan(data: st.DataObject, size: Si
 
 
 @given(st.data(), sizes, dtypes, st.sampled_from([3, 7]))
-def test_lag_is_a_share(data: st.DataObject, size: Size, dtype: Any, side: int) -> None:
+def test_lag_is_a_fraction(data: st.DataObject, size: Size, dtype: Any, side: int) -> None:
     history, recent = data.draw(images(size, dtype)), data.draw(images(size, dtype))
     variance = data.draw(images(size, dtype, st.floats(0, float(torch.finfo(dtype).max)), 1))
     share = ops.history_lag(history, recent, variance, kernel_size=side)

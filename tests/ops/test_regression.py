@@ -22,7 +22,7 @@ def scene(height: int = 40, width: int = 50) -> Tensor:
     return torch.cat([normal, torch.stack([100 + columns, rows - 50, depth])])[None].double()
 
 
-def test_what_is_linear_in_the_features_comes_back() -> None:
+def test_an_image_linear_in_the_features_is_returned() -> None:
     """But for the ridge, 1e-8; in float32 that is less than a rounding."""
     features, weights = scene(), drawn(3, 6) - 0.5
     image = 2 + torch.einsum("cf,bfhw->bchw", weights, features - features.mean((2, 3), keepdim=True))

@@ -117,7 +117,7 @@ def test_the_gradient_of_a_vmap_and_jacobians(op: Op) -> None:
         torch.testing.assert_close(forward, reverse, rtol=1e-9, atol=1e-11)
 
 
-def test_default_arguments_at_a_size_where_fast_forms_are_chosen() -> None:
+def test_default_arguments_at_a_size_where_fast_backends_are_chosen() -> None:
     """What was silently zero."""
     x = torch.rand(1, 3, 96, 128, dtype=torch.float64)
     kernel = torch.rand(1, 9, 96, 128, dtype=torch.float64)
@@ -129,7 +129,7 @@ def test_default_arguments_at_a_size_where_fast_forms_are_chosen() -> None:
     torch.testing.assert_close(gradient, one / 4)
 
 
-def test_a_named_fast_form_refuses() -> None:
+def test_a_named_backend_that_cannot_run_raises() -> None:
     x = torch.rand(1, 3, 4, 5)
     calls: list[Callable[[], Any]] = [
         lambda: torch.func.jvp(lambda x: by("numba", ops.downsample)(x), (x,), (x,)),

@@ -192,7 +192,9 @@ def test_pictures_are_shown_in_the_primaries_of_a_display(folder: Path, tmp_path
     results = Results.read(copy)
     before = report_writing._galleries(copy, results)[0].codes["ours"][FRAMES[0]]
     path = copy / "images" / "first" / "ours" / f"{FRAMES[0]}.exr"
-    write_exr(path, read_exr(path)[0] @ matrix.T, ["R", "G", "B"], half=False, metadata={"chromaticities": primaries})
+    write_exr(
+        path, read_exr(path)[0] @ matrix.T, ["R", "G", "B"], full_float=True, metadata={"chromaticities": primaries}
+    )
     after = report_writing._galleries(copy, results)[0].codes["ours"][FRAMES[0]]
     # The matrices of both ways are rounded to ten digits: a value on the border of two codes may fall to either side.
     assert np.abs(after.astype(int) - before).max() <= 1

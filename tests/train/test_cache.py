@@ -181,7 +181,7 @@ def test_a_pixel_that_is_no_radiance_is_the_mean_of_its_neighbours(
         image = np.full((20, 24, 3), 0.5, np.float32)
         if name == stem:
             image[10, 10] = value
-        write_exr(path, image, ["R", "G", "B"], half=False)
+        write_exr(path, image, ["R", "G", "B"], full_float=True)
     part = opened(small_sequence, tmp_path / "cache", front=Front(), features=[]).shots[0].read(slice(2, 3))
     assert (part["color"] == 0.5).all()
     assert (part["reference"] == 0.5).all()
@@ -202,7 +202,7 @@ def test_a_part_of_a_shot(noisy: Path, tmp_path: Path) -> None:
         assert torch.equal(shot.cut(frames).read()["color"], shot.read()["color"][frames])
 
 
-def test_what_a_model_begins_with() -> None:
+def test_the_front_of_a_model_is_split_from_its_network() -> None:
     model = create_model("cascaded_v2_micro", alpha_min=0.3)
     front, rest = split(model)
     assert front.settings[0] == ["Demodulated", {}]
@@ -221,7 +221,7 @@ def test_what_a_model_begins_with() -> None:
 def test_features_are_kept_once_and_in_half_precision_where_nothing_is_lost(noisy: Path, tmp_path: Path) -> None:
     inputs = noisy / "inputs"
     image, channels, _ = read_exr(inputs / "albedo2.exr")
-    write_exr(inputs / "albedo2.exr", image * 0.999 + 1e-5, channels, half=False)
+    write_exr(inputs / "albedo2.exr", image * 0.999 + 1e-5, channels, full_float=True)
     cached = opened(noisy, tmp_path / "cache")
     arrays = {path.name: np.load(path) for path in (tmp_path / "cache").rglob("*.npy")}
     kinds = {name: (array.dtype.name, array.shape[0]) for name, array in arrays.items()}
@@ -233,7 +233,7 @@ def test_features_are_kept_once_and_in_half_precision_where_nothing_is_lost(nois
     assert torch.equal(cached.shots[0].read()["albedo"][2], expected[0])
 
 
-def test_what_is_cached_is_not_decoded_again(noisy: Path, tmp_path: Path, reads: list[tuple[int, int]]) -> None:
+def test_cached_frames_are_not_decoded_again(noisy: Path, tmp_path: Path, reads: list[tuple[int, int]]) -> None:
     first = opened(noisy, tmp_path / "cache")
     assert sorted(reads) == [(number, noise_seed) for number in range(4) for noise_seed in range(3)]
     reads.clear()

@@ -146,7 +146,7 @@ def test_every_loss_has_its_name() -> None:
     assert set(LOSSES) == set(get_args(Loss))
 
 
-def test_weights_that_nobody_asked_for_are_the_papers() -> None:
+def test_default_weights_are_those_of_the_paper() -> None:
     image = torch.rand(1, 1, 3, 2, 2)
     assert stage_weights({}, Output(image)) == {"image": 1}
     assert stage_weights({}, Output(image, {"accumulated": image, "initial": image})) == BOTH

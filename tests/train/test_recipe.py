@@ -270,7 +270,7 @@ def test_nothing_beside_a_recipe_says_what_is_trained(
 
 
 @pytest.mark.parametrize("option", ["--data", "--runs"])
-def test_what_is_of_a_recipe_needs_one(capsys: pytest.CaptureFixture[str], option: str) -> None:
+def test_options_of_recipes_need_a_recipe(capsys: pytest.CaptureFixture[str], option: str) -> None:
     with pytest.raises(SystemExit):
         main(["train", "somewhere", "-o", "out", option, "data"])
     assert f"{option}: expected a --recipe" in capsys.readouterr().err

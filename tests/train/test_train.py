@@ -140,7 +140,7 @@ def test_a_finished_run_is_not_run_again(small_sequence: Path, tmp_path: Path) -
     assert (again, steps, describe_weights(again)["sha256"]) == (weights, [], digest)
 
 
-def test_what_a_run_leaves(small_sequence: Path, tmp_path: Path) -> None:
+def test_files_of_a_finished_run(small_sequence: Path, tmp_path: Path) -> None:
     run = tmp_path / "deep" / "run"
     weights = train(TrainConfig(**SMALL), [small_sequence], run, checkpoint_every=2, credits="A. Painter, CC0")
     assert weights == run / f"{DEFAULT}.safetensors"
@@ -546,13 +546,13 @@ def test_an_absurdly_bright_pixel_does_not_stop_a_run(
     for path in (small_sequence / "inputs").glob(f"{stem}[0-9].exr"):
         image, channels, _ = read_exr(path)
         image[::3, ::3] = value
-        write_exr(path, image, channels, half=False)
+        write_exr(path, image, channels, full_float=True)
     config = TrainConfig(**{**SMALL, "steps": 3}, exposure=10.0, tint=10.0)
     weights = train(config, [small_sequence], tmp_path / "run")
     assert all(tensor.isfinite().all() for tensor in load_file(weights).values())
 
 
-def test_a_batch_that_cannot_be_shared_out(
+def test_a_batch_that_the_processes_cannot_divide_is_refused(
     small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     launched = {"TORCHELASTIC_RUN_ID": "none", "WORLD_SIZE": "6", "LOCAL_WORLD_SIZE": "3"}
@@ -606,7 +606,7 @@ def test_frames_of_several_sizes_are_refused_and_sequences_of_several_sizes_are_
     assert not (tmp_path / "run").exists()
     for path in (other / "inputs").glob("*.exr"):
         image, channels, _ = read_exr(path)
-        write_exr(path, image[:17, :18], channels, half="position" not in path.stem)
+        write_exr(path, image[:17, :18], channels, full_float="position" in path.stem)
     assert train(config, [small_sequence, other], tmp_path / "run").exists()
     message = refused(lambda: train(TrainConfig(**{**SMALL, "crop": 19}), [small_sequence, other], tmp_path / "large"))
     assert "expected images of at least 19 pixels, found (17, 18)" in message

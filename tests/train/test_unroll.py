@@ -220,7 +220,7 @@ def test_a_module_of_one_buffer_learns_the_best_exposure(small_sequence: Path, t
         ("no_such", {}, "expected a factory 'no_such'"),
     ],
 )
-def test_what_cannot_be_trained_leaves_no_run(
+def test_a_model_that_cannot_be_trained_leaves_no_run(
     small_sequence: Path, tmp_path: Path, factory: str, changes: dict[str, Any], expected: str
 ) -> None:
     with pytest.raises(InputError) as error:

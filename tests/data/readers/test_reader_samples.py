@@ -57,7 +57,7 @@ def test_layers_beside_the_color(tmp_path: Path, save: Save, kind: str) -> None:
 def test_a_file_of_their_own_comes_back(tmp_path: Path, channels: int, layout: str) -> None:
     samples = drawn(channels)
     if layout == "files":
-        write_exr(tmp_path / "color_0004.exr", picture(samples), ["R", "G", "B"], half=False)
+        write_exr(tmp_path / "color_0004.exr", picture(samples), ["R", "G", "B"], full_float=True)
         write_samples(tmp_path / "samples_0004.exr", samples)
     else:
         color = torch.from_numpy(picture(samples)).permute(2, 0, 1)[None]
@@ -72,7 +72,7 @@ def test_a_file_of_their_own_comes_back(tmp_path: Path, channels: int, layout: s
 
 def test_the_features_of_samples_are_no_buffers(tmp_path: Path) -> None:
     samples = drawn(10)
-    write_exr(tmp_path / "color_0004.exr", picture(samples), ["R", "G", "B"], half=False)
+    write_exr(tmp_path / "color_0004.exr", picture(samples), ["R", "G", "B"], full_float=True)
     write_samples(tmp_path / "samples_0004.exr", samples)
     assert open_sequence(tmp_path).buffers == {"color", "samples"}
 
@@ -81,7 +81,7 @@ def test_the_features_of_samples_are_no_buffers(tmp_path: Path) -> None:
 def test_samples_whose_mean_is_not_the_color_are_not_used(tmp_path: Path, layout: str) -> None:
     samples = drawn()
     name = "color_0004.exr" if layout == "files" else "color4.exr"
-    write_exr(tmp_path / name, 1.02 * picture(samples), ["R", "G", "B"], half=False)
+    write_exr(tmp_path / name, 1.02 * picture(samples), ["R", "G", "B"], full_float=True)
     write_samples(tmp_path / name.replace("color", "samples"), samples)
     if layout == "bmfr":
         (tmp_path / "camera.json").write_text('{"color_includes_albedo": true}')
