@@ -707,7 +707,7 @@ def _grid_slice_cases() -> tuple[Case, ...]:
         cell: int,
         bins: int,
         grid: Callable[..., Tensor] = _normal,
-        known: Callable[[Tensor], Tensor] = lambda drawn: drawn,
+        filled: Callable[[Tensor], Tensor] = lambda drawn: drawn,
         differentiable: tuple[str, ...] = ("grid", "filled", "guide"),
     ) -> Case:
         batch, channels, height, width = size
@@ -716,7 +716,7 @@ def _grid_slice_cases() -> tuple[Case, ...]:
         def tensors(g: Generator) -> Inputs:
             return {
                 "grid": grid(g, batch, channels, *cells),
-                "filled": known(_uniform(g, batch, 1, *cells, low=0.2)),
+                "filled": filled(_uniform(g, batch, 1, *cells, low=0.2)),
                 "guide": _guide(g, batch, height, width, bins),
             }
 
@@ -729,14 +729,14 @@ def _grid_slice_cases() -> tuple[Case, ...]:
         case("3x4 in cells of 2", "ordinary", (1, 3, 3, 4), 2, 2),
         case("batch of 2, cells beyond the border", "ordinary", (2, 1, 3, 5), 4, 2),
         case("cells of 3, 4 bins", "ordinary", (1, 1, 4, 3), 3, 4),
-        case("one bin, all filled", "ordinary", (1, 2, 2, 3), 2, 1, known=torch.ones_like, differentiable=("grid",)),
+        case("one bin, all filled", "ordinary", (1, 2, 2, 3), 2, 1, filled=torch.ones_like, differentiable=("grid",)),
         case("cells of one pixel", "ordinary", (2, 1, 2, 1), 1, 2),
         case("one pixel", "ordinary", (1, 3, 1, 1), 8, 3),
         case("fireflies of 100", "stiff", (1, 1, 2, 3), 2, 2, lambda g, *shape: _radiance(g, *shape) / 100),
         case("fireflies", "extreme", (1, 3, 3, 3), 2, 2, _radiance, differentiable=("grid",)),
         # Where all cells around a pixel are empty, the result jumps once one of them is filled.
-        case("empty cells", "extreme", (1, 3, 3, 5), 2, 4, known=half_empty, differentiable=("grid",)),
-        case("no cell is filled", "extreme", (1, 1, 2, 2), 2, 2, known=torch.zeros_like, differentiable=("grid",)),
+        case("empty cells", "extreme", (1, 3, 3, 5), 2, 4, filled=half_empty, differentiable=("grid",)),
+        case("no cell is filled", "extreme", (1, 1, 2, 2), 2, 2, filled=torch.zeros_like, differentiable=("grid",)),
     )
 
 

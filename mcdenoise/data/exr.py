@@ -95,7 +95,7 @@ def write_exr(
     image: NDArray[Any],
     channels: Sequence[str],
     *,
-    half: bool = True,
+    full_float: bool = False,
     metadata: Mapping[str, MetadataValue] | None = None,
 ) -> None:
     """Write an EXR file with ZIP compression, atomically.
@@ -104,7 +104,7 @@ def write_exr(
         path: the file. Its folder must exist.
         image: ``(H, W, C)`` pixels, top row first.
         channels: C channel names.
-        half: store half floats, clamped to 65504; otherwise 32-bit floats.
+        full_float: whether to store 32-bit floats; otherwise half floats, clamped to 65504.
         metadata: attributes to keep, as :func:`read_exr` returns them.
 
     Raises:
@@ -117,14 +117,14 @@ def write_exr(
         )
     check_name(path)
     height, width, count = image.shape
-    spec = oiio.ImageSpec(width, height, count, "half" if half else "float")
+    spec = oiio.ImageSpec(width, height, count, "float" if full_float else "half")
     spec.channelnames = tuple(channels)
     for name, value in (metadata or {}).items():
         if not name.startswith(_STORAGE_PREFIXES):
             _set_attribute(spec, name, value)
     spec.attribute("compression", "zip")
     with atomic_path(path) as temporary:
-        reason = _write(temporary, spec, image, half).replace(str(temporary), path.name)
+        reason = _write(temporary, spec, image, full_float).replace(str(temporary), path.name)
         if reason:
             raise InputError(f"{path}: cannot be written ({reason}); check the folder, its permissions and free space")
 
@@ -221,7 +221,7 @@ def _set_attribute(spec: oiio.ImageSpec, name: str, value: MetadataValue) -> Non
         spec.attribute(name, value)
 
 
-def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], half: bool) -> str:
+def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], full_float: bool) -> str:
     """Write the file; return the reason of a failure, or an empty text."""
     file = oiio.ImageOutput.create("openexr")
     if file is None:
@@ -231,7 +231,7 @@ def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], half: bool) ->
     written = True
     for top in range(0, spec.height, _ROWS):
         pixels = np.ascontiguousarray(image[top : top + _ROWS], dtype=np.float32)
-        if half:
+        if not full_float:
             pixels = within_half(pixels)
         written = written and file.write_scanlines(top, top + len(pixels), 0, pixels)
     reason = pending_error(file)

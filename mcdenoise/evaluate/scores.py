@@ -42,7 +42,7 @@ def measure(
     metrics: Mapping[str, Metric],
     image: Tensor,
     reference: Tensor,
-    past: tuple[Tensor, Tensor] | None = None,
+    previous: tuple[Tensor, Tensor] | None = None,
     skipped: dict[str, str] | None = None,
 ) -> dict[str, float]:
     """Compute all metrics of one frame that can be computed.
@@ -51,7 +51,7 @@ def measure(
         metrics: by name.
         image: ``(1, 3, H, W)`` scene-linear radiance.
         reference: of the same shape.
-        past: image and reference of the previous frame; without them temporal metrics are skipped.
+        previous: image and reference of the previous frame; without them temporal metrics are skipped.
         skipped: receives the reason for each metric that these images, or this installation, do not allow.
     """
     values = {}
@@ -59,8 +59,8 @@ def measure(
         try:
             if not metric.temporal:
                 values[name] = float(metric.function(image, reference))
-            elif past is not None:
-                clip, truth = torch.stack([past[0], image], 1), torch.stack([past[1], reference], 1)
+            elif previous is not None:
+                clip, truth = torch.stack([previous[0], image], 1), torch.stack([previous[1], reference], 1)
                 values[name] = float(metric.function(clip, truth))
         except UncomputableError as error:
             if skipped is not None:

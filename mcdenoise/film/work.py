@@ -337,7 +337,7 @@ class _Writer:
     def _keep_joint(self, number: int, image: Tensor) -> None:
         """Keep the result before the joint, for :func:`summarize` to compare with that of the other piece."""
         pixels = image[0].permute(1, 2, 0).float().cpu().numpy()
-        write_exr(_joint_path(self.order, number), pixels, ["R", "G", "B"], half=False)
+        write_exr(_joint_path(self.order, number), pixels, ["R", "G", "B"], full_float=True)
 
 
 @functools.lru_cache(1)

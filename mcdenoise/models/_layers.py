@@ -110,11 +110,11 @@ def split(image: Tensor, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
     some, any_light = total > 0, all_light > 0
     total, all_light = torch.where(some, total, 1), torch.where(any_light, all_light, 1)
     equal = len(parts) - (REST in parts)
-    shares = {
+    proportions = {
         name: torch.where(any_light, mean / all_light, 0 if name == REST and equal else 1 / max(equal, 1))
         for name, mean in means.items()
     }
-    return {name: image * torch.where(some, part / total, shares[name]) for name, part in positive.items()}
+    return {name: image * torch.where(some, part / total, proportions[name]) for name, part in positive.items()}
 
 
 def fractions(frame: Frame, image: Tensor) -> Mapping[str, Tensor]:

@@ -249,15 +249,15 @@ class Frames(NamedTuple):
         """Bytes of whole images, at most, while none runs."""
         if self.spilled:
             return self._bytes(_IN_MEMORY_ELSEWHERE)
-        # One of the results also in other units.
+        # One of the results is kept in other units, too.
         kept = _KEPT + self._channels(*_SURFACE) if self.streaming else 1
         after = self._channels() + 3 + kept + 9
         if not self.streaming:
             return self._bytes(after)
-        # Color as it is and as it enters; the old past with the features it belongs to; the new one, long and short, as
-        # accumulated and without lag.
-        past = 12 + _KEPT + 2 * _KEPT
-        return self._bytes(max(after, self._channels() + 2 * self._channels(*_SURFACE) + past))
+        # Color as given and as it enters the history; the old history with its features; the new one, long and short,
+        # before and after the correction of lag.
+        histories = 12 + _KEPT + 2 * _KEPT
+        return self._bytes(max(after, self._channels() + 2 * self._channels(*_SURFACE) + histories))
 
     def _channels(self, *names: str) -> int:
         return sum(BUFFERS[name].channels for name in names or BUFFERS if name in self.buffers)

@@ -7,7 +7,7 @@ Isik et al. 2021, "Interactive Monte Carlo Denoising using Affinity of Neural Fe
 2. A U-Net takes ``e_t`` and ``W e_bar_{t-1}``. For each pixel it predicts ``lambda``; for each filter ``k`` features
    ``f^k``, a bandwidth ``a^k`` and a weight of the centre ``c^k``; and a temporal bandwidth ``b``.
 3. Exponential means are updated: ``L_bar_t = (1 - lambda) L_t + lambda W L_bar_{t-1}``, and ``e_bar_t`` in the same
-    way.
+   way.
 4. ``L_bar_t`` passes through the filters one after the other, with 7x7 taps 1, 2 and 4 pixels apart and the weights
    ``exp(-a_p |f_p - f_q|^2)``; the centre has the weight ``c_p`` (:func:`mcdenoise.ops.affinity_filter`).
 5. The last filter also has taps in the result of the previous frame, ``exp(-b_p |f_p - W f_{q, t-1}|^2)``, with the

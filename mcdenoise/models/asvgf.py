@@ -110,8 +110,8 @@ class Asvgf(Svgf):
         if shaded is not None:
             now, before, there = shaded.split(1, 1)
             return temporal_gradient(now, before, there, None, *surface, **settings)
-        past = torch.cat([history.moments, history.length.to(history.moments.dtype)], 1)
-        found, weight = reproject(past, motion, surface_before(frame), history.surface)
+        moments = torch.cat([history.moments, history.length.to(history.moments.dtype)], 1)
+        found, weight = reproject(moments, motion, surface_before(frame), history.surface)
         moments, length = found[:, :2], found[:, 2:].clamp_min(1)
         current = luminance_moments(frame.color.clamp_max(BRIGHTEST)).to(moments.dtype)
         spatial = moments_variance(current, *surface, kernel_size=WINDOW)

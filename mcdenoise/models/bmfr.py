@@ -5,7 +5,7 @@ Transactions on Graphics 38(5), and its public code, ``bmfr.cl``. The steps are:
 
 1. Demodulated radiance is accumulated by the BMFR rule, with the weight ``max(1 / n, 0.2)`` of the current frame
    (:class:`mcdenoise.models.Accumulated`, ``rule="bmfr"``). The limits of the rule are in scene units, and the authors
-      chose them for each scene: the defaults are their values for "classroom".
+   chose them for each scene: the defaults are their values for "classroom".
 2. Blocks of 32x32 pixels, whose origin cycles through 16 offsets from frame to frame, are fitted by 1, the normal, the
    position, and the squares of the position (:func:`mcdenoise.ops.block_regression`). Negative results are clamped to
    0.

@@ -17,8 +17,8 @@ Our choices where the paper and its re-implementation leave something open, and 
 
 - the 27 channels: the image, albedo, normal and depth (10), the horizontal and vertical differences of the image's
   luminance, albedo, normal and depth (16), and ``log(1 + variance)`` of the image (1). The variance is estimated from
-    the 7x7 neighbouring pixels of the same surface, because frames of one sample have no variance buffer, and the
-    variance of several samples is that of the color and not of its parts;
+  the 7x7 neighbouring pixels of the same surface, because frames of one sample have no variance buffer, and the
+  variance of several samples is that of the color and not of its parts;
 - convolutions are padded with zeros, where the authors crop the border;
 - taps of a kernel outside the image have the weight 0;
 - typical radiance is scaled to 0.5 first (:class:`mcdenoise.models.Exposed`); otherwise the logarithm, and with it the

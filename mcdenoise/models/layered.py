@@ -16,8 +16,8 @@ Our choices:
 - a layer's embedding is the weighted mean of its samples' embeddings; a second U-Net takes both layers, followed by a
   1x1 convolution that predicts the logits of each layer's kernel, and its alpha;
 - a layer holds ``C_l = mean_s w_sl x_s`` and its coverage ``A_l = mean_s w_sl``; both are filtered with the same kernel
-    (a softmax of the logits, gathered), and ``F_l`` is their quotient: the mean light of the layer. Weights are at
-    least 1e-3, so that no layer is empty;
+  (a softmax of the logits, gathered), and ``F_l`` is their quotient: the mean light of the layer. Weights are at
+  least 1e-3, so that no layer is empty;
 - sizes: width 16 and kernels of 11x11 by default.
 
 As for all compared methods, light is accumulated over frames by the rule of :mod:`mcdenoise.models.cascaded`,

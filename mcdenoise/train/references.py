@@ -51,7 +51,7 @@ def clean_references(source: Path, out: Path) -> Path:
         image = oidn(Frame(color=frame.reference, albedo=features[0], normal=features[1]))[0].image
         # The filter may return negative radiance.
         pixels = image[0].clamp(0, 65504).permute(1, 2, 0).numpy()
-        write_exr(copied / f"reference{number}.exr", pixels, ["R", "G", "B"], half=True)
+        write_exr(copied / f"reference{number}.exr", pixels, ["R", "G", "B"])
     rendered = inputs / description.name
     about = json.loads(read_text(rendered)) if rendered.exists() else {}
     # Remove statements about the references that no longer hold, so that no renderer refines them as means of paths.

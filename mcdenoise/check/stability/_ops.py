@@ -127,7 +127,7 @@ class _Exact:
     bound: Tensor
 
 
-Known = dict[str, list[_Exact]]
+Cache = dict[str, list[_Exact]]
 
 
 def select(names: Sequence[str] | None = None) -> list[Op]:
@@ -159,10 +159,10 @@ def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
     for dtype in dtypes:
         if not op.half_precision and accumulator_dtype(dtype) != dtype:
             continue
-        known: list[Known] = [{} for _ in op.cases]
+        caches: list[Cache] = [{} for _ in op.cases]
         for backend in backends(op):
-            for case, found in zip(op.cases, known, strict=True):
-                yield from check_case(op, case, dtype, backend, found)
+            for case, cache in zip(op.cases, caches, strict=True):
+                yield from check_case(op, case, dtype, backend, cache)
         for pair in ADJOINTS:
             if op.name == pair[0]:
                 yield from _check_adjoint(op, next(other for other in OPS if other.name == pair[1]), dtype)
@@ -193,7 +193,7 @@ def check_stability(
 
 
 def check_case(
-    op: Op, case: Case, dtype: torch.dtype, backend: Backend | None = None, known: Known | None = None
+    op: Op, case: Case, dtype: torch.dtype, backend: Backend | None = None, cache: Cache | None = None
 ) -> list[Check]:
     """Check an op on one case.
 
@@ -202,7 +202,7 @@ def check_case(
         case: one of its cases.
         dtype: dtype of the inputs.
         backend: see :func:`backends`.
-        known: a cache of the exact results for this case and dtype, which take most of the time and are the same for
+        cache: a cache of the exact results for this case and dtype, which take most of the time and are the same for
             every backend.
 
     Returns:
@@ -218,8 +218,8 @@ def check_case(
         passed = bool(backend) and "can run here" in str(error)
         message = in_one_line(error) if op.own else str(error)
         return [Check(op.name, case.name, name_of(dtype), backend or "", "runs", 0, 0, 0, passed, message)]
-    known = {} if known is None else known
-    exact = _once(known, "forward", _exact_results, trial, results)
+    cache = {} if cache is None else cache
+    exact = _once(cache, "forward", _exact_results, trial, results)
     checks = [_compare(trial, "forward", results, exact)]
     upstream = [_upstream(result) for result in results]
     leaves = [*trial.leaves, *upstream]
@@ -232,20 +232,20 @@ def check_case(
         if not isinstance(error, ValueError) or not backend or "can run here" not in str(error):
             raise
     else:
-        true = _once(known, "gradient", _exact_gradients, trial, leaves, exact)
+        true = _once(cache, "gradient", _exact_gradients, trial, leaves, exact)
         checks.append(_compare(trial, "gradient", gradients, true))
     if op.weights(case.settings):
         checks.append(_check_weights(trial, results[0]))
     if op.images and case.kind != "extreme":
-        checks += [_check_constant(trial, known), _check_exposure(trial, results[0])]
+        checks += [_check_constant(trial, cache), _check_exposure(trial, results[0])]
     return checks
 
 
-def _once(known: Known, what: str, find: Callable[..., list[_Exact]], *arguments: Any) -> list[_Exact]:
+def _once(cache: Cache, what: str, find: Callable[..., list[_Exact]], *arguments: Any) -> list[_Exact]:
     """The exact results, from the cache if they are in it."""
-    if what not in known:
-        known[what] = find(*arguments)
-    return known[what]
+    if what not in cache:
+        cache[what] = find(*arguments)
+    return cache[what]
 
 
 def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
@@ -407,14 +407,14 @@ def _check_weights(trial: _Trial, weights: Tensor) -> Check:
     return _found(trial, "weights", error / eps, allowed / eps, 1.0, message)
 
 
-def _check_constant(trial: _Trial, known: Known) -> Check:
+def _check_constant(trial: _Trial, cache: Cache) -> Check:
     """The forward check with constant images: a mean of equal numbers is that number."""
     inputs = dict(trial.inputs)
     for name in trial.images:
         inputs[name] = torch.full_like(_tensor(inputs[name]), _CONSTANT)
     constant = replace(trial, inputs=inputs)
     results = constant.run(constant.leaves)
-    exact = _once(known, "constant", _exact_results, constant, results)
+    exact = _once(cache, "constant", _exact_results, constant, results)
     return _compare(constant, "constant", results[:1], exact[:1])
 
 

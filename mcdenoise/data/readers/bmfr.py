@@ -492,9 +492,9 @@ def write_buffer(
     image = buffer[0].detach().float().permute(1, 2, 0).cpu().numpy()
     if name == "depth":
         image = np.where(np.isinf(image), 0, image)
-    half = name not in _FULL_FLOAT and not (name == "depth" and image.max() > LARGEST_HALF)
+    full_float = name in _FULL_FLOAT or (name == "depth" and bool(image.max() > LARGEST_HALF))
     path = folder / f"{_STEMS[name]}{number}.exr"
-    write_exr(path, image, _CHANNELS[image.shape[2]], half=half, metadata=metadata)
+    write_exr(path, image, _CHANNELS[image.shape[2]], full_float=full_float, metadata=metadata)
 
 
 def has_buffer(folder: Path, number: int, name: str, size: tuple[int, int]) -> bool:

@@ -172,7 +172,7 @@ class NoisebaseFiles:
         """
         source = self.files[number]
         target = out / (f"{source.stem}_{number:04d}.exr" if self.axis else f"{source.stem}.exr")
-        write_exr(target, image, ["R", "G", "B"], half=not full_float)
+        write_exr(target, image, ["R", "G", "B"], full_float=full_float)
         return target
 
     def _index(self, number: int) -> int | None:

@@ -107,4 +107,4 @@ def write_samples(path: Path, samples: Image) -> None:
     names = [f"sample{i}.{suffix}" for i in range(len(samples)) for suffix in suffixes]
     finite = np.where(np.isfinite(samples), samples, 0)
     image = finite.reshape(-1, *samples.shape[2:]).transpose(1, 2, 0)
-    write_exr(path, np.ascontiguousarray(image), names, half=bool(image.max(initial=0) <= LARGEST_HALF))
+    write_exr(path, np.ascontiguousarray(image), names, full_float=bool(image.max(initial=0) > LARGEST_HALF))

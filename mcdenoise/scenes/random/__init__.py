@@ -21,7 +21,7 @@ from mcdenoise.scenes.random.shiny import shine
 
 __all__ = ["RandomScene", "random_scene"]
 
-_MOVING_SHARE = 0.15
+_MOVING_FRACTION = 0.15
 # Stream of a seed from which further views are drawn.
 _VIEWS = 100
 _NEAREST_FOCUS = 0.3
@@ -70,7 +70,7 @@ def random_scene(seed: int, frames: int = 8, zoom: float = 1.0, *, shiny: bool =
     if shiny:
         shine(builder, shine_rng)
     cameras = shoot(builder, camera_rng, frames)
-    moves = _movements(builder, move_rng, frames, cameras[0]) if move_rng.random() < _MOVING_SHARE else {}
+    moves = _movements(builder, move_rng, frames, cameras[0]) if move_rng.random() < _MOVING_FRACTION else {}
     if zoom != 1:
         cameras = [replace(camera, fov_x=_narrowed(camera.fov_x, zoom)) for camera in cameras]
     scene = _exposed(builder.scene(), 10 ** float(level_rng.uniform(-1.5, 1.5)))

@@ -185,8 +185,8 @@ def rotate(axis: str, degrees: float) -> Array:
 
 def box(center: Vector, size: Vector, material: dict[str, str], turn: float = 0, tilt: float = 0) -> Part:
     """A box of full ``size``, tilted about x, then rotated about y, in degrees."""
-    half = [0.5 * length for length in size]
-    return Part("cube", place(center, turn, half, rotate("x", tilt)), material)
+    half_size = [0.5 * length for length in size]
+    return Part("cube", place(center, turn, half_size, rotate("x", tilt)), material)
 
 
 def ball(center: Vector, radius: float, material: dict[str, str], radiance: Color | None = None) -> Part:
@@ -220,10 +220,10 @@ def plate(center: Vector, radius: float, material: dict[str, str], up: bool = Tr
 
 def sheet(
     center: Vector,
-    half: Vector,
+    half_size: Vector,
     material: dict[str, str],
     rotation: Array,
     radiance: Color | None = None,
 ) -> Part:
     """A rectangle that faces +z before the rotation."""
-    return Part("rectangle", place(center, 0, (*half, 1), rotation), material, radiance)
+    return Part("rectangle", place(center, 0, (*half_size, 1), rotation), material, radiance)

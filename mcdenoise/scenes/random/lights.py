@@ -16,14 +16,14 @@ Rng = np.random.Generator
 _SKY_ROWS = 128
 
 
-def sky(rng: Rng, level: float, sun: Array | None, sun_share: float) -> Array:
+def sky(rng: Rng, level: float, sun: Array | None, sun_ratio: float) -> Array:
     """A lat-long image of a gradient, clouds, a dark ground with a skyline, and a sun.
 
     Args:
         rng: the source of randomness.
         level: mean radiance of the upper half without the sun.
         sun: unit vector towards the sun, if there is one.
-        sun_share: irradiance of the sun relative to that of the sky.
+        sun_ratio: irradiance of the sun relative to that of the sky.
     """
     rows, columns = _SKY_ROWS, 2 * _SKY_ROWS
     polar = (np.arange(rows) + 0.5)[:, None] / rows * math.pi
@@ -55,7 +55,7 @@ def sky(rng: Rng, level: float, sun: Array | None, sun_share: float) -> Array:
         lit = np.argsort(-(direction @ sun), axis=None)[: int(rng.choice([1, 4]))]
         solid = (math.pi / rows) * (2 * math.pi / columns) * np.sin(polar.ravel()[lit // columns])
         warmth = np.array(colorsys.hsv_to_rgb(0.09, rng.uniform(0, 0.6) * (1 - sun[1]), 1))
-        image.reshape(-1, 3)[lit] = sun_share * math.pi * level * warmth / float(solid.sum())
+        image.reshape(-1, 3)[lit] = sun_ratio * math.pi * level * warmth / float(solid.sum())
     return np.asarray(image)
 
 
@@ -106,8 +106,8 @@ def add_lamps(builder: SceneBuilder, rng: Rng, low: Array, high: Array, count: i
     """Add hanging, standing and hidden lamps to a room; together they light its surfaces to about ``brightness``."""
     width, height, depth = high - low
     flux = brightness * math.pi * 2 * (width * height + height * depth + depth * width) * 0.5
-    for share in rng.dirichlet(np.full(count, 1.5)):
-        power = float(flux * share)
+    for fraction in rng.dirichlet(np.full(count, 1.5)):
+        power = float(flux * fraction)
         kind = rng.choice(
             ["panel", "tube", "bulb", "standing", "cove", "spot", "point", "chandelier"],
             p=[0.24, 0.1, 0.2, 0.14, 0.1, 0.1, 0.04, 0.08],
@@ -116,8 +116,8 @@ def add_lamps(builder: SceneBuilder, rng: Rng, low: Array, high: Array, count: i
         color = light_color(rng)
         ceiling = float(high[1])
         if kind == "panel":
-            half = np.exp(rng.uniform(math.log(0.04), math.log(0.5 * min(width, depth) / 2), 2))
-            _panel(builder, (x, ceiling - 0.02, z), (float(half[0]), float(half[1])), power, color)
+            half_size = np.exp(rng.uniform(math.log(0.04), math.log(0.5 * min(width, depth) / 2), 2))
+            _panel(builder, (x, ceiling - 0.02, z), (float(half_size[0]), float(half_size[1])), power, color)
         elif kind == "tube":
             _panel(builder, (x, ceiling - 0.1, z), (0.03, 0.3 * float(depth) / 2), power, color)
         elif kind == "bulb":
@@ -165,19 +165,23 @@ def softbox(builder: SceneBuilder, rng: Rng, origin: Array, target: Array, power
     side /= max(float(np.linalg.norm(side)), 1e-6)
     rotation = np.eye(4)
     rotation[:3, :3] = np.stack((side, np.cross(axis, side), axis), axis=1)
-    half = (size, size * float(rng.uniform(0.3, 1)))
-    radiance = _scaled(color, power / (math.pi * 4 * half[0] * half[1]))
-    builder.add([sheet(origin, half, black, rotation, radiance)])
+    half_size = (size, size * float(rng.uniform(0.3, 1)))
+    radiance = _scaled(color, power / (math.pi * 4 * half_size[0] * half_size[1]))
+    builder.add([sheet(origin, half_size, black, rotation, radiance)])
 
 
 def _panel(
-    builder: SceneBuilder, center: tuple[float, float, float], half: tuple[float, float], power: float, color: Color
+    builder: SceneBuilder,
+    center: tuple[float, float, float],
+    half_size: tuple[float, float],
+    power: float,
+    color: Color,
 ) -> None:
     white = builder.material(diffuse((0.8, 0.8, 0.8)))
-    radiance = _scaled(color, power / (math.pi * 4 * half[0] * half[1]))
-    builder.add([sheet(center, half, white, rotate("x", 90), radiance)])
+    radiance = _scaled(color, power / (math.pi * 4 * half_size[0] * half_size[1]))
+    builder.add([sheet(center, half_size, white, rotate("x", 90), radiance)])
     frame = (center[0], center[1] + 0.012, center[2])
-    builder.add([box(frame, (2 * half[0] + 0.06, 0.02, 2 * half[1] + 0.06), white)])
+    builder.add([box(frame, (2 * half_size[0] + 0.06, 0.02, 2 * half_size[1] + 0.06), white)])
 
 
 def _pendant(
@@ -224,9 +228,9 @@ def _cove(builder: SceneBuilder, rng: Rng, low: Array, high: Array, power: float
     x = float(low[0] if side < 0 else high[0]) - side * 0.12
     y, z = float(high[1]) - 0.35, float(low[2] + high[2]) / 2
     length = 0.85 * float(high[2] - low[2])
-    half = (0.04, length / 2)
-    radiance = _scaled(color, 1.5 * power / (math.pi * 4 * half[0] * half[1]))
-    builder.add([sheet((x, y + 0.03, z), half, white, rotate("x", -90), radiance)])
+    half_size = (0.04, length / 2)
+    radiance = _scaled(color, 1.5 * power / (math.pi * 4 * half_size[0] * half_size[1]))
+    builder.add([sheet((x, y + 0.03, z), half_size, white, rotate("x", -90), radiance)])
     builder.add(
         [box((x, y, z), (0.2, 0.03, length), white), box((x - side * 0.1, y + 0.06, z), (0.02, 0.15, length), white)]
     )

@@ -105,17 +105,17 @@ def _wall_place(builder: SceneBuilder, rng: Rng) -> tuple[Array, float, float]:
 def _wall_mirror(builder: SceneBuilder, rng: Rng) -> None:
     """A mirror on a wall, sometimes slightly rough or tilted, with or without a frame."""
     frame, width, height = _wall_place(builder, rng)
-    half = rng.uniform(0.2, 0.5) * min(width, 3.0), rng.uniform(0.25, 0.42) * min(height, 2.6)
+    half_size = rng.uniform(0.2, 0.5) * min(width, 3.0), rng.uniform(0.25, 0.42) * min(height, 2.6)
     silver = mirror(str(rng.choice(["Ag", "Al"]))) if rng.random() < 0.75 else random_metal(rng)
     tilt = rotate("x", float(rng.uniform(-4, 8)) if rng.random() < 0.4 else 0.0)
-    parts = [sheet((0, 0, 0.06), half, builder.material(silver), tilt)]
+    parts = [sheet((0, 0, 0.06), half_size, builder.material(silver), tilt)]
     if rng.random() < 0.7:
         rim = builder.material(
             lacquer(texture(rng), (1, 1), nonlinear=True) if rng.random() < 0.5 else random_metal(rng)
         )
-        parts.append(box((0, 0, 0.01), (2 * half[0] + 0.1, 2 * half[1] + 0.1, 0.02), rim))
+        parts.append(box((0, 0, 0.01), (2 * half_size[0] + 0.1, 2 * half_size[1] + 0.1, 0.02), rim))
         for side in (-1, 1):
-            parts.append(box((side * (half[0] + 0.03), 0, 0.05), (0.06, 2 * half[1] + 0.1, 0.08), rim))
+            parts.append(box((side * (half_size[0] + 0.03), 0, 0.05), (0.06, 2 * half_size[1] + 0.1, 0.08), rim))
     builder.add(parts, frame)
     _look_at(builder, frame[:3, 3])
 
@@ -123,11 +123,11 @@ def _wall_mirror(builder: SceneBuilder, rng: Rng) -> None:
 def _glass_picture(builder: SceneBuilder, rng: Rng) -> None:
     """A large textured panel on a wall behind glass."""
     frame, width, height = _wall_place(builder, rng)
-    half = rng.uniform(0.2, 0.4) * min(width, 3.0), rng.uniform(0.2, 0.4) * min(height, 2.6)
+    half_size = rng.uniform(0.2, 0.4) * min(width, 3.0), rng.uniform(0.2, 0.4) * min(height, 2.6)
     image = builder.material(diffuse(_contrast(rng, texture(rng))))
     parts = [
-        sheet((0, 0, 0.03), half, image, np.eye(4)),
-        sheet((0, 0, float(rng.uniform(0.05, 0.3))), half, builder.material(pane()), np.eye(4)),
+        sheet((0, 0, 0.03), half_size, image, np.eye(4)),
+        sheet((0, 0, float(rng.uniform(0.05, 0.3))), half_size, builder.material(pane()), np.eye(4)),
     ]
     builder.add(parts, frame)
     _look_at(builder, frame[:3, 3])

@@ -22,10 +22,10 @@ _Value = TypeVar("_Value")
 # Minimum ratio of reference samples to noisy samples: a reference with nearly the same noise would teach nothing.
 CLEANER = 4
 _STREAM = 101
-_CENTRE_SHARE = 1 / 3
+_CENTRE_FRACTION = 1 / 3
 _FILTERS = {"box": 0.5, "gaussian": 0.25, "tent": 0.1, "mitchell": 0.15}
 _SAMPLES = {1: 0.5, 2: 0.14, 4: 0.14, 8: 0.1, 16: 0.08, 32: 0.025, 64: 0.015}
-_LENS_SHARE = 0.2
+_LENS_FRACTION = 0.2
 # Blur in pixels of a point at twice the focus distance.
 _BLUR = (1.0, 8.0)
 
@@ -93,14 +93,14 @@ def _take(
     name: str, made: RandomScene, rng: np.random.Generator, sampling: Sampling, spp: int | None, width: int
 ) -> Take:
     # Draw all values, used or not, so that one option does not change what another option draws.
-    centre, drawn = rng.random() < _CENTRE_SHARE, _draw(rng, _SAMPLES)
+    centre, drawn = rng.random() < _CENTRE_FRACTION, _draw(rng, _SAMPLES)
     film = _film(rng, made.cameras[0], made.focus, width)
     filtered = sampling == "filtered" or (sampling == "mixed" and not centre)
     return Take(name, made, film if filtered else None, drawn if spp is None else spp)
 
 
 def _film(rng: np.random.Generator, camera: Camera, focus: float, width: int) -> Film:
-    name, lens, blur = _draw(rng, _FILTERS), rng.random() < _LENS_SHARE, math.exp(rng.uniform(*np.log(_BLUR)))
+    name, lens, blur = _draw(rng, _FILTERS), rng.random() < _LENS_FRACTION, math.exp(rng.uniform(*np.log(_BLUR)))
     if not lens:
         return Film(name)
     pixel = 2 * focus * math.tan(math.radians(camera.fov_x) / 2) / width
