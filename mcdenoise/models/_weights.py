@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import operator
 from pathlib import Path
 from typing import Any
 
@@ -123,33 +124,42 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
     return model.eval() if isinstance(model, nn.Module) else model
 
 
-def start_with(model: Model, name: str) -> str:
-    """Copy the shipped weights of another model to the layers of the same names.
+def start_with(model: Model, name: str, **settings: Any) -> str:
+    """Copy the weights of another model to the layers of the same names.
+
+    A layer may have more channels than the other model's: its first channels then take the weights, and the rest start
+    with zeros, so that they have no effect at first.
 
     Args:
         model: changed in place; its other layers keep their weights.
-        name: a model with shipped weights.
+        name: a model with shipped weights, or one that brings its own, such as ``oidn_open``.
+        settings: arguments for its constructor.
 
     Returns:
         The checksum of the other model's weights.
 
     Raises:
-        InputError: there are no shipped weights of this name, or a layer of theirs is missing or has another shape.
+        InputError: there are no weights of this name, a layer of theirs is missing or smaller, or a package that the
+            other model needs is missing.
     """
-    path = find_weights(name)
-    if path is None:
-        raise InputError(f"start_from: expected a model with shipped weights, found '{name}'")
+    try:
+        other = create_model(name, pretrained=True, **settings)
+    except InputError as error:
+        raise InputError(f"start_from: {error}") from error
     own = _named(model)
-    for key, tensor in _named(load_weights(path)).items():
-        # Ranges are of the integer version, which is calibrated after the training.
-        if key.endswith(".ranges"):
-            continue
-        if key not in own or own[key].shape != tensor.shape:
-            found = "no such layer" if key not in own else f"shape {tuple(own[key].shape)}"
+    # Ranges are of the integer version, which is calibrated after the training.
+    tensors = {key: tensor for key, tensor in _named(other).items() if not key.endswith(".ranges")}
+    if not tensors:
+        raise InputError(f"start_from: expected a model with weights, found '{name}'")
+    for key, tensor in tensors.items():
+        shape = own[key].shape if key in own else ()
+        if len(shape) != tensor.dim() or any(map(operator.lt, shape, tensor.shape)):
+            found = f"shape {tuple(shape)}" if key in own else "no such layer"
             raise InputError(f"start_from: expected layer '{key}' of '{name}', {tuple(tensor.shape)}, found {found}")
         with torch.no_grad():
-            own[key].copy_(tensor)
-    return str(describe_weights(path)["sha256"])
+            own[key].zero_()[tuple(map(slice, tensor.shape))].copy_(tensor)
+    shipped = find_weights(name)
+    return _digest(tensors) if shipped is None else str(describe_weights(shipped)["sha256"])
 
 
 def describe_weights(path: Path) -> dict[str, Any]:

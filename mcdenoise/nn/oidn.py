@@ -62,12 +62,13 @@ class OidnUNet(nn.Module):
     Args:
         in_channels: number of input channels: 3 color, 3 albedo and 3 normal in the library.
         size: size in the library: "small" has 62 thousand multiply-adds per pixel, "base" 125, "large" 312.
+        out_channels: number of output channels: 3 in the library.
 
     Raises:
         ValueError: there is no such size.
     """
 
-    def __init__(self, in_channels: int = 9, size: Size = "base") -> None:
+    def __init__(self, in_channels: int = 9, size: Size = "base", out_channels: int = _COLORS) -> None:
         super().__init__()
         if size not in _SIZES:
             raise ValueError(f"size: expected one of {', '.join(get_args(Size))}, found '{size}'")
@@ -79,7 +80,7 @@ class OidnUNet(nn.Module):
         coarser = [encoder[-1][-1], *(widths[-1] for widths in decoder[:-1])]
         entering = [below + skip for below, skip in zip(coarser, skips, strict=True)]
         self.decoder = nn.ModuleList(itertools.starmap(_block, zip(entering, decoder, strict=True)))
-        self.last = nn.Conv2d(decoder[-1][-1], _COLORS, 3, padding=1)
+        self.last = nn.Conv2d(decoder[-1][-1], out_channels, 3, padding=1)
 
     @property
     def convolutions(self) -> list[nn.Conv2d]:
@@ -115,7 +116,8 @@ class OidnUNet(nn.Module):
             x: ``(B, in_channels, H, W)``.
 
         Returns:
-            ``(B, 3, H, W)``.
+            ``(B, out_channels, H, W)``, at least in float32: on a logarithmic scale of radiance, half a percent is less
+            than bfloat16 resolves.
         """
         height, width = x.shape[-2:]
         x = F.pad(x, (0, -width % _MULTIPLE, 0, -height % _MULTIPLE)).contiguous(memory_format=torch.channels_last)
@@ -130,7 +132,9 @@ class OidnUNet(nn.Module):
         for block in self.decoder:
             skip = skips.pop()
             x = block(torch.cat([F.interpolate(x, scale_factor=2.0), skip.to(x.dtype)], 1))
-        return corner(self.last(x), height, width)
+        with torch.autocast(x.device.type, enabled=False):
+            x = self.last(x.to(self.last.weight.dtype))
+        return corner(x, height, width)
 
 
 def _block(in_channels: int, widths: tuple[int, ...]) -> ConvBlock:

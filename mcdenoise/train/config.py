@@ -29,8 +29,8 @@ class TrainConfig:
         settings: arguments of the model's constructor, such as width=16,cascade=K+P.
         width: feature channels, the same as in the settings; 0 takes the model's default, or that of the initial
             weights.
-        start_from: a model with shipped weights, which the layers of the same names start with; all by default start
-            with random weights.
+        start_from: a model with weights, which the layers of the same names start with, such as cascaded_v2 or
+            oidn_open(quality=fast); all by default start with random weights.
         losses: weights of the result and of intermediate stages in the loss, such as image=1,initial=0.5; by default 1
             for the result and for the stage initial, if the model has one.
         loss: loss of a clip, see :data:`mcdenoise.train.losses.LOSSES`: smape, the paper's; l1_display, that of Meng et

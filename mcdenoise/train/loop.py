@@ -20,6 +20,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
+from mcdenoise.methods import parse_method
 from mcdenoise.models import (
     CoarseToFine,
     Model,
@@ -124,7 +125,8 @@ def train(
     if config.start_from:
         if initial_weights is not None:
             raise InputError("start_from: expected none beside initial weights, found both; leave one out")
-        start["sha256"] = start_with(network, config.start_from)
+        method = parse_method(config.start_from)
+        start["sha256"] = start_with(network, method.model, **method.settings)
     front, rest = split(network)
     if config.keep_fireflies and not front.accumulates:
         raise InputError("keep_fireflies: expected a model that begins with Accumulated, found another")

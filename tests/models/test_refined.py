@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor, nn
+from toys import frame_of, refused
 
 from mcdenoise.frame import Frame, Skip
 from mcdenoise.models import Needs, Output, State, create_model, start_with
 from mcdenoise.models.refined import _TAPS, Refined
-from toys import frame_of, refused
 
 SIZE = (26, 38)
 

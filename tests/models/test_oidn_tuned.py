@@ -1,0 +1,113 @@
+"""The equations of ``oidn_tuned``; what every model promises is tested in test_models.py."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import pytest
+import torch
+from toys import frame_of, refused
+
+from mcdenoise.frame import Frame
+from mcdenoise.models import create_model, start_with
+from mcdenoise.models.oidn_tuned import _LOGITS, TunedNetwork
+from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
+from mcdenoise.nn.oidn import compress, expand, oidn_exposure
+
+SIZE = (26, 38)
+has_oidn = pytest.mark.skipif(
+    importlib.util.find_spec("pyoidn") is None, reason="Open Image Denoise is in the extra mcdenoise[oidn]"
+)
+
+
+def network(own: float, logits: tuple[float, ...]) -> TunedNetwork:
+    """A network in float64 that predicts the same image and the same logits for every pixel."""
+    made = TunedNetwork("small").double().eval()
+    predicted = [own] * 3 + [a - b for a, b in zip(logits, _LOGITS, strict=True)]
+    with torch.no_grad():
+        made.unet.last.weight.zero_()
+        made.unet.last.bias.copy_(torch.tensor(predicted, dtype=torch.float64))
+    return made
+
+
+def given(weight: float) -> Frame:
+    """A frame with a previous result in both forms, of which this fraction shows the same surface."""
+    frame = frame_of(*SIZE).to(torch.float64)
+    draws = torch.Generator().manual_seed(1)
+    before, light = (torch.rand(1, 3, *SIZE, generator=draws, dtype=torch.float64) for _ in range(2))
+    valid = torch.full((1, 1, *SIZE), weight, dtype=torch.float64)
+    return frame.replace(extra={PREVIOUS: before, PREVIOUS_LIGHT: light, PREVIOUS_WEIGHT: valid})
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.3, 1.0])
+def test_the_image_is_the_weighted_mean_of_four_images(weight: float) -> None:
+    logits, frame = (0.4, -0.2, 0.1, -0.5), given(weight)
+    image = network(0.31, logits)(frame)[0].image
+    exposure = oidn_exposure(frame.color)
+    valid = torch.tensor([1.0, weight, weight, 1.0], dtype=torch.float64)
+    parts = torch.softmax(torch.tensor(logits, dtype=torch.float64), 0) * valid
+    parts /= parts.sum()
+    others = [compress(each * exposure) for each in (frame.extra[PREVIOUS], frame.extra[PREVIOUS_LIGHT], frame.color)]
+    expected = parts[0] * 0.31 + parts[1] * others[0] + parts[2] * others[1] + parts[3] * others[2]
+    torch.testing.assert_close(image, expand(expected) / exposure, rtol=1e-12, atol=1e-12)
+
+
+def test_it_returns_a_clean_input_where_it_trusts_the_pixels() -> None:
+    frame = given(1.0)
+    image = network(0.9, (-1e3, -1e3, -1e3, 1e3))(frame)[0].image
+    # Continuous, though not to rounding, where the parts of the transfer function meet.
+    torch.testing.assert_close(image, frame.color, rtol=2e-4, atol=1e-9)
+
+
+def test_before_the_first_frame_there_is_nothing_to_blend_with() -> None:
+    frame = given(0.0)
+    model = network(0.31, (0.0, 9.0, 9.0, -1e3))
+    torch.testing.assert_close(model(frame)[0].image, model(frame.replace(extra={}))[0].image, rtol=1e-12, atol=0)
+
+
+def test_features_may_be_missing() -> None:
+    frame = given(1.0)
+    flat = frame.replace(albedo=torch.ones_like(frame.color), normal=torch.zeros_like(frame.color))
+    model = TunedNetwork("small").double().eval()
+    expected = model(flat)[0].image
+    assert torch.equal(model(frame.replace(albedo=None, normal=None))[0].image, expected)
+    assert not torch.equal(model(frame)[0].image, expected)
+
+
+@has_oidn
+@pytest.mark.parametrize(("name", "quality"), [("oidn_tuned", "balanced"), ("oidn_tuned_small", "fast")])
+def test_it_starts_as_the_library(name: str, quality: str) -> None:
+    model, library = create_model(name), create_model("oidn_open", quality=quality)
+    assert len(start_with(model, "oidn_open", quality=quality)) == 64
+    frame = frame_of(48, 64)
+    with torch.no_grad():
+        image, expected = model(frame)[0].image, library(frame)[0].image
+    # The noisy pixels have a weight of e^-7 / (1 + e^-7), on a scale from 0 to 1.
+    exposure = oidn_exposure(frame.color)
+    difference = (compress(image * exposure) - compress(expected * exposure)).abs().max()
+    assert 0 < float(difference) < 1e-3
+
+
+@has_oidn
+def test_it_refuses_to_start_with_a_larger_network() -> None:
+    message = refused(lambda: start_with(create_model("oidn_tuned_small"), "oidn_open"))
+    assert message.startswith(
+        "start_from: expected layer 'unet.encoder.1.0.weight' of 'oidn_open', (48, 32, 3, 3), found"
+    )
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.6])
+def test_derivatives(weight: float) -> None:
+    torch.manual_seed(0)
+    frame = given(weight)
+    model = TunedNetwork("small").double().eval()
+    color = frame.color[..., :16, :16].clone().requires_grad_()
+    cut = frame.crop(slice(0, 16), slice(0, 16))
+    statistics = model.statistics(cut)
+
+    def run(color: torch.Tensor) -> torch.Tensor:
+        return model(cut.replace(color=color, statistics=statistics))[0].image
+
+    assert torch.autograd.gradcheck(run, (color,), fast_mode=True)
+    run(color).sum().backward()
+    assert all(weight.grad is not None and weight.grad.isfinite().all() for weight in model.parameters())
