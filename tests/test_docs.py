@@ -124,6 +124,15 @@ def test_every_operator_is_in_the_table_of_kornia_and_every_function_there_exist
             assert re.search(rf"\b{name}\(", tests), name
 
 
+def test_each_version_of_the_changelog_has_its_sections_once_and_in_order() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text()
+    versions = re.split(r"^## ", text, flags=re.MULTILINE)[1:]
+    assert versions[0].startswith("[Unreleased]")
+    for version in versions:
+        sections = re.findall(r"^### (\w+)$", version, re.MULTILINE)
+        assert sections == [name for name in ("Added", "Changed", "Fixed", "Removed") if name in sections]
+
+
 def test_words_of_the_glossary_stand_in_order() -> None:
     words = re.findall(r"^\| (?!word|-)(.+?) \|", (DOCS / "glossary.md").read_text(), re.MULTILINE)
     assert len(words) > 40
