@@ -188,7 +188,7 @@ def table_2(measured: Measured) -> Table:
     torch.manual_seed(0)
     channels = {"color": 3, "albedo": 3, "normal": 3, "depth": 1}
     frame = Frame(**{name: torch.rand(1, count, *size) for name, count in channels.items()})
-    found = Table([["method", "milliseconds at 1280x720", "quartiles", "convolutions", "all else"]])
+    found = Table([["method", "milliseconds at 1280x720", "quartiles", "convolutions", "rest"]])
     models: dict[str, Any] = {}
     for name, (model, settings) in _timed().items():
         try:
