@@ -30,7 +30,7 @@ FRAMES = 16
 SIZE = (320, 180)
 REFERENCE_SPP = 128
 REFERENCE_FRAMES = (14, 15)
-# Where the picture looks closer: left, top, width and height in parts of the image.
+# The close-ups of the picture: left, top, width and height as fractions of the image.
 _CLOSE_UP = (0.42, 0.40, 0.25, 0.25)
 
 

@@ -68,6 +68,19 @@ def test_no_file_names_a_path_of_one_machine(files: list[Path]) -> None:
     assert not found, "\n".join(found)
 
 
+def test_no_docstring_or_comment_lacks_its_subject(files: list[Path]) -> None:
+    """A text such as "Of each image, ..." or "What it does" does not name the thing that it describes."""
+    pattern = re.compile(r'("""|# )(Of|What|With what) ')
+    found = [
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()[:160]}"
+        for path in files
+        if path.suffix == ".py" and not path.relative_to(ROOT).as_posix().startswith("tests/")
+        for number, line in enumerate(text_of(path).splitlines(), start=1)
+        if pattern.search(line)
+    ]
+    assert not found, "\n".join(found)
+
+
 @pytest.mark.parametrize("words", PRIVATE_WORDS)
 def test_no_private_words(files: list[Path], words: str) -> None:
     pattern = re.compile(rf"\b(?:{words})\b", re.IGNORECASE)

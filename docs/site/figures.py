@@ -1,4 +1,4 @@
-"""What operators do to an image: each figure is drawn when the site is made, from one small picture.
+"""Figures of the effect of operators on an image, drawn from one small picture when the site is made.
 
 The picture has two walls, a chequered floor and a ball, in uniform light; every pixel has one sample of noise.
 """

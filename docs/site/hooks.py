@@ -1,4 +1,4 @@
-"""What `make docs` adds to the pages of docs/: generated pages, and links that stay within the site.
+"""Hooks of `make docs`, which add generated pages to those of docs/, and keep links within the site.
 
 A page for each method comes from the register of models, one for each operator from its docstring, one for each example
 from its source, and those of the repository's root are pages of the site, too.
@@ -60,7 +60,7 @@ def on_files(files: Files, config: Any) -> Files:
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
     """Lead links that leave docs/ to the pages that stand for their targets."""
     sources = {place: source for source, place in MOVED.items()}
-    # Where the text is in the repository, as seen from its root.
+    # Place of the text, relative to the root of the repository.
     own = Path(sources.get(page.file.src_uri, f"docs/{page.file.src_uri}"))
 
     def lead(match: re.Match[str]) -> str:

@@ -211,7 +211,7 @@ def sources(module: str) -> list[str]:
 
 
 def trained(entry: ModelOverview) -> str:
-    """What the header of the weights says of their making."""
+    """The text about the training of weights, from their header."""
     if entry.weights not in ("shipped", "compared"):
         return ""
     folder = Path(mcdenoise.models.__file__).parent / "weights" / ("compared" if entry.weights == "compared" else "")

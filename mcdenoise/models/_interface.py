@@ -36,7 +36,7 @@ class Output(NamedTuple):
 
 @dataclass(frozen=True)
 class Needs:
-    """What a method requires of its frames and its host.
+    """The requirements of a method for its frames and its host.
 
     Args:
         buffers: names of the required buffers, see :data:`mcdenoise.frame.BUFFERS`.

@@ -26,7 +26,7 @@ PLOTS = "plots"
 _PICTURE_BUDGET = 20_000_000
 # Beyond this many pixels even coarse JPEG does not fit: then the pictures are made smaller.
 _MOST_PIXELS = 60_000_000
-# Where the heat map of SMAPE ends; larger errors look the same.
+# The end of the heat map of SMAPE; larger errors look the same.
 _HEAT_END = 0.5
 # In place of a figure that is not known.
 _UNKNOWN = "\N{EN DASH}"

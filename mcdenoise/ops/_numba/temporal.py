@@ -74,7 +74,7 @@ def _motion(motion: Any, position: Any, matrices: Any, b: int, first: int, last:
 
 
 class Shorter(NamedTuple):
-    """Where a history is to be shorter, see :func:`mcdenoise.ops._steps.history.blend`.
+    """The settings that shorten histories, see :func:`mcdenoise.ops._steps.history.blend`.
 
     Args:
         recent_alpha: smallest weight of the current frame in a second, shorter history of the first channels.
