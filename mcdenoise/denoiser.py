@@ -27,6 +27,7 @@ from mcdenoise.models import (
     computing_in,
     create_model,
     fastest_precision,
+    has_network,
     listening,
     quantize,
     timed,
@@ -159,7 +160,7 @@ class Denoiser:
             return Chosen("float32", "derivatives are wanted")
         if not of_zoo:
             return Chosen("float32", "what bfloat16 rounds in a model of your own is for you to judge")
-        return fastest_precision(self.device) if self.model.needs.trainable else Chosen("float32", "nothing is learnt")
+        return fastest_precision(self.device) if has_network(self.model) else Chosen("float32", "nothing is learnt")
 
     def reset(
         self,

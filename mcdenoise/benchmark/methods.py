@@ -19,6 +19,7 @@ from mcdenoise.models import (
     PRECISIONS,
     Output,
     Skipping,
+    has_network,
     list_models,
     parts_of,
     precisions_of,
@@ -172,7 +173,7 @@ def one_line(error: BaseException) -> str:
 
 def _variants(method: Method, model: Any, precisions: list[str], keep_all: bool) -> Iterator[Method]:
     """A model in each of the precisions that it has, and also without skipping if it skips work and this is wanted."""
-    if not model.needs.trainable:
+    if not has_network(model):
         yield method
         return
     weights = sum(parameter.numel() for parameter in model.parameters()) if isinstance(model, nn.Module) else None

@@ -13,6 +13,7 @@ from mcdenoise.models._precision import (
     calibrating,
     computing_in,
     fastest_precision,
+    has_network,
     precisions_of,
     quantize,
 )
@@ -78,6 +79,7 @@ __all__ = [
     "find_model",
     "find_weights",
     "frames_remembered",
+    "has_network",
     "list_models",
     "listening",
     "load_weights",

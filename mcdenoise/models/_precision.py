@@ -21,6 +21,7 @@ from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.models._wrapper import parts_of
 from mcdenoise.nn import UNet
 from mcdenoise.nn.int8 import has_int8, integers
+from mcdenoise.nn.oidn import OidnUNet
 from mcdenoise.reading import read_text
 from mcdenoise.user_cache import cache_file, keep
 
@@ -67,6 +68,11 @@ def fastest_precision(device: torch.device) -> Chosen:
         keep(cache, json.dumps({**ratios, key: ratio}, indent=1) + "\n")
     precision: Precision = "bfloat16" if ratio >= _WORTH else "float32"
     return Chosen(precision, f"a convolution in bfloat16 takes {1 / ratio:.2f} of the time in float32 here")
+
+
+def has_network(model: Model) -> bool:
+    """Whether a model has convolutions of its own: those that it is trained with, or those of Open Image Denoise."""
+    return model.needs.trainable or any(True for _ in parts_of(model, OidnUNet))
 
 
 def precisions_of(model: Model) -> tuple[Precision, ...]:

@@ -97,7 +97,7 @@ class Oidn:
         if auxiliary == "prefiltered":
             frame = self.with_clean_features(frame, "high")
         with timed("network", frame.color.device), torch.no_grad():
-            image = self._run({"color": frame.color, **_guides(frame)}, self.quality, clean=auxiliary != "noisy")
+            image = self.filtered({"color": frame.color, **guides_of(frame)}, self.quality, clean=auxiliary != "noisy")
         return image.to(frame.color.dtype)
 
     def with_clean_features(self, frame: Frame, quality: Quality) -> Frame:
@@ -111,11 +111,25 @@ class Oidn:
             RuntimeError: the library reports an error; the message is the library's.
         """
         with timed("network", frame.color.device), torch.no_grad():
-            clean = {name: self._run({name: image}, quality, clean=False) for name, image in _guides(frame).items()}
+            clean = {
+                name: self.filtered({name: image}, quality, clean=False) for name, image in guides_of(frame).items()
+            }
         return frame.replace(**{name: image.to(getattr(frame, name).dtype) for name, image in clean.items()})
 
-    def _run(self, images: dict[str, Tensor], quality: Quality, *, clean: bool) -> Tensor:
-        """Run the filter for the given images ``(B, 3, H, W)``, one image of the batch at a time."""
+    def filtered(self, images: dict[str, Tensor], quality: Quality, *, clean: bool) -> Tensor:
+        """Run the library's filter, one image of the batch at a time.
+
+        Args:
+            images: ``(B, 3, H, W)`` each: color with or without features, or a single feature.
+            quality: see the class.
+            clean: whether the features of a color count as clean.
+
+        Returns:
+            ``(B, 3, H, W)`` float32: the filtered color or feature.
+
+        Raises:
+            RuntimeError: the library reports an error; the message is the library's.
+        """
         first = next(iter(images.values()))
         batch, _, height, width = first.shape
         self._resize(height, width)
@@ -191,7 +205,7 @@ def oidn(
     return denoiser
 
 
-def _guides(frame: Frame) -> dict[str, Tensor]:
+def guides_of(frame: Frame) -> dict[str, Tensor]:
     """The features that the library accepts; a normal only together with an albedo."""
     given = {"albedo": frame.albedo, "normal": frame.normal if frame.albedo is not None else None}
     return {name: image for name, image in given.items() if image is not None}

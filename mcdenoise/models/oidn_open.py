@@ -1,4 +1,4 @@
-"""The method ``oidn_open``: Open Image Denoise's network in torch. It has derivatives, any device, and can be trained.
+"""The method ``oidn_open``: Open Image Denoise's networks in torch, with derivatives, on any device, trainable.
 
 The weights come from the user's installation: from the library of the optional package pyoidn, or from an archive
 (``.tza``) as exported by the library's training scripts. The result equals the library's up to rounding.
@@ -7,8 +7,9 @@ The weights come from the user's installation: from the library of the optional 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,15 +17,16 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._contract import check_needs
-from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._journal import timed
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._tza import Archive, archives_in, read_tza
-from mcdenoise.models.oidn import Auxiliary, Oidn, Quality, library_of_oidn
+from mcdenoise.models.oidn import Auxiliary, Oidn, Quality, guides_of, library_of_oidn
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, compress, expand, oidn_exposure
 
-_CHANNELS = 9  # color, albedo, normal
+_FEATURES = ("albedo", "normal")
+_IMAGES = ("color", *_FEATURES)
 _PROBE = 48  # side of the test image that identifies the library's weights
 _CLOSE = 1e-2  # largest difference for the right weights; measured: 2e-5, and 1.4 for others
 
@@ -34,16 +36,18 @@ class OidnOpen(nn.Module):
 
     Args:
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
+        features: the features that it takes: none, albedo, or albedo and normal.
     """
 
-    def __init__(self, size: Size = "base") -> None:
+    def __init__(self, size: Size = "base", features: Sequence[str] = _FEATURES) -> None:
         super().__init__()
-        self.unet = OidnUNet(_CHANNELS, size)
+        self.features = tuple(features)
+        self.unet = OidnUNet(3 + 3 * len(self.features), size)
 
     @property
     def needs(self) -> Needs:
-        """Needs color, albedo and normal. It comes with weights, which can be trained further."""
-        buffers = frozenset({"color", "albedo", "normal"})
+        """Needs color and its features. It comes with weights, which can be trained further."""
+        buffers = frozenset({"color", *self.features})
         return Needs(buffers, trainable=False, reach=self.unet.reach, stride=self.unet.multiple)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
@@ -57,16 +61,15 @@ class OidnOpen(nn.Module):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         check_needs(self.needs, frame.buffers)
-        assert frame.albedo is not None
-        assert frame.normal is not None
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
         with timed("network", frame.color.device):
-            seen = seen_by_oidn(frame.color * exposure, frame.albedo, frame.normal)
+            features = {name: frame.buffer(name) for name in self.features}
+            seen = seen_by_oidn(frame.color * exposure, **features)
             image = expand(self.unet(seen).to(exposure.dtype)) / exposure
         return Output(image.to(frame.color.dtype)), None
 
 
-def seen_by_oidn(color: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+def seen_by_oidn(color: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None) -> Tensor:
     """The network's input.
 
     Args:
@@ -75,9 +78,12 @@ def seen_by_oidn(color: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
         normal: ``(B, 3, H, W)`` in [-1, 1], in world or camera space.
 
     Returns:
-        ``(B, 9, H, W)``, in [0, 1].
+        ``(B, 9, H, W)``, in [0, 1]; without a feature 3 channels fewer.
     """
-    return torch.cat([compress(color), albedo.clamp(0, 1), normal.clamp(-1, 1) * 0.5 + 0.5], 1)
+    images = [compress(color)]
+    images += [] if albedo is None else [albedo.clamp(0, 1)]
+    images += [] if normal is None else [normal.clamp(-1, 1) * 0.5 + 0.5]
+    return torch.cat(images, 1)
 
 
 def load_archive(unet: OidnUNet, archive: Archive, where: str) -> None:
@@ -99,38 +105,128 @@ def load_archive(unet: OidnUNet, archive: Archive, where: str) -> None:
             layer.bias.copy_(archive[f"{name}.bias"])  # type: ignore[union-attr]
 
 
-def _size(quality: Quality, *, clean: bool) -> Size:
-    """The network that the library uses for these settings."""
-    return "small" if quality == "fast" else "large" if quality == "high" and clean else "base"
+class FeatureFilter(nn.Module):
+    """The network for a single feature, from noisy to clean.
+
+    Args:
+        name: "albedo" or "normal".
+        size: see :class:`mcdenoise.nn.oidn.OidnUNet`; the library has "base" and "large".
+    """
+
+    def __init__(self, name: str, size: Size = "base") -> None:
+        super().__init__()
+        self.name = name
+        self.unet = OidnUNet(3, size)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Filter ``(B, 3, H, W)``: an albedo on the scale of sRGB, a normal from -1 to 1."""
+        # All of kornia comes with it, which takes as long to import as a single frame to denoise.
+        from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+
+        if self.name == "albedo":
+            clean: Tensor = rgb_to_linear_rgb(self.unet(linear_rgb_to_rgb(image.clamp(0, 1))).clamp(0, 1))
+        else:
+            clean = 2 * self.unet(image.clamp(-1, 1) * 0.5 + 0.5).clamp(0, 1) - 1
+        return clean.to(image.dtype)
+
+
+class OpenFilters(nn.Module):
+    """The library's filters in torch, with the methods of :class:`mcdenoise.models.oidn.Oidn` that other methods call.
+
+    They take half the time in bfloat16 where a processor has it. Their weights are the library's and are not part of a
+    method's own. Networks for frames without features are made when they are first needed.
+
+    Args:
+        quality: see :class:`mcdenoise.models.oidn.Oidn`.
+        clean: whether features will be denoised and then taken as clean.
+
+    Raises:
+        InputError: see :func:`archive_of_library`.
+    """
+
+    def __init__(self, quality: Quality = "high", *, clean: bool = True) -> None:
+        super().__init__()
+        self.quality = quality
+        self.networks = nn.ModuleDict()
+        self._network(_IMAGES, quality, clean=False)
+        if clean:
+            self._network(_IMAGES, quality, clean=True)
+            for name in _FEATURES:
+                self._network((name,), "fast", clean=False)
+
+    def state_dict(self, *args: Any, destination: Any = None, prefix: str = "", keep_vars: bool = False) -> Any:
+        """Nothing: the library has the weights."""
+        return {} if destination is None else destination
+
+    @property
+    def needs(self) -> Needs:
+        """Needs color; uses albedo and normal."""
+        return Needs(uses=frozenset(_FEATURES), trainable=False)
+
+    def denoised(self, frame: Frame, auxiliary: Auxiliary) -> Tensor:
+        """The denoised color ``(B, 3, H, W)``, see :meth:`mcdenoise.models.oidn.Oidn.denoised`."""
+        network = self._network(("color", *guides_of(frame)), self.quality, clean=auxiliary != "noisy").to(
+            frame.color.device
+        )
+        image: Tensor = network(prepared(network, frame.replace(statistics={}, skip=None, layers={})))[0].image
+        return image
+
+    def with_clean_features(self, frame: Frame, quality: Quality) -> Frame:
+        """The frame with denoised features, see :meth:`mcdenoise.models.oidn.Oidn.with_clean_features`."""
+        with timed("network", frame.color.device):
+            guides = guides_of(frame).items()
+            clean = {
+                name: self._network((name,), quality, clean=False).to(image.device)(image) for name, image in guides
+            }
+        return frame.replace(**clean)
+
+    def _network(self, images: tuple[str, ...], quality: Quality, *, clean: bool) -> Any:
+        key = "-".join([*images, quality, str(clean)])
+        if key not in self.networks:
+            made = _made(images, quality, clean)
+            load_archive(made.unet, archive_of_library(quality, "clean" if clean else "noisy", images), "pyoidn")
+            made.eval().requires_grad_(False)
+            self.networks[key] = Tiled(made) if isinstance(made, OidnOpen) else made
+        return self.networks[key]
+
+
+def _made(images: Sequence[str], quality: Quality, clean: bool) -> OidnOpen | FeatureFilter:
+    """The network that the library uses for these images, without its weights."""
+    if images[0] != "color":
+        return FeatureFilter(images[0], "large" if quality == "high" else "base")
+    return OidnOpen("small" if quality == "fast" else "large" if quality == "high" and clean else "base", images[1:])
 
 
 @functools.cache
-def archive_of_library(quality: Quality = "high", auxiliary: Auxiliary = "noisy") -> Archive:
-    """The weights that the installed library uses for HDR color with albedo and normal.
+def archive_of_library(
+    quality: Quality = "high", auxiliary: Auxiliary = "noisy", images: tuple[str, ...] = _IMAGES
+) -> Archive:
+    """The weights that the installed library uses for HDR color with these features, or for a single feature.
 
     The library contains them without names; they are identified by comparing a denoised image with the library's own.
 
     Args:
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
         auxiliary: likewise; "prefiltered" uses the weights of "clean".
+        images: names of the images: color, and its features if there are any; or albedo or normal alone.
 
     Raises:
         InputError: the package ``pyoidn`` is not installed, or its library has no such weights.
     """
     clean = auxiliary != "noisy"
     generator = torch.Generator().manual_seed(0)
-    color, albedo, normal = (torch.rand(1, 3, _PROBE, _PROBE, generator=generator) for _ in range(3))
-    frame = Frame(color=color, albedo=albedo, normal=normal)
-    wanted = Oidn(quality, "clean" if clean else "noisy", threads=1)(frame)[0].image
-    path, model = library_of_oidn(), OidnOpen(_size(quality, clean=clean)).eval()
+    probe: dict[str, Any] = {name: torch.rand(1, 3, _PROBE, _PROBE, generator=generator) for name in images}
+    wanted = Oidn(quality, threads=1).filtered(probe, quality, clean=clean)
+    path, model = library_of_oidn(), _made(images, quality, clean).eval()
     for archive in archives_in(path):
         try:
             load_archive(model.unet, archive, str(path))
         except InputError:
             continue
-        with torch.no_grad():
-            if float((model(frame)[0].image - wanted).abs().max()) < _CLOSE:
-                return archive
+        with torch.no_grad(), torch.autocast("cpu", enabled=False):
+            found = model(Frame(**probe))[0].image if "color" in images else model(*probe.values())
+        if float((found - wanted).abs().max()) < _CLOSE:
+            return archive
     raise InputError(f"{path}: expected the weights that the library denoises with, found none")
 
 
@@ -148,7 +244,8 @@ def oidn_open(*, quality: Quality = "high", auxiliary: Auxiliary = "noisy", arch
     """
     if auxiliary == "prefiltered":
         raise InputError("auxiliary: expected noisy or clean, found 'prefiltered'")
-    model = OidnOpen(_size(quality, clean=auxiliary == "clean"))
+    model = _made(_IMAGES, quality, auxiliary == "clean")
+    assert isinstance(model, OidnOpen)
     weights = archive_of_library(quality, auxiliary) if archive is None else read_tza(Path(archive))
     load_archive(model.unet, weights, str(archive or "pyoidn"))
     return Tiled(model)

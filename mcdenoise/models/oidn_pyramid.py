@@ -17,7 +17,7 @@ from mcdenoise.models.pyramid import PyramidNetwork, widths_of
 from mcdenoise.models.recurrent import Recurrent
 from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.models.with_oidn import OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
+from mcdenoise.models.with_oidn import OIDN, OIDN_ALBEDO, OIDN_CLEAN, Engine, WithOidn
 
 
 @register_model("oidn_pyramid", kind="peer", paper="after Zheng et al. 2021", requires="pyoidn")
@@ -27,6 +27,7 @@ def oidn_pyramid(
     *,
     quality: Quality = "high",
     threads: int | None = None,
+    engine: Engine = "library",
     history: float = 4.0,
 ) -> Model:
     """Combine Open Image Denoise (optional package pyoidn) with a network on the noisy pixels, and stabilize over time.
@@ -36,6 +37,7 @@ def oidn_pyramid(
         kernel_size: side of the network's kernels.
         quality: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         threads: likewise.
+        engine: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         history: see :class:`mcdenoise.models.steadied.Steadied`.
 
     Raises:
@@ -43,4 +45,4 @@ def oidn_pyramid(
     """
     network = PyramidNetwork(widths_of(width), kernel_size, others=(OIDN, OIDN_CLEAN))
     corrected, steadied = Demodulated(Tiled(network)), Recurrent(Tiled(Steadied(history)), albedo=OIDN_ALBEDO)
-    return WithOidn(Chain(corrected=corrected, steadied=steadied), quality=quality, threads=threads)
+    return WithOidn(Chain(corrected=corrected, steadied=steadied), quality=quality, threads=threads, engine=engine)

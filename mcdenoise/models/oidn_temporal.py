@@ -23,7 +23,7 @@ from mcdenoise.models.oidn import Quality
 from mcdenoise.models.recurrent import Recurrent
 from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.models.with_oidn import OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
+from mcdenoise.models.with_oidn import OIDN, OIDN_ALBEDO, OIDN_CLEAN, Engine, WithOidn
 
 # Weight of the image for clean features relative to that for noisy ones. On 74 frames of training data the errors of
 # weights from 2 to 8 differ by at most 1 %.
@@ -63,6 +63,7 @@ def oidn_temporal(
     quality: Quality = "high",
     auxiliary: Literal["both", "noisy"] = "both",
     threads: int | None = None,
+    engine: Engine = "library",
     history: float = 4.0,
 ) -> Model:
     """Open Image Denoise (optional package pyoidn) for noisy and for clean features, stabilized by the previous result.
@@ -71,6 +72,7 @@ def oidn_temporal(
         quality: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         auxiliary: ``"noisy"`` takes only the image for noisy features, in a fifth to a half of the time.
         threads: see :class:`mcdenoise.models.with_oidn.WithOidn`.
+        engine: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         history: see :class:`mcdenoise.models.steadied.Steadied`.
 
     Raises:
@@ -81,4 +83,4 @@ def oidn_temporal(
     both = auxiliary == "both"
     steadied = Recurrent(Tiled(Steadied(history)), albedo=OIDN_ALBEDO)
     chain = Chain(mixed=Mixed(_CLEAN_PART if both else 0.0), steadied=steadied)
-    return WithOidn(chain, quality=quality, threads=threads, clean=both)
+    return WithOidn(chain, quality=quality, threads=threads, engine=engine, clean=both)

@@ -31,9 +31,9 @@ class TrainConfig:
             weights.
         start_from: a model with weights, which the layers of the same names start with, such as cascaded_v2 or
             oidn_open(quality=fast); all by default start with random weights.
-        start_fraction: fraction of the weights of start_from in the result, which is their weighted mean with the trained
-            ones; for methods whose start was trained on far more scenes (Wortsman et al. 2022, "Robust fine-tuning of
-            zero-shot models").
+        start_fraction: fraction of the weights of start_from in the result, which is the weighted mean of these and of
+            the trained ones (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models"); for a start that was
+            trained on far more scenes.
         losses: weights of the result and of intermediate stages in the loss, such as image=1,initial=0.5; by default 1
             for the result and for the stage initial, if the model has one.
         loss: loss of a clip, see :data:`mcdenoise.train.losses.LOSSES`: smape, the paper's; l1_display, that of Meng et

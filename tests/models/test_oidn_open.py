@@ -20,7 +20,7 @@ from mcdenoise import Denoiser, Frame
 from mcdenoise.models import create_model
 from mcdenoise.models._tza import archives_in, read_tza
 from mcdenoise.models.oidn import Oidn
-from mcdenoise.models.oidn_open import OidnOpen, archive_of_library
+from mcdenoise.models.oidn_open import OidnOpen, OpenFilters, archive_of_library
 from mcdenoise.nn.oidn import MAX_RADIANCE, OidnUNet, compress, expand, oidn_exposure
 
 NAME = "oidn_open"
@@ -49,6 +49,24 @@ def test_equals_the_result_of_the_library(quality: Any, auxiliary: Any) -> None:
     # On the network's own scale, where rounding is even: some twenty layers in float32, summed in another order.
     exposure = oidn_exposure(frame.color)
     torch.testing.assert_close(compress(image * exposure), compress(expected * exposure), rtol=0, atol=20 * 2.0**-22)
+
+
+@has_oidn
+@pytest.mark.parametrize("quality", ["fast", "balanced", "high"])
+@pytest.mark.parametrize("missing", [{}, {"normal": None}, {"normal": None, "albedo": None}])
+def test_filters_equal_those_of_the_library(quality: Any, missing: dict[str, None]) -> None:
+    frame = lit().replace(**missing)
+    filters, library = OpenFilters(quality, clean=False), Oidn(quality, threads=1)
+    exposure = oidn_exposure(frame.color)
+    for auxiliary in ("noisy", "clean") if frame.normal is not None else ("noisy",):
+        image, expected = (compress(each.denoised(frame, auxiliary) * exposure) for each in (filters, library))
+        torch.testing.assert_close(image, expected, rtol=0, atol=20 * 2.0**-22)
+    clean, expected_frame = (each.with_clean_features(frame, quality) for each in (filters, library))
+    for name in ("albedo", "normal"):
+        if (expected := expected_frame.buffer(name)) is not None:
+            # The slope of the inverse sRGB curve is at most 2.3, that of a normal's scale 2.
+            torch.testing.assert_close(clean.buffer(name), expected, rtol=0, atol=2.3 * 20 * 2.0**-22)
+    assert not filters.state_dict()
 
 
 @has_oidn

@@ -16,7 +16,7 @@ from toys import frame_of, refused, whole_frame
 from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import create_model
+from mcdenoise.models import create_model, has_network
 from mcdenoise.models.noisy import Noisy
 from mcdenoise.models.oidn import Oidn
 from mcdenoise.models.oidn_temporal import Mixed
@@ -35,7 +35,7 @@ from mcdenoise.models.with_oidn import (
     has_centred_features,
     has_scattered_features,
 )
-from mcdenoise.nn.oidn import oidn_exposure
+from mcdenoise.nn.oidn import compress, oidn_exposure
 
 if importlib.util.find_spec("pyoidn") is None:
     pytest.skip("Open Image Denoise is in the extra mcdenoise[oidn]", allow_module_level=True)
@@ -318,3 +318,21 @@ def test_refuses_invalid_settings() -> None:
     assert "quality: expected one of fast, balanced, high" in refused(lambda: create_model(NAME, quality="best"))
     assert "auxiliary: expected both or noisy, found 'clean'" in refused(lambda: create_model(NAME, auxiliary="clean"))
     assert "history: expected above 0, found 0" in refused(lambda: create_model(NAME, history=0))
+
+
+@pytest.mark.parametrize("auxiliary", ["both", "noisy"])
+def test_both_engines_give_the_same_sequence(auxiliary: str) -> None:
+    methods = [Denoiser("oidn_temporal", auxiliary=auxiliary, engine=engine) for engine in ("library", "torch")]
+    assert has_network(methods[1].model)
+    assert not has_network(methods[0].model)
+    methods[1] = Denoiser("oidn_temporal", auxiliary=auxiliary, engine="torch", precision="float32")
+    for seed in range(2):
+        frame = whole_frame(methods[0].model, 40, 56, seed=seed)
+        images = [compress(method(frame)) for method in methods]
+        # Rounding of two images, and of the features that the second one is denoised with.
+        torch.testing.assert_close(*images, rtol=0, atol=4 * 20 * 2.0**-22)
+
+
+def test_an_unknown_engine_is_refused() -> None:
+    message = refused(lambda: create_model("oidn_temporal", engine="steam"))
+    assert message.startswith("engine: expected one of library, torch, found 'steam'")
