@@ -24,6 +24,7 @@ from mcdenoise.models.oidn_open import seen_by_oidn
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT, Recurrent
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, compress, expand, oidn_exposure
+from mcdenoise.ops._numbers import numbers_like
 
 # Color, albedo and normal, as in the library; the previous result in both forms, and its weight.
 _CHANNELS = 9 + 3 + 3 + 1
@@ -74,8 +75,7 @@ class TunedNetwork(nn.Module):
             seen = seen_by_oidn(color * exposure, albedo, normal)
             before, light = compress(before * exposure), compress(light * exposure)
             own, logits = self.unet(torch.cat([seen, before, light, valid], 1)).split([3, len(_LOGITS)], 1)
-            offsets = torch.tensor(_LOGITS, dtype=logits.dtype, device=logits.device)
-            weights = torch.softmax(logits + offsets.reshape(1, -1, 1, 1), 1)
+            weights = torch.softmax(logits + numbers_like(logits, _LOGITS).reshape(1, -1, 1, 1), 1)
             weights = weights * torch.cat([torch.ones_like(valid), valid, valid, torch.ones_like(valid)], 1)
             weights = weights / weights.sum(1, keepdim=True)
             images = (own.clamp_min(0), before, light, seen[:, :3])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from contextlib import AbstractContextManager, nullcontext
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import torch
@@ -132,9 +133,15 @@ class OidnUNet(nn.Module):
         for block in self.decoder:
             skip = skips.pop()
             x = block(torch.cat([F.interpolate(x, scale_factor=2.0), skip.to(x.dtype)], 1))
-        with torch.autocast(x.device.type, enabled=False):
+        with _without_autocast(x.device.type):
             x = self.last(x.to(self.last.weight.dtype))
         return corner(x, height, width)
+
+
+def _without_autocast(device_type: str) -> AbstractContextManager[object]:
+    """Compute in the precision of the operands; devices without values have no autocast to disable."""
+    known = torch.amp.is_autocast_available(device_type)
+    return torch.autocast(device_type, enabled=False) if known else nullcontext()
 
 
 def _block(in_channels: int, widths: tuple[int, ...]) -> ConvBlock:
