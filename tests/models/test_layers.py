@@ -32,7 +32,9 @@ MODELS = [
 # Of others the library decides, or there are none.
 DIFFERENTIABLE = [each for each in MODELS if each.values[0] not in OIDN]
 # What has no kernels keeps the alpha; its layers are split by their fractions.
-WITHOUT_KERNELS = (*OIDN, "rae")
+WITHOUT_KERNELS = (*OIDN, "oidn_tuned", "oidn_tuned_small", "rae")
+# The history of these is of images, or of hidden features, alone: no layer of a frame reaches the next frame's layers.
+HISTORY_OF_IMAGES = ("oidn_pyramid", "oidn_tuned", "oidn_tuned_small", "rae")
 NAMES = ("diffuse", "glossy", "emission")
 SIZE = (24, 40)
 
@@ -104,7 +106,7 @@ def test_layers_sum_to_the_image_in_float64_and_have_derivatives(name: str) -> N
         (gradient,) = torch.autograd.grad(glossy, part, retain_graph=True, materialize_grads=True)
         assert torch.isfinite(gradient).all()
         # The second frame's by way of the history; of those the history is of images, or of hidden features, alone.
-        assert bool(gradient.any()) is not (name in ("oidn_pyramid", "rae") and frame is second)
+        assert bool(gradient.any()) is not (name in HISTORY_OF_IMAGES and frame is second)
 
 
 @pytest.mark.slow
