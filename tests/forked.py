@@ -17,7 +17,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-# What starts threads or looks at the machine when it is imported, such as Mitsuba, is the script's own task.
+# A module that starts threads or looks at the machine when it is imported, such as Mitsuba, is not among them: the
+# script imports it.
 MODULES = (
     "mcdenoise",
     "mcdenoise.benchmark",

@@ -127,7 +127,7 @@ def test_random_scenes_are_translated_whole(seed: int, tmp_path: Path) -> None:
     assert faces.max() < len(description.content["materials"])
     seen = [n for n, e in made.scene.items() if isinstance(e, dict) and "to_world" in e and "bsdf" in e]
     low = min(made.scene[n]["to_world"][1, 3] for n in seen if n.startswith("spare_"))
-    # What Mitsuba needs below the floor is not there.
+    # The description holds nothing below the floor, which only Mitsuba needs.
     assert description.arrays["object0_vertices"][:, 1].min() > low + 0.005
     description.save(tmp_path)
     assert json.loads((tmp_path / "scene.json").read_text()) == description.content
@@ -247,7 +247,7 @@ def test_given_settings_change_no_others_that_are_drawn() -> None:
 
 
 def passes(height: int, width: int) -> dict[str, Any]:
-    """Of a frame in which nothing was hit."""
+    """Return the passes of a frame in which nothing was hit."""
     return {
         "Combined": np.ones((height, width, 3), np.float32),
         "Denoising Albedo": np.zeros((height, width, 3), np.float32),
@@ -282,7 +282,7 @@ def test_normals_are_turned_to_the_world() -> None:
     camera = Camera.look_at((1, 2, 4), (0, 0.5, 0), fov_x=50)
     left, up, forward = camera.to_world[:3, :3].T
     images = passes(1, 3)
-    # What faces the camera, the right and the top, in Blender's space of the camera.
+    # These normals face the camera, the right and the top, in Blender's space of the camera.
     images["Denoising Normal"][0] = (0, 0, -1), (1, 0, 0), (0, 1, 0)
     normal = _View(camera, (3, 1), {}).buffers(images)["normal"]
     np.testing.assert_allclose(normal[0], (-forward, -left, up), atol=1e-12)
@@ -364,7 +364,7 @@ def test_parts_add_up_to_each_noisy_color(blender: Blender, tmp_path: Path) -> N
     options: dict[str, Any] = {"size": (24, 16), "settings": CENTRE, "noise_seeds": 2, "reference_samples": 0}
     render_cycles(made, tmp_path, blender, **options)
     before = pixels(tmp_path)
-    # What is asked for later is added, and the noise stays what it was.
+    # Buffers that are requested later are added, and the noise stays the same.
     sequence = open_sequence(render_cycles(made, tmp_path, blender, **options, parts=True))
     for name, values in before.items():
         np.testing.assert_array_equal(pixels(tmp_path)[name], values)

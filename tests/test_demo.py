@@ -50,7 +50,7 @@ def test_demo_renders_denoises_and_shows(small_demo, tmp_path, monkeypatch):
     sheet = result.picture.read_bytes()
     assert sheet.startswith(b"\x89PNG")
 
-    # What is there is used again: the noise, and with it every clean frame, stays the same to the last bit.
+    # Existing files are used again: the noise, and with it every clean frame, stays the same to the last bit.
     before = read_exr(result.denoised / "denoised2.exr")[0]
     files = {path: path.stat().st_mtime_ns for path in (tmp_path / "sequence" / "inputs").glob("*.exr")}
     assert len(files) == 3 * 5 + 2

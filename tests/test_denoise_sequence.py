@@ -267,7 +267,7 @@ def test_an_interrupt_leaves_only_whole_files(
 ) -> None:
     slowly(monkeypatch, write=DELAY)
     out, done = tmp_path / "out", []
-    # What an earlier test of this process has left running is not of this run.
+    # A thread that an earlier test of this process has left running does not belong to this run.
     running = set(threading.enumerate())
 
     def interrupt() -> None:
@@ -277,7 +277,7 @@ def test_an_interrupt_leaves_only_whole_files(
 
     with pytest.raises(KeyboardInterrupt):
         denoise_sequence(open_sequence(small_sequence), out, Denoiser(small_model()), "small", on_frame=interrupt)
-    # What was being written is finished.
+    # The frame that was being written is finished.
     assert sorted(path.name for path in out.iterdir()) == ["denoised0.exr", "denoised1.exr"]
     for number in range(2):
         assert read_exr(out / f"denoised{number}.exr")[0].shape == (20, 24, 3)
@@ -320,7 +320,7 @@ def test_a_stage_that_some_frames_do_without_has_a_median(small_sequence: Path, 
     assert report.milliseconds["remodulate"] == 0
 
 
-# What is skipped
+# Skipped work
 
 
 def test_the_command_line_prints_and_writes_the_plan(

@@ -137,7 +137,7 @@ def test_missing_features_are_told() -> None:
     assert [network.seen[name] for name in ("albedo", "normal", "depth")] == [None] * 3
     denoiser(Frame(color=torch.rand(1, 3, 9, 7), normal=torch.zeros(1, 3, 9, 7)))
     assert denoiser.report.missing == ["albedo", "depth"]
-    # What tells motion is one thing, whichever buffers say it.
+    # Motion is one missing buffer, whichever buffers could provide it.
     denoiser = Denoiser(small_model())
     denoiser(Frame(color=torch.rand(1, 3, 9, 7)))
     assert denoiser.report.missing == ["albedo", "depth", "motion", "normal"]
@@ -495,7 +495,7 @@ def test_derivatives_go_through_the_state_and_leave_the_images_as_they_are(frame
 
 
 def test_the_derivative_through_time_of_a_method_written_out() -> None:
-    """Of the mean of three frames, a third in each."""
+    """The derivative of the mean of three frames is a third for each of them."""
     denoiser = Denoiser(Mean(), differentiable=True)
     colors = [torch.rand(1, 3, 9, 7, requires_grad=True) for _ in range(3)]
     for color in colors:

@@ -15,7 +15,7 @@ from mcdenoise.export import Exported, Step, default_buffers, export_model, trac
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, State, pretrained_models
 from mcdenoise.models import Recurrent as Recurrence
 
-# Of sums in another order, through some thirty layers: the suite's bound for whole models, see tests/golden.
+# Sums in another order, through some thirty layers: this is the suite's bound for whole models, see tests/golden.
 RTOL, ATOL = 1e-4, 1e-5
 
 MINE = '''
@@ -205,7 +205,7 @@ SHIPPED = sorted(set(pretrained_models()) - {"oidn_pyramid"})  # which calls a l
 @pytest.mark.parametrize("name", ["", *(pytest.param(name, marks=pytest.mark.slow) for name in SHIPPED)])
 @pytest.mark.timeout(1800)
 def test_a_step_is_one_graph_of_fixed_shapes_that_can_be_replayed(name: str) -> None:
-    """What a CUDA graph asks for: no value is read, no size depends on one, and a state goes in as it came out."""
+    """A CUDA graph requires that no value is read, no size depends on one, and a state goes in as it came out."""
     model = create_model(name, pretrained=True) if name else Demodulated(Recurrence(Moved()))
     step = Step(model, default_buffers(model))
     shot = frames((40, 56))

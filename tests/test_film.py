@@ -81,7 +81,7 @@ def test_the_mean_of_noisy_colors_and_features_is_that_of_many_samples(tmp_path:
     error = colors.std(axis=0, ddof=1) / np.sqrt(runs) + reference * ROUNDING + 1e-3
     away = (colors.mean(axis=0) - reference) / error
     if name == "box":
-        # Of independent errors of 384 pixels none is beyond six deviations.
+        # None of the independent errors of 384 pixels is beyond six deviations.
         assert np.abs(away).max() < 6
         assert abs(away.mean()) < 4 / np.sqrt(away[..., 0].size)
     else:
@@ -176,7 +176,7 @@ def test_the_same_seed_gives_the_same_pixels_and_a_stopped_run_is_resumed(
 
 
 def test_previous_positions_of_what_moves(tmp_path: Path) -> None:
-    """Of a ball that moves along x, where it is seen for sure; and of the wall, that stands still."""
+    """The ball moves along x, and is tested where it is seen for sure; the wall stands still."""
     ball = np.diag((0.4, 0.4, 0.4, 1.0))
     ball[2, 3] = 0.6
     scene = wall() | {"ball": {"type": "sphere", "to_world": ball, "bsdf": {"type": "diffuse"}}}

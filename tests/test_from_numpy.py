@@ -14,7 +14,7 @@ from mcdenoise.frame import BUFFERS, LAYOUTS, Layout
 
 HEIGHT, WIDTH = 5, 7
 MODEL = "cascaded_v2_micro"
-# What Accumulated adds to a frame: no renderer writes them.
+# Accumulated adds these buffers to a frame: no renderer writes them.
 OWN = {"current", "length"}
 
 

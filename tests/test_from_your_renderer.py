@@ -88,7 +88,7 @@ def test_a_row_is_what_is_read_and_written(row: str, tmp_path: Path) -> None:
     expected = {"color": color, "albedo": albedo, "normal": normal, "depth": depth}
     for buffer, layer in expected.items():
         if buffer == "depth" and layer == "P":
-            # Of positions, along the axis of their camera.
+            # The depth is computed from positions, along the axis of their camera.
             assert "depth" in sequence.buffers
         elif layer:
             assert _says(sources[buffer], layer), (buffer, sources[buffer])

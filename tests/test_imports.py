@@ -18,8 +18,8 @@ MODULES = {
     for path in sorted(PACKAGE.rglob("*.py"))
 }
 
-# What each room (a module or folder right below mcdenoise/) may import besides itself. A room that is not in the table
-# fails: place it deliberately.
+# The table of rooms names what each room (a module or folder right below mcdenoise/) may import besides itself. The
+# test fails for a room that is not in it: place it deliberately.
 SIGNAL = {"errors", "frame", "noise", "ops", "reading"}
 LIBRARY = SIGNAL | {
     "metrics",
@@ -35,12 +35,12 @@ ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),
     "reading": set(),
-    # What a signal ends, and what is to be tidied up then.
+    # It knows what a signal ends, and what must be tidied up then.
     "interruption": set(),
     "threads": set(),
     # Tasks run in other processes, whatever they do.
     "engines": {"errors", "interruption"},
-    # What is kept is written as all files are; nothing of them is read.
+    # Its files are written as all files are; it reads none of the data.
     "user_cache": {"data", "errors"},
     "own": {"errors"},
     "commit": set(),
@@ -142,7 +142,7 @@ def is_page(module: str) -> bool:
 
 
 def python(code: str) -> str:
-    """What a fresh interpreter prints, stderr included, with warnings as errors."""
+    """Return what a fresh interpreter prints, stderr included, with warnings as errors."""
     command = [sys.executable, "-W", "error", "-c", code]
     result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
     assert result.returncode == 0, result.stdout

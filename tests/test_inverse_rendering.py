@@ -27,7 +27,7 @@ def example() -> ModuleType:
 
 
 def derivative(example: ModuleType, variant: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Of the mean radiance of all but the brightest pixels, at two seeds."""
+    """Return the derivatives of the mean radiance of all but the brightest pixels, at two seeds."""
     box = example.Box(variant, 12)
     start = torch.tensor([0.5, 0.4, 0.3])
     found = []
@@ -74,5 +74,5 @@ def test_derivative_of_mitsuba_is_the_same_in_the_mean(example: ModuleType) -> N
     if first_working(("llvm_ad_rgb",)) is None:
         pytest.skip("Mitsuba's llvm_ad_rgb does not run here: no LLVM, or one that is too old for the processor")
     scalar, own = (torch.stack(derivative(example, variant)) for variant in ("scalar_rgb", "llvm_ad_rgb"))
-    # Of 288 paths the mean is known to a quarter.
+    # The mean of 288 paths is known to a quarter.
     assert ((own.mean(0) / scalar.mean(0)).log().abs() < 0.7).all()

@@ -237,7 +237,7 @@ def test_gradients_are_those_of_torch(ad: Any) -> None:
     assert all(each.grad is None for each in denoiser.denoiser.model.parameters())
 
 
-# Of torch's own making, when its rules for forward mode are loaded.
+# The warning is torch's own: it comes when its rules for forward mode are loaded.
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 def test_the_derivative_forward_is_the_one_backward(ad: Any) -> None:
     drjit = importlib.import_module("drjit")
@@ -294,7 +294,7 @@ def test_a_refusal_within_the_operation_of_drjit_is_one_line(ad: Any) -> None:
 
 
 def test_flow_leads_from_the_previous_to_the_current_frame(mi: Any) -> None:
-    """What was at x is at x + 2 and y + 1 now: with a flow of (2, 1), the history is what is seen already."""
+    """The pattern at x is now at x + 2 and y + 1: with a flow of (2, 1), the history equals the current frame."""
     pattern, moved = noise(3), np.roll(noise(3), (1, 2), axis=(0, 1))
     inside = (slice(4, -4), slice(4, -4))
 

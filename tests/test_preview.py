@@ -1,4 +1,4 @@
-"""What is written for people to look at: known codes, one exposure for all frames, a video of all of them."""
+"""Images for people to look at: known codes, one exposure for all frames, a video of all of them."""
 
 from __future__ import annotations
 

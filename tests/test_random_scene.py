@@ -28,7 +28,7 @@ CLOSE = 0.05
 
 @functools.cache
 def survey(seeds: range = SEEDS) -> list[RandomScene]:
-    """Of every seed its scene, with the smallest and the largest number of each image in place of the image."""
+    """Return the scene of each seed, with the smallest and the largest number of each image in place of the image."""
     found = (random_scene(seed, FRAMES) for seed in seeds)
     return [RandomScene(without_images(made.scene), made.cameras, made.moves) for made in found]
 
@@ -42,7 +42,7 @@ def without_images(value: Any) -> Any:
 
 
 def digest(seed: int, frames: int = FRAMES) -> str:
-    """Of everything that a scene consists of."""
+    """Return the digest of everything that a scene consists of."""
     made = random_scene(seed, frames)
     numbers = np.array([[*camera.to_world.ravel(), camera.fov_x] for camera in made.cameras])
     parts = (scene_digest(made.scene), scene_digest({"cameras": numbers}), scene_digest(made.moves))
@@ -117,7 +117,7 @@ def test_making_a_scene_needs_no_mitsuba() -> None:
     assert (child.returncode, child.stdout.strip()) == (0, ""), child.stderr
 
 
-# What is in it
+# Contents of the scenes
 
 
 @pytest.mark.slow
@@ -162,7 +162,7 @@ def test_textures_are_reflectances_opacities_or_roughnesses() -> None:
 
 
 def test_every_light_that_may_be_chosen_shines() -> None:
-    """What only keeps scenes alike is black and never chosen."""
+    """An entry that only keeps scenes alike is black and never chosen."""
     for made in survey():
         chosen = 0
         for entry in entries(made.scene):

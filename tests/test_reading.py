@@ -42,7 +42,7 @@ NO_FILES = ["pipe", "device", "terminal", "folder", "link", "loop", "huge"]
 
 
 def put(what: str, path: Path) -> None:
-    """What is no file of sensible size, at a path."""
+    """Put something that is no file of sensible size at a path."""
     path.unlink(missing_ok=True)
     if what == "pipe":
         os.mkfifo(path)

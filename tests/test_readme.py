@@ -16,7 +16,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def code_with(page: Path, part: str) -> dict:
-    """What the block of a page that contains ``part`` defines when it is run."""
+    """Return the names that the block of a page that contains ``part`` defines when it is run."""
     namespace: dict = {}
     blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     exec(next(block for block in blocks if part in block), namespace)

@@ -160,7 +160,7 @@ def test_a_stopped_run_is_resumed(tmp_path: Path) -> None:
 
 
 def test_damaged_files_are_rendered_again(tmp_path: Path) -> None:
-    """What is empty, cut short, garbage, of another size or elsewhere is none of a finished frame's files."""
+    """A file that is empty, cut short, garbage, of another size or elsewhere is not one of a finished frame."""
 
     def render() -> Path:
         return render_sequence(demo_scene(), demo_cameras(2), tmp_path, noise_seeds=2, reference_spp=2, **SCALAR)
@@ -178,7 +178,7 @@ def test_damaged_files_are_rendered_again(tmp_path: Path) -> None:
     render()
     for path, image in shown.items():
         np.testing.assert_array_equal(read_exr(path)[0], image)
-        # What was whole was not rendered again: the header holds the time.
+        # A whole file was not rendered again: the header holds the time.
         assert (path.read_bytes() == intact[path]) or path in paths
 
 
@@ -227,7 +227,7 @@ def test_known_radiance_and_the_background(tmp_path: Path) -> None:
     assert (read(folder, "color0")[~hit] == 2).all()
     assert (read(folder, "albedo0")[hit] == 0.5).all()
     assert (read(folder, "albedo0")[~hit] == 0).all()
-    # What the reader makes of the far point that stands for the background.
+    # The reader turns the far point that stands for the background into infinite depth.
     depth = open_sequence(tmp_path).frame(0).depth
     assert depth is not None
     assert torch.equal(torch.isinf(depth[0, 0]), torch.from_numpy(~hit))

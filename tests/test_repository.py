@@ -1,4 +1,4 @@
-"""What the repository may hold: no paths of one machine, no pickles, weights of a modest size, and no private words."""
+"""The repository holds no paths of one machine, no pickles, weights of a modest size, and no private words."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def test_no_code_reads_a_pickle(files: list[Path]) -> None:
 
 
 def test_the_source_archive_holds_every_file(files: list[Path]) -> None:
-    """What is neither of the package nor named in MANIFEST.in is missing outside of a clone, such as test data."""
+    """A file outside of the package that MANIFEST.in does not name is missing outside of a clone, such as test data."""
     lines = [line.split() for line in (ROOT / "MANIFEST.in").read_text(encoding="utf-8").splitlines()]
     grafted = {"mcdenoise", *(name for words in lines if words[:1] == ["graft"] for name in words[1:])}
     # The build adds these by itself; the last ones belong to a clone.

@@ -1,4 +1,4 @@
-"""What a renderer may rely on that streams frames: nothing of its own is kept, nothing bad is remembered."""
+"""A renderer that streams frames may rely on this: nothing of its own is kept, nothing bad is remembered."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_an_image_is_an_ordinary_tensor(without: tuple[str, ...]) -> None:
 
 @torch.inference_mode()
 def sealed(color: Tensor, albedo: Tensor) -> Tensor:
-    """What people write who denoise only: a model of theirs that knows no derivatives."""
+    """A model of a user who only denoises: it knows no derivatives."""
     return color * 0.5 + albedo
 
 

@@ -67,7 +67,7 @@ def weights(tmp_path: Path) -> Path:
 
 
 def denoise(*arguments: object) -> tuple[str, float]:
-    """What `mcdenoise denoise` prints, and the peak of its memory in GB."""
+    """Return what `mcdenoise denoise` prints, and the peak of its memory in GB."""
     command = [sys.executable, "-m", "mcdenoise", "denoise", *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None

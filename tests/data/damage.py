@@ -97,7 +97,7 @@ DAMAGES: tuple[Callable[[Generator, bytes], bytes], ...] = (
 
 
 def outcomes(folder: Path, files: Mapping[str, bytes], written: Path | None = None) -> dict[str, str]:
-    """What the reader made of each file; what it made of the process is asserted here.
+    """Return what the reader made of each file; the effects on the process are asserted here.
 
     Args:
         folder: for the files.
@@ -111,7 +111,7 @@ def outcomes(folder: Path, files: Mapping[str, bytes], written: Path | None = No
 
 
 def outcomes_of(folder: Path, written: Path | None = None) -> dict[str, str]:
-    """What the reader made of each file of a folder, see :func:`outcomes`."""
+    """Return what the reader made of each file of a folder, see :func:`outcomes`."""
     names = {path.name for path in folder.iterdir()}
     if written is not None:
         written.mkdir()

@@ -268,7 +268,7 @@ def test_device_is_never_replaced() -> None:
 
 
 def test_attributes_of_a_texture_do_not_make_one_of_an_image(tmp_path: Path) -> None:
-    """Of a texture with its levels of detail: an image that says it is one and has a single level cannot be read."""
+    """A texture has levels of detail: an image that says it is one and has a single level cannot be read."""
     image = np.full((5, 7, 3), 0.5, np.float32)
     write_exr(
         tmp_path / "out.exr", image, ["R", "G", "B"], metadata={"textureformat": "Plain Texture", "scene": "wall"}

@@ -23,7 +23,7 @@ from mcdenoise.errors import InputError
 
 zarr = pytest.importorskip("zarr")
 
-# Of the image that the frames are crops of, and theirs.
+# The sizes are those of the image that the frames are crops of, and of the crops.
 WHOLE, SIZE, SAMPLES, FRAMES = (30, 40), (20, 24), 6, 3
 CROP = (4, 7)
 EXPOSURE = (-3.0, 2.5)

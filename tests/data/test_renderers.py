@@ -1,4 +1,4 @@
-"""What renderers wrote and what was measured on it: facts that the readers rely on, on files that are kept here."""
+"""Facts about files that renderers wrote, measured on the files kept here; the readers rely on them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 FILES = Path(__file__).parent / "renderers"
-# Of `examples/blender/render.py`: focal length over sensor width, near clipping plane, the wall's y.
+# Values of `examples/blender/render.py`: focal length over sensor width, near clipping plane, the wall's y.
 FOCAL, NEAR, WALL = 30 / 36, 0.1, 3.5
 
 Image = NDArray[np.float32]
@@ -99,7 +99,7 @@ def test_blender_depth_is_along_the_axis_and_normals_are_in_the_world(frame: int
 def test_blender_vector_is_previous_minus_current_with_y_up(frame: int) -> None:
     channels = blender(f"blender/shot_{frame:04d}.exr")
     position, vector = layer(channels, "ViewLayer.Position", "XYZ"), layer(channels, "ViewLayer.Vector", "XYZW")
-    # What stands still: the wall and the floor.
+    # The wall and the floor stand still.
     still = (np.abs(position[..., 1] - WALL) < 1e-4) | (np.abs(position[..., 2]) < 1e-5)
     still &= channels["ViewLayer.Depth.Z"] < 1e9
     here = project(position, frame - 1)

@@ -71,7 +71,7 @@ def _toml(value: object) -> str:
 
 
 def pixels(folder: Path) -> dict[str, np.ndarray]:
-    """Of every image in a folder."""
+    """Return the pixels of every image in a folder."""
     return {path.name: read_exr(path)[0] for path in sorted(folder.glob("*.exr"))}
 
 

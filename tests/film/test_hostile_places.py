@@ -163,7 +163,7 @@ def test_a_full_disk_costs_what_has_no_room(tmp_path: Path, capsys: pytest.Captu
         assert status == 1
         assert "No space left on device" in printed
         assert printed.splitlines()[-1].startswith(("0 of 3", "1 of 3", "2 of 3"))
-        # What is there with its final name is whole.
+        # A file with its final name is whole.
         made = {name: pixels(out / name) for name in shots}
         assert 0 < sum(map(len, made.values())) < 18
         assert not [path for path in out.rglob("*") if path.name.startswith(".mcdenoise-")]

@@ -20,7 +20,7 @@ from mcdenoise.engines import LocalEngine
 from mcdenoise.film import Film, read_film, run_film
 from mcdenoise.film.record import read_records
 
-# Of a machine that others use, too.
+# The limit is that of a machine that others use, too.
 SECONDS = 240.0
 
 
@@ -154,7 +154,7 @@ def test_a_killed_driver_takes_its_workers_along_and_the_next_goes_on(
         time.sleep(0.05)
     finished = {number for each in shots for number in read_records(out / ".film" / each)}
     assert 3 <= len(finished) < 90
-    # What is there under its own name is whole.
+    # A file with its final name is whole.
     assert len(pixels(out / "s00")) >= 3
     kept = {number: record.at for number, record in read_records(out / ".film/s00").items()}
     assert run_film(Film(read_film(manifest), out, threads=1), LocalEngine(1)).complete

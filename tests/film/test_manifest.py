@@ -1,4 +1,4 @@
-"""What a film is made of, and one line for whatever nobody understands."""
+"""The manifest of a film, and the error of one line for an entry that it does not understand."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ def test_a_shot_in_pieces_is_the_whole_one_up_to_the_joint(
         assert max(errors.values()) == 0
         assert not closed.joints
         return
-    # What is told of the joint is what there is: the frame behind it differs by no more than that before it.
+    # The reported joint is true: the frame behind it differs by no more than that before it.
     assert set(closed.joints) == {19}
     assert 0 < errors[20] <= 2 * closed.joints[19] <= 2 * joint
     assert not [warning for warning in closed.warnings if "joint" in warning]

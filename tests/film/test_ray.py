@@ -16,7 +16,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.film import Film, read_film, run_film
 
 ray = pytest.importorskip("ray", reason="films on a cluster need Ray: pip install 'mcdenoise[ray]'")
-# Of Ray's own; none is of this package.
+# The warnings are Ray's own; none is of this package.
 pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.timeout(900)]
 FRAMES = 12
 

@@ -133,7 +133,7 @@ def test_finished_frames_are_not_made_again(shots: dict[str, Path], tmp_path: Pa
         (lambda shots, out: edit(shots["s1"] / "inputs/albedo0.exr"), [0, 1, 2, 3, 4]),
         (lambda shots, out: (out / "s1/denoised2.exr").unlink(), [2]),
         (lambda shots, out: edit(out / "s1/denoised2.exr"), [2]),
-        # What was written down is damaged.
+        # The record of the frames is damaged.
         (lambda shots, out: truncate(next((out / ".film/s1").glob("*.jsonl"))), [4]),
         # References change no result.
         (lambda shots, out: shutil.copy(shots["s1"] / "inputs/color0.exr", shots["s1"] / "inputs/reference0.exr"), []),

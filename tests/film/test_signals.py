@@ -15,7 +15,7 @@ from test_interruption import OBEYING, RENDER, WORDS, end, started
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="signals are those of Linux")
 FRAMES = 60
-# Of a machine that others use, too.
+# The limit is that of a machine that others use, too.
 SECONDS = 240.0
 PHASES: dict[str, Callable[[Path], bool]] = {
     "looking": lambda out: (out / ".film/.lock").exists(),

@@ -68,7 +68,7 @@ def test_true_changes_are_no_error() -> None:
 
 
 def test_pixels_without_a_history_do_not_count() -> None:
-    """Of four columns, the last comes from half outside the image, and the first shows another surface."""
+    """The last of four columns comes from half outside the image, and the first shows another surface."""
     clip = torch.zeros(1, 2, 3, 1, 4, dtype=torch.float64)
     clip[:, 1, :, :, 0] = 1.0
     clip[:, 1, :, :, 3] = 0.001

@@ -1,4 +1,4 @@
-"""What networks see of a frame."""
+"""The inputs that networks see of a frame."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ WIDTH = 8
 
 
 def whole_numbers(parameter: Tensor, generator: torch.Generator) -> Tensor:
-    """Of the weights of a convolution, two are 1 or -1 for each result and all others 0; no bias."""
+    """Return weights of a convolution of which two are 1 or -1 for each result and all others 0; the bias is 0."""
     values = torch.zeros(parameter.shape)
     if parameter.dim() > 1:
         # Transposed convolutions have their results second, and one weight of each input for each of two by two.
@@ -46,10 +46,10 @@ def test_shortcuts_of_inference_change_no_feature(dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
 def test_shortcuts_of_inference_change_no_convolution_by_more_than_rounding(dtype: torch.dtype) -> None:
-    """Of ``n`` products, sums in two orders differ by ``2 gamma_n`` times the sum of their absolute values, at most.
+    """Sums of ``n`` products in two orders differ by at most ``2 gamma_n`` times the sum of their absolute values.
 
-    ``gamma_n = n u / (1 - n u)`` with the ``u`` of float32 (Higham 2002, Sec. 3.1). What a first convolution differs by
-    the second one multiplies by its weights. A result in bfloat16 is rounded once more, by up to its ``u``.
+    ``gamma_n = n u / (1 - n u)`` with the ``u`` of float32 (Higham 2002, Sec. 3.1). The second convolution multiplies
+    the difference of the first by its weights. A result in bfloat16 is rounded once more, by up to its ``u``.
     """
     torch.manual_seed(0)
     net = UNet(4, [WIDTH] * 4).to(dtype=dtype, memory_format=torch.channels_last)
@@ -72,7 +72,7 @@ def test_shortcuts_of_inference_change_no_convolution_by_more_than_rounding(dtyp
                 weight, bias = layer.weight.detach().double().abs(), layer.bias.detach().double().abs()
                 gamma = (count := weight[0].numel() + 1) * unit / (1 - count * unit)
                 carried = nn.functional.conv2d(bound, weight, None, layer.stride, layer.padding)
-                # Of all absolute values: also an upper bound of the results.
+                # The sum of all absolute values is also an upper bound of the results.
                 magnitude = nn.functional.conv2d(magnitude + bound, weight, bias, layer.stride, layer.padding)
                 bound = carried + (2 * gamma + 2 * rounding) * magnitude
         assert ((trained.double() - inferred.double()).abs() <= bound).all()
@@ -148,7 +148,7 @@ def test_unet_needs_a_level_for_each_scale(levels: int, half: bool, lowest: int)
         UNet(5, [4] * levels, half=half)
 
 
-# Of torch's own making, when its rules for forward mode are loaded.
+# The warning is torch's own: it comes when its rules for forward mode are loaded.
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 def test_a_network_that_does_not_learn_has_its_derivative_forward() -> None:
     unet = UNet(3, [4] * 4).double().requires_grad_(False)

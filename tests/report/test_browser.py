@@ -60,7 +60,7 @@ def tab(browser: Any, page: Path) -> Iterator[Any]:
 
 
 def pixels(tab: Any) -> np.ndarray:
-    """What the comparer's canvas shows."""
+    """Return the pixels that the comparer's canvas shows."""
     uri = tab.evaluate("document.querySelector('#stage canvas').toDataURL()")
     return np.asarray(PIL.Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))).convert("RGB")).astype(int)
 
@@ -77,7 +77,7 @@ def at(image: np.ndarray, x: float, y: float) -> np.ndarray:
 
 
 def shown(image: np.ndarray, x: float, y: float) -> np.ndarray:
-    """What a display shows there of a scene-linear frame."""
+    """Return the value that a display shows there for a scene-linear frame."""
     return at(to_srgb(image), x, y).astype(int)
 
 

@@ -211,7 +211,7 @@ def test_the_front_of_a_model_is_split_from_its_network() -> None:
     assert (front.accumulates, front.demodulates) == (True, True)
     assert {id(weight) for weight in rest.parameters()} == {id(weight) for weight in model.parameters()}
     network = model.inner.inner.inner
-    # What is demodulated within the accumulation stays there, and so does whatever has weights before it.
+    # Demodulation within the accumulation stays there, and so does whatever has weights before it.
     front, rest = split(Accumulated(Demodulated(network)))
     assert (front.accumulates, front.demodulates, type(rest)) == (True, False, Demodulated)
     for whole in (network, Demodulated(network)):
@@ -302,7 +302,7 @@ def test_a_stale_cache_is_made_again(noisy: Path, tmp_path: Path, reads: list[tu
     assert len(reads) in (16, 24)  # twice four frames, two or three noise seeds
     assert again.sha256 == fresh.sha256
     assert torch.equal(again.shots[0].read()["color"], fresh.shots[0].read()["color"])
-    # What is stale is removed.
+    # A stale entry is removed.
     assert not set(entries(folder)) & set(before)
 
 

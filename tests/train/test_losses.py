@@ -109,7 +109,7 @@ def test_the_recurrent_autoencoders_loss_is_its_equation() -> None:
         pairs = [zip(values(r), values(y), strict=True) for r, y in zip(clip, true, strict=True)]
         errors = [[math.log1p(a) - math.log1p(b) for a, b in pair] for pair in pairs]
         for t, error in enumerate(errors):
-            # Of channel c, row y, column x: number 12 c + 4 y + x.
+            # Channel c, row y, column x is number 12 c + 4 y + x.
             across = [abs(error[i + 1] - error[i]) for i in range(36) if i % 4 < 3]
             down = [abs(error[i + 4] - error[i]) for i in range(36) if i % 12 < 8]
             moved = [abs(a - b) for a, b in zip(error, errors[t - 1], strict=True)] if t else [0.0]

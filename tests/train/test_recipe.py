@@ -95,7 +95,7 @@ def test_an_error_above_the_bound_is_said(trained: Path, tmp_path: Path, capsys:
     printed = capsys.readouterr()
     assert printed.err.splitlines()[-1].startswith("warning: expected a smape of at most 0 + 1e-09, found 0.")
     assert printed.err.endswith(": missed\n")
-    # What another run has rendered is used, and what is expected of weights does not change them.
+    # Data that another run has rendered are used, and the expected error of weights does not change them.
     assert renderings(trained / "data") == before
     assert not (tmp_path / "run" / "data").exists()
     both = [describe_weights(run / WEIGHTS) for run in (trained, tmp_path / "run")]
@@ -136,7 +136,7 @@ def test_the_recipes_can_be_read(recipe: Path) -> None:
     found = Recipe.read(recipe, options_of("generate"))
     assert found.data
     assert found.validation
-    # Of what is shipped it is known.
+    # Every run of shipped weights has an expected error.
     shipped = {*pretrained_models(), *compared_models()}
     runs = {name: run for run in found.runs if (name := run.name or run.config.model) in shipped}
     assert all(run.expected is not None for run in runs.values())
@@ -235,9 +235,9 @@ steps = 2
     about = describe_weights(out / "K-5" / "cascaded.safetensors")
     assert (about["settings"]["cascade"], json.loads((out / "K-5" / "config.json").read_text())["seed"]) == ("K", 5)
     said = capsys.readouterr().out
-    # What is expected is said of the run that says it.
+    # The expected error is printed for the run that has one.
     assert said.count("expected a smape of at most") == said.count("0.2 + 0.1") == 1
-    # What a run does not say for itself is what all have in common: it is the recipe of one run.
+    # A run has the common settings where it states none: this one is the recipe of a single run.
     assert follow(recipe, out, "--data", trained / "data", "--runs", "as-it-was") == 0
     assert describe_weights(out / "as-it-was" / WEIGHTS)["sha256"] == describe_weights(trained / WEIGHTS)["sha256"]
     assert describe_weights(out / "as-it-was" / WEIGHTS)["recipe"] == describe_weights(trained / WEIGHTS)["recipe"]
@@ -296,7 +296,7 @@ def test_cleaned_references(small_sequence: Path, tmp_path: Path, place: str) ->
     assert cleaned.reference_numbers == source.reference_numbers
     before, after = (dict(sequence.frame(1).items()) for sequence in (source, cleaned))
     assert {name for name in before if not torch.equal(before[name], after[name])} == {"reference"}
-    # What was known of the references is not said of what the filter made of them.
+    # Facts about the references as rendered are not stated of the filtered ones.
     said = json.loads((copied / "inputs" / "camera.json").read_text())
     assert said == {**about, "reference_filter": "Open Image Denoise, high, clean aux"}
 

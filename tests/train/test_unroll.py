@@ -68,7 +68,7 @@ def test_a_method_without_a_state_sees_all_frames_at_once() -> None:
 
 
 def test_the_gradient_through_time() -> None:
-    """Of the last frame alone, in the colours of all frames and in every weight, against finite differences."""
+    """The gradient of the last frame in the colours of all frames and every weight agrees with finite differences."""
     torch.manual_seed(1)
     model, clip = Recurrent(2).double(), clip_of(3, (3, 4), torch.float64)
     # No output is at the kink of the clamp.

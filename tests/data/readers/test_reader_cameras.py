@@ -77,7 +77,7 @@ def test_the_camera_of_exact_positions() -> None:
 def test_units_and_origin_of_the_world_do_not_matter(scale: float, offset: tuple[float, ...]) -> None:
     position = (room(rays()) + offset) * scale
     found = fit_camera(position, ALL)
-    # Of 64 bits, a thousand widths away.
+    # The error is that of 64-bit numbers, a thousand widths away.
     assert miss(found.matrix, position, ALL) < 1e-6
     np.testing.assert_allclose(found.eye / scale, EYE + offset, atol=1e-5)
 
@@ -191,7 +191,7 @@ def test_the_camera_of_mitsuba(number: int, rendered: Path) -> None:
 def test_how_a_matrix_is_written() -> None:
     position, right = room(rays()), matrix()
     for convention in ("", "y up", "transposed", "transposed, y up"):
-        # What turns it back is what has been done to it: a mirror first, and then a transpose.
+        # The convention names the steps that turn the matrix back: a mirror first, and then a transpose.
         stored = right.copy()
         if "y up" in convention:
             stored[:, 1] *= -1

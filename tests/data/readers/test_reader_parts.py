@@ -99,7 +99,7 @@ def test_a_color_that_has_been_denoised_is_not_the_sum(tmp_path: Path, save: Sav
     (warning,) = sequence.warnings
     assert "100.0% of the light" in warning
     assert warning.endswith("or the color has been denoised")
-    # What is not denoised yet is: it comes before the other.
+    # A color that is not denoised yet is the sum: it is preferred to the other.
     both = {**channels, **three("View.Combined", smooth), **three("View.Noisy Image", truth["color"])}
     assert not open_sequence(save(tmp_path / "both_0001.exr", both)).warnings
 

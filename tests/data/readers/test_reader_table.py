@@ -13,7 +13,7 @@ from mcdenoise.data import Sequence, open_sequence
 
 Image = np.ndarray[Any, Any]
 
-# What is read of each, without a flag; what is computed from it is in no row.
+# These layers are read without a flag; a buffer that is computed from them is in no row.
 BLENDER = {
     "color": "ViewLayer.Combined.RGBA",
     "albedo": "ViewLayer.Denoising Albedo.RGB",
@@ -22,7 +22,7 @@ BLENDER = {
     "position": "ViewLayer.Position.XYZ",
     "motion": "ViewLayer.Vector.XYZW",
 }
-# Of those that have the passes of light, which add up.
+# These layers are read in files that have the passes of light, which add up.
 PARTS = {
     "diffuse": "ViewLayer.DiffDir.RGB, DiffInd",
     "specular": "ViewLayer.GlossDir.RGB, GlossInd, TransDir, TransInd, Emit, Env",
@@ -176,7 +176,7 @@ def test_files_with_names_of_other_renderers_are_read_without_a_flag(
     assert sequence.numbers == [1, 2, 3]
     assert sequence.color_has_albedo
     said = {row.buffer: row.reading for row in sequence.table}
-    # What differs from what is usual is worth a word; nothing else is.
+    # A sign of motion that differs from the usual one gives a warning; nothing else does.
     words = [f"'motion': read as {SIGNS.get(renderer)}, since only so frames match the ones before them"]
     assert list(sequence.warnings) == (words if renderer in SIGNS else [])
     for number in sequence.numbers:

@@ -86,7 +86,7 @@ def test_radiance_is_read_as_stated_or_as_its_reference_or_as_it_seems() -> None
     included, words, warnings = read_radiance(irradiance, albedo, None, None)
     assert included is False
     assert "multiplied back" in words
-    # What is no ordinary radiance is worth a warning, with the flag that decides.
+    # A color that is no ordinary radiance gives a warning, with the flag that decides.
     assert len(warnings) == 1
     assert "--color-with-albedo" in warnings[0]
     # Where the texture tells nothing, the reference does.

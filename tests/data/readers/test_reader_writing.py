@@ -47,7 +47,7 @@ def stored(path: Path) -> list[tuple[dict[str, Any], dict[str, Image]]]:
 
 
 def header(entries: dict[str, Any]) -> dict[str, str]:
-    """What a header says, comparable; the list of its channels is compared by itself."""
+    """Return the entries of a header, comparable; the list of its channels is compared by itself."""
     return {name: str(value) for name, value in entries.items() if name not in ("channels", "chunkCount")}
 
 
@@ -329,7 +329,7 @@ def raw(path: Path) -> tuple[Image, str]:
 @pytest.mark.parametrize(("suffix", "kind"), [("hdr", "float"), ("tif", "float"), ("tif", "half")])
 def test_radiance_in_other_formats_comes_back(suffix: str, kind: str, tmp_path: Path) -> None:
     source = tmp_path / f"render_0003.{suffix}"
-    # Of eight bits and a common exponent, as .hdr has them, and so exact in all of these.
+    # These values have eight bits and a common exponent, as .hdr has them, and so are exact in all formats.
     radiance = np.broadcast_to(np.float32(2.0) ** np.arange(-4, SIZE[1] - 4)[:, None], (*SIZE, 3)).copy()
     radiance[..., 1] *= 0.75
     radiance[0] = 0.5
@@ -398,7 +398,7 @@ def test_a_picture_takes_no_layer(tmp_path: Path, refused: Callable[..., str]) -
     assert list((tmp_path / "out").iterdir()) == []
 
 
-# What cannot be written
+# Files that cannot be written
 
 
 def test_the_input_folder_is_no_output(rendered: Path, tmp_path: Path, refused: Callable[..., str]) -> None:

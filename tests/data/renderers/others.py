@@ -77,7 +77,7 @@ def _pbrt(source, pattern, case):
 
 
 def arnold(source):
-    """What Arnold's noice asks for: RGBA, denoise_albedo, N, Z, variance.
+    """Return the layers that Arnold's noice asks for: RGBA, denoise_albedo, N, Z, variance.
 
     Assumed: N in world space, Z 1e30 where nothing is hit.
     """
