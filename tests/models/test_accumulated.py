@@ -248,7 +248,7 @@ def test_the_published_rule_can_be_asked_for(small_sequence: Path) -> None:
 
 @pytest.mark.parametrize("rule", ["relative", "bmfr"])
 def test_any_buffers_may_come_and_go(rule: Rule) -> None:
-    """What only one of two frames has is not compared; where nothing can be, each frame stands alone."""
+    """A buffer that only one of two frames has is not compared; where none can be, each frame stands alone."""
     size = (1, 3, HEIGHT, WIDTH)
     every: dict[str, Tensor] = {
         "normal": torch.rand(size),
@@ -299,7 +299,7 @@ def test_a_firefly_does_not_survive(with_albedo: bool) -> None:
 
 
 def test_a_dark_texture_beside_a_bright_one_is_no_firefly() -> None:
-    """What is clamped is the light: a white pixel among black ones, both lit alike, is as bright as its neighbours."""
+    """The light is clamped: a white pixel among black ones, both lit alike, is as bright as its neighbours."""
     albedo = constant(3, 0.04, (9, 9))
     albedo[..., 4, 4] = 0.9
     seen = Shot().update(still(2 * albedo, albedo=albedo))
@@ -524,7 +524,7 @@ def test_samples_of_one_brightness_are_no_lights(fraction: float) -> None:
     assert all(mean == pytest.approx(expected, rel=0.05) for mean in means)
 
 
-# What a scene does not need
+# Buffers and work that a scene does not need
 
 
 def wall(color: Tensor, **buffers: Any) -> Frame:
@@ -712,7 +712,7 @@ def test_buffers_that_accumulation_provides_are_not_needed_of_a_frame() -> None:
         needs = dataclasses.replace(Watching.needs, buffers=frozenset({"color", "current", "length", "roughness"}))
 
     assert Accumulated(Wanting()).needs.buffers == {"color", "roughness"}
-    # What comes of a history depends on the whole image: whether there was a cut.
+    # The result of a history depends on the whole image: whether there was a cut.
     assert Accumulated(Wanting()).needs.reach is None
 
 

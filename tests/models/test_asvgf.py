@@ -68,7 +68,7 @@ def test_a_light_that_goes_out_is_gone_at_once() -> None:
 
 
 def test_noise_is_hardly_taken_for_a_change() -> None:
-    """Of steady light with the noise of one sample, a history of hardly less than the 10 frames of ``alpha``.
+    """Steady light with the noise of one sample keeps a history of hardly less than the 10 frames of ``alpha``.
 
     Pixels that exceed two standard errors of a neighbourhood discard as much, which is a few parts in a hundred.
     """

@@ -1,4 +1,4 @@
-"""What every method says of a frame, a state or a weights file that is not for it: one line, and nothing computed."""
+"""Every method refuses a frame, a state or a weights file that does not fit it, in one line, and computes nothing."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def model_of(name: str) -> Any:
 
 @functools.cache
 def state_of(name: str, batch: int = 1) -> Any:
-    """What a method keeps of two frames."""
+    """Return the state of a method after two frames."""
     model, state = model_of(name), None
     with torch.no_grad():
         for seed in range(2):

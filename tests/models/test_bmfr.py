@@ -147,7 +147,7 @@ def test_anti_aliasing_is_a_setting() -> None:
     assert not list(parts_of(without, Antialiased))
     for model in (with_it, without):
         assert [(part.alpha_min, part.rule) for part in parts_of(model, Accumulated)] == [(0.2, "bmfr")]
-    # Of what is black, nothing before is left.
+    # A black frame stays black.
     assert not Denoiser(with_it)(frame(torch.zeros(1, 3, HEIGHT, WIDTH))).any()
 
 

@@ -128,7 +128,7 @@ def filtered(image: Tensor, weights: Tensor) -> Tensor:
 
 
 def predictions(network: Any, frame: Frame) -> list[Tensor]:
-    """Of the heads, from the ten channels that the paper names."""
+    """Return the predictions of the heads, from the ten channels that the paper names."""
     levels = network.unet(torch.cat([frame.color, *features(frame)], 1))
     return [
         F.conv2d(level, head.weight, head.bias, padding=1) for level, head in zip(levels, network.heads, strict=True)

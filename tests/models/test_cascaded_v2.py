@@ -46,7 +46,7 @@ def widths(name: str, **settings: Any) -> tuple[int, ...]:
 def test_the_sizes_of_the_family(name: str, expected: tuple[int, int], taps: int) -> None:
     pixel, kernel = networks(create_model(name))
     assert widths(name) == expected
-    # Of half the resolution, a feature stands for two by two pixels.
+    # At half the resolution, a feature stands for two by two pixels.
     finest = 4 if name == "cascaded_v2_micro" else 1
     assert [head.out_channels for head in kernel.heads] == [finest * (taps + 3), taps + 3, taps + 3]
     assert [head.out_channels for head in pixel.heads] == [finest * 3, 3, 3]
@@ -95,7 +95,7 @@ def test_weights_and_filter_in_one_give_the_same_image(
                 filtered = kernel_conv(image, weights, border="zeros")
             torch.testing.assert_close(filtered, expected, rtol=1e-4, atol=1e-5)
             calls.append(filtered)
-            # What the next network reads is rounded to 8 bits in bfloat16, now and then to the other side.
+            # The input of the next network is rounded to 8 bits in bfloat16, now and then to the other side.
             return filtered if precision == torch.float32 else expected
 
         monkeypatch.setattr(page, "cross_bilateral_filter", in_two_steps)
@@ -169,7 +169,7 @@ def test_a_pixel_network_is_given_the_means_of_its_image_at_coarser_scales() -> 
 
 @torch.no_grad()
 def test_lower_resolutions_see_further() -> None:
-    """Of what is 70 pixels away half the resolution knows, of what is 150 away a quarter of it."""
+    """Half the resolution depends on a pixel that is 70 pixels away, and a quarter of it on one that is 150 away."""
     coarse, frame = next(parts_of(small("cascaded_v2"), CoarseToFine)), frame_of(64, 640)
     assert frame.albedo is not None
     for distance, resolutions in ((70, 2), (150, 3)):
@@ -212,7 +212,7 @@ def test_large_images_have_the_derivatives_of_the_reference() -> None:
 
 
 def test_initial_weights() -> None:
-    """What they give changes only together with the architecture, and then every file of weights is void."""
+    """Their results change only together with the architecture, and then every file of weights is void."""
     torch.manual_seed(0)
     model = create_model("cascaded_v2", width=8)
     grid = torch.linspace(0, 1, 8 * 9).reshape(1, 1, 8, 9)

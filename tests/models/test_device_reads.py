@@ -138,7 +138,7 @@ def test_the_counter_sees_a_read(way: str) -> None:
 def test_the_images_are_those_of_a_step_that_looks(name: str) -> None:
     model = small(name)
     frames = shot(model)
-    # What stands still, and a cut: nothing of the frame before is seen again.
+    # After a still frame comes a cut: nothing of the frame before is seen again.
     frames += [frames[-1].replace(motion=torch.zeros(1, 2, *SIZE))]
     frames += [frames[0].replace(motion=torch.full((1, 2, *SIZE), 1e4)), frames[1]]
     found, _ = as_on_a_gpu(Denoiser(model), frames)
@@ -240,7 +240,7 @@ def test_repairs_are_those_of_validation() -> None:
 
 
 class Event:
-    """What ``torch.cuda.Event`` does, of a device that is as fast as this processor."""
+    """A stand-in for ``torch.cuda.Event``, of a device that is as fast as this processor."""
 
     waits = 0
 

@@ -28,7 +28,7 @@ def test_is_the_filter_of_kornia() -> None:
 
 
 def test_light_that_is_linear_in_the_guides_stays() -> None:
-    """Of such light every window's model is exact, up to eps beside the guides' variance."""
+    """Every window's model of such light is exact, up to eps beside the guides' variance."""
     given = frame().to(torch.float64)
     light = 0.2 * given.albedo + 0.1 * given.normal.sum(1, keepdim=True) + 0.3
     image = Guided(4, 1e-9)(given.replace(color=light))[0].image

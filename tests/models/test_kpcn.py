@@ -89,7 +89,7 @@ def test_the_network_written_out() -> None:
     assert frame.albedo is not None
     matt = filtered(network.diffuse, frame.diffuse, frame)
     shiny = torch.exp(filtered(network.specular, torch.log(1 + frame.specular), frame)) - 1
-    # What is divided by in Demodulated: the albedo, at least 0.04 where there is any.
+    # Demodulated divides by the albedo, at least by 0.04 where there is any.
     albedo = frame.albedo.clamp_min(0.04)
     output, state = network(frame)
     torch.testing.assert_close(output.image * albedo, albedo * matt + shiny + 0.25, rtol=1e-9, atol=1e-9)

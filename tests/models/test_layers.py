@@ -29,9 +29,9 @@ MODELS = [
     )
     for name in list_models()
 ]
-# Of others the library decides, or there are none.
+# For the other methods the library decides on derivatives, or there are none.
 DIFFERENTIABLE = [each for each in MODELS if each.values[0] not in OIDN]
-# What has no kernels keeps the alpha; its layers are split by their fractions.
+# A method without kernels keeps the alpha; its layers are split by their fractions.
 WITHOUT_KERNELS = (*OIDN, "oidn_tuned", "oidn_tuned_small", "rae")
 # The history of these is of images, or of hidden features, alone: no layer of a frame reaches the next frame's layers.
 HISTORY_OF_IMAGES = ("oidn_pyramid", "oidn_tuned", "oidn_tuned_small", "rae")
@@ -84,7 +84,7 @@ def test_layers_sum_to_the_image(name: str, precision: Any) -> None:
             assert (layer >= 0).all()
         assert "layers" in denoiser.report.stages
         assert not plain.report.stages or "layers" not in plain.report.stages
-        # What a layer is of is not changed by it; kornia's filters sum in another order for more channels.
+        # The image is not changed by its layers; kornia's filters sum in another order for more channels.
         torch.testing.assert_close(output.image, plain(frame), rtol=1e-5, atol=1e-5)
 
 
@@ -201,7 +201,7 @@ def _modules(model: Any) -> list[Any]:
     return list(model.modules()) if isinstance(model, nn.Module) else [model]
 
 
-# What is asked for
+# Requested layers
 
 
 def test_any_parts_of_the_color_may_be_asked_for() -> None:
@@ -244,7 +244,7 @@ def test_layers_that_half_floats_rounded_sum_to_the_color() -> None:
     assert not complete.layers[REST].any()
     total = torch.stack(list(complete.layers.values())).double().sum(0)
     torch.testing.assert_close(total, complete.color.double(), rtol=8 * 2.0**-24, atol=0)
-    # What is more than rounding is a layer of its own.
+    # A remainder of more than rounding is a layer of its own.
     dim = closed(frame.replace(layers={"most": 0.99 * frame.color}))
     torch.testing.assert_close(dim.layers[REST], 0.01 * frame.color, rtol=1e-4, atol=1e-6)
 
@@ -294,7 +294,7 @@ def test_a_layer_that_is_no_radiance_is_refused() -> None:
 
 @torch.no_grad()
 def test_histories_of_layers_have_the_weights_of_the_color_s() -> None:
-    """Of what stands still the layer is the mean of the frames, and where a firefly is clamped so is its layer."""
+    """The layer of a still pixel is the mean of the frames, and where a firefly is clamped so is its layer."""
     model = Accumulated(Noisy(), lag_threshold=float("inf"))
     state, glossy = None, []
     for seed in range(4):

@@ -1,4 +1,4 @@
-"""What every model of the zoo promises, whatever its weights are; the tests read the register."""
+"""Properties of every model of the zoo, whatever its weights are; the tests read the register."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_a_step_is_a_pure_function(name: str) -> None:
 @pytest.mark.parametrize("name", MODELS)
 @torch.no_grad()
 def test_a_state_is_of_tensors_with_the_batch_first_and_of_one_structure(name: str, batch: int) -> None:
-    """What moves, what stands still, and a cut."""
+    """The frames move, then stand still, and then there is a cut."""
     model, state, structures = small(name), None, []
     for number in range(6):
         frame = whole_frame(model, 24, 40, batch, seed=number)
@@ -129,7 +129,7 @@ def test_a_state_is_of_tensors_with_the_batch_first_and_of_one_structure(name: s
         assert all(isinstance(leaf, Tensor) for leaf in tensors(state))
         assert {len(leaf) for leaf in tensors(state)} <= {batch}
         structures.append(dict(pytree.tree_flatten_with_path(state)[0]))
-    # What is not there may come, and go again; what is there keeps its number of axes.
+    # An absent tensor may appear, and disappear again; a tensor that is there keeps its number of axes.
     for before, after in pairwise(structures):
         for path in before.keys() & after.keys():
             pair = [each[path] for each in (before, after)]
@@ -168,7 +168,7 @@ def test_hints_change_no_image(name: str) -> None:
 @pytest.mark.parametrize("name", MODELS)
 @torch.no_grad()
 def test_the_declared_needs_suffice(name: str) -> None:
-    """Of what is only of use, all or any may be missing."""
+    """All or any of the buffers that are only useful may be missing."""
     model = small(name)
     whole = whole_frame(model, 17, 20)
     # Extra buffers are not of the frame's own.

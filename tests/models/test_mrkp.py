@@ -58,7 +58,7 @@ def copied(image: Tensor, height: int, width: int) -> Tensor:
 
 
 def features(unet: Any, x: Tensor) -> list[Tensor]:
-    """Of the finest three decoders, layer by layer."""
+    """Return the features of the finest three decoders, layer by layer."""
     height, width = x.shape[-2:]
     x = F.pad(x, (0, -width % 32, 0, -height % 32), mode="replicate")
     skips, found = [], []

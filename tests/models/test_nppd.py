@@ -52,7 +52,7 @@ def leaky(x: Tensor) -> Tensor:
 
 
 def logarithm(x: Tensor) -> Tensor:
-    """Of one image or stack of images."""
+    """Return the logarithm of one image or stack of images, relative to its mean."""
     return torch.log(1 + x / x.mean())
 
 
@@ -225,7 +225,7 @@ def test_a_constant_image_stays_constant_away_from_the_border() -> None:
     image = model(frame)[0].image
     torch.testing.assert_close(image[..., 47:-47, 47:-47], torch.full((1, 3, 34, 66), 0.7))
     assert not torch.isclose(image[..., 46, 80], torch.tensor(0.7)).any()
-    # What leaves the image is lost, and nothing is added.
+    # Light that leaves the image is lost, and nothing is added.
     assert image.max() <= 0.7 * (1 + 1e-5)
     assert image[..., 0, 0].max() < 0.5
 

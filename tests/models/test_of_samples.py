@@ -1,4 +1,4 @@
-"""What methods of single samples have in common: light without noise, tiles, layers, and what they wear."""
+"""Common properties of methods of single samples: light without noise, tiles, layers, and their wrappers."""
 
 from __future__ import annotations
 

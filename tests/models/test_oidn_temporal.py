@@ -44,7 +44,7 @@ NAME = "oidn_temporal"
 
 
 def given(height: int = 21, width: int = 34, weight: float = 1.0) -> Frame:
-    """What the last step sees: four images, all different."""
+    """Return the frame that the last step sees: it has four images, all different."""
     extra = {name: torch.rand(1, 3, height, width) + 0.1 for name in (NOISY, PREVIOUS, PREVIOUS_LIGHT)}
     extra[PREVIOUS_WEIGHT] = torch.full((1, 1, height, width), weight)
     return frame_of(height, width, extra=extra)
@@ -187,7 +187,7 @@ def test_light_that_has_moved_on_counts_little() -> None:
     before[..., 10:16, 10:16] = 5
     extra = {**frame.extra, NOISY: now, PREVIOUS: before, PREVIOUS_LIGHT: before}
     image = Steadied()(frame.replace(color=now, extra=extra))[0].image
-    # Of what would be ten parts of 5 in eleven.
+    # Otherwise it would be ten parts of 5 in eleven.
     assert image.max() < 0.2001
 
 

@@ -56,7 +56,7 @@ def test_a_model_without_its_package_is_listed_with_the_reason(
     printed = capsys.readouterr().out
     assert all(name in printed for name in list_models())
     assert "not available" in printed
-    # What is in brackets is no markup.
+    # The text in brackets is not taken for markup.
     assert "[oidn]" in printed
 
 

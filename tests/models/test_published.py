@@ -1,4 +1,4 @@
-"""What the methods of the paper's comparison have in common."""
+"""Common properties of the methods in the paper's comparison."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_the_ten_channels() -> None:
     normal, depth = torch.rand(2, 3, 4, 5) * 2 - 1, torch.full((2, 1, 4, 5), 7.0)
     depth[:, :, 0] = torch.inf
     seen = TenChannels().input_of(Frame(image, albedo=albedo, normal=normal, depth=depth), 2 * image)
-    # What is hit is all at the typical depth.
+    # All surfaces are at the typical depth.
     near = torch.where(torch.isinf(depth), 1.0, 0.5)
     torch.testing.assert_close(seen, torch.cat([2 * image, albedo, (normal + 1) / 2, near], 1))
 
@@ -47,7 +47,7 @@ def test_displayed_values_and_their_slope_at_black_and_white() -> None:
     light.requires_grad_()
     shown = displayed(Frame(light, albedo=albedo))
     torch.testing.assert_close(shown[0, 0, 0], torch.tensor([1e-6 ** (1 / 2.2), 1.0]))
-    # Of black the power has no finite slope; of one it is 1 / 2.2.
+    # At black the power has no finite slope; at one the slope is 1 / 2.2.
     (slope,) = torch.autograd.grad(shown.sum(), light)
     torch.testing.assert_close(slope[0, 0, 0], torch.tensor([0.0, 0.25 / 2.2]))
     torch.testing.assert_close(displayed(Frame(light.detach())), light.detach().clamp_min(1e-6) ** (1 / 2.2))

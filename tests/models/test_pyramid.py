@@ -124,12 +124,12 @@ def test_gradients_are_finite_at_any_level(level: float) -> None:
 
 
 def test_the_albedo_of_what_is_multiplied_back_may_be_that_of_the_history() -> None:
-    """Of a matt surface, with the albedo's logit far up: the texture is that of the history."""
+    """The surface is matt and the albedo's logit far up: the texture is that of the history."""
     net = network()
     with torch.no_grad():
         for head in net.heads:
             head.weight.zero_()  # type: ignore[operator]
-        # Of the history, the second of three, and of what is not matt.
+        # The logits of the history (the second of three) and of light that is not matt are set.
         for place, logit in ((3, 1000.0), (sum(list(_PARTS.values())[:3]), -1000.0)):
             net.heads[0].bias[net.channels[0] + place] = logit  # type: ignore[index,operator]
     noisy, history = (torch.rand(1, 3, *SIZE, dtype=torch.float64) * 0.9 + 0.05 for _ in range(2))

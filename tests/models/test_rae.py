@@ -157,7 +157,7 @@ def test_it_has_no_accumulation_of_its_own() -> None:
     assert [type(part) for part in (model, model.inner, model.inner.inner)] == [Demodulated, Exposed, Rae]
 
 
-# What it remembers
+# The hidden state
 
 
 @torch.no_grad()

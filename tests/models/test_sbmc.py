@@ -26,7 +26,7 @@ def drawn(width: int = 4, rounds: int = 2, convolutions: int = 1, kernel_size: i
 
 
 def splat(network: SbmcNetwork, given: Frame, samples: Tensor) -> Tensor:
-    """Of every sample of every pixel, what goes where; divided by all that arrived."""
+    """Return the sum of all splats of every sample of every pixel, divided by the sum of their weights."""
     given = given.replace(statistics=network.statistics(given))
     embedded, context = network.embedding(samples_input(given, samples))
     height, width = given.size

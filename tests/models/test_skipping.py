@@ -1,4 +1,4 @@
-"""What a scene does not need is skipped, and the pixels stay the same, or as near as was asked for."""
+"""Work that a scene does not need is skipped, and the pixels stay the same, or as near as was requested."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_one_frame_and_the_last_one_are_not_remembered() -> None:
             assert (denoiser._state is not None) is keeps
 
 
-# What has no noise
+# Pixels without noise
 
 
 def found(frame: Frame) -> Tensor | None:
@@ -237,7 +237,7 @@ def test_a_tile_without_noise_is_passed_through() -> None:
     assert (tiles.skipped, tiles.exact) == (pytest.approx(128 / WIDTH), False)
     assert torch.equal(output.image[..., 96:], output.stages["accumulated"][..., 96:])
     assert not torch.equal(output.image[..., :96], output.stages["accumulated"][..., :96])
-    # What is passed through is a better image for the second network, at its border too.
+    # The pixels that are passed through are a better image for the second network, at its border too.
     assert relative(output.image[..., :64], expected.image[..., :64]) < 0.02
 
 
@@ -286,7 +286,7 @@ def test_only_edited_parts_are_computed_again() -> None:
 def test_a_tile_does_not_switch_to_and_fro() -> None:
     """The noise of every tile hovers about the tolerance: it leaves once, and comes back never."""
     noise, frames, alpha_min = 0.02, 60, 0.1
-    # Of uniform noise, in the exponential window.
+    # This is the deviation of uniform noise in the exponential window.
     expected = noise / 12**0.5 * (alpha_min / (2 - alpha_min)) ** 0.5
     changes = {}
     for name, hysteresis in (("with", 2.0), ("without", 1.0)):

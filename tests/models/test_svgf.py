@@ -96,7 +96,7 @@ def test_no_edge_of_normals_or_depths_is_crossed() -> None:
     flat = torch.zeros_like(noise)
     flat[:, 2] = 1
     apart = frame(lit, normal=flat, depth=torch.where(right, 3.0, 6.0))
-    # What is left is exp(-1000): a step of the depth itself, beside a thousandth of it.
+    # The remaining weight is exp(-1000): a step of the depth itself, beside a thousandth of it.
     assert not Svgf()(apart)[0].image[..., : WIDTH // 2].any()
     together = frame(lit, normal=flat)
     assert Svgf()(together)[0].image[..., : WIDTH // 2].any()
@@ -127,7 +127,7 @@ def test_motion_comes_from_positions_and_cameras_too() -> None:
             output, state = model(given, state)
         results.append((output.image, state.length))
     torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-3, atol=1e-3)
-    # What came into view at the right has no history, and the corner moves over the wall.
+    # The pixels that came into view at the right have no history, and the corner moves over the wall.
     assert results[0][1][..., -2:].unique().tolist() == [1.0]
     assert results[0][1][..., :10].unique().tolist() == [2.0]
 

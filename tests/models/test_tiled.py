@@ -206,7 +206,7 @@ def test_known_pixels_are_not_computed() -> None:
 @pytest.mark.parametrize(("top", "left"), [(0, 0), (100, 131), (170, 250)])
 @torch.no_grad()
 def test_a_part_of_an_image_is_that_of_the_whole(name: str, top: int, left: int) -> None:
-    """Of each network of the zoo."""
+    """This holds for each network of the zoo."""
     frame = frame_of(237, 331, length=torch.ones(1, 1, 237, 331))
     mask = torch.ones(1, 1, 237, 331, dtype=torch.bool)
     mask[..., top : top + 60, left : left + 70] = False
@@ -261,12 +261,12 @@ def test_the_whole_image_is_one_tile_where_tiles_would_cost_as_much() -> None:
     assert regions(needed, 8) == [Region(32, 64, 64, 96)]
 
 
-# What is chosen
+# The choice of tiles
 
 
 @pytest.fixture
 def loaded(monkeypatch: pytest.MonkeyPatch) -> float:
-    """What a process holds that has loaded torch and no images, unlike the one that runs tests."""
+    """Return the memory of a process that has loaded torch and no images, unlike the one that runs tests."""
     monkeypatch.setattr("mcdenoise.models._memory._memory_in_use", lambda device: 0.64e9)
     return 0.64e9
 

@@ -1,4 +1,4 @@
-"""What any method may wear: demodulation, exposure, another method before it, lower resolutions."""
+"""Wrappers of any method: demodulation, exposure, another method before it, lower resolutions."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_demodulated_light_contains_no_albedo() -> None:
     assert torch.equal(seen.color, demodulate(frame.color, frame.albedo))
     assert torch.equal(seen.current, demodulate(frame.color / 2, frame.albedo))
     assert torch.equal(seen.diffuse, demodulate(frame.color / 3, frame.albedo))
-    # Of a coat, and whatever a sample holds beside its radiance, nothing is divided.
+    # The light of a coat is not divided, nor is anything that a sample holds beside its radiance.
     assert seen.specular is frame.specular
     for sample in seen.samples.unbind(1):
         torch.testing.assert_close(sample[:, :3], seen.color)
@@ -253,7 +253,7 @@ def test_each_method_sees_the_image_of_the_one_before() -> None:
 
 
 def test_statistics_go_down_the_chain_anew_for_each() -> None:
-    """Of what a method sees itself; what another found before is there beside it."""
+    """A method computes statistics of its own input; those that another found before stay beside them."""
     frame, watching = frame_of(9, 7), Watching()
     Chain(first=Brightest(), second=Exposed(watching))(frame)
     assert watching.frames[0].statistics.keys() == {"brightest", "exposure"}

@@ -69,7 +69,7 @@ def bright_frame() -> Frame:
 
 
 def seen(frame: Frame) -> Tensor:
-    """What the networks are given."""
+    """Return the input of the networks."""
     assert frame.albedo is not None
     assert frame.normal is not None
     assert frame.depth is not None

@@ -166,7 +166,7 @@ class Watching(Same):
 
 
 class Seen(NamedTuple):
-    """What a method inside :class:`Accumulated` sees of a frame, and why it has no history."""
+    """A record of the frame that a method inside :class:`Accumulated` sees, and why it has no history."""
 
     color: Tensor
     current: Tensor

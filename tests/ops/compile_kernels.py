@@ -55,7 +55,7 @@ def main(capability: int, dtype: torch.dtype) -> None:
 
 
 def steps(image: Callable[[int], torch.Tensor]) -> None:
-    """What has no derivatives, in all that it may be asked for."""
+    """Call the operators and steps that have no derivatives, with all that may be requested of them."""
     color, one = image(3), image(1)
     factor = one[:, :, :1, :1]
     surface = Surface(image(3), image(3), one, one)

@@ -198,7 +198,7 @@ def test_the_interpreter_is_no_default() -> None:
     assert _backend.choose_backend(["triton"], [torch.rand(1, 3, 256, 256)]) != "triton"
 
 
-# What has no derivatives: the steps of the models, and what they accumulate with.
+# Functions without derivatives: the steps of the models, and the operators of the accumulation.
 
 WITHOUT = [
     *(step for step in STEPS if "triton" in backends_of(step.function)),
@@ -208,7 +208,7 @@ STEP_CASES = [(op, case) for op in WITHOUT for case in op.cases if case.kind == 
 
 
 def is_plain(function: Callable[..., Any], tolerance: float, *given: Any, **settings: Any) -> None:
-    """Of what was given in another precision, the reference implementation's result in float64."""
+    """Compare a result in another precision with that of the reference implementation in float64."""
 
     def exact(value: Any) -> Any:
         return value.double() if isinstance(value, Tensor) else value

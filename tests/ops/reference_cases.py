@@ -13,8 +13,8 @@ from mcdenoise.ops import use
 from mcdenoise.ops._backend import Backend
 
 FAST = [op for op in OPS if op.name in ("kernel_conv", "kernel_splat", "cross_bilateral_filter")]
-# Of the largest number in the case. Half precision is rounded once, after a sum in float32; a derivative in float32
-# is a sum over up to 49 taps of products of sums.
+# The tolerance is relative to the largest number in the case. Half precision is rounded once, after a sum in float32;
+# a derivative in float32 is a sum over up to 49 taps of products of sums.
 TOLERANCE = {
     torch.float64: 1e-13,
     torch.float32: 32 * torch.finfo(torch.float32).eps,

@@ -1,4 +1,4 @@
-"""What the affinity filter promises, beside its equation."""
+"""Properties of the affinity filter, beside its equation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ONE = torch.ones(1, 1, *SIZE, dtype=torch.float64)
 
 
 def test_it_is_the_bilateral_filter_of_its_features() -> None:
-    """Of logits 0, and log c at the centre; taps outside of the image do not count."""
+    """The logits are 0, and log c at the centre; taps outside of the image do not count."""
     color, features, bandwidth, center = image(3), image(4, 1), 5 * image(1, 2), image(1, 3)
     logits = torch.zeros(1, 49, *SIZE, dtype=torch.float64)
     logits[:, 24] = center[:, 0].log()
@@ -64,7 +64,7 @@ def test_the_frame_before_counts_as_much_as_it_is_known() -> None:
     found = affinity_filter(color, features, ONE, center, before, there, width, known, kernel_size=1)
     w = known * torch.exp(-width * (features - there).square().sum(1, keepdim=True))
     torch.testing.assert_close(found, (center * color + w * before) / (center + w))
-    # What is not known is not looked at, however large it is.
+    # An unknown history is not read, however large it is.
     alone = affinity_filter(color, features, ONE, center)
     unknown = affinity_filter(color, features, ONE, center, 1e30 * before, there, width, 0 * known)
     assert torch.equal(unknown, alone)
@@ -78,7 +78,7 @@ def test_flips_and_turns_go_through() -> None:
 
 
 def test_no_weight_of_a_tap_is_kept_for_the_derivative() -> None:
-    """What the graph holds is as many numbers as the arguments have, whatever the size of the window."""
+    """The graph holds as many numbers as the arguments have, whatever the size of the window."""
     held = []
     for kernel_size in (3, 9):
         kept: list[int] = []

@@ -1,4 +1,4 @@
-"""What the a-trous transform and the variance of moments promise, beside their equations."""
+"""Properties of the a-trous transform and of the variance of moments, beside their equations."""
 
 from __future__ import annotations
 

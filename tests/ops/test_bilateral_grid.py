@@ -1,4 +1,4 @@
-"""What the bilateral grid promises, beside its equations."""
+"""Properties of the bilateral grid, beside its equations."""
 
 from __future__ import annotations
 

@@ -329,7 +329,7 @@ def gradients_of_both(backend: Any, case: Case, dtype: torch.dtype, **changed: A
 def test_derivatives_of_accumulation_are_those_of_the_reference(case: Case, dtype: torch.dtype) -> None:
     found, expected = (gradients_of_both(backend, case, dtype) for backend in ("numba", "torch"))
     assert [each.dtype for each in found] == [each.dtype for each in expected]
-    # Of a motion the derivative is a difference of the taps, which are as large as they are.
+    # The derivative of a motion is a difference of the taps: its rounding is in proportion to their size.
     largest = max(1.0, *(each.abs().max().item() for each in expected if each.numel()))
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=32 * torch.finfo(dtype).eps * largest)

@@ -78,7 +78,7 @@ ZOO: dict[str, tuple[Callable[[Draw, int], Inputs], dict[str, Any]]] = {
     "temporal_gradient": (_changes, {"stratum": 2, "levels": 2, "sigma_n": 2.0}),
 }
 FAST = [op for op in OPS if op.name in ZOO]
-# Of the others the derivatives are those of the reference implementation.
+# The derivatives of the other operators are those of the reference implementation.
 DIFFERENTIABLE = [op for op in FAST if op.name != "importance_filter"]
 every_op = pytest.mark.parametrize("op", FAST, ids=lambda op: op.name)
 
@@ -149,7 +149,7 @@ def test_threads_change_nothing(op: Op, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def _cells_apart(tensor: Tensor) -> Tensor:
-    """Of a grid, with others beside each of its cells."""
+    """Return a view of a grid that has other cells beside each of its own."""
     return torch.stack([torch.full_like(tensor, torch.nan), tensor], -1)[..., 1]
 
 

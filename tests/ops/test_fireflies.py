@@ -98,7 +98,7 @@ def test_a_limit_beyond_the_range_of_the_dtype_makes_no_nan() -> None:
 
 @pytest.mark.parametrize("lit", [1, 2, 3])
 def test_sparse_light_is_kept(lit: int) -> None:
-    """Of 49 paths few find any light: what they bring is as bright as everything else that was found."""
+    """Few of 49 paths find any light: the light of these is as bright as everything else that was found."""
     image = torch.zeros(1, 3, 15, 15, dtype=torch.float64)
     image[..., 7, 7 : 7 + lit] = 9.0
     assert torch.equal(clamp_fireflies(image), image)

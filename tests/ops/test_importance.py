@@ -1,4 +1,4 @@
-"""What is special about means that a map of importance weighs."""
+"""Tests of means that a map of importance weighs."""
 
 from __future__ import annotations
 

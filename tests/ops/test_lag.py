@@ -1,4 +1,4 @@
-"""What the test for lag can see, and what it must not take for lag."""
+"""Changes that the test for lag can see, and noise that it must not take for lag."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcdenoise.ops import history_lag
 SIZE = (40, 40)
 # 121 pixels a window.
 lag = functools.partial(history_lag, kernel_size=11)
-# Of the mean of three channels, each of deviation 1.
+# The variance is that of the mean of three channels, each of deviation 1.
 VARIANCE = torch.full((1, 1, *SIZE), 1 / 3)
 
 

@@ -16,7 +16,7 @@ from mcdenoise.ops import downsample
 from mcdenoise.ops._numba import _runtime
 from mcdenoise.ops._steps import network
 
-# Of the largest number in a result: a few roundings of sums of up to 54 products.
+# The tolerance is relative to the largest number in a result: a few roundings of sums of up to 54 products.
 TOLERANCE = {dtype: 32 * torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
 SIZES = [(1, 1, 1), (2, 5, 7), (1, 8, 300), (2, 33, 2), (1, 2, 1030)]
 

@@ -20,7 +20,7 @@ numba = pytest.importorskip("numba")
 from mcdenoise.ops._numba._cache import VerifiedCache  # noqa: E402
 
 KERNEL = "def twice(value):\n    return value + value\n\n\ndef thrice(value):\n    return 3 * value\n"
-# What one op needs: six functions, quickly compiled.
+# One op needs six functions, which are compiled quickly.
 OP = """
 import json, sys
 import numba.core.dispatcher as dispatcher
@@ -137,7 +137,7 @@ def test_nothing_of_a_damaged_file_is_used(
     assert not (tmp_path / "opened").exists()
     path.write_bytes(content)
     assert load(sig, context) is not None
-    # What another function was compiled to, under this one's name.
+    # The file holds the compiled code of another function, under this one's name.
     kept(kernels["thrice"])(2.0)
     other = next(each for each in files(folder) if each != path)
     path.write_bytes(other.read_bytes())

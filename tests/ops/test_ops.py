@@ -1,4 +1,4 @@
-"""What holds for every op, on every case of the table in ``mcdenoise/check/cases.py``."""
+"""Properties of every op, on every case of the table in ``mcdenoise/check/cases.py``."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.check.overview import DTYPES, overview, relative_error
 from mcdenoise.errors import InputError
 
-# Of the largest absolute value of a result. Half precision is rounded once, after a sum in float32, or a few times by
-# the ops that have no sum; float32 is rounded at every tap, and an exponent near 50 is known to 50 eps.
+# It is relative to the largest absolute value of a result. Half precision is rounded once, after a sum in float32, or
+# a few times by the ops that have no sum; float32 is rounded at every tap, and an exponent near 50 is known to 50 eps.
 # Measured at most: 0.6 eps for half precision, 3 eps for float32 and float64.
 TOLERANCE = {
     torch.float64: 1e-10,

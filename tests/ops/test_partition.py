@@ -71,7 +71,7 @@ def test_a_sum_of_weights_of_4_keeps_the_light(side: int) -> None:
     kernel = 4 * torch.softmax(4 * draw(2, side**2, 3, 5, seed=1), 1)
     found = learned_upsample(coarse, kernel, (6, 10))
     torch.testing.assert_close(found.sum((2, 3)), 4 * coarse.sum((2, 3)), rtol=1e-12, atol=0)
-    # Of what is two pixels from the border nothing leaves the image.
+    # Light that is two pixels or more from the border does not leave the image.
     inner = coarse.clone()
     inner[..., [0, -1], :] = inner[..., [0, -1]] = 0
     lost = learned_upsample(inner, kernel, (6, 10), border="zeros")

@@ -1,4 +1,4 @@
-"""What holds for the ops on any input: shapes, dtypes and values are drawn by hypothesis, which shrinks what fails.
+"""Properties of the ops on any input: hypothesis draws shapes, dtypes and values, and shrinks the inputs that fail.
 
 A failure that turns up here becomes a case of the table in ``mcdenoise/check/extreme.py``.
 """

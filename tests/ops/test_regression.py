@@ -1,4 +1,4 @@
-"""What block regression promises, beside its equation."""
+"""Properties of block regression, beside its equation."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def test_squares_are_fitted_wherever_the_origin_is() -> None:
     spread = (2.0**-5 * (32**2 - 1) ** 0.5 / 12**0.5) / 2
     for origin in (0.0, 1e2, 1e4, 1e5):
         found = block_regression(image, origin + place, squares=1)
-        # What deviates by 1e-7 of its size counts half, and all else is as much less. Each function is off by that of
-        # its deviation, which is no more than the image's, so that no pixel is off by more than three of both.
+        # A feature that deviates by 1e-7 of its size counts half, and all others lose less. Each function is off by that
+        # of its deviation, which is no more than the image's, so that no pixel is off by more than three of both.
         lost = 1e-8 + (1e-7 * (origin + 1) / spread) ** 2
         assert (found - image).abs().max() < 6 * lost * image.std()
         assert (block_regression(image, origin + place) - image).abs().max() > 1e-2
@@ -84,7 +84,7 @@ def test_features_that_say_nothing_new_change_nothing() -> None:
 
 
 def test_a_flat_wall_is_its_mean() -> None:
-    """What float32 rounds off a constant normal is no feature: 1e-7 of it."""
+    """The rounding of a constant normal in float32, 1e-7 of it, is no feature."""
     image = drawn(1, 3, 32, 32).float()
     normal = torch.tensor([0.6, 0.0, -0.8]).reshape(1, 3, 1, 1).expand(1, 3, 32, 32)
     mean = image.double().mean((2, 3), keepdim=True).float().expand_as(image)
@@ -95,10 +95,10 @@ def test_a_flat_wall_is_its_mean() -> None:
 
 
 def test_noise_is_left_in_proportion_to_the_features() -> None:
-    """Of 1024 independent values and k functions, the constant among them, k / 1024 of the variance."""
+    """With 1024 independent values and k functions, the constant among them, k / 1024 of the variance is left."""
     noise = torch.randn(64, 1, 32, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     found = block_regression(noise, scene(32, 32).expand(64, -1, -1, -1), squares=3)
-    # Of 64 sums of 10 squares the mean deviates by sqrt(2 / 640), 6 %; five of these.
+    # The mean of 64 sums of 10 squares deviates by sqrt(2 / 640), 6 %; the tolerance is five of these.
     assert found.square().mean().item() == pytest.approx(10 / 1024, rel=0.3)
 
 

@@ -1,4 +1,4 @@
-"""What is special about ``softmax_splat``: known answers, its limits, and that splats add up."""
+"""Tests of ``softmax_splat``: known answers, its limits, and that splats add up."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def test_a_pixel_that_is_sent_to_its_neighbour() -> None:
     mean, log_weight = softmax_splat(image, logits)
     assert mean[0, 0, 0, 1] == 1
     assert log_weight[0, 0, 0, 1] == 200
-    # What arrives elsewhere does not know of it.
+    # A value that arrives elsewhere is not affected.
     torch.testing.assert_close(mean[0, 0, 0, 2], torch.tensor(2.5))
 
 
 def test_only_differences_of_logits_count() -> None:
-    """Of exponents whose exponentials no number holds."""
+    """This holds for exponents whose exponentials no number holds, too."""
     image, logits = drawn(1, 3, 4, 5), drawn(1, 9, 4, 5, seed=1)
     mean, log_weight = softmax_splat(image, logits)
     for offset in (-1e4, 1e4):

@@ -1,4 +1,4 @@
-"""What holds for every fused step: its formula, its derivatives, and its stability."""
+"""Properties of every fused step: its formula, its derivatives, and its stability."""
 
 from __future__ import annotations
 

@@ -394,7 +394,7 @@ class TestNothingMoves:
 
 
 def test_motion_keeps_its_precision_under_autocast() -> None:
-    """Of a scene 100 units from the origin, where bfloat16 would be off by 64 pixels."""
+    """The scene is 100 units from the origin, where bfloat16 would be off by 64 pixels."""
     position = 100 + torch.rand(1, 3, 36, 64)
     matrix = torch.eye(4)[None] * 0.5
     matrix[:, 3, 3] = 6

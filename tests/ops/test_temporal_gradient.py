@@ -1,4 +1,4 @@
-"""What temporal gradients promise, beside their equation."""
+"""Properties of temporal gradients, beside their equation."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_signs_cancel_within_a_neighbourhood() -> None:
 
 
 def test_noise_within_two_standard_errors_is_none() -> None:
-    """Of normal noise 4.6 % of the strata differ by more than two; without its variance, all of them do."""
+    """With normal noise 4.6 % of the strata differ by more than two; without its variance, all of them do."""
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(2, 1, 1, 120, 120, generator=generator, dtype=torch.float64)
     now, before = 20 + noise

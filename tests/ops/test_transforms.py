@@ -16,7 +16,7 @@ from mcdenoise import ops
 from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.ops import _backend
 
-# Of torch's own making, when its rules for forward mode are loaded.
+# The warning is torch's own: it comes when its rules for forward mode are loaded.
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 
 every_case = pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_forward_mode_is_the_transpose_of_reverse_mode(op: Op, case: Case) -> No
     with forward_ad.dual_level():
         dual = function(*(forward_ad.make_dual(*each) for each in zip(leaves, tangents, strict=True)))
         torch.testing.assert_close(forward_ad.unpack_dual(dual).tangent, moved, rtol=1e-12, atol=1e-12)
-    # Of one argument at a time.
+    # The same holds for one argument at a time.
     alone = [
         torch.func.jvp(lambda x, i=i: function(*leaves[:i], x, *leaves[i + 1 :]), (leaves[i],), (tangents[i],))[1]
         for i in range(len(leaves))
@@ -92,7 +92,7 @@ def test_vmap_is_a_loop(op: Op, case: Case) -> None:
         torch.testing.assert_close(found[i], expected.detach(), rtol=1e-12, atol=1e-12)
         for found_gradient, gradient in zip(gradients, torch.autograd.grad(expected.cos().sum(), one), strict=True):
             torch.testing.assert_close(found_gradient[i], gradient, rtol=1e-9, atol=1e-11)
-    # Of one argument at a time, beside others that have no such axis.
+    # The same holds for one argument at a time, beside others that have no such axis.
     for k in range(len(leaves)):
         dims = tuple(0 if i == k else None for i in range(len(leaves)))
         arguments = [several[i] if i == k else leaves[i] for i in range(len(leaves))]
@@ -118,7 +118,7 @@ def test_the_gradient_of_a_vmap_and_jacobians(op: Op) -> None:
 
 
 def test_default_arguments_at_a_size_where_fast_backends_are_chosen() -> None:
-    """What was silently zero."""
+    """The derivatives were silently zero here once."""
     x = torch.rand(1, 3, 96, 128, dtype=torch.float64)
     kernel = torch.rand(1, 9, 96, 128, dtype=torch.float64)
     one = torch.ones_like(x)
