@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 ADDON = ROOT / "examples" / "blender" / "denoise_animation.py"
 RENDERED = ROOT / "tests" / "data" / "renderers" / "blender_filtered"
 PYTHON = os.environ.get("BLENDER_PYTHON")
-# Where mcdenoise is: a script in the folder of this interpreter.
+# The command is a script in the folder of this interpreter.
 PROGRAM = Path(sys.executable).with_name("mcdenoise")
 
 SCRIPT = f"""

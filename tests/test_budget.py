@@ -102,7 +102,7 @@ def test_limits_that_no_model_meets_are_told_in_one_line(sequence: Sequence, res
         path.unlink()
     bare = open_sequence(sequence.root)
     assert "expected references in" in refused(lambda: choose_model(bare, max_error=0.1))
-    # Without any error, the slowest that keeps to the budget.
+    # Without a limit of the error, the slowest method that keeps to the budget is chosen.
     assert choose_model(bare, budget=150).name == "cascaded_v2_small, bfloat16"
 
 
@@ -125,7 +125,7 @@ def test_times_are_measured_once_for_each_size_and_number_of_threads(
         path.unlink()
     sequence = open_sequence(sequence.root)
     first = choose_model(sequence, **bare)
-    # In both floats, and in integers where the model and the machine can.
+    # The methods run in both float types, and in integers where the model and the machine can.
     calibrated = {name for name in pretrained_models() if name.startswith("cascaded_v2") and has_int8()}
     count = 2 * len(pretrained_models()) + len(calibrated)
     assert len(measured) == count

@@ -339,7 +339,7 @@ def image(buffer: Any) -> Any:
 def test_a_gray_ball_in_an_even_sky_is_as_bright_as_it_is_gray(blender: Blender, tmp_path: Path) -> None:
     frame = rendered(blender, tmp_path, scene_of(ball=ball(GRAY), sky={"type": "constant", "radiance": 2.0}))
     rays = pixel_rays(CAMERA, 24, 16)
-    # Where a ray meets the ball of radius 1, well inside of its outline, of which triangles cut off a little.
+    # A ray meets the ball of radius 1 here, well inside of its outline, of which triangles cut off a little.
     along = -(rays.directions @ rays.origin)
     nearest = np.sqrt(rays.origin @ rays.origin - along**2)
     hit = (nearest < 0.9).reshape(16, 24)

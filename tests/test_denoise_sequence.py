@@ -1,4 +1,4 @@
-"""From a folder of frames to a folder of clean ones: what is written, what is told, and what goes on beside."""
+"""Denoising of a folder of frames into a folder of clean ones: what is written, what is told, and what runs beside."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_the_command_line_sets_the_precision(
 
 
 def stored(path: Path) -> str:
-    """How an EXR stores its pixels."""
+    """Return how an EXR stores its pixels."""
     file = oiio.ImageInput.open(str(path))
     kind = str(file.spec().format)
     file.close()

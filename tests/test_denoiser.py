@@ -166,7 +166,7 @@ def test_an_invalid_pixel_is_replaced_and_counted(frames: list[Frame], value: fl
     image = denoiser(frames[0].replace(color=broken))
     assert denoiser.report.replaced_pixels == 1
     assert torch.isfinite(image).all()
-    # As if the pixel had been rendered like that: nothing else remembers it, now or in the next frame.
+    # The result is as if the pixel had been rendered like that: nothing else remembers it, now or in the next frame.
     other = Denoiser(small_model())
     torch.testing.assert_close(image, other(frames[0].replace(color=mended)))
     torch.testing.assert_close(denoiser(frames[1]), other(frames[1]))

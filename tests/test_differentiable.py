@@ -88,7 +88,7 @@ def check(denoiser: Denoiser, frames: list[dict[str, Tensor]], names: tuple[str,
         direction = torch.randn(gradient.shape, generator=generator, dtype=torch.float64)
         values = []
         for sign in (1, -1):
-            # On record as well, so that the same forms of operators are chosen.
+            # The changed buffers require gradients as well, so that the same backends of operators are chosen.
             changed = {key: buffer.detach().clone() for key, buffer in first.items()}
             changed[name] += sign * STEP * direction
             changed = {**frames[0], **{key: buffer.requires_grad_() for key, buffer in changed.items()}}

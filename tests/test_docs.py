@@ -75,7 +75,7 @@ def test_code_for_those_who_come_from_oidn_runs() -> None:
 
 
 def test_code_about_threads_runs_before_torch() -> None:
-    """In a process of its own, since torch is here already."""
+    """The code runs in a process of its own, since torch is here already."""
     import subprocess
 
     (code,) = blocks("performance.md", "python")

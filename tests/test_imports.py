@@ -55,7 +55,7 @@ ALLOWED: dict[str, set[str]] = {
     "scenes": SIGNAL | {"data", "engines", "interruption"},
     "denoiser": SIGNAL | {"models"},
     "methods": SIGNAL | {"models", "denoiser"},
-    # For scripts of a renderer: nothing of the package imports them.
+    # These modules are for scripts of a renderer: nothing of the package imports them.
     "integrations": SIGNAL | {"models", "denoiser"},
     "folder": LIBRARY,
     "shot": LIBRARY | {"budget", "methods"},
@@ -119,7 +119,7 @@ def arrows(module: str, source: str) -> Iterator[str]:
 
 
 def files_of(room: str) -> dict[str, set[str]]:
-    """For each file of a room, the files of it that it imports, whatever they hold."""
+    """Return, for each file of a room, the files of it that it imports, whatever they hold."""
     files = {module for module in MODULES if room_of(module) == room}
     return {file: set(imported(file, MODULES[file].read_text())) & files - {file} for file in files}
 

@@ -171,7 +171,7 @@ def interrupt(folder: Path, moment: str, number: signal.Signals = signal.SIGINT)
     process = started(OWN.replace("{moment}", moment), "wait", folder=folder)
     assert process.stdout is not None
     assert process.stdout.readline() == "begun\n"
-    # Until it does what is meant: a file is only written once its reader is loaded.
+    # Wait until it does what is meant: a file is only written once its reader is loaded.
     deadline = time.monotonic() + 60
     while moment in WRITING.values() and not list(folder.glob(".mcdenoise-*")):
         assert time.monotonic() < deadline

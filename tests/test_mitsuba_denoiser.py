@@ -1,4 +1,4 @@
-"""In the place of `mi.OptixDenoiser`: bitmaps, tensors, gradients, and what its arguments mean here."""
+"""The stand-in for `mi.OptixDenoiser`: bitmaps, tensors, gradients, and the meaning of its arguments here."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ assert drjit.grad(x).numpy().ravel().tolist() == [2, 4]
 
 @pytest.fixture(scope="session")
 def differentiates() -> str:
-    """Why no variant differentiates here, if none does: an LLVM that is too old aborts a process, so a child tries."""
+    """Return why no variant differentiates here, if none does: an old LLVM aborts a process, so a child tries."""
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed: pip install 'mcdenoise[render]'")
     child = subprocess.run([sys.executable, "-c", TRIAL], capture_output=True, text=True, timeout=120, check=False)
     return "" if child.returncode == 0 else "Mitsuba's llvm_ad_rgb does not run here: no LLVM, or one that is too old"

@@ -182,7 +182,7 @@ def test_every_light_that_may_be_chosen_shines() -> None:
         assert chosen > 0
 
 
-# Where it is seen from
+# Cameras
 
 
 def test_cameras_are_outside_the_boxes_of_all_shapes() -> None:
@@ -218,7 +218,7 @@ def test_every_frame_of_a_path_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
     assert moving > 3
 
 
-# As Mitsuba sees it
+# The scenes in Mitsuba
 
 
 @pytest.mark.parametrize("seeds", [range(10), pytest.param(range(10, 40), marks=pytest.mark.slow)])

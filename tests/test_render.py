@@ -372,7 +372,7 @@ TUNGSTEN = """{"bsdfs": [{"name": "odd, ]"},], "camera": {"resolution": [1280, 7
 
 
 def test_camera_paths_of_tungsten_scenes(tmp_path: Path) -> None:
-    """As published: a scene file per frame, with commas that JSON does not allow."""
+    """The scenes are written as published: a file per frame, with commas that JSON does not allow."""
     expected = [Camera.look_at((x, 2, 3), (0, 1, 0), fov_x=65).to_world for x in (1, 2, 10)]
     scenes = tmp_path / "scenes"
     scenes.mkdir()

@@ -24,7 +24,7 @@ def passes(count: int, paths: int, seed: int = 0) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("start", [0, 16, 200])
 def test_noise_is_the_smape_against_the_truth(start: int) -> None:
-    """With equal halves, and where one half is all there was before."""
+    """This holds with equal halves, and where one half is all that there was before."""
     before = passes(1, start, seed=1)[0] if start else np.zeros((PIXELS, 3))
     halves = ReferenceHalves.start(before, start, start)
     for mean in passes(6, 16):

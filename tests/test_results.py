@@ -53,7 +53,7 @@ def results() -> Results:
 
 
 def test_a_spread_has_the_quartiles_of_its_values() -> None:
-    # Between neighbours, as numpy and most others define them.
+    # They are interpolated between neighbours, as numpy and most others define them.
     assert Spread.of([4.0, 1.0, 3.0, 2.0]) == Spread(2.5, 1.75, 3.25, 4)
     assert Spread.of([7.0]) == Spread(7.0, 7.0, 7.0, 1)
 
@@ -112,7 +112,7 @@ HOSTILE += [[], {}, [[]], {"a": 1}, [None], [-1], ["x"]]
 
 
 def places(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where something is in what JSON holds, itself excepted."""
+    """Yield the path of everything in the content of a JSON file, the content itself excepted."""
     items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
     for key, value in items:
         yield (*path, key)
@@ -129,7 +129,7 @@ def changed(content: Any, path: tuple[Any, ...], change: Callable[[Any, Any], No
 
 
 def damaged(content: Any) -> Iterator[Any]:
-    """With one thing replaced, gone, or more."""
+    """Yield the content with one thing replaced, gone, or more."""
     for path in places(content):
         for value in HOSTILE:
             yield changed(content, path, lambda holder, key, value=value: holder.__setitem__(key, value))

@@ -17,7 +17,7 @@ from mcdenoise.cli import main
 from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame, write_buffer
 
-# With shipped weights, and fast.
+# A fast model with shipped weights.
 MODEL = "cascaded_v2_micro"
 HEIGHT, WIDTH = 40, 72
 
@@ -81,7 +81,7 @@ def denoised(frames: list[Frame], denoiser: Denoiser | None = None) -> list[Tens
 
 
 def in_one_place(frames: list[Frame]) -> Iterator[Frame]:
-    """As a renderer hands them over that writes every frame into the same buffers."""
+    """Yield the frames as a renderer does that writes every frame into the same buffers."""
     place = Frame(**{name: torch.empty_like(value) for name, value in frames[0].items()})
     for frame in frames:
         for (_, mine), (_, value) in zip(place.items(), frame.items(), strict=True):
@@ -94,7 +94,7 @@ def test_a_renderer_may_write_every_frame_into_the_same_buffers(shot: list[Frame
     expected = denoised(shot, Denoiser(MODEL, anti_lag=anti_lag))
     denoiser = Denoiser(MODEL, anti_lag=anti_lag)
     found = [denoiser(frame) for frame in in_one_place(shot)]
-    # Not cloned: what was handed out stays what it was, too.
+    # The images are not cloned: those that were handed out stay unchanged.
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
 

@@ -1,4 +1,4 @@
-"""How random scenes are photographed, and what shines in them."""
+"""The way random scenes are photographed, and the materials and lights in them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def described(take: Take) -> list[Any]:
 
 
 def kinds(scene: dict[str, Any]) -> Counter[str]:
-    """How many shapes have which kind of material."""
+    """Return how many shapes have which kind of material."""
     found: Counter[str] = Counter()
     for name, entry in scene.items():
         reference = entry.get("bsdf") if isinstance(entry, dict) else None

@@ -1,4 +1,4 @@
-"""How the threads of commands wait."""
+"""The way the threads of commands wait."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def test_buffers_for_the_history_are_not_kept_without_one(
         opened = open_sequence(small_sequence, frames)
         report = denoise_sequence(opened, tmp_path / frames, Denoiser(small_model()), "small")
         assert all(("position" in names) is kept for names in seen)
-        # From the positions, which say it in this folder.
+        # The depth is computed from the positions of this folder.
         assert all("depth" in names for names in seen)
         accumulate = next(row for row in report.plan if row["stage"] == "accumulate")
         assert accumulate["reason"] == ("positions and cameras" if kept else "one frame")

@@ -55,7 +55,7 @@ class Process:
 
 
 class Ended(NamedTuple):
-    """How a process ended."""
+    """The end of a process: its status, and what it printed."""
 
     status: int
     out: str

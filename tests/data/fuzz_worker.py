@@ -30,7 +30,7 @@ def taken() -> int:
 
 
 def read_alone(path: Path) -> None:
-    """As a buffer of the BMFR layout, or its matrices."""
+    """Read the file as a buffer of the BMFR layout, or its matrices."""
     if path.suffix == ".h":
         read_camera_matrices(path)
     else:
@@ -51,7 +51,7 @@ def read_and_write(path: Path, out: Path) -> None:
         written = sequence.write(out, number, np.nan_to_num(image, posinf=1))
     finally:
         files = list(out.iterdir())
-        # Not yet there, or there whole; and nothing else.
+        # The file is not there yet, or whole; nothing else is there.
         if files and files != [out / path.name]:
             raise AssertionError(f"left behind: {files}")
     again = read_image_header(written)

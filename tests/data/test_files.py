@@ -64,7 +64,7 @@ def test_only_leftovers_of_a_killed_process_are_removed_by_the_next(tmp_path: Pa
         files._swept.clear()
         write_text(tmp_path / "whole.txt", "text")
         left = {path.name for path in tmp_path.iterdir()} - {".mcdenoise-link.tmp", *others, "whole.txt"}
-        # That of the process that still writes.
+        # The remaining file is that of the process that still writes.
         assert len(left) == 1
         assert left < {path.name for path in hidden}
         assert (tmp_path / "file.tmp").read_text() == "somebody's"

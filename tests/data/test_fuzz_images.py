@@ -116,7 +116,7 @@ def absurd_sides(g: Generator, content: bytes) -> bytes:
         (count,) = struct.unpack_from("<H", content, start)
         for place in range(start + 2, start + 2 + 12 * count, 12):
             (tag,) = struct.unpack_from("<H", content, place)
-            # Also tiles and strips as large as the image.
+            # These tags include tiles and strips as large as the image.
             if tag in (256, 257, 278, 322, 323) and g.random() < 0.7:
                 struct.pack_into("<HHII", damaged, place, tag, 4, 1, w if tag in (256, 322) else h)
         return bytes(damaged)

@@ -149,7 +149,7 @@ def test_a_thousand_layers(tmp_path: Path) -> None:
 
 
 def test_a_text_in_latin_1_is_unchanged(tmp_path: Path) -> None:
-    """As renderers on old systems write it: the library that writes here knows nothing but UTF-8."""
+    """Renderers on old systems write it so: the library that writes here knows nothing but UTF-8."""
     content = write(tmp_path / "shot.exr", part("RGB", owner="M?ller", extra=3)).read_bytes()
     (tmp_path / "shot.exr").write_bytes(content.replace(b"M?ller", b"M\xfcller"))
     sequence = open_sequence([tmp_path / "shot.exr"])
@@ -264,7 +264,7 @@ def test_a_full_disk_is_told_to_the_last_byte(tmp_path: Path, name: str, kind: s
     assert file.close()
     sequence, out = open_sequence([tmp_path / name]), tmp_path / "out"
     out.mkdir()
-    # As large as the file will be.
+    # The length is that of the file as it will be.
     length = sequence.write(out, 0, noise).stat().st_size
     (out / name).unlink()
     unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)

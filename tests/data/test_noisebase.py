@@ -83,7 +83,7 @@ def arrays(number: int, samples: int = SAMPLES) -> dict[str, np.ndarray]:
 
 
 def write(path: Path, content: dict[str, np.ndarray], axis: bool = False, **chunks: Any) -> Path:
-    """As the published files are: chunks of one frame and four samples, LZ4HC."""
+    """Write a file as the published ones are: chunks of one frame and four samples, LZ4HC."""
     from numcodecs import Blosc
 
     with zarr.storage.ZipStore(path, mode="w") as store:

@@ -42,7 +42,7 @@ def blender(path: str) -> dict[str, Image]:
 
 
 def camera(step: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where the camera of a frame stands, and its axes as rows: right, up, into the scene."""
+    """Return where the camera of a frame stands, and its axes as rows: right, up, into the scene."""
     others = load_others()
     place = others.CAMERA + step * others.STEP
     forward = (others.TARGET - place) / np.linalg.norm(others.TARGET - place)

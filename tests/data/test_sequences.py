@@ -454,7 +454,7 @@ def test_camera_header_round_trip(tmp_path: Path) -> None:
 def test_written_frame_is_read_back(small_sequence: Path, tmp_path: Path) -> None:
     frame = open_sequence(small_sequence).frame(1)
     frame = frame.replace(motion=torch.randn(1, 2, 20, 24, generator=torch.Generator().manual_seed(0)).half().float())
-    # Not rounded to half floats.
+    # These positions are not rounded to half floats.
     frame = frame.replace(previous_position=frame.position + 1e-3)
     write_bmfr_frame(tmp_path / "new", 0, frame, metadata={"owner of it": "me"})
     sequence = open_sequence(tmp_path / "new")

@@ -51,7 +51,7 @@ class Killer(threading.Thread):
                 wanted = self.random.randint(0 if wanted else 1, self.most)
 
     def processes(self) -> dict[int, int]:
-        """How many frames each has finished of what it does now."""
+        """Return how many frames of its current piece each process has finished."""
         found: dict[int, int] = {}
         for path in sorted(self.out.glob(".film/*/*.jsonl"), key=lambda path: path.stat().st_mtime_ns):
             process = 0

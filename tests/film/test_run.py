@@ -26,7 +26,7 @@ MODEL = "accumulated"
 
 
 class Inline:
-    """Does every task at once, in this process; loses those that somebody says."""
+    """An engine that does every task at once, in this process, and loses those that ``lose`` selects."""
 
     def __init__(self, lose: Callable[[str, int], bool] = lambda task, count: False) -> None:
         self.done: dict[Hashable, Done] = {}
@@ -168,7 +168,7 @@ def test_other_settings_make_all_anew_and_silent_ones_nothing(shots: dict[str, P
 
 def test_a_film_that_was_stopped_goes_on(shots: dict[str, Path], tmp_path: Path) -> None:
     run(shots, tmp_path / "whole")
-    # As if it had been killed after three frames.
+    # The film is left as if it had been killed after three frames.
     records = sorted(read_records(tmp_path / "whole/.film/s1").values(), key=lambda each: each.number)
     run({"s1": shots["s1"]}, tmp_path / "out")
     for path in (tmp_path / "out/.film/s1").glob("*.jsonl"):

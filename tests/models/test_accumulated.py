@@ -252,7 +252,7 @@ def test_any_buffers_may_come_and_go(rule: Rule) -> None:
     size = (1, 3, HEIGHT, WIDTH)
     every: dict[str, Tensor] = {
         "normal": torch.rand(size),
-        # As this camera sees positions: its clip w.
+        # This camera sees positions at this depth: its clip w.
         "depth": constant(1),
         "position": torch.rand(size),
         "motion": torch.zeros(1, 2, HEIGHT, WIDTH),
@@ -325,7 +325,7 @@ def test_where_fireflies_are_much_of_the_light_they_are_caustics(fraction: float
     frame, history = caustics(fraction), Shot()
     seen = history.update(frame)
     assert torch.equal(seen.current, frame.color) is kept
-    # For the whole shot, and no longer.
+    # The limit holds for the whole shot, and no longer.
     assert torch.equal(history.update(caustics(0.1)).current, caustics(0.1).color) is kept
     history.reset()
     assert not torch.equal(history.update(caustics(0.1)).current, caustics(0.1).color)
@@ -333,7 +333,7 @@ def test_where_fireflies_are_much_of_the_light_they_are_caustics(fraction: float
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])
 def test_each_image_of_a_batch_and_each_shot_has_its_own_caustics(backend: Backend) -> None:
-    """As if every image were alone; at a cut, which positions tell, the first frame of the next shot counts."""
+    """Every image is as if alone; at a cut, which is found by positions, the first frame of the next shot counts."""
     few, many = caustics(0.1), caustics(0.3)
 
     def shot(*images: Frame, x: float = 0.0) -> Frame:
@@ -505,7 +505,7 @@ def test_a_lamp_does_not_bleed_into_the_ceiling_around_it(backend: Backend) -> N
         seen, bled = history.update(frame), without.update(frame)
         assert (seen.color * ~lamp).max() <= 1
         assert ((seen.color - 40) * lamp).abs().max() < 1e-3
-    # Nor does it cost any of the history.
+    # This does not cost any of the history.
     assert seen.length[..., 12:-12, 12:-12].min() > 11.9
     assert (bled.color * ~lamp).max() > 5
 
@@ -601,7 +601,7 @@ def test_a_still_wall_is_averaged_pixel_by_pixel() -> None:
     history, colors = Shot(), torch.rand(8, 1, 3, 20, 30)
     for color in colors:
         seen = history.update(wall(color))
-    # To the rounding of the average: no pixel has anything of its neighbours.
+    # It is the average up to rounding: no pixel has anything of its neighbours.
     torch.testing.assert_close(seen.color, colors.mean(0), rtol=1e-6, atol=1e-7)
 
 
@@ -661,7 +661,7 @@ def test_the_state_of_a_recurrent_method_ends_with_the_shot() -> None:
 @pytest.mark.parametrize("by_positions", [False, True])
 @pytest.mark.parametrize("size", [(20, 30), (96, 110)])
 def test_a_state_of_zeros_is_no_state(size: tuple[int, int], by_positions: bool) -> None:
-    """So that a graph which takes a state begins with zeros; also of the method inside."""
+    """A graph that takes a state can begin with zeros; so can the method inside."""
     model = Accumulated(Mean())
     colors = torch.rand(3, 2, 3, *size)
 

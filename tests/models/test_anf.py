@@ -25,7 +25,7 @@ SIZE = (6, 7)
 
 
 def drawn(width: int = 6) -> Any:
-    """In float64, with weights of which every part of the equations is felt."""
+    """Return the model in float64, with weights so that every part of the equations has an effect."""
     torch.manual_seed(2)
     model = Anf(width).double()
     for parameter in model.parameters():

@@ -62,7 +62,7 @@ def test_a_light_that_goes_out_is_gone_at_once() -> None:
     dark = frame(torch.zeros(1, 3, HEIGHT, WIDTH))
     assert plain(dark, other)[0].image.mean() > 0.85
     assert model(dark, state)[0].image.mean() < 0.1
-    # And it is there as fast when it comes back.
+    # The light is there as fast when it comes back.
     _, state = model(dark, model(dark, state)[1])
     assert model(frame(seed=20), state)[0].image.mean() > 0.9
 
@@ -109,7 +109,7 @@ def test_extremes_stay_finite() -> None:
 
 
 def test_differentiable_through_time() -> None:
-    """Also by way of the weight; two thirds of the light are gone in the second frame."""
+    """The derivative includes that of the weight; two thirds of the light are gone in the second frame."""
     frames = [
         frame(scale * (0.9 + 0.2 * torch.rand(1, 3, 2, 3, generator=torch.Generator().manual_seed(seed)).double()))
         for seed, scale in enumerate((3.0, 1.0))

@@ -69,7 +69,7 @@ def said_to_do(message: str) -> list[str]:
 @torch.no_grad()
 @pytest.mark.parametrize("name", DEMANDING)
 def test_a_missing_buffer_is_named_with_methods_that_do_without(name: str) -> None:
-    """By the bare step and by the denoiser, of every buffer that is needed, and of all of them."""
+    """The bare step and the denoiser name every buffer that is needed, if one is missing or all are."""
     model = model_of(name)
     whole = whole_frame(model, HEIGHT, WIDE)
     needed = sorted(model.needs.buffers - {"color"})
@@ -139,7 +139,7 @@ def test_an_accumulated_buffer_that_comes_or_goes_begins_a_new_shot() -> None:
 @torch.no_grad()
 @pytest.mark.parametrize("name", MODELS)
 def test_a_state_of_another_method_is_refused(name: str) -> None:
-    """But one of the same parts, such as the accumulated radiance; what keeps nothing looks at none."""
+    """A state of the same parts, such as the accumulated radiance, is accepted; a method without a state reads none."""
     model, own = model_of(name), state_of(name)
     frame = whole_frame(model, HEIGHT, WIDE, seed=5)
     for other in MODELS:

@@ -25,7 +25,7 @@ def networks(model: Any) -> list[PixelNetwork | KernelNetwork]:
 
 
 def drawn(network: nn.Module) -> Any:
-    """With weights in float64 of which every part of the equations is felt."""
+    """Return the network with weights in float64, so that every part of the equations has an effect."""
     torch.manual_seed(3)
     for name, parameter in network.named_parameters():
         nn.init.normal_(parameter, std=0.3 if "fusions" in name or "heads" in name else 0.15)
@@ -239,7 +239,7 @@ def test_a_cascade_that_is_none_is_refused(cascade: str) -> None:
 
 
 def test_without_bilateral_weights_features_matter_to_the_u_net_alone() -> None:
-    """With a U-Net that is blind, normals change what is filtered with the weights, and not without them."""
+    """If the U-Net is blind, normals change the filtered image with the weights, and not without them."""
     frame = frame_of_doubles(*SIZE)
     assert frame.normal is not None
     other = frame.replace(normal=frame.normal.flip(3))
@@ -288,7 +288,7 @@ def test_accumulation_is_the_published_average() -> None:
 @pytest.mark.slow
 @torch.no_grad()
 def test_large_images_have_the_pixels_of_small_ones() -> None:
-    """Where the fast backend of the filter is chosen, with each way of normalising."""
+    """At this size the fast backend of the filter is chosen, with each way of normalising."""
     for normalize in ("softmax", "none"):
         network = drawn(KernelNetwork(8, 3, normalize=normalize)).float()
         frame = frame_of_doubles(96, 110).to(torch.float32)

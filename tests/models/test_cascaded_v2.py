@@ -173,7 +173,7 @@ def test_lower_resolutions_see_further() -> None:
     coarse, frame = next(parts_of(small("cascaded_v2"), CoarseToFine)), frame_of(64, 640)
     assert frame.albedo is not None
     for distance, resolutions in ((70, 2), (150, 3)):
-        # On which the exposure does not depend.
+        # The exposure does not depend on the albedo.
         albedo = frame.albedo.clone()
         albedo[..., distance : distance + 16] = 1 - albedo[..., distance : distance + 16]
         changes = []

@@ -33,7 +33,7 @@ SIZE = (40, 56)
 
 READS = {
     *("_local_scalar_dense", "item", "is_nonzero", "equal", "allclose"),
-    # Whose result has as many elements as the values say.
+    # Their result has as many elements as the values say.
     *("nonzero", "masked_select", "unique_consecutive", "_unique", "_unique2", "unique_dim", "bincount", "histc"),
     # A constant that the host made.
     "lift_fresh",

@@ -18,7 +18,7 @@ from mcdenoise.ops import luminance_moments, moments_variance
 
 
 def drawn(width: int = 4, layers: int = 3, kernel_size: int = 3) -> KpcnNetwork:
-    """With weights in float64 of which every part of the equations is felt."""
+    """Return the network with weights in float64, so that every part of the equations has an effect."""
     torch.manual_seed(3)
     network = KpcnNetwork(width, layers, kernel_size).double()
     for parameter in network.parameters():
@@ -82,7 +82,7 @@ def filtered(branch: Any, image: Tensor, frame: Frame) -> Tensor:
 
 @torch.no_grad()
 def test_the_network_written_out() -> None:
-    """On light whose diffuse part is without albedo: its result times albedo is ``a d + exp(l) - 1``."""
+    """The diffuse part of the light is without albedo: the result times albedo is ``a d + exp(l) - 1``."""
     network, frame = drawn(), parts(6, 7, emission=torch.full((1, 3, 6, 7), 0.25).double())
     assert frame.diffuse is not None
     assert frame.specular is not None

@@ -17,7 +17,7 @@ from mcdenoise.nn.samples import samples_input
 
 
 def drawn(width: int = 4, convolutions: int = 1, kernel_size: int = 3) -> LayeredNetwork:
-    """With weights in float64 of which every part of the equations is felt."""
+    """Return the network with weights in float64, so that every part of the equations has an effect."""
     torch.manual_seed(3)
     network = LayeredNetwork(width, convolutions, kernel_size).double()
     for parameter in network.parameters():
@@ -107,7 +107,7 @@ def test_a_firefly_in_the_layer_behind_is_not_seen() -> None:
     samples[:, 0, :, 2, 3] = 1e3
 
     class ByBrightness(nn.Module):
-        """In front what is darker than 100: with the logits of what is certain."""
+        """Decide the layer by brightness: samples darker than 100 are in front, with logits that leave no doubt."""
 
         def forward(self, x: Tensor) -> Tensor:
             bright = samples.flatten(0, 1).amax(1, keepdim=True) > 100
@@ -124,7 +124,7 @@ def test_a_firefly_in_the_layer_behind_is_not_seen() -> None:
 
 
 def test_the_default_is_small() -> None:
-    """From the sizes of the layers: chains, two U-Nets, and what a pixel without samples costs."""
+    """The cost follows from the sizes of the layers: chains, two U-Nets, and the cost of a pixel without samples."""
     (entry,) = (entry for entry in overview() if entry.name == "layered")
     flat = [(11, 16), (16, 16), (16, 16), (32, 16), (16, 2), (16, 2 * 121 + 1)]
     unets = [

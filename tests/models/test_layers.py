@@ -289,7 +289,7 @@ def test_a_layer_that_is_no_radiance_is_refused() -> None:
     assert refused(lambda: Frame(color, layers={"a": color.int()})).startswith("layer 'a': expected a floating-point")
 
 
-# Where the proportions come from
+# The source of the proportions
 
 
 @torch.no_grad()

@@ -156,7 +156,7 @@ def test_images_of_a_batch_do_not_see_each_other(name: str) -> None:
 @pytest.mark.parametrize("name", MODELS)
 @torch.no_grad()
 def test_hints_change_no_image(name: str) -> None:
-    """By more than the tolerance, and of a single frame not at all."""
+    """They change none by more than the tolerance, and that of a single frame not at all."""
     model = small(name)
     frame = whole_frame(model, 24, 40)
     expected, _ = model(frame)
@@ -222,10 +222,10 @@ def test_a_gradient_reaches_every_parameter(name: str) -> None:
         assert parameter.grad.abs().max() > 0, key
 
 
-# Before oidn_pyramid's network comes a library without derivatives.
+# oidn_pyramid's network is preceded by a library without derivatives.
 @pytest.mark.parametrize("name", [name for name in TRAINABLE if name != "oidn_pyramid"])
 def test_a_gradient_goes_through_the_state(name: str) -> None:
-    """From the second frame's image to the light of the first, in the direction of which it changes the image."""
+    """It reaches the light of the first frame from the image of the second, in a direction that changes the image."""
     model = small(name)
     first, second = (whole_frame(model, 24, 24, seed=seed) for seed in range(2))
     light = {name: image.requires_grad_() for name, image in first.items() if name in RADIANCE}

@@ -25,7 +25,7 @@ SIZE = (7, 9)
 
 
 def drawn() -> Any:
-    """With weights in float64 of which every part of the equations is felt."""
+    """Return the model with weights in float64, so that every part of the equations has an effect."""
     model = small("nppd", width=3)
     torch.manual_seed(3)
     for name, parameter in model.named_parameters():
@@ -232,7 +232,7 @@ def test_a_constant_image_stays_constant_away_from_the_border() -> None:
 
 @torch.no_grad()
 def test_lambda_keeps_the_mean_and_mu_the_result() -> None:
-    """At one half each: means of halves, of what is still."""
+    """Both are one half here: the results are means of halves, since nothing moves."""
     model = decided(mu=0.0, trust=0.0, splat=only(12, 25), previous=only(12, 25), partition=only(0, 5))
     state, mean, image = None, torch.zeros(1, 3, 6, 7), torch.zeros(1, 3, 6, 7)
     for seed in range(4):

@@ -22,7 +22,7 @@ both = pytest.mark.parametrize("name", NETWORKS)
 
 
 def drawn(name: str) -> LayeredNetwork | SbmcNetwork:
-    """With weights in float64 of which every part of the equations is felt."""
+    """Return the network with weights in float64, so that every part of the equations has an effect."""
     torch.manual_seed(3)
     network = NETWORKS[name]().double()
     for parameter in network.parameters():

@@ -46,7 +46,7 @@ def test_equals_the_result_of_the_library(quality: Any, auxiliary: Any) -> None:
     with torch.no_grad():
         image = create_model(NAME, quality=quality, auxiliary=auxiliary)(frame)[0].image
     expected = Oidn(quality, auxiliary, threads=1)(frame)[0].image
-    # On the network's own scale, where rounding is even: some twenty layers in float32, summed in another order.
+    # They agree on the network's scale, where rounding is even: some twenty layers in float32 sum in another order.
     exposure = oidn_exposure(frame.color)
     torch.testing.assert_close(compress(image * exposure), compress(expected * exposure), rtol=0, atol=20 * 2.0**-22)
 

@@ -254,7 +254,7 @@ def plane(offsets: Tensor) -> Frame:
 def test_features_of_rays_through_the_centers() -> None:
     centred = plane(torch.zeros(2, 40, 60))
     assert has_centred_features(centred)
-    # As files in half precision have it.
+    # Files in half precision have such a depth.
     assert has_centred_features(centred.replace(depth=centred.depth.half().float()))
     assert not has_centred_features(plane(torch.rand(2, 40, 60)))
     mixed = centred.normal.clone()

@@ -106,7 +106,7 @@ def test_a_factory_has_to_be_somewhere(tmp_path: Path) -> None:
 
 
 def test_a_file_may_import_modules_of_its_folder(tmp_path: Path) -> None:
-    """Also if another folder has a module of the same name, and whatever the working folder is."""
+    """This holds also if another folder has a module of the same name, and whatever the working folder is."""
     for folder, factor in (("a", 2), ("b", 3)):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "neighbour_of_mine.py").write_text(f"FACTOR = {factor}\n")
@@ -220,7 +220,7 @@ def test_a_module_that_returns_an_output_alone_lacks_a_state() -> None:
 
 
 def test_zeros_stand_for_no_history() -> None:
-    """For the whole of a model, so that a graph whose state is an input can begin with them."""
+    """They do for the whole of a model, so that a graph whose state is an input can begin with them."""
     model = create_model("cascaded_v2_micro", pretrained=True)
     color, position = torch.rand(1, 3, *SIZE), torch.rand(1, 3, *SIZE) + 1
     camera = torch.eye(4).roll(-1, 1)[None] + 0.01 * torch.eye(4)

@@ -17,7 +17,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where the ratio of this machine will be kept, of a user who never measured one; the processor has bfloat16."""
+    """Return the file for the ratio of this machine, of a user who never measured one; the processor has bfloat16."""
     monkeypatch.delenv(ENVIRONMENT)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(_precision, "_has_bfloat16", lambda device: True)

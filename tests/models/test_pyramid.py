@@ -35,7 +35,7 @@ def network(seed: int = 0, half: bool = False) -> PyramidNetwork:
 
 @pytest.mark.parametrize("half", [False, True])
 def test_pixels_are_weighted_means_times_a_bounded_factor(half: bool) -> None:
-    """Without an albedo, of an image between 1 and 2, whatever the network predicts: between 1 / e and 2 e."""
+    """Without an albedo, pixels of an image between 1 and 2 become 1 / e to 2 e, whatever the network predicts."""
     color = 1 + torch.rand(1, 3, *SIZE, dtype=torch.float64)
     image = network(half=half)(frame_of(color))[0].image
     assert image.min() >= 1 / torch.e
@@ -140,7 +140,7 @@ def test_the_albedo_of_what_is_multiplied_back_may_be_that_of_the_history() -> N
 
 
 def test_an_albedo_has_a_history_of_its_own() -> None:
-    """Where nothing moves, the mean of three frames, as the radiance."""
+    """For a still frame, it is the mean of three frames, as the radiance is."""
 
     class Seen:
         needs = PyramidNetwork((4, 6, 8), 3).needs

@@ -211,7 +211,7 @@ def test_the_reason_of_a_new_beginning_is_told() -> None:
 
 
 def test_it_learns_with_its_own_loss(small_sequence: Path, tmp_path: Path) -> None:
-    """Through the state of three frames."""
+    """The gradient goes through the state of three frames."""
     config = TrainConfig(
         model="rae", width=4, frames=3, crop=16, batch=1, steps=40, learning_rate=3e-3, validation_frames=0, loss="rae"
     )

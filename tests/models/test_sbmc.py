@@ -17,7 +17,7 @@ from mcdenoise.nn.samples import samples_input
 
 
 def drawn(width: int = 4, rounds: int = 2, convolutions: int = 1, kernel_size: int = 3) -> SbmcNetwork:
-    """With weights in float64 of which every part of the equations is felt."""
+    """Return the network with weights in float64, so that every part of the equations has an effect."""
     torch.manual_seed(3)
     network = SbmcNetwork(width, rounds, convolutions, kernel_size).double()
     for parameter in network.parameters():

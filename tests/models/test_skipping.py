@@ -54,7 +54,7 @@ def wall(seed: int, noise: float = 1.0, size: tuple[int, int] = (HEIGHT, WIDTH),
 
 
 def sky(frame: Frame, rows: int) -> Frame:
-    """With a clear sky at the top."""
+    """Return the frame with a clear sky at the top."""
     assert frame.albedo is not None
     assert frame.normal is not None
     assert frame.depth is not None
@@ -349,7 +349,7 @@ def test_only_tiles_with_noise_are_computed() -> None:
     [output], journal = shot_of(model, [frame])
     assert torch.equal(output.image[..., 90:, :], expected.image[..., 90:, :])
     assert torch.equal(output.image[..., :90, :], frame.color[..., :90, :])
-    # From row 64, a multiple of 32, and the two rows above it that it looks at.
+    # It reads the rows from 64, a multiple of 32, and the two rows above them.
     assert toy.pixels == (HEIGHT - 64 + 2) * WIDTH
     assert journal.stages["network"].skipped == pytest.approx(64 / HEIGHT)
     assert journal.stages["noise-free pixels"] == Stage(
@@ -423,7 +423,7 @@ def test_nothing_is_skipped_but_copied_where_all_is_to_be_kept() -> None:
 
 
 def test_a_recurrent_method_keeps_its_state_beside_skipped_pixels() -> None:
-    """Where nothing is known, it is as it is without; at a cut it begins anew, and so does what is remembered."""
+    """Where there is no state, it is as it is without; at a cut it begins anew, and so does the stored image."""
     frames = [wall(number) for number in range(10)]
     frames.append(frames[-1].replace(normal=-frames[-1].normal))
     outputs, journal = shot_of(Accumulated(Skipping(Mean()), alpha_min=1.0), frames)

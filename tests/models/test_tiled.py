@@ -127,7 +127,7 @@ def test_a_toy_whose_pixels_depend_on_statistics_is_given_those_of_the_whole_ima
         [Brightest()(frame.crop(slice(0, 96), columns))[0].image for columns in (slice(0, 80), slice(80, 160))], 3
     )
     assert not torch.equal(apart, expected.image)
-    # Also where another wrapper is around it, or has been given statistics of its own.
+    # The same holds where another wrapper is around it, or has statistics of its own.
     for model in (Tiled(Exposed(Brightest()), 32), Exposed(Tiled(Brightest(), 32))):
         torch.testing.assert_close(model(frame)[0].image, expected.image, rtol=1e-6, atol=1e-7)
 
@@ -143,7 +143,7 @@ def test_a_method_that_needs_the_whole_image_is_not_tiled() -> None:
         assert model.halo is None
         model(frame)
     assert seen == [(96, 160)] * 2
-    # Nor is what begins at multiples that tiles do not.
+    # A method whose blocks begin at other multiples than tiles do is not tiled either.
     toy = Blur()
     toy.needs = Needs(reach=2, stride=24)
     assert Tiled(toy, 32).halo is None
@@ -160,7 +160,7 @@ def test_a_halo_holds_reach_and_margin_in_whole_strides(reach: int, stride: int,
 
 
 def test_tiles_begin_at_multiples_of_the_stride() -> None:
-    """As a U-Net wants that pools eight by eight pixels."""
+    """A U-Net that pools eight by eight pixels requires it."""
 
     class Blocks(Same):
         needs = Needs(reach=7, stride=8)
@@ -180,7 +180,7 @@ def test_a_method_with_a_state_is_refused_in_tiles() -> None:
     frame = frame_of(96, 160)
     with pytest.raises(TypeError, match="expected a method without a state to compute in tiles"):
         Tiled(toy, 32)(frame)
-    # In one piece, it keeps it.
+    # In one piece, the method keeps its state.
     _, state = Tiled(toy)(frame)
     assert Tiled(toy)(frame.replace(color=3 * frame.color), state)[0].image.equal(2 * frame.color)
 

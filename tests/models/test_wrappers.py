@@ -72,7 +72,7 @@ def test_a_wrapper_of_the_identity_returns_the_image(name: str) -> None:
 @pytest.mark.parametrize("outer", WRAPPERS)
 @pytest.mark.parametrize("inner", WRAPPERS)
 def test_a_chain_of_one_method_is_that_method(outer: str, inner: str) -> None:
-    """Also where the method's pixels depend on statistics, which are those of what the method itself sees."""
+    """This holds also if the method's pixels depend on statistics, which are those of its own input."""
     frame = frame_of(40, 48)
     model = WRAPPERS[outer](WRAPPERS[inner](Brightest()))
     expected, _ = model(frame)

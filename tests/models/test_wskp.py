@@ -130,7 +130,7 @@ def test_the_unet_has_the_backbone_of_mrkp_and_seven_channels_a_scale() -> None:
     assert isinstance(network, WskpUNet)
     assert isinstance(network.unet, Backbone)
     backbone, heads = (sum(p.numel() for p in part.parameters()) for part in (network.unet, network.heads))
-    # That of MRKP without its three heads of 26 channels.
+    # The backbone is that of MRKP without its three heads of 26 channels.
     assert backbone == 341_838 - 3 * (96 * 9 + 1) * 26
     assert heads == 3 * (96 * 9 + 1) * 7
 

@@ -40,7 +40,7 @@ def test_it_is_kernel_conv_with_the_softmax_of_the_window() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16])
 def test_a_steep_map_picks_the_most_important_pixel_of_each_window(dtype: torch.dtype) -> None:
-    """On either side of a cliff of 2e4 no weight of the other side is left, and all are there of its own."""
+    """At a cliff of 2e4 no weight of the other side is left, and all weights of a pixel's own side are kept."""
     image = drawn(1, 5, 8, dtype)
     order = torch.randperm(40, generator=torch.Generator().manual_seed(0)).reshape(1, 1, 5, 8)
     importance = (500.0 * order - 1e4).to(dtype)

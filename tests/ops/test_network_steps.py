@@ -155,7 +155,7 @@ def test_the_input_of_a_network_has_the_precision_of_autocast(size: tuple[int, i
         assert found.dtype == torch.bfloat16
         assert found.is_contiguous(memory_format=torch.channels_last)
         if logarithms:
-            # On either side of what is rounded.
+            # The rounding may fall to either side.
             torch.testing.assert_close(found.float(), plain, rtol=2**-8, atol=0)
         else:
             assert torch.equal(found, plain.bfloat16())
@@ -240,7 +240,7 @@ def test_numbers_of_any_size() -> None:
     nothing = torch.zeros(1, 0, 2, image.shape[-1])
     found = by("numba", network.network_input)(image, nothing)
     torch.testing.assert_close(found, torch.log1p(image), rtol=4e-7, atol=0, equal_nan=True)
-    # And back again, where a fusion changes nothing: alpha is 0.
+    # The fusion turns the logarithms back, and changes nothing where alpha is 0.
     logs = torch.log1p(image.nan_to_num(0, 1e38))
     weight, bias, maximum = torch.zeros(1, 6, 3, 3), torch.tensor([-1e4]), torch.full((1, 1, 1, 1), 80.0)
     given = (logs, downsample(logs), weight, bias)
@@ -300,7 +300,7 @@ def test_a_far_sky_hides_no_differences_of_what_is_near(rows: int, sky: float, b
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])
 def test_depths_of_zero_are_finite(backend: str) -> None:
-    """Where nothing was hit some renderers write 0."""
+    """Some renderers write 0 where nothing was hit."""
     depth = torch.ones(1, 1, 4, 6)
     depth[..., 0] = 0
     for image in (depth, torch.zeros_like(depth), torch.full_like(depth, 1e-38)):

@@ -60,7 +60,7 @@ def kept(function: Callable[..., Any]) -> Any:
 
 
 def hits(function: Callable[..., Any], value: Any) -> int:
-    """How often code was found, in what is as good as a new process."""
+    """Return how often code was found, by a kernel that is as good as one of a new process."""
     kernel = kept(function)
     assert kernel(value) == function(value)
     return sum(kernel.stats.cache_hits.values())

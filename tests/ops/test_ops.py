@@ -86,7 +86,7 @@ def test_equals_the_equation_in_float64(op: Op, case: Case) -> None:
 @every_case
 def test_error_is_that_of_rounding(op: Op, case: Case) -> None:
     for dtype, tolerance in TOLERANCE.items():
-        # That of float64 is in the test above, number by number.
+        # The error in float64 is tested above, number by number.
         if dtype != torch.float64 and not ILL_CONDITIONED.match(case.name):
             assert relative_error(op, case, dtype) <= tolerance, dtype
         expected = dtype if op.least_dtype is None else torch.promote_types(dtype, op.least_dtype)

@@ -21,7 +21,7 @@ def uniform_kernel(image: Tensor, side: int = 4) -> Tensor:
 
 
 def pixels_of_blocks(height: int, width: int, side: int) -> Tensor:
-    """How many pixels of the image each block holds."""
+    """Return how many pixels of the image each block holds."""
     ones = torch.zeros(-(-height // side), -(-width // side), dtype=torch.float64)
     for y in range(height):
         for x in range(width):

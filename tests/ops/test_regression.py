@@ -23,7 +23,7 @@ def scene(height: int = 40, width: int = 50) -> Tensor:
 
 
 def test_an_image_linear_in_the_features_is_returned() -> None:
-    """But for the ridge, 1e-8; in float32 that is less than a rounding."""
+    """Only the ridge, 1e-8, makes a difference; in float32 that is less than a rounding."""
     features, weights = scene(), drawn(3, 6) - 0.5
     image = 2 + torch.einsum("cf,bfhw->bchw", weights, features - features.mean((2, 3), keepdim=True))
     for offset in ((0, 0), (5, 17)):
@@ -40,8 +40,8 @@ def test_squares_are_fitted_wherever_the_origin_is() -> None:
     spread = (2.0**-5 * (32**2 - 1) ** 0.5 / 12**0.5) / 2
     for origin in (0.0, 1e2, 1e4, 1e5):
         found = block_regression(image, origin + place, squares=1)
-        # A feature that deviates by 1e-7 of its size counts half, and all others lose less. Each function is off by that
-        # of its deviation, which is no more than the image's, so that no pixel is off by more than three of both.
+        # A feature that deviates by 1e-7 of its size counts half, and all others lose less. Each function is off by
+        # that of its deviation, which is no more than the image's, so that no pixel is off by more than three of both.
         lost = 1e-8 + (1e-7 * (origin + 1) / spread) ** 2
         assert (found - image).abs().max() < 6 * lost * image.std()
         assert (block_regression(image, origin + place) - image).abs().max() > 1e-2

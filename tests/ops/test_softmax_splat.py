@@ -45,7 +45,7 @@ def test_only_differences_of_logits_count() -> None:
 
 
 def test_splats_of_several_samples_are_one() -> None:
-    """By their weights, in any order, as over all of them at once."""
+    """Their means are averaged by their weights, in any order, as if all were splatted at once."""
     images, logits = drawn(4, 3, 4, 5), 30 * drawn(4, 9, 4, 5, seed=1)
     weights = torch.exp(logits)
     total = kernel_splat(torch.cat([images, torch.ones_like(images[:, :1])], 1), weights, border="zeros").sum(0)

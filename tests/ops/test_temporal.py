@@ -32,7 +32,7 @@ def still(height: int, width: int, batch: int = 1) -> Tensor:
 
 
 class TestBmfrRule:
-    """By hand, on one pixel (the upper left of 2 x 2) that was at x = 0.25, y = 0.5 of the previous frame.
+    """Results by hand, on one pixel (the upper left of 2 x 2) that was at x = 0.25, y = 0.5 of the previous frame.
 
     Its taps have the bilinear weights 0.375, 0.125 / 0.375, 0.125; the others moved in from outside.
     """
@@ -106,7 +106,7 @@ def test_a_still_camera_averages() -> None:
         frame = frames[n - 1 : n]
         history, length = accumulate(frame, history, length, still(5, 7), alpha_min=1e-3)
         expected = torch.lerp(expected, frame, 1 / torch.full((1, 1, 5, 7), n, dtype=torch.float64))
-        # To the last bit: nothing is lost by reprojecting onto the same pixel.
+        # They are equal to the last bit: nothing is lost by reprojecting onto the same pixel.
         assert torch.equal(history, expected)
         assert torch.equal(length, torch.full_like(length, n))
     torch.testing.assert_close(history, frames.mean(0, keepdim=True), rtol=1e-12, atol=0)
@@ -139,7 +139,7 @@ def test_without_a_surface_it_is_kornias_remap_inside_the_image() -> None:
     assert 0.2 < inside.double().mean().item() < 0.9
     torch.testing.assert_close(value[inside.expand_as(value)], expected[inside.expand_as(value)], rtol=1e-10, atol=0)
     torch.testing.assert_close(weight[inside], torch.ones_like(weight[inside]), rtol=1e-12, atol=0)
-    # At the border kornia mixes in zeros; here they are left out, and the weight says how much was there.
+    # At the border kornia mixes in zeros; here they are rejected, and the weight says how much was inside.
     torch.testing.assert_close(value * weight, expected, rtol=1e-10, atol=1e-12)
 
 

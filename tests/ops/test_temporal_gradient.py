@@ -37,7 +37,7 @@ def test_it_is_the_change_of_the_larger_one(factor: float) -> None:
     found = temporal_gradient(factor * light(), light())
     expected = abs(factor - 1) / max(factor, 1)
     torch.testing.assert_close(found, torch.full_like(found, expected))
-    # In any unit.
+    # This holds in any unit.
     torch.testing.assert_close(temporal_gradient(1e6 * factor * light(), 1e6 * light()), found)
 
 

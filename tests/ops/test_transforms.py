@@ -27,7 +27,7 @@ every_case = pytest.mark.parametrize(
 
 @pytest.fixture(autouse=True)
 def no_image_is_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that fast backends are chosen wherever they can run."""
+    """Choose fast backends wherever they can run."""
     monkeypatch.setattr(_backend, "_FEW_PIXELS", 0)
 
 

@@ -26,7 +26,7 @@ def picture(seed: int, noise: float, frame: int) -> np.ndarray:
 
 
 def write_benchmark(root: Path) -> None:
-    """With a method that is missing, one that failed on the second scene, and one with a hostile name."""
+    """Write a benchmark with a missing method, one that failed on the second scene, and one with a hostile name."""
     methods = [
         Method("noisy", "baseline", "noisy", "noisy"),
         Method("ours", "trainable", "ours", "cascaded_v2", parameters=1234),

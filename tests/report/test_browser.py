@@ -364,7 +364,7 @@ def test_a_close_up_opens_in_the_comparer(tab: Any):
     assert zoom == pytest.approx(WIDTH / 32 / 2, rel=0.02)
     assert tab.text_content("#pixel").endswith("(middle)")
     middle = [int(part) for part in tab.text_content("#pixel").split(" (")[0].split(", ")]
-    # As near to the crop as the border of the picture lets the view come.
+    # The view is as near to the crop as the border of the picture allows.
     half_x, half_y = WIDTH / zoom / 2, HEIGHT / zoom / 2
     expected = np.clip(x, half_x, WIDTH - half_x), np.clip(y, half_y, HEIGHT - half_y)
     assert np.abs(np.array(middle) - np.floor(expected)).max() <= 1

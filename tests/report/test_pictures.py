@@ -42,7 +42,7 @@ def test_error_where_pictures_mostly_are():
 
 
 def test_codes_of_known_values():
-    # By hand: x = 1 is 1/2 of 64/65, and (65/128)^(1/2.2) = 0.7350, times 255 = 187.4.
+    # Computed by hand: x = 1 is 1/2 of 64/65, and (65/128)^(1/2.2) = 0.7350, times 255 = 187.4.
     assert encode(np.float32([0, 1, BRIGHTEST, 1e9, np.inf, np.nan, -3])).tolist() == [0, 187, 255, 255, 255, 0, 0]
     assert decode(np.array([0, 255])) == pytest.approx([0, BRIGHTEST])
     assert (encode(decode(np.arange(256)).astype(np.float32)) == np.arange(256)).all()

@@ -43,7 +43,7 @@ def test_mean_over_scenes(folder: Path):
         for metric in ("SMAPE", "PSNR"):
             expected = (one.errors[metric].value + other.errors[metric].value) / 2
             assert both.errors[metric].value == pytest.approx(expected, rel=1e-12)
-    # Without files: the network alone, 10 ms of the second method, with its quartiles.
+    # The time is that without files: the network alone, 10 ms of the second method, with its quartiles.
     assert mean.rows[1].milliseconds == Range(10.0, 9.0, 12.0)
     assert mean.rows[1].throughput == pytest.approx(96 * 64 / 0.010 / 1e6)
 

@@ -36,12 +36,12 @@ class Recurrent(nn.Module):
 
 
 def plain(width: int = 8) -> Model:
-    """On noisy radiance as it comes."""
+    """Return a model of noisy radiance as it comes."""
     return Recurrent(width)
 
 
 def accumulated(width: int = 8) -> Model:
-    """On accumulated radiance without albedo; the hidden state ends where the history ends."""
+    """Return a model of accumulated radiance without albedo; the hidden state ends where the history ends."""
     return Demodulated(Accumulated(Recurrent(width)))
 
 
@@ -71,7 +71,7 @@ class Scaled(nn.Module):
 
 
 class Cropped(Scaled):
-    """Not an image of the frame's size."""
+    """A model whose image does not have the frame's size."""
 
     def forward(self, color: Tensor) -> Tensor:
         """Radiance of half the image."""

@@ -109,7 +109,7 @@ def test_shots_start_anew_and_are_accumulated(noisy: Path, tmp_path: Path) -> No
 
 
 def test_parts_of_the_light_are_accumulated_as_a_method_has_them(small_sequence: Path, tmp_path: Path) -> None:
-    """And not as they stand in the files: behind accumulation and demodulation they are what the network sees."""
+    """They are stored as the network sees them, after accumulation and demodulation, not as they are in the files."""
     inputs, sequence = small_sequence / "inputs", open_sequence(small_sequence)
     for number in sequence.numbers:
         color = sequence.frame(number).color

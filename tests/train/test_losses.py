@@ -62,7 +62,7 @@ def test_the_gradient_of_the_loss() -> None:
 
 
 def test_the_loss_on_the_curve_of_a_display() -> None:
-    """In place of SMAPE, and the temporal loss as it was."""
+    """The loss replaces SMAPE, and the temporal loss stays as it was."""
     image, reference = (3 * torch.rand(2, 3, 3, 4, 5, dtype=torch.float64) - 0.5 for _ in range(2))
     shown, wanted = ((each.clamp_min(0) + 1e-3) ** (1 / 2.2) for each in (image, reference))
     expected = (shown - wanted).abs().mean()
@@ -96,7 +96,7 @@ def test_the_loss_of_one_frame() -> None:
 
 def test_the_recurrent_autoencoders_loss_is_its_equation() -> None:
     image, reference = (torch.rand(2, 7, 3, 3, 4, dtype=torch.float64) for _ in range(2))
-    # As the paper prints them.
+    # The paper prints these values.
     printed = [0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0]
     counts = [math.exp(-((6 - t) ** 2) / 8) for t in range(7)]
     assert counts == pytest.approx(printed, abs=6e-4)
@@ -123,7 +123,7 @@ def test_the_recurrent_autoencoders_loss_is_its_equation() -> None:
 
 
 def test_a_constant_error_has_no_gradient_and_no_flicker() -> None:
-    """And counts the same in clips of any length, of any size."""
+    """It also counts the same in clips of any length, of any size."""
     for shape in ((1, 1, 3, 1, 1), (2, 3, 3, 4, 5), (1, 9, 3, 1, 6)):
         ones = torch.ones(shape, dtype=torch.float64)
         for temporal_weight in (0.0, 0.1, 5.0):

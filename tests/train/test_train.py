@@ -258,7 +258,7 @@ def test_the_log_of_a_stopped_run_has_every_step_once(small_sequence: Path, tmp_
 
     with pytest.raises(Stopped):
         train(config, [small_sequence], tmp_path / "run", checkpoint_every=2, report=stop_at_4)
-    # As if the last checkpoint had been that of step 2.
+    # The run is left as if the last checkpoint had been that of step 2.
     saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
     saved["step"] = 2
     content = io.BytesIO()

@@ -45,7 +45,7 @@ def rays(offset: Array | float = 0.0) -> Array:
 
 
 def room(directions: Array, origin: Array = EYE) -> Array:
-    """Where rays meet a floor, a wall, a wall on the left or a ball."""
+    """Return where rays meet a floor, a wall, a wall on the left or a ball."""
     distances = [(0 - origin[..., 2]) / directions[..., 2], (3 - origin[..., 1]) / directions[..., 1]]
     distances.append((-3 - origin[..., 0]) / directions[..., 0])
     away, radius = origin - np.array([0.3, 0.0, 1.0]), 0.9
@@ -111,7 +111,7 @@ def test_no_camera_is_found_from_points_of_one_plane() -> None:
     down = direction[..., 2] < -0.05
     assert down.sum() > 1000
     assert fit_camera(floor, down) is None
-    # With noise of 32 bits it is a plane still.
+    # It is still a plane with the noise of 32 bits.
     assert fit_camera(floor.astype(np.float32).astype(np.float64), down) is None
 
 
@@ -123,7 +123,7 @@ def test_no_camera_is_found_in_other_images_than_positions() -> None:
     few = np.zeros_like(ALL)
     few[:3, :3] = True
     assert fit_camera(room(rays()), few) is None
-    # Nor do unit vectors, which a normal has.
+    # Unit vectors, which a normal has, have no camera either.
     vectors = random.standard_normal((HEIGHT, WIDTH, 3))
     assert fit_camera(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True), ALL) is None
 

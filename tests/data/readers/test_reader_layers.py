@@ -33,7 +33,7 @@ def three(name: str, components: str = "RGB") -> str:
     return " ".join(f"{name}.{each}" for each in components)
 
 
-# As they are called in the files of each renderer; ~ stands for a blank.
+# The layers have these names in the files of each renderer; ~ stands for a blank.
 TABLE = {
     "blender 4": [
         (three("ViewLayer.Combined", "BGRA"), "ViewLayer.Combined.RGBA", "color"),
@@ -134,7 +134,7 @@ ROWS = [(renderer, *row) for renderer, rows in TABLE.items() for row in rows]
 
 @pytest.mark.parametrize(("renderer", "channels", "layer", "buffer"), ROWS, ids=[f"{r[0]}: {r[2]}" for r in ROWS])
 def test_the_names_of_every_renderer(renderer: str, channels: str, layer: str, buffer: str | None) -> None:
-    # Beside others, and so a layer of its own, unless the file holds nothing else.
+    # The layer is beside others, and so one of its own, unless the file holds nothing else.
     layers = layers_of(0, "render", [part(channels if layer == "render.RGB" else f"{channels} other.R other.T")])
     assert found(f"{channels} other.R other.T" if layer != "render.RGB" else channels).get(layer) == buffer
     assert sum(len(each.channels) for each in layers) >= len(channels.split())

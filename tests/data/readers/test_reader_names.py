@@ -37,7 +37,7 @@ def image(save: Callable[..., Path], tmp_path: Path) -> Callable[..., list[Path]
     return written
 
 
-# Which digits count
+# The digits that count
 
 
 @pytest.mark.parametrize(
@@ -243,7 +243,7 @@ def test_tungsten_writes_a_file_a_buffer(image: Callable[..., list[Path]], tmp_p
         "depth": "kitchenDepth.exr",
         "variance": "kitchenVariance.exr",
     }
-    # Whose variance it is, the names say.
+    # The names say whose variance it is.
     assert float(sequence.frame(0).variance[0, 0, 0, 0]) == 2
 
 
@@ -283,7 +283,7 @@ def test_a_buffer_that_some_frames_lack_is_told(
 def test_a_shot_may_have_a_letter_for_a_name(letter: str, image: Callable[..., list[Path]], tmp_path: Path) -> None:
     image(f"s/{letter}_1.exr", f"s/{letter}_2.exr", f"s/{letter}_albedo_1.exr", f"s/{letter}_albedo_2.exr")
     assert open_sequence(tmp_path / "s").buffers == {"color", "albedo"}
-    # Beside radiance it is what it stands for.
+    # A letter stands for its buffer if there is radiance beside it.
     image("t/beauty_1.exr", f"t/{letter}_1.exr")
     meaning = {"a": "alpha", "n": "normal", "p": "position", "z": "depth"}.get(letter.lower())
     taken = {row.buffer: row.source for row in open_sequence(tmp_path / "t").table}

@@ -116,7 +116,7 @@ NAMED = {
     },
 }
 CAMERA_SPACE = {"pbrt", "pbrt_2021", "renderman", "renderman_rgba", "vray"}
-# How they store motion, where it is not as pixels, previous - current, y down.
+# These renderers store motion in another way than in pixels, previous - current, y down.
 SIGNS = {
     "vray": "current - previous, y down, pixels",
     "redshift": "current - previous, y up, pixels",

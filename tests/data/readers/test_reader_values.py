@@ -57,7 +57,7 @@ def test_one_noisy_frame_tells_whether_the_albedo_is_in(kind: str, seed: int) ->
     with_it, without = albedo_included(albedo * irradiance, albedo), albedo_included(irradiance, albedo)
     assert with_it.included is True
     assert without.included is False
-    # By how many percent light grows with albedo is 1 or 0, to a few of its errors.
+    # Light grows with albedo by 1 or 0 percent for each percent, up to a few of its errors.
     assert with_it.elasticity == pytest.approx(1, abs=5 * with_it.error + 0.02)
     assert without.elasticity == pytest.approx(0, abs=5 * without.error + 0.02)
     # A frame of zeros and NaN in places says the same.
@@ -146,13 +146,13 @@ def test_normals_signed_or_encoded(noise: float, shortened: bool) -> None:
     normal = directions(0)
     random = np.random.default_rng(1)
     if shortened:
-        # At edges a filter makes means of several.
+        # A filter makes means of several normals at edges.
         normal = normal * np.where(random.random((*normal.shape[:2], 1)) < 0.3, 0.5, 1)
     noisy = normal + noise * random.standard_normal(normal.shape)
     assert not normal_is_encoded(noisy.astype(np.float32))
     encoded = (noisy / 2 + 0.5).clip(0, 1).astype(np.float32)
     assert normal_is_encoded(encoded)
-    # With the sky at 0, whichever of both it is.
+    # This holds with the sky at 0, too, for both.
     encoded[:8] = 0
     assert normal_is_encoded(encoded)
     noisy[:8] = 0
@@ -283,7 +283,7 @@ def test_a_fast_pan_is_no_contradiction(pan: tuple[float, float], contrast: floa
 def test_two_small_frames_of_a_renderer_tell_the_sign(
     frames: tuple[int, int], signs: tuple[int, int], features: tuple[str, ...], others: Any
 ) -> None:
-    """At one sample a pixel, where points move by a pixel."""
+    """The frames have one sample a pixel, and points move by a pixel."""
     sources = [others.read(number) for number in frames]
     for source in sources:
         source["turned"] = others.to_camera(source, source["normal"])
@@ -338,7 +338,7 @@ def test_motion_in_files_is_told_by_the_frames(save: Callable[..., Path], tmp_pa
 
 
 def test_zero_motion_is_dropped_where_the_camera_moves(others: Any, save: Callable[..., Path], tmp_path: Path) -> None:
-    """As Blender writes it with motion blur."""
+    """Blender writes such motion with motion blur."""
     first: dict[str, Any] = {}
     for number in (1, 2, 3):
         truth = others.read(number)

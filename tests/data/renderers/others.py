@@ -19,7 +19,7 @@ import OpenImageIO
 
 HERE = Path(__file__).resolve().parent
 FRAMES = (1, 2, 3)
-# Where the camera of `examples/blender/render.py` stands in its first frame, how it moves, and what it looks at.
+# The place of the camera of `examples/blender/render.py` in its first frame, its step, and the point that it looks at.
 CAMERA, STEP, TARGET = np.array((-0.6, -5.2, 1.7)), np.array((0.16, 0.05, 0.05)), np.array((0.1, 0.9, 0.95))
 
 
