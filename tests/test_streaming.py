@@ -52,7 +52,7 @@ def scene(number: int, *, still: bool = False, without: tuple[str, ...] = (), sk
 
 
 def with_motion(number: int) -> Frame:
-    """Its past is found by motion vectors alone."""
+    """Return a frame whose history is found by motion vectors alone."""
     motion = torch.full((1, 2, HEIGHT, WIDTH), 0.4)
     return scene(number, without=("position", "view_projection")).replace(motion=motion)
 

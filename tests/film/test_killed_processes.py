@@ -1,4 +1,4 @@
-"""Processes that are killed while they make a film, by the system or by somebody: nothing is lost or partial."""
+"""Processes that are killed while they make a film, by the system or by a user: nothing is lost or partial."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def networks(model: Any) -> tuple[PixelNetwork, KernelNetwork]:
 
 
 def chain_of(model: Any) -> Chain:
-    """Both networks without what they wear, on radiance as it is given."""
+    """Both networks without their wrappers, on radiance as it is given."""
     return next(parts_of(model, Chain))
 
 

@@ -2,8 +2,8 @@
 
 Three proofs, of every method of the zoo. A dispatch mode sees every operator of torch, and counts those that hand a
 value to the host or whose result has a size that depends on values, and constants that come from the host. Tensors of
-the device ``meta`` have no values at all: whoever asks for one fails, in whatever way it asks. And the images are those
-of a step that looks.
+the device ``meta`` have no values at all: an operation that asks for one fails, in whatever way it asks. And the images
+are those of a step that looks.
 """
 
 from __future__ import annotations

@@ -274,7 +274,7 @@ def test_only_edited_parts_are_computed_again() -> None:
         image, expected = short(frame), whole(frame)
         errors.append(relative(image, expected))
         fractions.append(stage(short, "unchanged tiles").skipped)
-    # A frame that is repeated has the noise it has; its share in the average still changes at first.
+    # A frame that is repeated has the noise it has; its fraction of the average still changes at first.
     assert set(fractions[:15]) == {0}
     assert fractions[15:17] == [1, 1]
     # The box lies in the first two of 5 x 7 tiles; four more on each side see it.

@@ -335,7 +335,7 @@ def test_a_module_that_computes_no_tiles_has_none() -> None:
     denoiser = Denoiser(copy)
     denoiser(synthetic(64, 48))
     assert denoiser.report.tiles == "whole frames: the model computes no tiles"
-    # One whose reach is known may wear them.
+    # A model whose reach is known may be wrapped in tiles.
     denoiser = Denoiser(Tiled(FromBuffers(copy, reach=0)), tile=64)
     assert denoiser(synthetic(130, 48)).shape == (1, 3, 48, 130)
     assert denoiser.report.tiles == "3 x 1 tiles of up to 64x48 pixels: as asked for"

@@ -1,4 +1,4 @@
-"""Methods of ten lines that know nothing of what they wear, and frames for them."""
+"""Methods of ten lines that know nothing of their wrappers, and frames for them."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def test_result_and_derivatives_are_those_of_the_reference(op: Op, case: Case, d
     assert_same(actual, exact, TOLERANCE[dtype])
 
 
-# Wider than a run of pixels, taller than a share, smaller than the kernel.
+# The sizes are wider than a run of pixels, taller than the rows of a thread, and smaller than the kernel.
 @pytest.mark.parametrize("size", [(1, 3, 3, 300, 5), (1, 4, 40, 2, 7), (2, 3, 7, 9, 3), (1, 1, 1, 1, 5)], ids=str)
 @pytest.mark.parametrize("border", ["replicate", "zeros", "renormalize"])
 @every_op

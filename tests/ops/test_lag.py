@@ -27,7 +27,7 @@ def exponential(seed: int, frames: int = 1) -> Tensor:
 def test_noise_is_no_lag() -> None:
     shares = [lag(exponential(seed, 12), exponential(100 + seed), VARIANCE) for seed in range(10)]
     given_up = torch.cat(shares).mean().item()
-    # z is normal, and of 13/12 of the variance, since the history has noise too: the mean of its share, by integration.
+    # z is normal, with 13/12 of the variance, since the history has noise too: the mean of the fraction, by integration.
     z = torch.linspace(2, 12, 100_001, dtype=torch.float64)
     density = 2 * torch.exp(-(z**2) / 2 / (13 / 12)) / math.sqrt(2 * math.pi * 13 / 12)
     expected = torch.trapezoid(density * ((z**2 / 4 - 1) / 3).clamp(0, 1), z).item()
@@ -55,7 +55,7 @@ def test_a_change_is_found_where_it_is() -> None:
 
 
 def test_rare_bright_paths_are_no_lag() -> None:
-    """One path in 300 brings 300: most windows of a frame see none, but the past knows of the noise."""
+    """One path in 300 brings 300: most windows of a frame see none, but the history has the noise."""
     g = torch.Generator().manual_seed(0)
     recent = 300.0 * (torch.rand(1, 1, *SIZE, generator=g) < 1 / 300)
     dark = lag(torch.ones(1, 1, *SIZE), recent, torch.zeros(1, 1, *SIZE))

@@ -55,7 +55,7 @@ def eps(dtype: torch.dtype, roundings: int = 1) -> float:
 
 
 def assert_between(result: Tensor, *images: Tensor, roundings: int) -> None:
-    """A weighted mean of images of no negative values lies between their extremes, to rounding."""
+    """A weighted mean of images of no negative values lies between their minimum and maximum, up to rounding."""
     if result.numel():
         low, high = (float(f(torch.stack([f(image.double()) for image in images]))) for f in (torch.min, torch.max))
         slack = eps(result.dtype, roundings)
