@@ -27,7 +27,7 @@ def exponential(seed: int, frames: int = 1) -> Tensor:
 def test_noise_is_no_lag() -> None:
     shares = [lag(exponential(seed, 12), exponential(100 + seed), VARIANCE) for seed in range(10)]
     given_up = torch.cat(shares).mean().item()
-    # z is normal, with 13/12 of the variance, since the history has noise too: the mean of the fraction, by integration.
+    # z is normal, with 13/12 of the variance, since the history has noise too: the mean fraction, by integration.
     z = torch.linspace(2, 12, 100_001, dtype=torch.float64)
     density = 2 * torch.exp(-(z**2) / 2 / (13 / 12)) / math.sqrt(2 * math.pi * 13 / 12)
     expected = torch.trapezoid(density * ((z**2 / 4 - 1) / 3).clamp(0, 1), z).item()
