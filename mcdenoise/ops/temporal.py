@@ -74,6 +74,21 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
     return torch.where(in_front, previous - centre, torch.inf)
 
 
+def _check_reproject(
+    previous: Tensor,
+    motion: Tensor | None,
+    surface: Surface | None = None,
+    previous_surface: Surface | None = None,
+    *,
+    rule: str = "relative",
+    position_limit: float | None = None,
+    normal_limit: float | None = None,
+) -> None:
+    _check_images(motion, previous=(previous, "B C H W"))
+    check_surfaces(surface, previous_surface, previous, rule, position_limit, normal_limit)
+
+
+@op("numba", check=_check_reproject)
 def reproject(
     previous: Tensor,
     motion: Tensor | None,
@@ -134,14 +149,12 @@ def reproject(
         >>> value.flatten().tolist(), weight.flatten().tolist()
         ([1.5, 2.5, 3.0], [1.0, 1.0, 0.5])
     """
-    sizes = _check_images(motion, previous=(previous, "B C H W"))
-    check_surfaces(surface, previous_surface, previous, rule, position_limit, normal_limit)
     here, there = comparable(surface, previous_surface)
     test = _bmfr_test if rule == "bmfr" else _relative_test
     if motion is None:
         kept = torch.ones_like(previous[:, :1], dtype=torch.bool) & test(here, there, position_limit, normal_limit)
         return torch.where(kept, previous, 0), kept.to(previous.dtype)
-    height, width = sizes["H"], sizes["W"]
+    height, width = previous.shape[-2:]
     dtype = torch.promote_types(previous.dtype, torch.float32)
 
     known = torch.isfinite(motion).all(1, keepdim=True)
@@ -297,8 +310,8 @@ def accumulate(
 Accumulate = module_of("Accumulate", accumulate)
 
 
-def _check_images(motion: Tensor | None, **images: tuple[Tensor, str]) -> dict[str, int]:
-    return check_shapes(**images) if motion is None else check_shapes(**images, motion=(motion, "B 2 H W"))
+def _check_images(motion: Tensor | None, **images: tuple[Tensor, str]) -> None:
+    check_shapes(**images, **({} if motion is None else {"motion": (motion, "B 2 H W")}))
 
 
 def _pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtype) -> Tensor:

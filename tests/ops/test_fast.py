@@ -268,48 +268,67 @@ def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPa
 
 
 ACCUMULATE = next(op for op in OPS if op.name == "accumulate")
+REPROJECT = next(op for op in OPS if op.name == "reproject")
+of_both_ops = pytest.mark.parametrize("op", [ACCUMULATE, REPROJECT], ids=lambda op: op.name)
 
 
 @every_dtype
-@pytest.mark.parametrize("case", ACCUMULATE.cases, ids=lambda case: case.name)
-def test_accumulation_is_that_of_the_reference(case: Case, dtype: torch.dtype) -> None:
+@pytest.mark.parametrize(
+    ("op", "case"),
+    [pytest.param(op, case, id=f"{op.name}-{case.name}") for op in (ACCUMULATE, REPROJECT) for case in op.cases],
+)
+def test_histories_are_those_of_the_reference(op: Op, case: Case, dtype: torch.dtype) -> None:
     inputs = case.inputs(dtype)
-    actual = by("numba", ops.accumulate)(**inputs, **case.settings)
-    for result, plain in zip(actual, by("torch", ops.accumulate)(**inputs, **case.settings), strict=True):
+    actual = by("numba", op.function)(**inputs, **case.settings)
+    for result, plain in zip(actual, by("torch", op.function)(**inputs, **case.settings), strict=True):
         assert result.dtype == dtype
         # Both round to half precision once.
         eps = torch.finfo(dtype).eps
         torch.testing.assert_close(result, plain, rtol=8 * eps, atol=8 * eps)
 
 
+@of_both_ops
 @pytest.mark.parametrize("rule", ["relative", "bmfr"])
 @pytest.mark.parametrize("layout", [channels_last, slice_of_pixels, every_other_column, transposed])
-def test_accumulation_of_any_layout_and_by_any_number_of_threads(
-    layout: Callable[[Tensor], Tensor], rule: Any, monkeypatch: pytest.MonkeyPatch
+def test_histories_of_any_layout_and_by_any_number_of_threads(
+    layout: Callable[[Tensor], Tensor], rule: Any, op: Op, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_runtime, "PIXELS_A_THREAD", 1)
-    case = next(case for case in ACCUMULATE.cases if "all buffers" in case.name)
+    case = next(case for case in op.cases if "all buffers" in case.name)
     inputs = case.inputs()
     limits: dict[str, Any] = {"rule": rule, "position_limit": 0.05, "normal_limit": 0.3}
-    plain = by("torch", ops.accumulate)(**inputs, **limits)
+    plain = by("torch", op.function)(**inputs, **limits)
     threads = torch.get_num_threads()
     try:
         for count in (1, 3):
             torch.set_num_threads(count)
-            results = by("numba", ops.accumulate)(**map_tensors(layout, inputs), **limits)
+            results = by("numba", op.function)(**map_tensors(layout, inputs), **limits)
             for result, expected in zip(results, plain, strict=True):
                 torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-12)
     finally:
         torch.set_num_threads(threads)
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_what_no_tap_shows_is_zero_whatever_the_image_holds(value: float) -> None:
+    """The normals of both frames face away from one another, so that no tap is kept."""
+    image = torch.full((1, 2, 4, 6), value)
+    normal = torch.ones(1, 3, 4, 6) / math.sqrt(3)
+    found, weight = by("numba", ops.reproject)(
+        image, torch.full((1, 2, 4, 6), 0.25), ops.Surface(None, normal, None), ops.Surface(None, -normal, None)
+    )
+    assert not found.any()
+    assert not weight.any()
+
+
+@of_both_ops
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_accumulation_goes_through_the_compiler() -> None:
-    case = ACCUMULATE.cases[1]
+def test_histories_go_through_the_compiler(op: Op) -> None:
+    case = op.cases[1]
     torch.compiler.reset()
-    compiled = torch.compile(ops.accumulate, fullgraph=True, backend="aot_eager")
+    compiled = torch.compile(op.function, fullgraph=True, backend="aot_eager")
     results = by("numba", compiled)(**case.inputs(), **case.settings)
-    for result, expected in zip(results, ops.accumulate(**case.inputs(), **case.settings), strict=True):
+    for result, expected in zip(results, op.function(**case.inputs(), **case.settings), strict=True):
         torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-12)
 
 

@@ -73,6 +73,48 @@ def _motion(motion: Any, position: Any, matrices: Any, b: int, first: int, last:
             along[i] = (v + one) * high - down if in_front else infinite
 
 
+def reproject(
+    previous: Tensor,
+    motion: Tensor | None,
+    surface: Surface | None,
+    previous_surface: Surface | None,
+    rule: str,
+    *limits: float | None,
+) -> Any:
+    """See :func:`mcdenoise.ops.reproject`; without motion the reference reads every pixel once, and is as fast."""
+    if motion is None:
+        return NotImplemented
+    here, there = comparable(surface, previous_surface)
+    return _reproject(previous, motion, list(here), list(there), rule == "bmfr", *_limits(here, *limits))
+
+
+@custom_op(
+    "mcdenoise::reproject",
+    device_types="cpu",
+    schema="(Tensor previous, Tensor motion, Tensor?[] surface, Tensor?[] previous_surface, bool bmfr, "
+    "float position_limit, float normal_limit) -> (Tensor, Tensor)",
+)
+def _reproject(
+    previous: Tensor,
+    motion: Tensor,
+    surface: list[Tensor | None],
+    previous_surface: list[Tensor | None],
+    bmfr: bool,
+    *limits: float,
+) -> tuple[Tensor, Tensor]:
+    """The surfaces have the same buffers."""
+    nothing = previous.new_empty((0, 0, 0, 0))
+    # A length is read, and has no effect.
+    images = nothing, previous, previous[:, :1], motion
+    value, weight, _ = _pass(*images, surface, previous_surface, 1.0, *limits, 1.0, None, math.inf, 0.0, bmfr)
+    return value.to(previous.dtype), weight.to(previous.dtype)
+
+
+@_reproject.register_fake
+def _(previous: Tensor, *_: Any) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(previous), torch.empty_like(previous[:, :1])
+
+
 class Shorter(NamedTuple):
     """The settings that shorten histories, see :func:`mcdenoise.ops._steps.history.blend`.
 
@@ -189,7 +231,7 @@ def _pass(
             taps = nothing.to(dtype), nothing.long()
         records = tuple(each.numpy() for each in taps)
         arguments = (accumulated.numpy(), length.numpy(), kept.numpy(), *images, *surfaces, *limits, bmfr, *records)
-        share_rows(color, lambda *rows: _accumulate(*arguments, *rows))
+        share_rows(previous, lambda *rows: _accumulate(*arguments, *rows))
     return accumulated, length, kept
 
 
@@ -228,7 +270,8 @@ def _accumulate(
 ) -> None:
     """Rows ``first`` to ``last`` of the result, by the rules of :func:`mcdenoise.ops.reproject`.
 
-    And of their taps, where there is room for them.
+    And of their taps, where there is room for them. Without a color the result is the history, and its weight instead
+    of its length.
 
     In one piece, and with the memory of each image in a variable: handed to other functions, arrays are counted, pixel
     by pixel, which takes ten times as long as all the rest. The taps of a run of pixels are found first and summed
@@ -335,6 +378,11 @@ def _accumulate(
                 for tap in range(kept, 4):
                     weights[i, tap] = zero
                     places[i, tap] = places[i, 0] if kept else np.uint64(0)
+                if not fresh:
+                    lengths[b, 0, y, x] = weight
+                    for tap in range(kept if weight > 0 else 0):
+                        weights[i, tap] /= weight
+                    continue
                 if not weight > 0:
                     alphas[:, i] = one
                     lengths[b, 0, y, x] = one
@@ -379,6 +427,11 @@ def _accumulate(
                         w0 * old[i0 + plane] + w1 * old[i1 + plane] + w2 * old[i2 + plane] + w3 * old[i3 + plane]
                     )
                     plane += np.uint64(old_strides[1])
+            if not fresh:
+                for c in range(channels):
+                    for i in range(size):
+                        accumulated[b, c, y, x0 + i] = sums[c, i] if lengths[b, 0, y, x0 + i] > 0 else zero
+                continue
             for c in range(channels):
                 recent = 1 if c >= fresh else 0
                 start = b * new_strides[0] + (c - recent * fresh) * new_strides[1]
