@@ -100,13 +100,14 @@ def _reproject(
     surface: list[Tensor | None],
     previous_surface: list[Tensor | None],
     bmfr: bool,
-    *limits: float,
+    position_limit: float,
+    normal_limit: float,
 ) -> tuple[Tensor, Tensor]:
     """The surfaces have the same buffers."""
     nothing = previous.new_empty((0, 0, 0, 0))
     # A length is read, and has no effect.
-    images = nothing, previous, previous[:, :1], motion
-    value, weight, _ = _pass(*images, surface, previous_surface, 1.0, *limits, 1.0, None, math.inf, 0.0, bmfr)
+    settings = (1.0, position_limit, normal_limit, 1.0, None, math.inf, 0.0, bmfr)
+    value, weight, _ = _pass(nothing, previous, previous[:, :1], motion, surface, previous_surface, *settings)
     return value.to(previous.dtype), weight.to(previous.dtype)
 
 
