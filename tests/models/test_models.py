@@ -535,6 +535,11 @@ def test_the_cascades_have_weights() -> None:
     assert set(FAMILY) <= set(pretrained_models())
 
 
+# The last line of this run's recipe was committed while it ran, as training/README.md says. That the weights are those
+# of the committed recipe is tested by the digest in their header, in tests/train/test_recipe.py.
+BEGAN_BEFORE_ITS_COMMIT = ("oidn_tuned_small",)
+
+
 @pytest.mark.parametrize("file", sorted(SHIPPED.rglob("*.safetensors")), ids=lambda file: file.stem)
 def test_the_shipped_weights(file: Path) -> None:
     name, about = file.stem, describe_weights(file)
@@ -543,7 +548,8 @@ def test_the_shipped_weights(file: Path) -> None:
     model = create_model(name, pretrained=True)
     assert about["licence"] == "Apache-2.0"
     assert int(about["steps"]) == json.loads(about["config"])["steps"]
-    assert all(len(part["commit"]) == 40 for part in json.loads(about["commits"]))
+    mark = "-dirty" if name in BEGAN_BEFORE_ITS_COMMIT else ""
+    assert all(re.fullmatch(rf"[0-9a-f]{{40}}{mark}", part["commit"]) for part in json.loads(about["commits"]))
     with torch.no_grad():
         assert torch.isfinite(model(whole_frame(model, 33, 20))[0].image).all()
 
