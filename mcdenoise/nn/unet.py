@@ -195,9 +195,16 @@ def bytes_of(live: float, *, bfloat16: bool) -> float:
 
 def _padded(x: Tensor, size: Sequence[int]) -> Tensor:
     """Repeat the last row and column of ``x`` up to ``size``."""
-    missing = (0, size[1] - x.shape[-1], 0, size[0] - x.shape[-2])
+    below, right = size[0] - x.shape[-2], size[1] - x.shape[-1]
     # A graph for any image size cannot branch on whether padding is needed.
-    return F.pad(x, missing, mode="replicate") if torch.compiler.is_compiling() or any(missing) else x
+    if torch.compiler.is_compiling():
+        return F.pad(x, (0, right, 0, below), mode="replicate")
+    # torch's padding takes several times as long, and computes in float32 under autocast.
+    for dim, missing in ((-2, below), (-1, right)):
+        if missing:
+            edge = x.narrow(dim, -1, 1)
+            x = torch.cat([x, *[edge] * missing], dim)
+    return x
 
 
 def _block(in_channels: int, out_channels: int, stride: int = 1) -> nn.Sequential:
