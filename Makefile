@@ -9,7 +9,7 @@ PIP := $(BIN)/pip --disable-pip-version-check install --quiet --constraint const
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: $(VENV)/.stamp-fast,render,peers,report ## render a short sequence, denoise it, compare, and write pictures and a report to demo/
+demo: $(VENV)/.stamp-fast,render,peers,report,preview ## render a short sequence, denoise it, compare, and write pictures and a report to demo/
 	$(BIN)/mcdenoise demo -o demo
 
 # OMP_NUM_THREADS: each process has a core, which threads would only share. GOMP_SPINCOUNT: those of tests that ask for
