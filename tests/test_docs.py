@@ -19,8 +19,8 @@ DOCS = ROOT / "docs"
 TEXTS = [*sorted(DOCS.glob("*.md")), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "training/README.md"))]
 # Run by tests of their own, with the files that they need.
 ELSEWHERE = {"from-your-renderer.md", "from-oidn.md", "performance.md"}
-# A first block that is a file, which the other blocks import.
-FILES = {"bring-your-own-model.md": "mine", "bring-your-own-op.md": "my_ops"}
+# Pages with blocks that are files, which later blocks import: their first line is a comment with the file's name.
+FILES = {"bring-your-own-model.md": ["mine"], "bring-your-own-op.md": ["my_ops", "fog", "smooth"]}
 # Names that stand for what a reader puts there.
 STANDS_FOR = {"SCENE.xml": "scene.xml", "...": "", "N": "1"}
 
@@ -49,19 +49,20 @@ def test_no_page_with_code_is_forgotten() -> None:
 @pytest.mark.parametrize("path", CODE, ids=[path.name for path in CODE])
 def test_code_of_a_page_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    code = blocks(path, "python")
-    name = FILES.get(path.name)
-    if name:
-        monkeypatch.syspath_prepend(tmp_path)
-        first, *code = code
-        assert first.startswith(f"# {name}.py\n")
-        (tmp_path / f"{name}.py").write_text(first)
-        # A module of that name may be there from another test.
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    assert code
-    for number, block in enumerate(code):
-        exec(compile(block, f"{path.name}, block {number + 1}", "exec"), {"__name__": "page"})
-    sys.modules.pop(name or "", None)
+    monkeypatch.syspath_prepend(tmp_path)
+    written = []
+    for number, block in enumerate(blocks(path, "python")):
+        if named := re.match(r"# (\w+)\.py\n", block):
+            name = named[1]
+            (tmp_path / f"{name}.py").write_text(block)
+            # A module of that name may be there from another test.
+            monkeypatch.delitem(sys.modules, name, raising=False)
+            written.append(name)
+        else:
+            exec(compile(block, f"{path.name}, block {number + 1}", "exec"), {"__name__": "page"})
+    for name in written:
+        sys.modules.pop(name, None)
+    assert written == FILES.get(path.name, [])
 
 
 def test_code_for_those_who_come_from_oidn_runs() -> None:

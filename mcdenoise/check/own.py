@@ -11,7 +11,8 @@ random seed. If some of the tensors require gradients, derivatives are checked i
 element is perturbed separately, so the tensors must be small, and away from points without a derivative.
 
 A function without example inputs is checked on small images of positive radiance, one for each argument that has no
-default: derivatives on ordinary images, stability also on dark, bright and black images and on a firefly.
+default: derivatives on ordinary images, stability also on dark, bright and black images, on fireflies in all arguments
+and in each alone, and at the ends of the range of half precision and of float32.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from torch import Generator, Tensor
 
 from mcdenoise.check.case import Case, Inputs, Kind, Op, uniform
 from mcdenoise.errors import InputError
+from mcdenoise.methods import parse_method
 from mcdenoise.own import in_one_line, load_own
 
 ATTRIBUTE, BESIDE = "example_inputs", "inputs"
@@ -41,12 +43,16 @@ def find_ops(names: Sequence[str], table: Sequence[Op]) -> list[Op]:
     """Find ops by name.
 
     Args:
-        names: names of ops in the table, or ``path/to/file.py:function``, ``package.module:function``.
+        names: names of ops in the table, or ``path/to/file.py:function``, ``package.module:function``, which may have
+            settings as in :func:`mcdenoise.methods.parse_method`.
         table: the known ops.
 
     Raises:
         InputError: there is no such op or function, or the function runs on none of its example inputs.
     """
+    for name in names:
+        if name.endswith(".py"):
+            raise _without_function(name)
     known = {op.name: op for op in table}
     unknown = [name for name in names if name not in known and ":" not in name]
     if unknown:
@@ -74,9 +80,42 @@ def op_of(function: Callable[..., Any], inputs: Sequence[Tensor] = ()) -> Op:
     )
 
 
+def note_of(op: Op) -> str:
+    """One line that says that example inputs replace the images drawn by default; empty if there are none."""
+    if not op.own or any(case.kind != "ordinary" for case in op.cases):
+        return ""
+    cases = ", ".join(case.name for case in op.cases)
+    return f"{op.name}: its example inputs ({cases}) replace the stiff and extreme images that are tried without them"
+
+
 def _load(name: str) -> Op:
-    function, module = load_own(name, "function", "function")
-    return _op(name, function, _examples(name, function, module))
+    spelling = parse_method(name)
+    function, module = load_own(spelling.model, "function", "function")
+    return _op(name, _with_settings(name, function, spelling.settings), _examples(name, function, module))
+
+
+def _with_settings(name: str, function: Any, settings: dict[str, Any]) -> Any:
+    if not settings or not callable(function):
+        return function
+    try:
+        inspect.signature(function).bind_partial(**settings)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"function '{name}': {error}") from error
+    return partial(function, **settings)
+
+
+def _without_function(path: str) -> InputError:
+    """The error for a file whose function is not named."""
+    _, module = load_own(f"{path}:__name__", "function", "function")
+    functions = [
+        name
+        for name, value in vars(module).items()
+        if inspect.isfunction(value) and value.__module__ == module.__name__ and not name.startswith("_")
+    ]
+    found = [name for name in functions if name != BESIDE]
+    if not found:
+        return InputError(f"{path}: expected a Python file with a function of tensors, found none")
+    return InputError(f"{path}: add ':function', such as {path}:{found[0]}; its functions are {', '.join(found)}")
 
 
 def _examples(name: str, function: Any, module: Any) -> Any:
@@ -134,22 +173,27 @@ def _image_cases(name: str, function: Any) -> tuple[Case, ...]:
         ) from error
     spark = torch.ones(IMAGE, dtype=torch.float64)
     spark[:, :, 2, 3] = 1e4
+    # The ends of the range are those of the ops of this package; numbers beyond that of a dtype are clamped to it.
     kinds: dict[str, tuple[Kind, Tensor | float]] = {
         "ordinary image": ("ordinary", 1.0),
         "dark": ("stiff", 1e-3),
         "bright": ("stiff", 1e3),
         "firefly": ("stiff", spark),
         "black": ("extreme", 0.0),
+        **{f"radiance {value:g}": ("extreme", value) for value in (6e4, 1e30, 1e-30)},
     }
+    factors = {case: (kind, dict.fromkeys(names, factor)) for case, (kind, factor) in kinds.items()}
+    if len(names) > 1:
+        factors |= {f"firefly in {name}": ("stiff", {name: spark}) for name in names}
     return tuple(
         Case(
             case,
             kind,
-            partial(_draw, {each: image * factor for each, image in zip(names, images, strict=True)}),
+            partial(_draw, {each: image * by.get(each, 1.0) for each, image in zip(names, images, strict=True)}),
             # For the other images the step of the finite differences is too large or too small.
             names if kind == "ordinary" else (),
         )
-        for case, (kind, factor) in kinds.items()
+        for case, (kind, by) in factors.items()
     )
 
 

@@ -26,8 +26,8 @@ def gradcheck(
     every argument is an image of 6 by 5 pixels.
 
     Args:
-        ops: names of operators, or functions of your own, path/to/file.py:function or package.module:function; all
-            operators by default.
+        ops: names of operators, or functions of your own, path/to/file.py:function or package.module:function, with
+            optional settings, file.py:function(setting=value); all operators by default.
         order: 1 to check first derivatives only, for functions that can be differentiated once.
         json: write the results to this file too.
     """

@@ -28,8 +28,8 @@ def stability(
     for all functions in the file; by default every argument is an image of 6 by 5 pixels.
 
     Args:
-        ops: names of operators, or functions of your own, path/to/file.py:function or package.module:function; all
-            operators by default.
+        ops: names of operators, or functions of your own, path/to/file.py:function or package.module:function, with
+            optional settings, file.py:function(setting=value); all operators by default.
         models: names with optional settings, weights files, or file.py:factory; by default all available models, or
             none if operators are named.
         dtypes: precisions to check.
@@ -47,6 +47,8 @@ def stability(
                 checks.append(result) if isinstance(result, Check) else runs.append(result)
     _print_checks(checks)
     _print_long_runs(runs)
+    for note in filter(None, (group.note for group in chosen)):
+        print(note)
     write_json(json, as_json(checks, runs))
     failed = sum(not check.passed for check in checks) + sum(not run.passed for run in runs)
     print(f"{len(checks) + len(runs)} checks, {failed} failed")

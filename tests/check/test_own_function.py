@@ -273,7 +273,8 @@ def test_a_missing_function_is_rejected(tmp_path: Path, run: Run, command: str) 
         "package.of.nobody:square": "package.of.nobody cannot be imported",
         f"{bare}:halves": "cannot be tried on images of (1, 3, 5, 6): it fails in float64: RuntimeError: The size of ",
         f"{bare}:none": "it names no argument without a default; give it an attribute example_inputs, or its file",
-        str(bare): "or path/to/file.py:function",
+        str(bare): f"{bare}: add ':function', such as {bare}:halves; its functions are halves, none",
+        "bare": "or path/to/file.py:function",
     }.items():
         status, _, err = run(command, name)
         assert status == 2
@@ -298,10 +299,83 @@ def test_images_are_drawn_for_a_function_without_example_inputs(tmp_path: Path, 
     assert run("gradcheck", f"{mine}:power", "--json", path)[0] == 0
     assert [result["inputs"] for result in json.loads(path.read_text())] == [["image", "other"]]
     assert failed("power", "float32") == set()
-    # The derivative of a root at 0 is infinite or NaN, and the square of 300 exceeds the range of half precision.
-    assert failed("norm", "float32") == {("black", "gradient")}
+    # The derivative of a root at 0 is infinite or NaN, and a square leaves the range: those of 1e30 and 1e-30 that of
+    # float32, and that of 300 the one of half precision.
+    squares = {(f"radiance {value}", what) for value in ("1e+30", "1e-30") for what in ("forward", "gradient")}
+    assert failed("norm", "float32") == {("black", "gradient"), *squares}
     assert {("bright", "forward"), ("firefly", "forward")} <= failed("mean", "float16")
-    assert failed("mean", "float32") == set()
+    assert {case for case, _ in failed("mean", "float32")} == {"radiance 1e+30"}
+
+
+def test_an_op_that_is_undefined_in_float64_fails(tmp_path: Path, run: Run) -> None:
+    mine, path = tmp_path / "mine.py", tmp_path / "own.json"
+    mine.write_text(
+        "import torch\n\n"
+        "def ratio(color, history):\n    return color / history\n\n"
+        "def root(color):\n    return color.sqrt()\n\n"
+        "def exponential(color):\n    return color.exp()\n\n"
+        "def logarithm(color):\n    return torch.log(1 - color)\n\n"
+        # The next number is 1, where the logarithm is infinite.
+        "logarithm.example_inputs = (torch.tensor([1 - 2**-24]),)\n"
+    )
+
+    def undefined(name: str) -> dict[tuple[str, str], str]:
+        status, out, _ = run("stability", f"{mine}:{name}", "--dtypes", "float32", "--json", path)
+        assert "of nan" not in out
+        checks = json.loads(path.read_text())["checks"]
+        assert status == 1
+        return {(x["case"], x["what"]): x["message"] for x in checks if not x["passed"]}
+
+    nan, infinity = (f"{value} in float64, where all inputs are finite" for value in ("NaN", "infinity"))
+    assert undefined("ratio") == {("black", "forward"): nan, ("black", "gradient"): nan}
+    assert undefined("root") == {("black", "gradient"): infinity}
+    large = ("bright", "firefly", "radiance 60000", "radiance 1e+30")
+    assert undefined("exponential") == {(x, what): infinity for x in large for what in ("forward", "gradient")}
+    assert undefined("logarithm").keys() == {("example", "derivative")}
+
+
+def test_an_infinite_input_may_have_an_infinite_result_but_no_nan_in_the_gradient_of_a_finite_one() -> None:
+    def masked(depth: Tensor) -> Tensor:
+        return torch.where(depth.isinf(), 0, depth * depth.exp())
+
+    depth = torch.tensor([1.0, torch.inf])
+
+    def failed(function: Callable[[Tensor], Tensor]) -> set[str]:
+        checks = check_stability(function, depth, dtypes=(torch.float32,))
+        return {check.what for check in checks if not check.passed} - {"derivative"}
+
+    assert failed(torch.relu) == set()
+    assert failed(masked) == {"gradient"}
+
+
+def test_a_firefly_in_one_argument_only(tmp_path: Path, run: Run) -> None:
+    mine, path = tmp_path / "mine.py", tmp_path / "own.json"
+    mine.write_text("def grows(color, history):\n    return (history / (color + 0.1)).exp()\n")
+    assert run("stability", f"{mine}:grows", "--dtypes", "float32", "--json", path)[0] == 1
+    failed = {(x["case"], x["what"]) for x in json.loads(path.read_text())["checks"] if not x["passed"]}
+    assert failed == {("firefly in history", "forward"), ("firefly in history", "gradient")}
+
+
+def test_example_inputs_that_replace_images_are_reported(mine: Path, run: Run, tmp_path: Path) -> None:
+    _, out, _ = run("stability", f"{mine}:logarithm", "--dtypes", "float32")
+    assert f"{mine}:logarithm: its example inputs (ordinary, dark) replace the stiff and extreme images" in out
+    bare = tmp_path / "bare.py"
+    bare.write_text("def twice(image):\n    return 2 * image\n")
+    assert "replace" not in run("stability", f"{bare}:twice", "downsample", "--dtypes", "float32")[1]
+
+
+def test_settings_of_a_function(tmp_path: Path, run: Run) -> None:
+    mine, path = tmp_path / "mine.py", tmp_path / "own.json"
+    mine.write_text("def power(image, exponent):\n    return image**exponent\n")
+    assert run("gradcheck", f"{mine}:power(exponent=3)", "--json", path)[0] == 0
+    (result,) = json.loads(path.read_text())
+    assert (result["op"], result["inputs"]) == (f"{mine}:power(exponent=3)", ["image"])
+    # A root has no derivative at 0.
+    assert [run("stability", f"{mine}:power(exponent={x})", "--dtypes", "float32")[0] for x in (1, 0.5)] == [0, 1]
+    status, _, err = run("gradcheck", f"{mine}:power(power=3)")
+    assert status == 2
+    assert f"function '{mine}:power(power=3)': got an unexpected keyword argument 'power'" in err
+    assert err.count("\n") == 1
 
 
 def cube(image: Tensor) -> Tensor:

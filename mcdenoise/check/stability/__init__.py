@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from mcdenoise.check.own import note_of
 from mcdenoise.check.stability import _denoiser, _long_runs, _models, _ops
 from mcdenoise.check.stability._check import DTYPES, Check, Summary, parse_dtypes, summarize
 from mcdenoise.check.stability._denoiser import check_denoiser
@@ -47,10 +48,12 @@ class Group:
     Args:
         name: of the op, the model or the denoiser that is checked.
         run: runs the checks, or the long runs.
+        note: what is not checked, in one line; usually empty.
     """
 
     name: str
     run: Callable[[], Iterable[Check | LongRun]]
+    note: str = ""
 
 
 def groups(
@@ -62,8 +65,8 @@ def groups(
     """The groups of checks: ops, then models, then the denoiser, then long runs.
 
     Args:
-        ops: names of ops, or functions of your own, ``path/to/file.py:function``; ``None`` means all ops, or none if
-            models are named.
+        ops: names of ops, or functions of your own, ``path/to/file.py:function``, see
+            :func:`mcdenoise.check.own.find_ops`; ``None`` means all ops, or none if models are named.
         models: models, see :func:`mcdenoise.methods.parse_method`. Each is checked in a denoiser, and trainable ones
             also by themselves. ``None`` means all models whose packages are installed and whose weights are shipped, or
             none if ops are named.
@@ -77,7 +80,7 @@ def groups(
     chosen_ops = _ops.select(ops) if everything or ops is not None else []
     chosen_models = _available(models) if everything or models is not None else []
     return [
-        *(Group(op.name, partial(_ops.check_op, op, dtypes)) for op in chosen_ops),
+        *(Group(op.name, partial(_ops.check_op, op, dtypes), note_of(op)) for op in chosen_ops),
         *(Group(name, partial(_models.check_model, name, dtypes)) for name in chosen_models),
         *(Group(f"Denoiser, {name}", partial(_denoiser.check_denoiser, name, dtypes)) for name in chosen_models),
         *([Group("long runs", partial(_long_runs.long_runs, dtypes, frames))] if everything else []),

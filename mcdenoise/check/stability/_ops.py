@@ -20,7 +20,8 @@ because half-precision values are rounded when an op passes them to autograd.
 
 A user's function is compared with itself in float64. Its intermediate values are unknown, so ``u`` is that of the dtype
 itself for its results too, and its perturbed inputs are computed one by one. Its gradients in float64, with which those
-in other dtypes are compared, are first compared with finite differences.
+in other dtypes are compared, are first compared with finite differences. Where all inputs are finite, its results and
+its gradients must be finite in float64.
 """
 
 from __future__ import annotations
@@ -85,6 +86,11 @@ class _Trial:
     def inner(self) -> torch.dtype:
         """The dtype in which the op computes."""
         return self.dtype if self.op.own else accumulator_dtype(self.dtype)
+
+    @property
+    def must_be_finite(self) -> bool:
+        """Whether float64 must be finite: a user's function is its own reference, and NaN would excuse any result."""
+        return self.op.own and _all_finite(self.leaves)
 
     @property
     def numbers(self) -> Inputs:
@@ -273,8 +279,9 @@ def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact])
     conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype, at_once=trial.op.batched)
     largest = max((leaf.abs().max().item() for leaf in exact[len(trial.leaves) :] if leaf.numel()), default=0.0)
     cancelling = _by_leaf(trial, [torch.zeros_like(leaf) for leaf in exact[: len(trial.leaves)]], rounding.gradients)
-    # If a result is rightly infinite, its derivative may be infinite or NaN; otherwise it must be finite.
-    defined = all(result.value.isfinite().all() for result in results)
+    # If a result is rightly infinite, its derivative may be infinite or NaN; otherwise it must be finite. What must be
+    # finite in any case stays as it is, so that it is reported.
+    defined = not trial.must_be_finite and _all_finite([result.value for result in results])
     bounded = []
     for value, terms, (condition, fan_in) in zip(trial.gradients(exact), cancelling, conditions, strict=True):
         excused = ~value.isnan() | (not defined)
@@ -355,6 +362,10 @@ def _bounded(value: Tensor, condition: Tensor, fan_in: Tensor, inner: torch.dtyp
 
 def _compare(trial: _Trial, what: str, results: list[Tensor], exact: list[_Exact]) -> Check:
     """Compare results with exact ones; results beyond the range of the dtype must be infinite, all others finite."""
+    values = [truth.value for truth in exact]
+    if trial.must_be_finite and not _all_finite(values):
+        kind = "NaN" if any(value.isnan().any() for value in values) else "infinity"
+        return _found(trial, what, 0, 0, 0, f"{kind} in float64, where all inputs are finite")
     worst, highest, condition, message = (0.0, 0.0), 0.0, 0.0, ""
     for result, truth in zip(results, exact, strict=True):
         largest = torch.finfo(result.dtype).max
@@ -380,12 +391,16 @@ def _compare(trial: _Trial, what: str, results: list[Tensor], exact: list[_Exact
         if fraction.reshape(-1)[i] >= highest:
             highest = fraction.reshape(-1)[i].item()
             unit = torch.finfo(result.dtype).eps * truth.condition.reshape(-1)[i].item()
-            worst = (
-                (error.reshape(-1)[i].item() / unit, truth.bound.reshape(-1)[i].item() / unit) if unit else (0.0, 0.0)
-            )
+            # Within the reach of rounding there may be a pole, beside which no figure is meaningful.
+            known = 0 < unit < math.inf
+            worst = (error.reshape(-1)[i].item() / unit, truth.bound.reshape(-1)[i].item() / unit) if known else (0, 0)
         if fraction.max() > 1 and not message:
             message = f"found {found.reshape(-1)[i].item():.9g}, expected {truth.value.reshape(-1)[i].item():.9g}"
     return _found(trial, what, *worst, condition, message)
+
+
+def _all_finite(tensors: Sequence[Tensor]) -> bool:
+    return all(bool(tensor.isfinite().all()) for tensor in tensors)
 
 
 def _check_derivative(op: Op, case: Case) -> Check:
