@@ -24,7 +24,7 @@ from mcdenoise.cli import COMMANDS, load_command, main
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
-from mcdenoise.models import compared_models, create_model, list_models, pretrained_models, save_weights
+from mcdenoise.models import compared_models, create_model, list_models, overview, pretrained_models, save_weights
 from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
 from mcdenoise.shot import ShotSettings
 from mcdenoise.train import TrainConfig
@@ -503,6 +503,16 @@ def test_models(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> Non
         parameters = f"{entry['parameters']:,}" if entry["parameters"] else "-"
         assert re.search(rf"\b{entry['name']} .* {parameters} ", text)
     assert "SMAPE" not in text
+
+
+def test_models_in_a_narrow_terminal(run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("COLUMNS", "80")
+    _, text, _ = run("models")
+    rows = [line.split("│") for line in text.splitlines() if line.startswith("│")]
+    assert [row[1].strip() for row in rows if row[1].strip()] == [entry.name for entry in overview()]
+    assert all(len(row[-2]) > 20 for row in rows)
+    assert "not shown, for lack of width (see --json): kMAC per pixel, paper, parameters, uses" in text
 
 
 def test_models_with_results_of_a_benchmark(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
