@@ -415,7 +415,9 @@ def test_settings_are_those_of_the_model(weights: Path) -> None:
         lambda: Denoiser("cascaded_v2", weights=weights, nonsense=1),
     ):
         message = refused(make)
-        assert "model 'cascaded_v2': got an unexpected keyword argument 'nonsense'; it takes width" in message
+        assert (
+            "but alpha_min, anti_lag, tolerance beside its weights, found nonsense=1; the weights fix width" in message
+        )
     assert refused(lambda: Denoiser(Keep(), width=8)) == "width: expected a model's name, found a model"
     assert refused(lambda: Denoiser(Keep(), weights=weights)) == "weights: expected a model's name, found a model"
     assert "alpha_min: expected in (0, 1], found 2.0" in refused(lambda: Denoiser("cascaded_v2", alpha_min=2.0))
