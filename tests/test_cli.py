@@ -210,13 +210,31 @@ def test_bad_options_leave_nothing(
 
 def test_models_that_are_not_available(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
     denoise = ("denoise", small_sequence, "-o", out, "--model")
-    message = refused(*denoise, "unet")
-    assert "model 'unet': expected one of " in message
+    message = refused(*denoise, "resnet18")
+    assert "model 'resnet18': expected one of " in message
     assert all(name in message for name in pretrained_models())
     for name in list_models():
         if create_model(name).needs.trainable and name not in {*pretrained_models(), *compared_models()}:
             assert "expected shipped weights" in refused(*denoise, name)
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [
+        ("oidn_tund", "model 'oidn_tund': found no model of this name; did you mean oidn_tuned or "),
+        ("OIDN-tuned", "did you mean oidn_tuned or "),
+        ("joint_bilateral(sigma_color=1", "expected ')' after the settings, found none; add it"),
+        ("folder/mine.py:blur(radius=2", "expected ')' after the settings, found none; add it"),
+    ],
+)
+def test_misspelt_models(
+    refused: Callable[..., str], small_sequence: Path, out: Path, model: str, expected: str
+) -> None:
+    message = refused("denoise", small_sequence, "-o", out, "--model", model)
+    assert expected in message
+    # All models are not listed.
+    assert "asvgf" not in message
 
 
 MINE = """
