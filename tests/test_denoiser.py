@@ -141,6 +141,7 @@ def test_missing_features_are_told() -> None:
     denoiser = Denoiser(small_model())
     denoiser(Frame(color=torch.rand(1, 3, 9, 7)))
     assert denoiser.report.missing == ["albedo", "depth", "motion", "normal"]
+    assert "\nmissing: albedo, depth, motion, normal\n" in str(denoiser.report)
     position, camera = torch.rand(1, 3, 9, 7), torch.eye(4)[None]
     denoiser(Frame(color=torch.rand(1, 3, 9, 7), position=position, view_projection=camera))
     assert denoiser.report.missing == ["albedo", "normal"]
@@ -441,6 +442,12 @@ def test_the_report_of_a_frame(frames: list[Frame]) -> None:
     }
     assert all(name == stage.name for name, stage in report.stages.items())
     assert list(report.milliseconds) == STAGES
+    lines = str(report).splitlines()
+    names = ["milliseconds", "history", "skipped", "tiles", "precision"]
+    assert [line.partition(":")[0] for line in lines] == names
+    assert lines[0].startswith("milliseconds: validate ")
+    assert lines[2] == "skipped: remember (last frame)"
+    assert repr(report).startswith("FrameReport(milliseconds={")
     denoiser = Denoiser(Keep())
     denoiser(frames[0])
     assert denoiser.report.stages == {}
