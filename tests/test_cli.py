@@ -208,6 +208,31 @@ def test_bad_options_leave_nothing(
     assert not out.exists()
 
 
+def test_an_output_that_cannot_be_written_is_refused_before_anything_is_printed(
+    run: Callable[..., tuple[int, str, str]], small_sequence: Path, weights: Path, tmp_path: Path
+) -> None:
+    file, taken = tmp_path / "file", tmp_path / "taken"
+    file.touch()
+    (taken / "denoise.json").mkdir(parents=True)
+    for out, expected in (
+        (small_sequence, "expected another folder than that of the input, found the same"),
+        (file, "expected a folder that can be written to"),
+        (taken, "expected to replace it, found what cannot be removed"),
+    ):
+        status, text, message = run("denoise", small_sequence, "-o", out, "--weights", weights)
+        assert (status, text) == (2, "")
+        assert expected in message
+
+
+def test_the_users_folder_in_quotes(
+    run: Callable[..., tuple[int, str, str]], small_sequence: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(small_sequence.parent))
+    status, _, errors = run("denoise", f"~/{small_sequence.name}", "-o", "~/a", "--weights=~/small.safetensors")
+    assert (status, errors) == (0, "")
+    assert (weights.parent / "a" / "denoise.json").is_file()
+
+
 def test_models_that_are_not_available(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
     denoise = ("denoise", small_sequence, "-o", out, "--model")
     message = refused(*denoise, "resnet18")
