@@ -60,6 +60,26 @@ class FrameReport(Journal):
     missing: list[str] = field(default_factory=list)
     beside: dict[str, float] = field(default_factory=dict)
 
+    def __str__(self) -> str:
+        """A few lines: run times, the history, and what was skipped, missing or replaced."""
+        stages = ", ".join(f"{stage} {value:.1f}" for stage, value in self.milliseconds.items())
+        history = "" if self.history is None else f"{self.history:.0%} of the pixels"
+        skipped = (
+            f"{stage.name}{'' if stage.skipped == 1 else f' {stage.skipped:.1%}'} ({stage.reason})"
+            for stage in self.stages.values()
+            if stage.skipped
+        )
+        lines = {
+            "milliseconds": f"{stages}; together {sum(self.milliseconds.values()):.1f}" if stages else "",
+            "history": f"none ({self.reset})" if self.reset else history,
+            "skipped": ", ".join(skipped),
+            "missing": ", ".join(self.missing),
+            "replaced pixels": str(self.replaced_pixels or ""),
+            "tiles": self.tiles,
+            "precision": self.precision,
+        }
+        return "\n".join(f"{name}: {text}" for name, text in lines.items() if text)
+
 
 class Denoiser:
     """Denoises the frames of a shot one after the other, and keeps the method's state.

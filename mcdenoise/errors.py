@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 # A channel name may have 255 bytes, and a path 4096.
 _LONGEST = 1500
 
@@ -22,6 +25,17 @@ class InputError(ValueError):
 
 class MissingBufferError(InputError):
     """A frame lacks a buffer that a method needs."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """A question that offers the known names nearest to one that is unknown; empty if none is near.
+
+    Example:
+        >>> did_you_mean("oidn-tuned", ["noisy", "oidn_tuned"])
+        'did you mean oidn_tuned?'
+    """
+    near = get_close_matches(name.lower(), known)
+    return f"did you mean {' or '.join(near)}?" if near else ""
 
 
 def is_unicode(text: str) -> bool:

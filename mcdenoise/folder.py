@@ -21,7 +21,7 @@ from torch import Tensor
 
 from mcdenoise.data import Sequence
 from mcdenoise.data.exr import Image, Metadata
-from mcdenoise.data.files import remove, write_text
+from mcdenoise.data.files import check_writable, remove, write_text
 from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
 from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
@@ -153,10 +153,7 @@ def denoise_sequence(
         InputError: a file is damaged, a buffer is missing or has invalid values, the result is not finite, the folder
             cannot be written to, or memory is insufficient. Frames before the one that the message names are written.
     """
-    make_folder(out)
-    check_apart(sequence, out)
-    # A report stands for a complete result: remove an old one, in case this run fails.
-    remove(out / "denoise.json")
+    prepare_folder(sequence, out)
     report = new_report(sequence, model)
 
     write_frames(
@@ -413,6 +410,19 @@ def make_folder(out: Path) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{out}: expected a folder that can be written to, found: {error.strerror}") from error
+
+
+def prepare_folder(sequence: Sequence, out: Path) -> None:
+    """Create the folder for the results of a sequence, or remove an old report from it.
+
+    Raises:
+        InputError: the results cannot be written there, or would overwrite inputs.
+    """
+    make_folder(out)
+    check_apart(sequence, out)
+    # A report stands for a complete result: remove an old one, in case this run fails.
+    remove(out / "denoise.json")
+    check_writable(out / "denoise.json")
 
 
 def check_apart(sequence: Sequence, out: Path) -> None:

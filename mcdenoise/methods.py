@@ -77,12 +77,15 @@ def parse_method(text: str) -> Spelling:
     if match is None:
         raise InputError(f"method '{text}': expected a name, or name(setting=value, ...), found neither")
     settings: dict[str, Any] = {}
-    for part in match["settings"].split(",") if (match["settings"] or "").strip() else []:
-        name, equals, value = (each.strip() for each in part.partition("="))
-        if not (name.isidentifier() and equals and value) or name in settings:
-            raise InputError(f"method '{text}': expected settings such as (setting=value), found '{part.strip()}'")
-        settings[name] = _value(value)
     name = match["name"].strip()
+    opened = name.rpartition(":")[2]
+    if "(" in opened and ")" not in opened and not name.endswith(WEIGHTS):
+        raise InputError(f"method '{text}': expected ')' after the settings, found none; add it")
+    for part in match["settings"].split(",") if (match["settings"] or "").strip() else []:
+        setting, equals, value = (each.strip() for each in part.partition("="))
+        if not (setting.isidentifier() and equals and value) or setting in settings:
+            raise InputError(f"method '{text}': expected settings such as (setting=value), found '{part.strip()}'")
+        settings[setting] = _value(value)
     if not name.endswith(WEIGHTS):
         return Spelling(name, None, settings)
     return Spelling(str(describe_weights(Path(name))["architecture"]), Path(name), settings)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.util
 import sys
+from contextlib import suppress
 from importlib.abc import Loader
 from pathlib import Path
 from types import ModuleType
@@ -22,7 +24,8 @@ def load_own(name: str, kind: str, thing: str) -> tuple[Any, ModuleType]:
     A file is executed at each call, as a new module, and so are the modules beside it that it imports.
 
     Args:
-        name: ``path/to/file.py:attribute`` or ``package.module:attribute``.
+        name: ``path/to/file.py:attribute`` or ``package.module:attribute``; for a file without an attribute, the
+            error names those that it has.
         kind: use of the object, such as ``"model"``; for messages.
         thing: kind of attribute that is expected, such as ``"factory"``; for messages.
 
@@ -32,6 +35,10 @@ def load_own(name: str, kind: str, thing: str) -> tuple[Any, ModuleType]:
     Raises:
         InputError: the file or module does not exist, cannot be imported, or has no such attribute.
     """
+    if name.endswith(".py"):
+        functions = _functions_in(Path(name), kind, thing)
+        choice = " or ".join(f":{each}" for each in functions or [thing])
+        raise InputError(f"{kind} '{name}': expected {name}:{thing}, found only the file; add {choice}")
     place, _, attribute = name.rpartition(":")
     try:
         module = _module_of_file(Path(place), kind, thing) if place.endswith(".py") else importlib.import_module(place)
@@ -50,10 +57,25 @@ def in_one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
-def _module_of_file(path: Path, kind: str, thing: str) -> ModuleType:
+def _check_file(path: Path, kind: str, thing: str) -> None:
     if not path.is_file():
         wanted = f"a {thing}" if thing == kind else f"a {thing} of a {kind}"
         raise InputError(f"{path}: expected a Python file with {wanted}, found no such file")
+
+
+def _functions_in(path: Path, kind: str, thing: str) -> list[str]:
+    """The names of the functions and classes in a file, which is not executed; none if it cannot be read."""
+    _check_file(path, kind, thing)
+    # A syntax error is a SyntaxError or, for a null byte, a ValueError.
+    with suppress(OSError, SyntaxError, ValueError, RecursionError):
+        body = ast.parse(path.read_bytes()).body
+        names = [each.name for each in body if isinstance(each, ast.FunctionDef | ast.ClassDef)]
+        return [name for name in names if not name.startswith("_")]
+    return []
+
+
+def _module_of_file(path: Path, kind: str, thing: str) -> ModuleType:
+    _check_file(path, kind, thing)
     # A unique name, so that files of the same name are different modules.
     module_name = f"mcdenoise_own_{path.stem}_{abs(hash(path.resolve()))}"
     spec = importlib.util.spec_from_file_location(module_name, path)

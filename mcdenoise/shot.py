@@ -36,8 +36,8 @@ class ShotSettings:
         color_with_albedo: the noisy color includes the albedo. By default this is determined from the values; if they
             do not tell, the color is assumed to include it.
         output_layer: add the result as a layer of this name, and replace nothing.
-        layers: layers of light to denoise with the same kernels as the color, so that they still add up: names such as
-            DiffDir or Combined_*, or all.
+        layers: layers of light to denoise with the same kernels as the color, so that they still add up: names or
+            patterns, separated by spaces, such as DiffDir DiffInd or Combined_*, or all.
         alpha: also denoise the alpha with the same kernels; otherwise it is not changed.
         alpha_min: smallest weight of the current frame in the accumulation, in (0, 1]; the model's own by default.
         anti_lag: discard history where the light has changed.

@@ -24,7 +24,7 @@ from mcdenoise.cli import COMMANDS, load_command, main
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
-from mcdenoise.models import compared_models, create_model, list_models, pretrained_models, save_weights
+from mcdenoise.models import compared_models, create_model, list_models, overview, pretrained_models, save_weights
 from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
 from mcdenoise.shot import ShotSettings
 from mcdenoise.train import TrainConfig
@@ -197,7 +197,7 @@ def test_bad_usage(refused: Callable[..., str], arguments: list[str], expected: 
         ("--alpha-min", "nan", "--alpha-min: expected in (0, 1], found nan"),
         ("--device", "abacus", "device 'abacus': expected one that torch can use"),
         ("--model", "cascaded_v2_tiny", "expected weights of model 'cascaded_v2_tiny', found those of 'cascaded_v2'"),
-        ("--model", "cascaded_v2(hue=1)", "model 'cascaded_v2': got an unexpected keyword argument 'hue'"),
+        ("--model", "cascaded_v2(hue=1)", "expected no settings but alpha_min, anti_lag, tolerance beside its weights"),
         ("--weights", "nothing.safetensors", "nothing.safetensors: expected a safetensors file"),
     ],
 )
@@ -208,15 +208,58 @@ def test_bad_options_leave_nothing(
     assert not out.exists()
 
 
+def test_an_output_that_cannot_be_written_is_refused_before_anything_is_printed(
+    run: Callable[..., tuple[int, str, str]], small_sequence: Path, weights: Path, tmp_path: Path
+) -> None:
+    file, taken = tmp_path / "file", tmp_path / "taken"
+    file.touch()
+    (taken / "denoise.json").mkdir(parents=True)
+    for out, expected in (
+        (small_sequence, "expected another folder than that of the input, found the same"),
+        (file, "expected a folder that can be written to"),
+        (taken, "expected to replace it, found what cannot be removed"),
+    ):
+        status, text, message = run("denoise", small_sequence, "-o", out, "--weights", weights)
+        assert (status, text) == (2, "")
+        assert expected in message
+
+
+def test_the_users_folder_in_quotes(
+    run: Callable[..., tuple[int, str, str]], small_sequence: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(small_sequence.parent))
+    status, _, errors = run("denoise", f"~/{small_sequence.name}", "-o", "~/a", "--weights=~/small.safetensors")
+    assert (status, errors) == (0, "")
+    assert (weights.parent / "a" / "denoise.json").is_file()
+
+
 def test_models_that_are_not_available(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
     denoise = ("denoise", small_sequence, "-o", out, "--model")
-    message = refused(*denoise, "unet")
-    assert "model 'unet': expected one of " in message
+    message = refused(*denoise, "resnet18")
+    assert "model 'resnet18': expected one of " in message
     assert all(name in message for name in pretrained_models())
     for name in list_models():
         if create_model(name).needs.trainable and name not in {*pretrained_models(), *compared_models()}:
             assert "expected shipped weights" in refused(*denoise, name)
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [
+        ("oidn_tund", "model 'oidn_tund': found no model of this name; did you mean oidn_tuned or "),
+        ("OIDN-tuned", "did you mean oidn_tuned or "),
+        ("joint_bilateral(sigma_color=1", "expected ')' after the settings, found none; add it"),
+        ("folder/mine.py:blur(radius=2", "expected ')' after the settings, found none; add it"),
+    ],
+)
+def test_misspelt_models(
+    refused: Callable[..., str], small_sequence: Path, out: Path, model: str, expected: str
+) -> None:
+    message = refused("denoise", small_sequence, "-o", out, "--model", model)
+    assert expected in message
+    # All models are not listed.
+    assert "asvgf" not in message
 
 
 MINE = """
@@ -503,6 +546,16 @@ def test_models(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> Non
         parameters = f"{entry['parameters']:,}" if entry["parameters"] else "-"
         assert re.search(rf"\b{entry['name']} .* {parameters} ", text)
     assert "SMAPE" not in text
+
+
+def test_models_in_a_narrow_terminal(run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("COLUMNS", "80")
+    _, text, _ = run("models")
+    rows = [line.split("│") for line in text.splitlines() if line.startswith("│")]
+    assert [row[1].strip() for row in rows if row[1].strip()] == [entry.name for entry in overview()]
+    assert all(len(row[-2]) > 20 for row in rows)
+    assert "not shown, for lack of width (see --json): kMAC per pixel, paper, parameters, uses" in text
 
 
 def test_models_with_results_of_a_benchmark(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:

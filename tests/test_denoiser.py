@@ -141,6 +141,7 @@ def test_missing_features_are_told() -> None:
     denoiser = Denoiser(small_model())
     denoiser(Frame(color=torch.rand(1, 3, 9, 7)))
     assert denoiser.report.missing == ["albedo", "depth", "motion", "normal"]
+    assert "\nmissing: albedo, depth, motion, normal\n" in str(denoiser.report)
     position, camera = torch.rand(1, 3, 9, 7), torch.eye(4)[None]
     denoiser(Frame(color=torch.rand(1, 3, 9, 7), position=position, view_projection=camera))
     assert denoiser.report.missing == ["albedo", "normal"]
@@ -415,7 +416,9 @@ def test_settings_are_those_of_the_model(weights: Path) -> None:
         lambda: Denoiser("cascaded_v2", weights=weights, nonsense=1),
     ):
         message = refused(make)
-        assert "model 'cascaded_v2': got an unexpected keyword argument 'nonsense'; it takes width" in message
+        assert (
+            "but alpha_min, anti_lag, tolerance beside its weights, found nonsense=1; the weights fix width" in message
+        )
     assert refused(lambda: Denoiser(Keep(), width=8)) == "width: expected a model's name, found a model"
     assert refused(lambda: Denoiser(Keep(), weights=weights)) == "weights: expected a model's name, found a model"
     assert "alpha_min: expected in (0, 1], found 2.0" in refused(lambda: Denoiser("cascaded_v2", alpha_min=2.0))
@@ -439,6 +442,12 @@ def test_the_report_of_a_frame(frames: list[Frame]) -> None:
     }
     assert all(name == stage.name for name, stage in report.stages.items())
     assert list(report.milliseconds) == STAGES
+    lines = str(report).splitlines()
+    names = ["milliseconds", "history", "skipped", "tiles", "precision"]
+    assert [line.partition(":")[0] for line in lines] == names
+    assert lines[0].startswith("milliseconds: validate ")
+    assert lines[2] == "skipped: remember (last frame)"
+    assert repr(report).startswith("FrameReport(milliseconds={")
     denoiser = Denoiser(Keep())
     denoiser(frames[0])
     assert denoiser.report.stages == {}

@@ -27,7 +27,7 @@ import torch
 from torch import Generator, Tensor
 
 from mcdenoise.check.case import Case, Inputs, Kind, Op, uniform
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.methods import parse_method
 from mcdenoise.own import in_one_line, load_own
 
@@ -56,6 +56,8 @@ def find_ops(names: Sequence[str], table: Sequence[Op]) -> list[Op]:
     known = {op.name: op for op in table}
     unknown = [name for name in names if name not in known and ":" not in name]
     if unknown:
+        if near := did_you_mean(unknown[0], known):
+            raise InputError(f"op: found no {unknown[0]}; {near} `mcdenoise ops` lists all")
         raise InputError(
             f"op: expected one of {', '.join(known)}, or path/to/file.py:function, or package.module:function, "
             f"found {', '.join(unknown)}"

@@ -7,6 +7,7 @@ import functools
 import importlib
 import io
 import itertools
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import is_dataclass
@@ -167,7 +168,7 @@ def parse(name: str, arguments: list[str]) -> Callable[[], int | None]:
     messages = io.StringIO()
     try:
         with contextlib.redirect_stderr(messages):
-            return tyro.cli(bind, args=arguments, prog=prog)
+            return tyro.cli(bind, args=[_expanded(each) for each in arguments], prog=prog)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -175,6 +176,12 @@ def parse(name: str, arguments: list[str]) -> Callable[[], int | None]:
         lines = [line.strip("│╭╮╰╯ ") for line in messages.getvalue().splitlines()]
         error = itertools.takewhile(lambda line: line.strip("─"), lines[1:])
         raise InputError(f"{' '.join(error).rstrip('.')}; see `{prog} --help`") from stop
+
+
+def _expanded(argument: str) -> str:
+    """The argument with the user's folder for ``~``, which a shell does not expand in quotes or after ``--option=``."""
+    option, equals, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
+    return f"{option}{equals}{os.path.expanduser(value)}"
 
 
 def _summary() -> str:

@@ -34,11 +34,16 @@ def say(line: object) -> None:
     print(printable(str(line)), flush=True)
 
 
-def show(table: Table) -> None:
-    """Print a table to stdout."""
+def console_of_tables() -> Console:
+    """Stdout, with the width of the terminal."""
     # A pipe has no width; do not wrap lines that a script may read.
     console = Console()
-    Console(width=None if console.is_terminal else 200).print(table)
+    return console if console.is_terminal else Console(width=200)
+
+
+def show(table: Table) -> None:
+    """Print a table to stdout."""
+    console_of_tables().print(table)
 
 
 def print_rows(rows: list[dict[str, str]]) -> None:

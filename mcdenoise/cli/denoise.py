@@ -15,7 +15,7 @@ from mcdenoise.cli._output import print_times, progress_bar, say, stages, warn, 
 from mcdenoise.cli._shot import ShotOptions
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import Sequence
-from mcdenoise.folder import denoise_sequence
+from mcdenoise.folder import denoise_sequence, prepare_folder
 from mcdenoise.frame import MOTION
 from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.models import pretrained_models
@@ -68,6 +68,8 @@ def denoise(
             )
         say(f"picked {choice}")
     denoiser, spelling = resolved.denoiser(), resolved.spelling
+    # Before anything is printed about a shot that cannot be written.
+    prepare_folder(opened, out)
     print_sequence(opened)
     began = time.perf_counter()
     with progress_bar() as progress, _backend(opened, resolved):

@@ -7,13 +7,22 @@ from pathlib import Path
 from statistics import mean
 
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from mcdenoise.cli._options import Json
-from mcdenoise.cli._output import show, write_json
-from mcdenoise.models import overview
+from mcdenoise.cli._output import console_of_tables, show, write_json
+from mcdenoise.models import ModelOverview, overview
 
 _MEASURED = ("SMAPE", "ms a frame")
+# In a narrower terminal the descriptions take the place of these columns.
+_WIDE = 160
+_ONLY_WIDE = {"paper", "uses", "parameters", "kMAC per pixel"}
+_WEIGHTS = """weights:
+  shipped   They come with the package.
+  compared  They come with the package, for comparisons only: the training was short.
+  to train  None come with the package: train them with `mcdenoise train`.
+  its own   The model finds them itself.
+  -         The method has none."""
 # Buffers from which motion is computed; a model uses those that a frame has.
 _MOTION = {"motion", "position", "previous_position", "view_projection"}
 
@@ -30,25 +39,35 @@ def models(results: Path | None = None, json: Json = None) -> None:
     """
     measured = _measured(results) if results else {}
     entries = overview()
-    columns = ("model", "paper", "needs", "uses", "weights", "parameters", "kMAC per pixel")
-    columns = (*columns, *(_MEASURED if results else ()), "description")
+    hidden = _ONLY_WIDE if console_of_tables().width < _WIDE else set()
     for kind in dict.fromkeys(entry.kind for entry in entries):
-        table = Table(*columns, title=kind, title_justify="left")
-        for entry in (each for each in entries if each.kind == kind):
-            motion = ["motion"] if _MOTION & set(entry.uses) else []
-            table.add_row(
-                entry.name,
-                entry.paper or "-",
-                ", ".join(entry.needs) or "-",
-                ", ".join([*(name for name in entry.uses if name not in _MOTION), *motion]) or "-",
-                "not available" if entry.reason else entry.weights if entry.weights != "none" else "-",
-                f"{entry.parameters:,}" if entry.parameters else "-",
-                "-" if entry.kmacs_per_pixel is None else f"{entry.kmacs_per_pixel:.1f}",
-                *(measured.get(entry.name, ("-", "-")) if results else ()),
-                escape(entry.reason or entry.description),
-            )
+        rows = [_row(entry, measured) for entry in entries if entry.kind == kind]
+        columns = [name for name in rows[0] if name not in hidden and (results or name not in _MEASURED)]
+        headers = (Column(name, no_wrap=name == "model", overflow="fold") for name in columns)
+        table = Table(*headers, title=kind, title_justify="left")
+        for row in rows:
+            table.add_row(*(row[name] for name in columns))
         show(table)
+    print(_WEIGHTS)
+    if hidden:
+        print(f"not shown, for lack of width (see --json): {', '.join(sorted(hidden))}")
     write_json(json, [asdict(entry) for entry in entries])
+
+
+def _row(entry: ModelOverview, measured: dict[str, tuple[str, str]]) -> dict[str, str]:
+    """The cells of a model by column."""
+    motion = ["motion"] if _MOTION & set(entry.uses) else []
+    return {
+        "model": entry.name,
+        "paper": entry.paper or "-",
+        "needs": ", ".join(entry.needs) or "-",
+        "uses": ", ".join([*(name for name in entry.uses if name not in _MOTION), *motion]) or "-",
+        "weights": "not available" if entry.reason else entry.weights if entry.weights != "none" else "-",
+        "parameters": f"{entry.parameters:,}" if entry.parameters else "-",
+        "kMAC per pixel": "-" if entry.kmacs_per_pixel is None else f"{entry.kmacs_per_pixel:.1f}",
+        **dict(zip(_MEASURED, measured.get(entry.name, ("-", "-")), strict=True)),
+        "description": escape(entry.reason or entry.description),
+    }
 
 
 def _measured(folder: Path) -> dict[str, tuple[str, str]]:

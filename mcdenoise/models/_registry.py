@@ -15,7 +15,7 @@ from typing import Any, Literal, get_args
 
 from torch import nn
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._defaults import plain_defaults
 from mcdenoise.models._interface import Model
@@ -118,10 +118,13 @@ def find_model(name: str) -> Entry:
         return _MODELS[name]
     if name in _installed():
         return _of_factory(name, _loaded_entry_point(name))
-    if ":" in name:
+    if ":" in name or name.endswith(".py"):
         return _of_factory(name, load_own(name, "model", "factory")[0])
+    known = list_models()
+    if near := did_you_mean(name, known):
+        raise InputError(f"model '{name}': found no model of this name; {near} `mcdenoise models` lists all models")
     raise InputError(
-        f"model '{name}': expected one of {', '.join(list_models())}, or path/to/file.py:factory, or "
+        f"model '{name}': expected one of {', '.join(known)}, or path/to/file.py:factory, or "
         "package.module:factory; see `mcdenoise models`"
     )
 

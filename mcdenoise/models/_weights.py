@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import operator
 from pathlib import Path
@@ -77,11 +78,12 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
         path: a file written by :func:`save_weights`.
         name: registered model that the file must hold, or a user's own model to load it into; by default the model that
             the file names.
-        settings: override the settings in the file.
+        settings: arguments for the model's constructor; those of a registered model that determine the weights must be
+            as in the file.
 
     Raises:
         InputError: the file does not exist, is not safetensors, holds another model, has tensors that do not fit (the
-            message names the first one), or has weights that are not finite.
+            message names the first one), or has weights that are not finite; or the model has no such setting.
     """
     description = describe_weights(path)
     found = description["architecture"]
@@ -93,13 +95,15 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
             f"{path}: header 'settings': expected every setting of model '{found}', found no {', '.join(lacking)}; "
             "save the weights again"
         )
-    settings = {**description["settings"], **settings}
+    if ":" not in (name or found):
+        _check_settings(found, settings, description["settings"])
     try:
-        model = build_model(name or found, **settings)
+        model = build_model(name or found, **{**description["settings"], **settings})
     except (TypeError, ValueError, RuntimeError) as error:
-        if isinstance(error, InputError):
-            raise InputError(f"{path}: {error}") from error
-        raise InputError(f"{path}: expected settings of model '{found}', found {settings}") from error
+        # Settings that are given are not the file's mistake.
+        where, given = ("", settings) if settings else (f"{path}: ", description["settings"])
+        reason = str(error) if isinstance(error, InputError) else f"expected settings of model '{found}', found {given}"
+        raise InputError(f"{where}{reason}") from error
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - a safetensors handle is no dict
     for name, unet in _unets(model).items():
@@ -122,6 +126,25 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
         with torch.no_grad():
             own[key].copy_(tensor)
     return model.eval() if isinstance(model, nn.Module) else model
+
+
+def _check_settings(name: str, given: dict[str, Any], fixed: dict[str, Any]) -> None:
+    """Raise ``InputError`` for a setting that a registered model does not take beside weights with fixed settings."""
+    entry = find_model(name)
+    parameters = inspect.signature(entry.construct).parameters.values()
+    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+        return
+    free = [each.name for each in parameters if each.name not in entry.architecture]
+    wrong = [each for each in given if each not in free and (each not in fixed or given[each] != fixed[each])]
+    if wrong:
+        shipped = (*pretrained_models(), *compared_models())
+        family = [each for each in shipped if each != name and find_model(each).construct is entry.construct]
+        allowed = f"no settings but {', '.join(free)}" if free else "no settings"
+        others = f", or take another model: {', '.join(family)}" if family else ""
+        raise InputError(
+            f"model '{name}': expected {allowed} beside its weights, found {wrong[0]}={given[wrong[0]]}; the weights "
+            f"fix {', '.join(fixed)}; for other values train it{others}"
+        )
 
 
 def start_with(model: Model, name: str, **settings: Any) -> str:

@@ -476,7 +476,9 @@ def test_an_unknown_layer_is_named(weights: Path) -> None:
 
 
 def test_a_layer_of_another_shape_is_named(weights: Path) -> None:
-    message = refused(lambda: load_weights(weights, width=6, kernel_width=8))
+    settings = json.dumps(describe_weights(weights)["settings"] | {"width": 6, "kernel_width": 8})
+    path = altered(weights, lambda tensors, header: header.update(settings=settings))
+    message = refused(lambda: load_weights(path))
     assert "layer 'initial.heads.0.weight': model 'cascaded_v2' expects (3, 6, 3, 3), found (3, 8, 3, 3)" in message
 
 
@@ -498,6 +500,18 @@ def test_a_header_that_means_nothing_is_refused(weights: Path, key: str, value: 
     message = refused(lambda: load_weights(path))
     assert expected in message
     assert str(path) in message or key == "architecture"
+
+
+def test_shipped_weights_fix_the_settings_that_determine_them() -> None:
+    beside = "model 'oidn_tuned': expected no settings beside its weights, found "
+    for settings, found in (({"quality": "high"}, "quality=high"), ({"size": "small"}, "size=small")):
+        message = refused(lambda settings=settings: create_model("oidn_tuned", pretrained=True, **settings))
+        assert message == (
+            f"{beside}{found}; the weights fix size; for other values train it, or take another model: oidn_tuned_small"
+        )
+    create_model("oidn_tuned", pretrained=True, size="base")
+    message = refused(lambda: create_model("cascaded_v2_micro", pretrained=True, alpha_min=2.0))
+    assert message == "alpha_min: expected in (0, 1], found 2.0"
 
 
 def test_files_that_are_no_weights_are_refused(weights: Path, tmp_path: Path) -> None:

@@ -97,6 +97,15 @@ def test_an_invalid_factory_is_refused_in_one_line(mine: Path, name: str, messag
 def test_a_factory_has_to_be_somewhere(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected a Python file with a factory of a model, found no such file"):
         create_model(f"{tmp_path}/absent.py:network")
+    several = tmp_path / "several.py"
+    several.write_text("raise SystemExit\n\ndef smooth(): ...\n\nclass Sharp: ...\n\ndef _hidden(): ...")
+    with pytest.raises(InputError, match=r"several\.py:factory, found only the file; add :smooth or :Sharp$"):
+        create_model(str(several))
+    several.write_text("def smooth(:")
+    with pytest.raises(InputError, match=r"several\.py:factory, found only the file; add :factory$"):
+        create_model(str(several))
+    with pytest.raises(InputError, match="expected a Python file with a factory of a model, found no such file"):
+        create_model(f"{tmp_path}/absent.py")
     broken = tmp_path / "broken.py"
     broken.write_text("import nothing_of_this_name")
     with pytest.raises(InputError, match=r"broken\.py cannot be imported: ModuleNotFoundError"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -116,9 +117,9 @@ def find_lights(where: str, layers: Sequence[Layer], color: Layer, names: Sequen
         InputError: a layer does not exist, or has fewer than three channels.
     """
     own = [layer for layer in layers if (layer.family == color.family or layer.anonymous) and layer != color]
+    known = [layer for layer in own if layer.is_color and recognise(layer) is None]
     expanded: list[str] = []
     for name in names:
-        known = [layer for layer in own if layer.is_color and recognise(layer) is None]
         if name == ALL:
             expanded += [layer.name for layer in known if layer.title in _ADDED]
         elif any(mark in name for mark in "*?["):
@@ -127,15 +128,21 @@ def find_lights(where: str, layers: Sequence[Layer], color: Layer, names: Sequen
             expanded.append(name)
             continue
         if not expanded:
-            raise InputError(f"{where}: expected layers of light for --layers {name}, found none; name them")
+            advice = f"name them: --layers {shlex.join(map(str, known[:2]))}" if known else "omit the option"
+            raise InputError(f"{where}: expected layers of light for --layers {name}, found none; {advice}")
     lights: dict[str, Light] = {}
     for name in expanded:
         found = named(own, name) or named(layers, name)
         if len(found) != 1 or not found[0].is_color or found[0] == color:
-            pictures = ", ".join(str(layer) for layer in own if layer.title in _ADDED) or "the others: none is known"
+            lit = [layer for layer in known if layer.title in _ADDED] or known
+            advice = f"choose among {', '.join(map(str, lit))}" if lit else "omit the option"
+            # Commas separate the channels of one layer.
+            if "," in name:
+                separate = shlex.join(map(str.strip, name.split(",")))
+                advice = f"separate names by spaces: --layers {separate}; or {advice}"
             raise InputError(
                 f"{where}: expected one layer of light for --layers {name}, found "
-                f"{', '.join(map(str, found)) or 'none'}; choose among {pictures}"
+                f"{', '.join(map(str, found)) or 'none'}; {advice}"
             )
         (layer,) = found
         lights[layer.name] = Light((layer, *color_of(layer, own)))

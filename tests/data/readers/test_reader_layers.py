@@ -293,6 +293,23 @@ def test_layers_that_cannot_be_requested(
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("channels", "lights", "expected"),
+    [
+        ("R G B DiffDir.R DiffDir.G DiffDir.B", "Glow", "found none; choose among DiffDir.RGB"),
+        ("R G B Sun.R Sun.G Sun.B a~b.R a~b.G a~b.B", "all", "found none; name them: --layers Sun.RGB 'a b.RGB'"),
+        ("R G B Sun.R Sun.G Sun.B", "Sun,Sky", "separate names by spaces: --layers Sun Sky; or choose among Sun.RGB"),
+        ("R G B", "all", "found none; omit the option"),
+        ("R G B", "Glow", "found none; omit the option"),
+    ],
+)
+def test_lights_that_cannot_be_requested(
+    channels: str, lights: str, expected: str, save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    path = save(tmp_path / "a.exr", {name.replace("~", " "): np.ones(SIZE) for name in channels.split()})
+    assert refused(open_sequence, path, lights=(lights,)).endswith(expected)
+
+
 def test_every_buffer_can_be_asked_for() -> None:
     assert parse_mapping([f"{buffer} = Some Layer" for buffer in MAPPABLE]) == dict.fromkeys(MAPPABLE, "Some Layer")
     assert {"color", "albedo", "normal", "depth", "position", "motion", "reference"} <= set(MAPPABLE)
