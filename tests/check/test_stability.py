@@ -251,8 +251,13 @@ def test_the_checks_by_default_and_by_name() -> None:
     assert [group.name for group in stability.groups(["demodulate"])] == ["demodulate"]
     named = [group.name for group in stability.groups(None, ["cascaded_v2_tiny"])]
     assert named == ["cascaded_v2_tiny", "Denoiser, cascaded_v2_tiny"]
-    for arguments in ((["sharpen"], None), (None, ["unet"])):
-        with pytest.raises(InputError, match=r"(expected .* found sharpen|model 'unet': expected one of)"):
+    for arguments, message in (
+        ((["sharpen"], None), "expected .* found sharpen"),
+        ((["demodulat"], None), "found no demodulat; did you mean demodulate"),
+        ((None, ["resnet18"]), "model 'resnet18': expected one of"),
+        ((None, ["unet"]), "model 'unet': found no model of this name; did you mean wskp_unet"),
+    ):
+        with pytest.raises(InputError, match=message):
             stability.groups(*arguments)
     with pytest.raises(InputError, match="found float8"):
         stability.parse_dtypes(["float32", "float8"])
