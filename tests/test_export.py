@@ -198,11 +198,8 @@ def test_every_model_of_the_zoo_is_exported_for_images_of_any_size(name: str, tm
         assert_alike(with_onnxruntime(exported, step, shot), eager(model, shot))
 
 
-SHIPPED = sorted(set(pretrained_models()) - {"oidn_pyramid"})  # which calls a library
-
-
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
-@pytest.mark.parametrize("name", ["", *(pytest.param(name, marks=pytest.mark.slow) for name in SHIPPED)])
+@pytest.mark.parametrize("name", ["", *(pytest.param(name, marks=pytest.mark.slow) for name in pretrained_models())])
 @pytest.mark.timeout(1800)
 def test_a_step_is_one_graph_of_fixed_shapes_that_can_be_replayed(name: str) -> None:
     """A CUDA graph requires that no value is read, no size depends on one, and a state goes in as it came out."""

@@ -138,21 +138,21 @@ class OpenFilters(nn.Module):
 
     Args:
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
-        clean: whether features will be denoised and then taken as clean.
+        prefilter: quality of the networks that will denoise features, which then count as clean; ``None`` for none.
 
     Raises:
         InputError: see :func:`archive_of_library`.
     """
 
-    def __init__(self, quality: Quality = "high", *, clean: bool = True) -> None:
+    def __init__(self, quality: Quality = "high", *, prefilter: Quality | None = "high") -> None:
         super().__init__()
         self.quality = quality
         self.networks = nn.ModuleDict()
         self._network(_IMAGES, quality, clean=False)
-        if clean:
+        if prefilter:
             self._network(_IMAGES, quality, clean=True)
             for name in _FEATURES:
-                self._network((name,), "fast", clean=False)
+                self._network((name,), prefilter, clean=False)
 
     def state_dict(self, *args: Any, destination: Any = None, prefix: str = "", keep_vars: bool = False) -> Any:
         """Nothing: the library has the weights."""

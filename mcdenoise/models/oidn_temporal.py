@@ -3,8 +3,8 @@
 The library denoises every frame separately: single images are state of the art, but sequences flicker. It also has to
 be told whether albedo and normal have noise, which rarely holds for a whole image: they are exact on a wall, and noisy
 behind glass, in a blurred mirror and out of focus. This method runs the library for noisy features and for clean ones,
-which it denoises first unless they are exact. The mean of both images is about as good as the better one, without
-having to know which one that is. Then the previous result is blended in. No weights are learnt.
+which it denoises first. The mean of both images is about as good as the better one, without having to know which one
+that is. Then the previous result is blended in. No weights are learnt.
 """
 
 from __future__ import annotations
@@ -62,8 +62,9 @@ def oidn_temporal(
     *,
     quality: Quality = "high",
     auxiliary: Literal["both", "noisy"] = "both",
+    prefilter: Quality = "high",
     threads: int | None = None,
-    engine: Engine = "library",
+    engine: Engine = "auto",
     history: float = 4.0,
 ) -> Model:
     """Open Image Denoise (optional package pyoidn) for noisy and for clean features, stabilized by the previous result.
@@ -71,6 +72,7 @@ def oidn_temporal(
     Args:
         quality: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         auxiliary: ``"noisy"`` takes only the image for noisy features, in a fifth to a half of the time.
+        prefilter: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         threads: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         engine: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         history: see :class:`mcdenoise.models.steadied.Steadied`.
@@ -83,4 +85,4 @@ def oidn_temporal(
     both = auxiliary == "both"
     steadied = Recurrent(Tiled(Steadied(history)), albedo=OIDN_ALBEDO)
     chain = Chain(mixed=Mixed(_CLEAN_PART if both else 0.0), steadied=steadied)
-    return WithOidn(chain, quality=quality, threads=threads, engine=engine, clean=both)
+    return WithOidn(chain, quality=quality, prefilter=prefilter, threads=threads, engine=engine, clean=both)

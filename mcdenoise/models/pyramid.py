@@ -41,7 +41,7 @@ from mcdenoise.ops.demodulation import modulation
 from mcdenoise.ops.lag import THRESHOLD
 
 SCALE_UNITS = (10.0, 1000.0, 1.0)  # units of the falloffs with normal, depth and distance
-_USES, _HISTORY = frozenset({"albedo", "normal", "depth"}), frozenset({"current", "length", ALBEDO_HISTORY})
+_USES = frozenset({"albedo", "normal", "depth", "current", "length", ALBEDO_HISTORY})
 _COARSE_CHANNELS = 7  # logarithms of the means, with and without history, and the deviation of the pixels
 _FEATURE_TAPS = 9  # taps of the feature filter
 # "albedo" has weights of the filtered 3x3 neighbourhood, of the history, and of the albedo that the pyramid filters.
@@ -62,24 +62,17 @@ class PyramidNetwork(nn.Module):
         widths: feature channels of each level of the U-Net, finest first.
         kernel_size: side of the kernels at every scale.
         half: whether the U-Net begins at half the resolution.
-        others: keys of ``frame.extra`` for images ``(B, 3, H, W)`` that other methods made of the frame. The network
-            takes them, and the result is a mean of its own image and theirs with predicted weights. An image that a
-            frame lacks is replaced by the noisy color.
     """
 
-    def __init__(
-        self, widths: Sequence[int], kernel_size: int = 5, half: bool = False, others: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, widths: Sequence[int], kernel_size: int = 5, half: bool = False) -> None:
         super().__init__()
         scales = len(widths) + half
-        self.others = tuple(others)
-        self.unet = UNet(9 + FEATURES + 3 * len(self.others), widths, scales, _COARSE_CHANNELS, half)
+        self.unet = UNet(9 + FEATURES, widths, scales, _COARSE_CHANNELS, half)
         self.taps = kernel_size**2
         # Channels per scale: kernel, its three falloffs, the kept fraction, and the fraction taken from the coarser
         # scale.
         self.channels = [self.taps + 5] * (scales - 1) + [self.taps + 3]
-        self.parts = {"others": 1 + len(self.others), **_PARTS} if self.others else _PARTS
-        extra = [sum(self.parts.values())] + [0] * (scales - 1)
+        extra = [sum(_PARTS.values())] + [0] * (scales - 1)
         self.heads = nn.ModuleList(
             Head(self.unet, scale, own + more)
             for scale, (own, more) in enumerate(zip(self.channels, extra, strict=True))
@@ -87,7 +80,7 @@ class PyramidNetwork(nn.Module):
         for head in self.heads:
             nn.init.normal_(head.weight, std=0.01)  # type: ignore[arg-type]
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
-        at_rest = {name: torch.full((count,), _AT_REST.get(name, 0.0)) for name, count in self.parts.items()}
+        at_rest = {name: torch.full((count,), _AT_REST.get(name, 0.0)) for name, count in _PARTS.items()}
         at_rest["features"][_FEATURE_TAPS // 2] = 4.0
         at_rest["albedo"][0] = 1.0  # of the pixels around
         rest = torch.cat(list(at_rest.values()))
@@ -103,9 +96,7 @@ class PyramidNetwork(nn.Module):
         radius = math.isqrt(self.taps) // 2
         behind = sum((radius + 1) << scale for scale in range(self.unet.scales))
         ways = (self.unet.reach(scale) + max(1 << scale, self.unet.stride) for scale in range(self.unet.scales))
-        # The other methods' images do not depend on the history.
-        uses = _USES | (frozenset(self.others) or _HISTORY)
-        return Needs(uses=uses, reach=max(ways) + behind, stride=self.unet.multiple)
+        return Needs(uses=_USES, reach=max(ways) + behind, stride=self.unet.multiple)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """Exposure and depth scale of the whole image."""
@@ -122,18 +113,15 @@ class PyramidNetwork(nn.Module):
         image = frame.color * exposure
         albedo = modulation(features_of(frame)[0]) if frame.albedo is not None else torch.ones_like(image)
         before = modulation(frame.extra[ALBEDO_HISTORY]) if ALBEDO_HISTORY in frame.extra else albedo
-        # In the unit of the image, including albedo.
-        others = [frame.extra[name] * exposure if name in frame.extra else image * albedo for name in self.others]
-        logarithms = [torch.log1p(each) for each in (image * albedo, *others)]
-        seen = torch.cat([input_of(frame, image), logarithms[0], before, *logarithms[1:]], 1)
+        seen = torch.cat([input_of(frame, image), torch.log1p(image * albedo), before], 1)
         levels = self.unet(seen, self._coarse(frame, exposure))
         sizes = _sizes(frame.size, len(levels))
         predicted = [
             head(level, size).to(torch.promote_types(image.dtype, torch.float32))
             for head, level, size in zip(self.heads, levels, sizes, strict=True)
         ]
-        counts = list(self.parts.values())
-        parts = dict(zip(self.parts, predicted[0][:, self.channels[0] :].split(counts, 1), strict=True))
+        counts = list(_PARTS.values())
+        parts = dict(zip(_PARTS, predicted[0][:, self.channels[0] :].split(counts, 1), strict=True))
         predicted[0] = predicted[0][:, : self.channels[0]]
 
         # The features of the pixel, which may be of one sample, and their mean over the neighbourhood.
@@ -158,9 +146,6 @@ class PyramidNetwork(nn.Module):
         smooth = near * smooth + history * before + wide * mean[:, 3:6]
         gain = torch.exp(_MOST_GAIN * torch.tanh(parts["gain"]))
         result = mean[:, :3] * gain / _ratio(albedo, smooth, matt)
-        if others:
-            weights = torch.softmax(parts["others"], 1).split(1, 1)
-            result = sum(w * each for w, each in zip(weights, [result, *(o / albedo for o in others)], strict=True))
         return answered(frame, result / exposure, None if layers is None else mean[:, 6:]), None
 
     def _coarse(self, frame: Frame, exposure: Tensor) -> list[Tensor]:

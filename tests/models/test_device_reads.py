@@ -27,7 +27,7 @@ from mcdenoise.models._reads import at_hand, without_reads
 from mcdenoise.models._stopwatch import Stopwatch
 
 # Open Image Denoise is a library for processors here: images go there and back, which waits.
-ON_THE_HOST = {"oidn", "oidn_pyramid", "oidn_temporal"}
+ON_THE_HOST = {"oidn", "oidn_temporal"}
 MODELS = [name for name in list_models() if name not in ON_THE_HOST]
 SIZE = (40, 56)
 

@@ -222,8 +222,7 @@ def test_a_gradient_reaches_every_parameter(name: str) -> None:
         assert parameter.grad.abs().max() > 0, key
 
 
-# oidn_pyramid's network is preceded by a library without derivatives.
-@pytest.mark.parametrize("name", [name for name in TRAINABLE if name != "oidn_pyramid"])
+@pytest.mark.parametrize("name", TRAINABLE)
 def test_a_gradient_goes_through_the_state(name: str) -> None:
     """It reaches the light of the first frame from the image of the second, in a direction that changes the image."""
     model = small(name)

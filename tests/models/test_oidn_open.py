@@ -56,7 +56,7 @@ def test_equals_the_result_of_the_library(quality: Any, auxiliary: Any) -> None:
 @pytest.mark.parametrize("missing", [{}, {"normal": None}, {"normal": None, "albedo": None}])
 def test_filters_equal_those_of_the_library(quality: Any, missing: dict[str, None]) -> None:
     frame = lit().replace(**missing)
-    filters, library = OpenFilters(quality, clean=False), Oidn(quality, threads=1)
+    filters, library = OpenFilters(quality, prefilter=None), Oidn(quality, threads=1)
     exposure = oidn_exposure(frame.color)
     for auxiliary in ("noisy", "clean") if frame.normal is not None else ("noisy",):
         image, expected = (compress(each.denoised(frame, auxiliary) * exposure) for each in (filters, library))

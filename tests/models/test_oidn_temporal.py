@@ -17,6 +17,7 @@ from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import create_model, has_network
+from mcdenoise.models._precision import Chosen, Precision
 from mcdenoise.models.noisy import Noisy
 from mcdenoise.models.oidn import Oidn
 from mcdenoise.models.oidn_temporal import Mixed
@@ -53,13 +54,22 @@ def given(height: int = 21, width: int = 34, weight: float = 1.0) -> Frame:
 def test_a_still_is_a_mean_of_two_images() -> None:
     model, oidn = create_model(NAME, threads=1), Oidn("high", threads=1)
     frame = frame_of(24, 40)
-    # Random normals are not exact, so that features are denoised first.
     noisy = oidn.denoised(frame, "noisy")
-    clean = oidn.denoised(oidn.with_clean_features(frame, "fast"), "clean")
+    clean = oidn.denoised(oidn.with_clean_features(frame, "high"), "clean")
     output, _ = model(frame)
     torch.testing.assert_close(output.image, (noisy + 3 * clean) / 4)
     torch.testing.assert_close(output.stages["oidn"], noisy)
     torch.testing.assert_close(output.stages["oidn_clean"], clean)
+
+
+def test_features_without_noise_count_as_they_are_and_denoised() -> None:
+    model, oidn = create_model(NAME, threads=1), Oidn("high", threads=1)
+    exact = plane(torch.zeros(2, 40, 60)).replace(albedo=torch.rand(1, 3, 40, 60))
+    given = Frame(exact.color, albedo=exact.albedo, normal=exact.normal)
+    both = (given, oidn.with_clean_features(given, "high"))
+    extra = model.before(exact).extra
+    torch.testing.assert_close(extra[OIDN_CLEAN], sum(oidn.denoised(each, "clean") for each in both) / 2)
+    assert torch.equal(extra[OIDN_ALBEDO], exact.albedo)
 
 
 def test_noise_that_neighbours_share_is_removed() -> None:
@@ -233,8 +243,8 @@ def test_a_copy_has_a_library_of_its_own() -> None:
     model = create_model(NAME, threads=1, quality="fast")
     other = copy.deepcopy(model)
     frame = whole_frame(model, 24, 40)
-    assert other._oidn is not model._oidn
-    assert (other._oidn.quality, other._oidn.threads) == ("fast", 1)
+    assert other._library is not model._library
+    assert (other._library.quality, other._library.threads) == ("fast", 1)
     assert torch.equal(other(frame)[0].image, model(frame)[0].image)
 
 
@@ -333,6 +343,30 @@ def test_both_engines_give_the_same_sequence(auxiliary: str) -> None:
         torch.testing.assert_close(*images, rtol=0, atol=4 * 20 * 2.0**-22)
 
 
+@pytest.mark.parametrize("fastest", ["float32", "bfloat16"])
+def test_the_engine_is_torch_where_bfloat16_is_chosen(fastest: Precision, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mcdenoise.models.with_oidn.fastest_precision", lambda _: Chosen(fastest, ""))
+    auto, library, torches = (create_model("oidn_temporal", engine=each) for each in ("auto", "library", "torch"))
+    frame = frame_of(24, 40)
+    for rounded in (False, True):
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=rounded):
+            images = [model(frame)[0].image for model in (auto, library, torches)]
+        assert not torch.equal(images[1], images[2])
+        assert torch.equal(images[0], images[2 if rounded and fastest == "bfloat16" else 1])
+
+
+@pytest.mark.parametrize("engine", ["library", "torch"])
+def test_the_quality_of_the_filters_of_features(engine: str) -> None:
+    frame = frame_of(24, 40)
+    for quality in ("fast", "high"):
+        image = create_model("oidn_temporal", prefilter=quality, engine=engine)(frame)[0].stages[OIDN_CLEAN]
+        oidn = Oidn("high", threads=1)
+        expected = oidn.denoised(oidn.with_clean_features(frame, quality), "clean")
+        torch.testing.assert_close(image, expected, rtol=2e-3, atol=2e-4)
+    message = refused(lambda: create_model("oidn_temporal", prefilter="best"))
+    assert message == "prefilter: expected one of fast, balanced, high, found 'best'"
+
+
 def test_an_unknown_engine_is_refused() -> None:
     message = refused(lambda: create_model("oidn_temporal", engine="steam"))
-    assert message.startswith("engine: expected one of library, torch, found 'steam'")
+    assert message.startswith("engine: expected one of auto, library, torch, found 'steam'")

@@ -11,7 +11,7 @@ from typing import get_args
 import pytest
 
 from mcdenoise.cli.models import models
-from mcdenoise.models import _registry, list_models, overview, pretrained_models, register_model
+from mcdenoise.models import _registry, list_models, overview, register_model
 from mcdenoise.models._registry import Kind
 from mcdenoise.models.oidn_open import archive_of_library
 
@@ -47,10 +47,9 @@ def test_a_model_without_its_package_is_listed_with_the_reason(
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     archive_of_library.cache_clear()
     models(json=tmp_path / "models.json")
-    assert "oidn_pyramid" not in pretrained_models()
     absent = [entry for entry in json.loads((tmp_path / "models.json").read_text()) if entry["reason"]]
     assert [(entry["name"], entry["kind"]) for entry in absent] == [
-        (name, "peer") for name in ("oidn", "oidn_open", "oidn_pyramid", "oidn_temporal")
+        (name, "peer") for name in ("oidn", "oidn_open", "oidn_temporal")
     ]
     assert all("pip install 'mcdenoise[oidn]'" in entry["reason"] for entry in absent)
     printed = capsys.readouterr().out

@@ -141,7 +141,7 @@ def test_the_recipes_can_be_read(recipe: Path) -> None:
     runs = {name: run for run in found.runs if (name := run.name or run.config.model) in shipped}
     assert all(run.expected is not None for run in runs.values())
     # kpcn's settings were once defaults, which the recipe did not state.
-    for name in {"cascaded", "oidn_pyramid", *compared_models()} & runs.keys() - {"kpcn"}:
+    for name in {"cascaded", *compared_models()} & runs.keys() - {"kpcn"}:
         assert (path := find_weights(name)) is not None
         assert describe_weights(path)["recipe"] == runs[name].sha256
 
