@@ -90,10 +90,9 @@ class WithOidn(Wrapper):
         clean: bool = True,
     ) -> None:
         super().__init__(inner)
-        if engine not in get_args(Engine):
-            raise InputError(f"engine: expected one of {', '.join(get_args(Engine))}, found '{engine}'")
-        if prefilter not in get_args(Quality):
-            raise InputError(f"prefilter: expected one of {', '.join(get_args(Quality))}, found '{prefilter}'")
+        for name, value, kind in (("engine", engine, Engine), ("prefilter", prefilter, Quality)):
+            if value not in get_args(kind):
+                raise InputError(f"{name}: expected one of {', '.join(get_args(kind))}, found '{value}'")
         self.quality, self.threads, self.engine = quality, threads, engine
         self.prefilter, self.clean = prefilter, clean
         self._library = Oidn(quality, threads=threads)
@@ -132,16 +131,14 @@ class WithOidn(Wrapper):
         given = given.map(_phases) if spread else given
         exact = centred and frame.normal is not None and not has_scattered_features(frame.normal)
         images = {OIDN: (noisy := oidn.denoised(given, "noisy"))}
-        features = oidn.with_clean_features(given, self.prefilter) if self.clean else given
+        clean = [given] if exact else []
         if self.clean:
-            # Without features both images are the same.
-            images[OIDN_CLEAN] = noisy if features.albedo is None else oidn.denoised(features, "clean")
-        if exact:
-            features = given
-            if self.clean:
-                images[OIDN_CLEAN] = (images[OIDN_CLEAN] + oidn.denoised(given, "clean")) / 2
-        if features.albedo is not None and (self.clean or exact):
-            images[OIDN_ALBEDO] = features.albedo
+            clean.append(oidn.with_clean_features(given, self.prefilter))
+            # OIDN takes no normal without an albedo; then all images are the same.
+            made = [noisy] if given.albedo is None else [oidn.denoised(each, "clean") for each in clean]
+            images[OIDN_CLEAN] = torch.stack(made).mean(0)
+        if clean and clean[0].albedo is not None:
+            images[OIDN_ALBEDO] = clean[0].albedo
         if spread:
             images = {name: _without_pattern(_merged(image, frame.size)) for name, image in images.items()}
         images |= {NOISY: frame.color, CENTRED: torch.full_like(frame.color[:, :1], float(centred))}

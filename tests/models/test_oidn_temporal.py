@@ -37,6 +37,8 @@ from mcdenoise.models.with_oidn import (
     has_scattered_features,
 )
 from mcdenoise.nn.oidn import compress, oidn_exposure
+from mcdenoise.train.clips import LIGHT
+from mcdenoise.train.front import split
 
 if importlib.util.find_spec("pyoidn") is None:
     pytest.skip("Open Image Denoise is in the extra mcdenoise[oidn]", allow_module_level=True)
@@ -341,6 +343,21 @@ def test_both_engines_give_the_same_sequence(auxiliary: str) -> None:
         images = [compress(method(frame)) for method in methods]
         # Rounding of two images, and of the features that the second one is denoised with.
         torch.testing.assert_close(*images, rtol=0, atol=4 * 20 * 2.0**-22)
+
+
+def test_training_begins_behind_oidn() -> None:
+    """Its images are computed into the cache. They are light, and clips scale them as such."""
+    model = WithOidn(Mixed(), threads=1)
+    front, rest = split(model)
+    assert [kind for kind, _ in front.wrappers] == [WithOidn]
+    assert (front.accumulates, front.demodulates) == (False, False)
+    assert front.parts == {"color": 3, OIDN: 3, OIDN_CLEAN: 3, OIDN_ALBEDO: 3, NOISY: 3, CENTRED: 1}
+    assert front.parts.keys() - {OIDN_ALBEDO, CENTRED} <= LIGHT
+    frame = frame_of(24, 40)
+    seen, output = front.begin()(frame), model(frame)[0]
+    for name in (OIDN, OIDN_CLEAN):
+        assert torch.equal(seen.extra[name], output.stages[name])
+    assert torch.equal(rest(seen)[0].image, output.image)
 
 
 @pytest.mark.parametrize("fastest", ["float32", "bfloat16"])
