@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from mcdenoise.errors import InputError
 from mcdenoise.models._interface import Model
 from mcdenoise.models._stopwatch import Stopwatch
-from mcdenoise.models._wrapper import parts_of
+from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.nn import UNet
 from mcdenoise.nn.int8 import has_int8, integers
 from mcdenoise.nn.oidn import OidnUNet
@@ -71,8 +71,12 @@ def fastest_precision(device: torch.device) -> Chosen:
 
 
 def has_network(model: Model) -> bool:
-    """Whether a model has convolutions of its own: those that it is trained with, or those of Open Image Denoise."""
-    return model.needs.trainable or any(True for _ in parts_of(model, OidnUNet))
+    """Whether a model has convolutions of its own: those that it is trained with, or those of Open Image Denoise.
+
+    A wrapper that loads them with the first frame has an attribute ``has_network``.
+    """
+    loads = any(getattr(part, "has_network", False) for part in parts_of(model, Wrapper))
+    return model.needs.trainable or loads or any(True for _ in parts_of(model, OidnUNet))
 
 
 def precisions_of(model: Model) -> tuple[Precision, ...]:

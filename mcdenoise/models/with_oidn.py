@@ -96,10 +96,7 @@ class WithOidn(Wrapper):
         self.quality, self.threads, self.engine = quality, threads, engine
         self.prefilter, self.clean = prefilter, clean
         self._library = Oidn(quality, threads=threads)
-        self._filters: OpenFilters | None = None
-        fast = engine == "auto" and fastest_precision(torch.device("cpu")).precision == "bfloat16"
-        if engine == "torch" or fast:
-            self._filters = OpenFilters(quality, prefilter=prefilter if clean else None)
+        self._filters = self._made_in_torch() if engine == "torch" else None
 
     @property
     def needs(self) -> Needs:
@@ -144,10 +141,23 @@ class WithOidn(Wrapper):
         images |= {NOISY: frame.color, CENTRED: torch.full_like(frame.color[:, :1], float(centred))}
         return frame.replace(extra={**frame.extra, **images}, skip=None)
 
+    @property
+    def has_network(self) -> bool:
+        """Whether frames that are denoised in bfloat16 are denoised by networks in torch."""
+        automatic = self.engine == "auto" and fastest_precision(torch.device("cpu")).precision == "bfloat16"
+        return self.engine == "torch" or automatic
+
     def _faster(self) -> Oidn | OpenFilters:
-        """The library, or its networks in torch."""
+        """The library, or its networks in torch, which are loaded for the first frame that is denoised by them."""
+        if self._filters is None and torch.is_autocast_enabled("cpu") and self.has_network:
+            self._filters = self._made_in_torch()
         rounded = self.engine == "torch" or torch.is_autocast_enabled("cpu")
         return self._filters if self._filters is not None and rounded else self._library
+
+    def _made_in_torch(self) -> OpenFilters:
+        made = OpenFilters(self.quality, prefilter=self.prefilter if self.clean else None)
+        # As a denoiser prepares the networks that are there when it is made.
+        return made.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 
 def _phases(image: Tensor) -> Tensor:

@@ -364,6 +364,9 @@ def test_training_begins_behind_oidn() -> None:
 def test_the_engine_is_torch_where_bfloat16_is_chosen(fastest: Precision, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mcdenoise.models.with_oidn.fastest_precision", lambda _: Chosen(fastest, ""))
     auto, library, torches = (create_model("oidn_temporal", engine=each) for each in ("auto", "library", "torch"))
+    assert [has_network(model) for model in (auto, library, torches)] == [fastest == "bfloat16", False, True]
+    # It is loaded with the first frame that needs it.
+    assert not list(auto.parameters())
     frame = frame_of(24, 40)
     for rounded in (False, True):
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=rounded):
