@@ -53,6 +53,25 @@ def test_correlated_noise_is_detected(kind: str, seed: int) -> None:
     assert not noise_is_spread(through_film(color)[..., ::2, ::2], albedo[..., ::2, ::2])
 
 
+@pytest.mark.parametrize("kind", ["colored", "grey", "plain"])
+def test_a_normal_shows_correlation_of_little_noise(kind: str) -> None:
+    torch.manual_seed(0)
+    albedo, normal = texture(kind), F.normalize(torch.tensor([0.2, 0.3, 1.0]), dim=0).reshape(1, 3, 1, 1)
+    normal = normal.expand(1, 3, HEIGHT, WIDTH)
+    smooth = 1 + 0.5 * torch.sin(ROWS / 40) * torch.cos(COLUMNS / 50)
+    # As of a hundred samples a pixel.
+    color = albedo * smooth * (1 + 0.12 * torch.randn(1, 1, HEIGHT, WIDTH)).clamp_min(0.5)
+    assert noise_is_spread(through_film(color), albedo, normal)
+    assert not noise_is_spread(through_film(color), albedo)
+    assert not noise_is_spread(color, albedo, normal)
+    # An encoded normal changes as little.
+    assert noise_is_spread(through_film(color), albedo, normal / 2 + 0.5)
+    assert not noise_is_spread((albedo * smooth).expand(1, 3, -1, -1), albedo, normal)
+    # A normal that is even nowhere tells nothing, so that the noise has to be stronger.
+    assert not noise_is_spread(through_film(color), albedo, torch.rand_like(normal))
+    assert noise_is_spread(through_film(albedo * light(0)), albedo, torch.rand_like(normal))
+
+
 def test_an_image_without_noise_has_no_correlated_noise() -> None:
     smooth = (2 + torch.sin(ROWS / 9) * torch.cos(COLUMNS / 7)).expand(1, 3, -1, -1)
     assert not noise_is_spread(smooth, None)

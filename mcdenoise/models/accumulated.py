@@ -358,7 +358,7 @@ class Accumulated(Wrapper):
         """The limit of the fireflies of each image of a shot that begins with this frame."""
         if self.firefly_limit is not None:
             return torch.full_like(color[:, :1, :1, :1], self.firefly_limit, dtype=torch.float32)
-        return torch.where(_takes_light(color), CAUSTICS, LIMIT).reshape(-1, 1, 1, 1).to(torch.float32)
+        return torch.where(light_of_fireflies(color) > _LOST, CAUSTICS, LIMIT).reshape(-1, 1, 1, 1).to(torch.float32)
 
     def _tell_cut(self, cut: Tensor) -> None:
         if (found := journal()) is None:
@@ -481,8 +481,15 @@ def _steady(color: Tensor) -> Tensor:
     return color[:, SQUARE] - mean.square() <= (_STEADY * mean).square()
 
 
-def _takes_light(color: Tensor) -> Tensor:
-    """Whether clamping takes much light from most blocks of each image; false for images with few lit blocks."""
+def light_of_fireflies(color: Tensor) -> Tensor:
+    """Fraction of the light of the median 32x32 block that clamping takes.
+
+    Args:
+        color: ``(B, 3, H, W)`` radiance without albedo, finite and non-negative.
+
+    Returns:
+        ``(B,)``; 0 for images with fewer than 16 lit blocks.
+    """
     color = color.detach()
     height = color.shape[-2]
     step = _BLOCK * -(-height // (_BLOCK * _STRIPS))
@@ -506,4 +513,4 @@ def _takes_light(color: Tensor) -> Tensor:
     known = (~lost.isnan()).sum(1, keepdim=True)
     ascending = torch.where(lost.isnan(), torch.inf, lost).sort(1).values
     median = ascending.gather(1, (known - 1).clamp_min(0) // 2)
-    return ((known >= _LEAST_BLOCKS) & (median > _LOST))[:, 0]
+    return torch.where(known >= _LEAST_BLOCKS, median, 0)[:, 0]

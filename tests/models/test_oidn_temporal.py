@@ -32,6 +32,7 @@ from mcdenoise.models.with_oidn import (
     WithOidn,
     _merged,
     _phases,
+    _without_fireflies,
     _without_pattern,
     has_centred_features,
     has_scattered_features,
@@ -72,6 +73,37 @@ def test_features_without_noise_count_as_they_are_and_denoised() -> None:
     extra = model.before(exact).extra
     torch.testing.assert_close(extra[OIDN_CLEAN], sum(oidn.denoised(each, "clean") for each in both) / 2)
     assert torch.equal(extra[OIDN_ALBEDO], exact.albedo)
+
+
+def test_fireflies_are_clamped_for_oidn() -> None:
+    frame = frame_of(40, 60, albedo=torch.full((1, 3, 40, 60), 0.5))
+    bright = frame.replace(color=frame.color.clone())
+    bright.color[..., 20, 30] *= 1e4
+    extra = WithOidn(Noisy(), threads=1, clean=False).before(bright).extra
+    # 15 times the mean of the 48 pixels around it.
+    hue = frame.color[..., 20, 30] / frame.color[..., 20, 30].mean()
+    around = frame.color[..., 17:24, 27:34].mean(1).sum() - frame.color[..., 20, 30].mean()
+    clamped = frame.color.clone()
+    clamped[..., 20, 30] = 15 * hue * around / 48
+    expected = Oidn("high", threads=1).denoised(frame.replace(color=clamped), "noisy")
+    torch.testing.assert_close(extra[OIDN], expected)
+    assert torch.equal(extra[NOISY], bright.color)
+
+
+def test_the_more_light_fireflies_have_the_less_they_are_clamped() -> None:
+    highest = {}
+    # One firefly in every fourth block of 32x32 pixels, in every block, and 16 in every block.
+    for apart in (64, 32, 8):
+        color = torch.ones(1, 3, 192, 256)
+        color[..., 4::apart, 4::apart] = 100
+        clamped = _without_fireflies(Frame(color)).color
+        highest[apart] = float(clamped.max())
+        assert torch.equal(clamped[color == 1], color[color == 1])
+    assert highest[64] == pytest.approx(15)
+    # The limit rises eightfold where they have 5 to 15 % of the light.
+    light = 85 / (1023 + 100)
+    assert highest[32] == pytest.approx(15 * 8 ** ((light - 0.05) / 0.1), rel=1e-4)
+    assert highest[8] == 100
 
 
 def test_noise_that_neighbours_share_is_removed() -> None:

@@ -269,7 +269,9 @@ def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
         )
     albedo = np.clip(np.nan_to_num(images["albedo"]), 0, 1) if "albedo" in images else None
     color = np.nan_to_num(images["color"][..., :3])
-    if noise_is_spread(_as_tensor(color), None if albedo is None else _as_tensor(albedo)):
+    features = {"albedo": albedo, "normal": np.nan_to_num(images["normal"]) if "normal" in images else None}
+    given = {name: None if image is None else _as_tensor(image) for name, image in features.items()}
+    if noise_is_spread(_as_tensor(color), **given):
         shot.warnings.append(
             "'color': neighbouring pixels share noise, since the film's filter counts each sample in several of them, "
             "as Mitsuba's default does; many denoisers leave such noise in, OIDN most: render with a box filter, or "
