@@ -31,7 +31,6 @@ from mcdenoise.models.oidn import Oidn, Quality
 from mcdenoise.models.oidn_open import OpenFilters
 from mcdenoise.noise import noise_is_spread
 from mcdenoise.ops import clamp_fireflies, cross_bilateral_filter, demodulate, remodulate
-from mcdenoise.ops.fireflies import LIMIT
 
 Engine = Literal["auto", "library", "torch"]
 # Keys in ``frame.extra``: OIDN's images for the features as they are and for clean ones, the clean albedo, and the
@@ -46,9 +45,9 @@ _LEAST_SLOPE, _EVEN = 4e-3, 0.1
 # Smallest difference of dissimilar normals, and largest fraction of dissimilar pixels. Fractions of up to 0.0039 were
 # measured in scenes without rough glass and metal, and 0.0069 in Cycles with them.
 _UNLIKE, _MOST_SPECKS = 0.1, 0.0045
-# Fraction of the light up to which bright pixels are fireflies, and from which they are caustics. Measured on 20 random
-# rooms: SMAPE falls by 3.6 % in the mean, by up to 20 % with one sample a pixel, and PSNR by 0.02 dB.
-_RARE, _COMMON = 0.05, 0.15
+# Fraction of the light up to which bright pixels are fireflies, and from which they are caustics, and the limit of
+# fireflies. With one sample a pixel a limit of 15 has a smaller SMAPE in most scenes, but a lower PSNR.
+_RARE, _COMMON, _LIMIT = 0.05, 0.15, 30.0
 # The binomial kernel is zero at the frequencies of every pattern of two by two pixels. Falloff of its weights for the
 # squared difference of logarithms, and darkest color that matters, relative to the mean (on 15 stills of the training
 # data falloffs of 10 to 300 differ by 0.0008 in SMAPE).
@@ -63,7 +62,7 @@ class WithOidn(Wrapper):
     features; ``noisy``, the frame's radiance, for later methods of a chain; and ``centred`` ``(B, 1, H, W)``, 1 or 0,
     see :func:`has_centred_features`. Both images are also stages of the output. OIDN always takes the whole image, or,
     if its noise is correlated (:func:`mcdenoise.noise.noise_is_spread`), four images of half the size. Fireflies are
-    clamped for it (:func:`mcdenoise.ops.clamp_fireflies`, with a limit that rises from 15 to 120 with the fraction of
+    clamped for it (:func:`mcdenoise.ops.clamp_fireflies`, with a limit that rises from 30 to 120 with the fraction of
     the light that they have), so that the images lack a little light in return for fewer bright spots.
 
     Features of rays through the pixels' centres have no noise (:func:`has_centred_features` and not
@@ -174,7 +173,7 @@ def _without_fireflies(frame: Frame) -> Frame:
     """The frame with clamped fireflies; the more of the light is in them, the more likely they are caustics."""
     light = frame.color if frame.albedo is None else demodulate(frame.color, frame.albedo)
     common = ((light_of_fireflies(light.detach()) - _RARE) / (_COMMON - _RARE)).clamp(0, 1)
-    limit = (LIMIT * (CAUSTICS / LIMIT) ** common).reshape(-1, 1, 1, 1).to(light.dtype)
+    limit = (_LIMIT * (CAUSTICS / _LIMIT) ** common).reshape(-1, 1, 1, 1).to(light.dtype)
     clamped = clamp_fireflies(light, limit=limit)
     kept = clamped if frame.albedo is None else remodulate(clamped, frame.albedo)
     # All other pixels remain as they are, without rounding errors.

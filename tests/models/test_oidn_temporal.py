@@ -80,11 +80,11 @@ def test_fireflies_are_clamped_for_oidn() -> None:
     bright = frame.replace(color=frame.color.clone())
     bright.color[..., 20, 30] *= 1e4
     extra = WithOidn(Noisy(), threads=1, clean=False).before(bright).extra
-    # 15 times the mean of the 48 pixels around it.
+    # 30 times the mean of the 48 pixels around it.
     hue = frame.color[..., 20, 30] / frame.color[..., 20, 30].mean()
     around = frame.color[..., 17:24, 27:34].mean(1).sum() - frame.color[..., 20, 30].mean()
     clamped = frame.color.clone()
-    clamped[..., 20, 30] = 15 * hue * around / 48
+    clamped[..., 20, 30] = 30 * hue * around / 48
     expected = Oidn("high", threads=1).denoised(frame.replace(color=clamped), "noisy")
     torch.testing.assert_close(extra[OIDN], expected)
     assert torch.equal(extra[NOISY], bright.color)
@@ -99,10 +99,10 @@ def test_the_more_light_fireflies_have_the_less_they_are_clamped() -> None:
         clamped = _without_fireflies(Frame(color)).color
         highest[apart] = float(clamped.max())
         assert torch.equal(clamped[color == 1], color[color == 1])
-    assert highest[64] == pytest.approx(15)
-    # The limit rises eightfold where they have 5 to 15 % of the light.
+    assert highest[64] == pytest.approx(30)
+    # The limit rises fourfold where they have 5 to 15 % of the light.
     light = 85 / (1023 + 100)
-    assert highest[32] == pytest.approx(15 * 8 ** ((light - 0.05) / 0.1), rel=1e-4)
+    assert highest[32] == pytest.approx(30 * 4 ** ((light - 0.05) / 0.1), rel=1e-4)
     assert highest[8] == 100
 
 
