@@ -50,16 +50,13 @@ def noise_is_spread(color: Tensor, albedo: Tensor | None, normal: Tensor | None 
     light = color.detach()[..., rows, columns]
     if albedo is not None:
         light = light / features[0].clamp_min(_DARKEST)
-    ratio = None
-    if normal is not None:
-        ratio, rule = _ratio(light.mean(1), torch.cat(features, 1), _ON_EVEN), _ON_EVEN
-    if ratio is None:
-        ratio, rule = _ratio(light.mean(1), None, _ANYWHERE), _ANYWHERE
-    return ratio is not None and ratio < rule.spread
+    brightness = light.mean(1)
+    told = None if normal is None else _is_spread(brightness, torch.cat(features, 1), _ON_EVEN)
+    return bool(_is_spread(brightness, None, _ANYWHERE)) if told is None else told
 
 
-def _ratio(brightness: Tensor, features: Tensor | None, rule: _Rule) -> float | None:
-    """The larger ratio of rows and columns of ``(B, H, W)``; ``None`` if too few of the examined pixels are noisy.
+def _is_spread(brightness: Tensor, features: Tensor | None, rule: _Rule) -> bool | None:
+    """Whether the larger ratio of rows and columns of ``(B, H, W)`` is below the rule's; ``None`` for few noisy pixels.
 
     With features ``(B, C, H, W)`` only even surfaces are examined.
     """
@@ -79,4 +76,4 @@ def _ratio(brightness: Tensor, features: Tensor | None, rule: _Rule) -> float | 
         if int(noisy.sum()) < rule.least or float(wide.median()) < rule.typical:
             return None
         ratios.append(float(near[noisy].median() / wide[noisy].median()))
-    return max(ratios)
+    return max(ratios) < rule.spread

@@ -172,7 +172,7 @@ class WithOidn(Wrapper):
 def _without_fireflies(frame: Frame) -> Frame:
     """The frame with clamped fireflies; the more of the light is in them, the more likely they are caustics."""
     light = frame.color if frame.albedo is None else demodulate(frame.color, frame.albedo)
-    common = ((light_of_fireflies(light.detach()) - _RARE) / (_COMMON - _RARE)).clamp(0, 1)
+    common = ((light_of_fireflies(light) - _RARE) / (_COMMON - _RARE)).clamp(0, 1)
     limit = (_LIMIT * (CAUSTICS / _LIMIT) ** common).reshape(-1, 1, 1, 1).to(light.dtype)
     clamped = clamp_fireflies(light, limit=limit)
     kept = clamped if frame.albedo is None else remodulate(clamped, frame.albedo)
