@@ -7,6 +7,7 @@ The weights come from the user's installation: from the library of the optional 
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,8 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models._tza import Archive, archives_in, read_tza
 from mcdenoise.models.oidn import Auxiliary, Oidn, Quality, guides_of, library_of_oidn
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.oidn import OidnUNet, Size, compress, expand, oidn_exposure
+from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
+from mcdenoise.ops._steps.transfer import compress, expand
 
 _FEATURES = ("albedo", "normal")
 _IMAGES = ("color", *_FEATURES)
@@ -64,7 +66,7 @@ class OidnOpen(nn.Module):
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
         with timed("network", frame.color.device):
             features = {name: frame.buffer(name) for name in self.features}
-            seen = seen_by_oidn(frame.color * exposure, **features)
+            seen = seen_by_oidn(compress(frame.color * exposure), **features)
             image = expand(self.unet(seen).to(exposure.dtype)) / exposure
         return Output(image.to(frame.color.dtype)), None
 
@@ -73,14 +75,14 @@ def seen_by_oidn(color: Tensor, albedo: Tensor | None = None, normal: Tensor | N
     """The network's input.
 
     Args:
-        color: ``(B, 3, H, W)`` exposed radiance.
+        color: ``(B, 3, H, W)``, see :func:`compress`.
         albedo: ``(B, 3, H, W)`` in [0, 1].
         normal: ``(B, 3, H, W)`` in [-1, 1], in world or camera space.
 
     Returns:
         ``(B, 9, H, W)``, in [0, 1]; without a feature 3 channels fewer.
     """
-    images = [compress(color)]
+    images = [color]
     images += [] if albedo is None else [albedo.clamp(0, 1)]
     images += [] if normal is None else [normal.clamp(-1, 1) * 0.5 + 0.5]
     return torch.cat(images, 1)
@@ -103,6 +105,38 @@ def load_archive(unet: OidnUNet, archive: Archive, where: str) -> None:
                 raise InputError(f"{where}: '{name}': expected weights of shape {own}, found {tuple(weight.shape)}")
             layer.weight.copy_(weight)
             layer.bias.copy_(archive[f"{name}.bias"])  # type: ignore[union-attr]
+
+
+def narrowed(archive: Archive, unet: OidnUNet) -> Archive:
+    """The weights of a wider network for a narrow one, by magnitude: each layer keeps the channels that matter most.
+
+    A channel matters as the norm of its weights times that of the weights which read it, since a factor can be moved
+    from the former to the latter. The result is a start for training.
+
+    Args:
+        archive: weights of a network of the same layers.
+        unet: the narrow network.
+    """
+    names = [name.removesuffix(".weight") for name in archive if name.endswith(".weight")]
+    weights = [archive[f"{name}.weight"] for name in names]
+    # The input, number -1, keeps all of its channels.
+    width = {-1: weights[0].shape[1], **{number: len(weight) for number, weight in enumerate(weights)}}
+    read = {number: torch.zeros(count) for number, count in width.items()}
+    for weight, sources in zip(weights, unet.sources, strict=True):
+        norms = weight.float().square().sum((0, 2, 3)).sqrt()
+        for source, part in zip(sources, norms.split([width[source] for source in sources]), strict=True):
+            read[source] += part
+    kept = {-1: torch.arange(width[-1])}
+    found: dict[str, Tensor] = {}
+    for number, (name, layer, sources) in enumerate(zip(names, unet.convolutions, unet.sources, strict=True)):
+        matters = weights[number].float().square().sum((1, 2, 3)).sqrt() * read[number]
+        # Nothing reads the last layer's channels, all of which are kept.
+        kept[number] = matters.topk(min(layer.out_channels, len(matters))).indices.sort().values
+        starts = itertools.accumulate([0, *(width[source] for source in sources[:-1])])
+        inputs = torch.cat([kept[source] + start for source, start in zip(sources, starts, strict=True)])
+        found[f"{name}.weight"] = weights[number][kept[number]][:, inputs]
+        found[f"{name}.bias"] = archive[f"{name}.bias"][kept[number]]
+    return found
 
 
 class FeatureFilter(nn.Module):
@@ -231,13 +265,21 @@ def archive_of_library(
 
 
 @register_model("oidn_open", kind="peer", requires="pyoidn")
-def oidn_open(*, quality: Quality = "high", auxiliary: Auxiliary = "noisy", archive: Path | str | None = None) -> Model:
+def oidn_open(
+    *,
+    quality: Quality = "high",
+    auxiliary: Auxiliary = "noisy",
+    archive: Path | str | None = None,
+    size: Size | None = None,
+) -> Model:
     """Open Image Denoise's network in torch: differentiable (weights of the optional package pyoidn, or a .tza file).
 
     Args:
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
         auxiliary: likewise, except that "prefiltered" is rejected.
         archive: a file of weights (``.tza``) to use instead of the library's, for the network of this quality.
+        size: a narrower network than that of this quality, with the channels of the latter that matter most, to be
+            trained further; see :class:`mcdenoise.nn.oidn.OidnUNet`.
 
     Raises:
         InputError: the package is not installed, or the file is no such archive.
@@ -247,5 +289,8 @@ def oidn_open(*, quality: Quality = "high", auxiliary: Auxiliary = "noisy", arch
     model = _made(_IMAGES, quality, auxiliary == "clean")
     assert isinstance(model, OidnOpen)
     weights = archive_of_library(quality, auxiliary) if archive is None else read_tza(Path(archive))
+    if size is not None:
+        model = OidnOpen(size)
+        weights = narrowed(weights, model.unet)
     load_archive(model.unet, weights, str(archive or "pyoidn"))
     return Tiled(model)

@@ -23,8 +23,9 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.oidn_open import seen_by_oidn
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT, Recurrent
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.oidn import OidnUNet, Size, compress, expand, oidn_exposure
+from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
 from mcdenoise.ops._numbers import numbers_like
+from mcdenoise.ops._steps.transfer import compress, expand
 
 # Color, albedo and normal, as in the library; the previous result in both forms, and its weight.
 _CHANNELS = 9 + 3 + 3 + 1
@@ -72,14 +73,14 @@ class TunedNetwork(nn.Module):
         before, light = (frame.extra.get(name, torch.zeros_like(color)) for name in (PREVIOUS, PREVIOUS_LIGHT))
         valid = frame.extra.get(PREVIOUS_WEIGHT, torch.zeros_like(color[:, :1]))
         with timed("network", color.device):
-            seen = seen_by_oidn(color * exposure, albedo, normal)
-            before, light = compress(before * exposure), compress(light * exposure)
+            images = compress(torch.cat([color, before, light], 1) * exposure)
+            noisy, before, light = images.split(3, 1)
+            seen = seen_by_oidn(noisy, albedo, normal)
             own, logits = self.unet(torch.cat([seen, before, light, valid], 1)).split([3, len(_LOGITS)], 1)
             weights = torch.softmax(logits + numbers_like(logits, _LOGITS).reshape(1, -1, 1, 1), 1)
             weights = weights * torch.cat([torch.ones_like(valid), valid, valid, torch.ones_like(valid)], 1)
-            weights = weights / weights.sum(1, keepdim=True)
-            images = (own.clamp_min(0), before, light, seen[:, :3])
-            mixed = sum(weights[:, i : i + 1] * image for i, image in enumerate(images))
+            choices = torch.stack([own.clamp_min(0), before, light, noisy], 1)
+            mixed = (weights[:, :, None] * choices).sum(1) / weights.sum(1, keepdim=True)
             image = (expand(mixed) / exposure).to(color.dtype)
         return answered(frame, image, None), None
 
@@ -87,6 +88,7 @@ class TunedNetwork(nn.Module):
 _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("oidn_tuned", "the network of quality balanced", {}),
     ("oidn_tuned_small", "the network of quality fast", {"size": "small"}),
+    ("oidn_tuned_tiny", "the network of quality fast, narrowed", {"size": "tiny"}),
 )
 
 

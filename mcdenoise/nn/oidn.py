@@ -1,13 +1,12 @@
-"""Open Image Denoise's network, and its transfer function for radiance.
+"""Open Image Denoise's network, and its exposure.
 
-Layers, transfer function and exposure are those of the library (https://www.openimagedenoise.org, version 2.5, Apache
+Layers and exposure are those of the library (https://www.openimagedenoise.org, version 2.5, Apache
 License 2.0), so that weights are interchangeable.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 from contextlib import AbstractContextManager, nullcontext
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
@@ -19,9 +18,8 @@ from mcdenoise.nn._cpu import ConvBlock, ReLU, max_pool
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._window import corner
 
-Size: TypeAlias = Literal["small", "base", "large"]
+Size: TypeAlias = Literal["tiny", "small", "base", "large"]
 
-MAX_RADIANCE = 65504.0  # largest half-precision number; brighter radiance is clamped to it
 _COLORS = 3
 _LEVELS = 5
 _MULTIPLE = 1 << (_LEVELS - 1)
@@ -29,11 +27,6 @@ _MULTIPLE = 1 << (_LEVELS - 1)
 # surrounding images, which stay float32.
 _LIVE_IMAGES = 100
 
-# The library's PU transfer function: linear in the dark, then a power, then a logarithm.
-_A, _B, _C, _D = 1.41283765e03, 1.64593172e00, 4.31384981e-01, -2.94139609e-03
-_E, _F, _G = 1.92653254e-01, 6.26026094e-03, 9.98620152e-01
-_Y0, _Y1, _X0, _X1 = 1.57945760e-06, 3.22087631e-02, 2.23151711e-03, 3.70974749e-01
-_WHITE = _E * math.log(MAX_RADIANCE + _F) + _G
 _KEY, _BIN, _DARK = 0.18, 16, 1e-8
 _LUMINANCE = (0.212671, 0.715160, 0.072169)
 
@@ -46,6 +39,7 @@ class _Widths(NamedTuple):
 
 
 _SIZES: dict[Size, _Widths] = {
+    "tiny": _Widths(((16, 16), (24,), (32,), (32,), (32, 32)), ((64, 64), (48, 48), (32, 24), (16, 16))),
     "small": _Widths(((32, 32), (32,), (32,), (32,), (32, 32)), ((64, 64), (64, 64), (64, 32), (32, 32))),
     "base": _Widths(((32, 32), (48,), (64,), (80,), (96, 96)), ((112, 112), (96, 96), (64, 64), (64, 32))),
     "large": _Widths(
@@ -62,7 +56,8 @@ class OidnUNet(nn.Module):
 
     Args:
         in_channels: number of input channels: 3 color, 3 albedo and 3 normal in the library.
-        size: size in the library: "small" has 62 thousand multiply-adds per pixel, "base" 125, "large" 312.
+        size: "tiny" has 24 thousand multiply-adds per pixel. The others are the library's: "small" has 62, "base" 125,
+            "large" 312.
         out_channels: number of output channels: 3 in the library.
 
     Raises:
@@ -87,6 +82,21 @@ class OidnUNet(nn.Module):
     def convolutions(self) -> list[nn.Conv2d]:
         """All convolutions, in the order of the library's archives."""
         return [layer for layer in self.modules() if isinstance(layer, nn.Conv2d)]
+
+    @property
+    def sources(self) -> list[tuple[int, ...]]:
+        """The convolutions, by number, whose results each convolution takes, concatenated; -1 is the input."""
+        encoder, decoder = _SIZES[self.size]
+        found: list[tuple[int, ...]] = []
+        skips = [-1]
+        for widths in encoder:
+            found += [(len(found) + each - 1,) for each in range(len(widths))]
+            skips.append(len(found) - 1)
+        # The two coarsest levels have no skip connection.
+        del skips[-2:]
+        for widths in decoder:
+            found += [(len(found) - 1, skips.pop()), *((len(found) + each,) for each in range(len(widths) - 1))]
+        return [*found, (len(found) - 1,)]
 
     @property
     def multiple(self) -> int:
@@ -151,40 +161,6 @@ def _block(in_channels: int, widths: tuple[int, ...]) -> ConvBlock:
         nn.init.kaiming_normal_(layers[-2].weight, nonlinearity="relu")  # type: ignore[arg-type]
         nn.init.zeros_(layers[-2].bias)  # type: ignore[arg-type]
     return ConvBlock(*layers)
-
-
-def compress(radiance: Tensor) -> Tensor:
-    """Map radiance to a perceptually uniform scale from 0 to 1.
-
-    Args:
-        radiance: any shape; exposed, see :func:`oidn_exposure`. Values are clamped to [0, 65504].
-
-    Returns:
-        The same shape, in [0, 1]. Its derivative is finite, also at 0.
-
-    Source: Aydin et al. 2008, "Extending Quality Metrics to Full Luminance Range Images", as fitted in Open Image
-    Denoise: ``a y`` up to y0, ``b y^c + d`` up to y1, ``e log(y + f) + g`` above, over its value at 65504.
-    """
-    y = radiance.clamp(0, MAX_RADIANCE)
-    power = _B * y.clamp_min(_Y0).pow(_C) + _D
-    found = torch.where(y <= _Y0, _A * y, torch.where(y <= _Y1, power, _E * torch.log(y + _F) + _G))
-    return found / _WHITE
-
-
-def expand(compressed: Tensor) -> Tensor:
-    """The inverse of :func:`compress`; negative values count as 0.
-
-    Args:
-        compressed: any shape.
-
-    Returns:
-        The same shape; not negative, and without an upper limit.
-    """
-    x = compressed.clamp_min(0) * _WHITE
-    power = ((x - _D) / _B).clamp_min(1e-12).pow(1 / _C)
-    # Clamp the input of each branch, so that branches that are not selected do not overflow.
-    bright = torch.exp((x.clamp_min(_X1) - _G) / _E) - _F
-    return torch.where(x <= _X0, x / _A, torch.where(x <= _X1, power, bright))
 
 
 def oidn_exposure(color: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 # Reflectance of a smooth dielectric at normal incidence: on a darker surface most of the light is gloss, which no
 # albedo tints, and dividing it by a smaller number would give sparse, coloured, huge values.
 FLOOR = 4e-2
@@ -46,3 +48,13 @@ LEAST_CENTER, FARTHEST_FEATURE = 1e-6, 1e15
 # A guide in [0, 1] is a value from 0 to 255, whose 256 steps are divided among the bins of a grid. The tents use
 # sqrt(x^2 + TENT_ROUNDING) for |x|, which has a derivative at 0.
 GUIDE_STEPS, TENT_ROUNDING = 256, 1e-8
+
+# Open Image Denoise's perceptually uniform scale: `a y` in the dark, `b y^c + d` in the middle, `e log(y + f) + g` for
+# bright radiance. The joints are radiance (y0, y1), and places on the scale (x0, x1) before it is divided by its value
+# at the largest half-precision number, to which brighter radiance is clamped.
+PU_DARK = 1.41283765e03
+PU_MIDDLE = (1.64593172e00, 4.31384981e-01, -2.94139609e-03)
+PU_BRIGHT = (1.92653254e-01, 6.26026094e-03, 9.98620152e-01)
+PU_JOINTS = (1.57945760e-06, 3.22087631e-02, 2.23151711e-03, 3.70974749e-01)
+MAX_RADIANCE = 65504.0
+PU_WHITE = PU_BRIGHT[0] * math.log(MAX_RADIANCE + PU_BRIGHT[1]) + PU_BRIGHT[2]

@@ -21,7 +21,8 @@ from mcdenoise.models import create_model
 from mcdenoise.models._tza import archives_in, read_tza
 from mcdenoise.models.oidn import Oidn
 from mcdenoise.models.oidn_open import OidnOpen, OpenFilters, archive_of_library
-from mcdenoise.nn.oidn import MAX_RADIANCE, OidnUNet, compress, expand, oidn_exposure
+from mcdenoise.nn.oidn import OidnUNet, oidn_exposure
+from mcdenoise.ops._steps.transfer import MAX_RADIANCE, compress, expand
 
 NAME = "oidn_open"
 has_oidn = pytest.mark.skipif(

@@ -37,7 +37,8 @@ from mcdenoise.models.with_oidn import (
     has_centred_features,
     has_scattered_features,
 )
-from mcdenoise.nn.oidn import compress, oidn_exposure
+from mcdenoise.nn.oidn import oidn_exposure
+from mcdenoise.ops._steps.transfer import compress
 from mcdenoise.train.clips import LIGHT
 from mcdenoise.train.front import split
 

@@ -12,7 +12,8 @@ from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, start_with
 from mcdenoise.models.oidn_tuned import _LOGITS, TunedNetwork
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
-from mcdenoise.nn.oidn import compress, expand, oidn_exposure
+from mcdenoise.nn.oidn import oidn_exposure
+from mcdenoise.ops._steps.transfer import compress, expand
 
 SIZE = (26, 38)
 has_oidn = pytest.mark.skipif(

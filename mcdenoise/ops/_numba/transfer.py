@@ -1,0 +1,91 @@
+"""Open Image Denoise's transfer function on a CPU: one pass, where torch takes a dozen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mcdenoise.ops._constants import MAX_RADIANCE, PU_BRIGHT, PU_DARK, PU_JOINTS, PU_MIDDLE, PU_WHITE
+from mcdenoise.ops._numba._runtime import compiled, exp, log, read_row, share_rows, source
+from mcdenoise.ops._operator import custom_op
+
+_B, _C, _D = PU_MIDDLE
+_E, _F, _G = PU_BRIGHT
+_Y0, _Y1, _X0, _X1 = PU_JOINTS
+
+
+def compress(radiance: Tensor) -> Any:
+    """See :func:`mcdenoise.ops._steps.transfer.compress`."""
+    return _compress(radiance) if _is_supported(radiance) else NotImplemented
+
+
+def expand(compressed: Tensor) -> Any:
+    """See :func:`mcdenoise.ops._steps.transfer.expand`."""
+    return _expand(compressed) if _is_supported(compressed) else NotImplemented
+
+
+def _is_supported(image: Tensor) -> bool:
+    return image.ndim == 4 and image.dtype in (torch.float32, torch.float64)
+
+
+@custom_op("mcdenoise::compress", device_types="cpu", schema="(Tensor radiance) -> Tensor")
+def _compress(radiance: Tensor) -> Tensor:
+    return _mapped(radiance, _compress_rows)
+
+
+@custom_op("mcdenoise::expand", device_types="cpu", schema="(Tensor compressed) -> Tensor")
+def _expand(compressed: Tensor) -> Tensor:
+    return _mapped(compressed, _expand_rows)
+
+
+def _mapped(image: Tensor, rows: Any) -> Tensor:
+    result = _empty_planes(image)
+    if result.numel():
+        arguments = (result.numpy(), source(image))
+        share_rows(image, lambda *span: rows(*arguments, *span), light=True)
+    return result
+
+
+@_compress.register_fake
+@_expand.register_fake
+def _empty_planes(image: Tensor) -> Tensor:
+    return image.new_empty(image.shape)
+
+
+@compiled
+def _compress_rows(out: Any, image: Any, b: int, first: int, last: int) -> None:
+    number = out.dtype.type
+    zero, most = number(0), number(MAX_RADIANCE)
+    for y in range(first, last):
+        for c in range(out.shape[1]):
+            row = out[b, c, y]
+            read_row(row, image, b, c, y, 0)
+            for x in range(row.size):
+                value = row[x]
+                light = min(max(value, zero), most)
+                power = number(_B) * exp(number(_C) * log(max(light, number(_Y0)))) + number(_D)
+                bright = number(_E) * log(light + number(_F)) + number(_G)
+                found = number(PU_DARK) * light if light <= number(_Y0) else power if light <= number(_Y1) else bright
+                # A comparison with a NaN is false, and the NaN stays.
+                row[x] = found / number(PU_WHITE) if value == value else value
+
+
+@compiled
+def _expand_rows(out: Any, image: Any, b: int, first: int, last: int) -> None:
+    number = out.dtype.type
+    zero, inverse = number(0), number(1 / _C)
+    for y in range(first, last):
+        for c in range(out.shape[1]):
+            row = out[b, c, y]
+            read_row(row, image, b, c, y, 0)
+            for x in range(row.size):
+                value = row[x]
+                scaled = max(value, zero) * number(PU_WHITE)
+                power = exp(inverse * log((max(scaled, number(_X0)) - number(_D)) / number(_B)))
+                bright = exp((max(scaled, number(_X1)) - number(_G)) / number(_E)) - number(_F)
+                found = (
+                    scaled / number(PU_DARK) if scaled <= number(_X0) else power if scaled <= number(_X1) else bright
+                )
+                row[x] = found if value == value else value
