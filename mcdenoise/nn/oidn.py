@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from mcdenoise.nn._cpu import ConvBlock, ReLU, max_pool
 from mcdenoise.ops._numbers import numbers_like
+from mcdenoise.ops._steps.network import network_input
 from mcdenoise.ops._window import corner
 
 Size: TypeAlias = Literal["tiny", "small", "base", "large"]
@@ -39,7 +40,7 @@ class _Widths(NamedTuple):
 
 
 _SIZES: dict[Size, _Widths] = {
-    "tiny": _Widths(((16, 16), (24,), (32,), (32,), (32, 32)), ((64, 64), (48, 48), (32, 24), (16, 16))),
+    "tiny": _Widths(((16, 16), (32,), (32,), (32,), (32, 32)), ((64, 64), (48, 48), (32, 32), (16, 16))),
     "small": _Widths(((32, 32), (32,), (32,), (32,), (32, 32)), ((64, 64), (64, 64), (64, 32), (32, 32))),
     "base": _Widths(((32, 32), (48,), (64,), (80,), (96, 96)), ((112, 112), (96, 96), (64, 64), (64, 32))),
     "large": _Widths(
@@ -56,7 +57,7 @@ class OidnUNet(nn.Module):
 
     Args:
         in_channels: number of input channels: 3 color, 3 albedo and 3 normal in the library.
-        size: "tiny" has 24 thousand multiply-adds per pixel. The others are the library's: "small" has 62, "base" 125,
+        size: "tiny" has 26 thousand multiply-adds per pixel. The others are the library's: "small" has 62, "base" 125,
             "large" 312.
         out_channels: number of output channels: 3 in the library.
 
@@ -131,6 +132,7 @@ class OidnUNet(nn.Module):
             than bfloat16 resolves.
         """
         height, width = x.shape[-2:]
+        x = network_input(x[:, :_COLORS], x[:, _COLORS:], logarithms=False)
         x = F.pad(x, (0, -width % _MULTIPLE, 0, -height % _MULTIPLE)).contiguous(memory_format=torch.channels_last)
         skips = [x]
         for level, block in enumerate(self.encoder):
