@@ -116,6 +116,9 @@ def narrowed(archive: Archive, unet: OidnUNet) -> Archive:
     Args:
         archive: weights of a network of the same layers.
         unet: the narrow network.
+
+    Raises:
+        ValueError: the network is wider.
     """
     names = [name.removesuffix(".weight") for name in archive if name.endswith(".weight")]
     weights = [archive[f"{name}.weight"] for name in names]
@@ -131,7 +134,9 @@ def narrowed(archive: Archive, unet: OidnUNet) -> Archive:
     for number, (name, layer, sources) in enumerate(zip(names, unet.convolutions, unet.sources, strict=True)):
         matters = weights[number].float().square().sum((1, 2, 3)).sqrt() * read[number]
         # Nothing reads the last layer's channels, all of which are kept.
-        kept[number] = matters.topk(min(layer.out_channels, len(matters))).indices.sort().values
+        if layer.out_channels > len(matters):
+            raise ValueError(f"expected at most {len(matters)} channels of layer {number}, found {layer.out_channels}")
+        kept[number] = matters.topk(layer.out_channels).indices.sort().values
         starts = itertools.accumulate([0, *(width[source] for source in sources[:-1])])
         inputs = torch.cat([kept[source] + start for source, start in zip(sources, starts, strict=True)])
         found[f"{name}.weight"] = weights[number][kept[number]][:, inputs]
@@ -282,7 +287,7 @@ def oidn_open(
             trained further; see :class:`mcdenoise.nn.oidn.OidnUNet`.
 
     Raises:
-        InputError: the package is not installed, or the file is no such archive.
+        InputError: the package is not installed, the file is no such archive, or the size is larger.
     """
     if auxiliary == "prefiltered":
         raise InputError("auxiliary: expected noisy or clean, found 'prefiltered'")
@@ -291,6 +296,10 @@ def oidn_open(
     weights = archive_of_library(quality, auxiliary) if archive is None else read_tza(Path(archive))
     if size is not None:
         model = OidnOpen(size)
-        weights = narrowed(weights, model.unet)
+        try:
+            weights = narrowed(weights, model.unet)
+        except ValueError as error:
+            expected = f"expected a network no wider than that of quality {quality}"
+            raise InputError(f"size: {expected}, found '{size}': {error}") from error
     load_archive(model.unet, weights, str(archive or "pyoidn"))
     return Tiled(model)

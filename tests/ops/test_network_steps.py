@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mcdenoise.ops import downsample
 from mcdenoise.ops._numba import _runtime
-from mcdenoise.ops._steps import network
+from mcdenoise.ops._steps import network, transfer
 
 # The tolerance is relative to the largest number in a result: a few roundings of sums of up to 54 products.
 TOLERANCE = {dtype: 32 * torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
@@ -81,6 +81,9 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
             {"image_factor": maximum, "logarithms": False},
         ),
         (downsample, [some(13, 3)], {}),
+        # From the dark, where the scale is linear, to the largest radiance and beyond.
+        (transfer.compress, [layout((6 * draw(15, batch, 3, height, width, dtype)).exp())], {}),
+        (transfer.expand, [layout(draw(16, batch, 3, height, width, dtype).sigmoid())], {}),
     ]
     return calls
 
@@ -138,6 +141,18 @@ def test_predictions_in_bfloat16_are_read_as_they_are(size: tuple[int, int, int]
     ]
     for call in read:
         assert_same(results(call, "numba"), results(call, "torch"), TOLERANCE[torch.float32])
+
+
+@every_dtype
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_a_scale_of_radiance_keeps_what_is_no_number(backend: str, dtype: torch.dtype) -> None:
+    image = torch.full((1, 3, 4, 5), torch.nan, dtype=dtype)
+    assert by(backend, transfer.compress)(image).isnan().all()
+    assert by(backend, transfer.expand)(image).isnan().all()
+    ends = torch.tensor([-torch.inf, -1.0, 0.0, torch.inf], dtype=dtype).reshape(1, 1, 2, 2)
+    expected = [0.0, 0.0, 0.0, 1.0]
+    assert by(backend, transfer.compress)(ends).flatten().tolist() == pytest.approx(expected, abs=1e-6)
+    assert by(backend, transfer.expand)(ends).flatten().tolist() == [0.0, 0.0, 0.0, torch.inf]
 
 
 def _half(size: tuple[int, int, int]) -> tuple[int, int, int, int]:
