@@ -63,13 +63,12 @@ def _compress_rows(out: Any, image: Any, b: int, first: int, last: int) -> None:
             row = out[b, c, y]
             read_row(row, image, b, c, y, 0)
             for x in range(row.size):
-                value = row[x]
-                light = min(max(value, zero), most)
+                # Where a comparison with a NaN is false, `min` and `max` return their first argument, the NaN.
+                light = min(max(row[x], zero), most)
                 power = number(_B) * exp(number(_C) * log(max(light, number(_Y0)))) + number(_D)
                 bright = number(_E) * log(light + number(_F)) + number(_G)
                 found = number(PU_DARK) * light if light <= number(_Y0) else power if light <= number(_Y1) else bright
-                # A comparison with a NaN is false, and the NaN stays.
-                row[x] = found / number(PU_WHITE) if value == value else value
+                row[x] = found / number(PU_WHITE)
 
 
 @compiled
@@ -81,11 +80,8 @@ def _expand_rows(out: Any, image: Any, b: int, first: int, last: int) -> None:
             row = out[b, c, y]
             read_row(row, image, b, c, y, 0)
             for x in range(row.size):
-                value = row[x]
-                scaled = max(value, zero) * number(PU_WHITE)
+                scaled = max(row[x], zero) * number(PU_WHITE)
                 power = exp(inverse * log((max(scaled, number(_X0)) - number(_D)) / number(_B)))
                 bright = exp((max(scaled, number(_X1)) - number(_G)) / number(_E)) - number(_F)
-                found = (
-                    scaled / number(PU_DARK) if scaled <= number(_X0) else power if scaled <= number(_X1) else bright
-                )
-                row[x] = found if value == value else value
+                lit = power if scaled <= number(_X1) else bright
+                row[x] = scaled / number(PU_DARK) if scaled <= number(_X0) else lit
