@@ -7,7 +7,6 @@ The weights come from the user's installation: from the library of the optional 
 from __future__ import annotations
 
 import functools
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -105,43 +104,6 @@ def load_archive(unet: OidnUNet, archive: Archive, where: str) -> None:
                 raise InputError(f"{where}: '{name}': expected weights of shape {own}, found {tuple(weight.shape)}")
             layer.weight.copy_(weight)
             layer.bias.copy_(archive[f"{name}.bias"])  # type: ignore[union-attr]
-
-
-def narrowed(archive: Archive, unet: OidnUNet) -> Archive:
-    """The weights of a wider network for a narrow one, by magnitude: each layer keeps the channels that matter most.
-
-    A channel matters as the norm of its weights times that of the weights which read it, since a factor can be moved
-    from the former to the latter. The result is a start for training.
-
-    Args:
-        archive: weights of a network of the same layers.
-        unet: the narrow network.
-
-    Raises:
-        ValueError: the network is wider.
-    """
-    names = [name.removesuffix(".weight") for name in archive if name.endswith(".weight")]
-    weights = [archive[f"{name}.weight"] for name in names]
-    # The input, number -1, keeps all of its channels.
-    width = {-1: weights[0].shape[1], **{number: len(weight) for number, weight in enumerate(weights)}}
-    read = {number: torch.zeros(count) for number, count in width.items()}
-    for weight, sources in zip(weights, unet.sources, strict=True):
-        norms = weight.float().square().sum((0, 2, 3)).sqrt()
-        for source, part in zip(sources, norms.split([width[source] for source in sources]), strict=True):
-            read[source] += part
-    kept = {-1: torch.arange(width[-1])}
-    found: dict[str, Tensor] = {}
-    for number, (name, layer, sources) in enumerate(zip(names, unet.convolutions, unet.sources, strict=True)):
-        matters = weights[number].float().square().sum((1, 2, 3)).sqrt() * read[number]
-        # Nothing reads the last layer's channels, all of which are kept.
-        if layer.out_channels > len(matters):
-            raise ValueError(f"expected at most {len(matters)} channels of layer {number}, found {layer.out_channels}")
-        kept[number] = matters.topk(layer.out_channels).indices.sort().values
-        starts = itertools.accumulate([0, *(width[source] for source in sources[:-1])])
-        inputs = torch.cat([kept[source] + start for source, start in zip(sources, starts, strict=True)])
-        found[f"{name}.weight"] = weights[number][kept[number]][:, inputs]
-        found[f"{name}.bias"] = archive[f"{name}.bias"][kept[number]]
-    return found
 
 
 class FeatureFilter(nn.Module):
@@ -270,36 +232,21 @@ def archive_of_library(
 
 
 @register_model("oidn_open", kind="peer", requires="pyoidn")
-def oidn_open(
-    *,
-    quality: Quality = "high",
-    auxiliary: Auxiliary = "noisy",
-    archive: Path | str | None = None,
-    size: Size | None = None,
-) -> Model:
+def oidn_open(*, quality: Quality = "high", auxiliary: Auxiliary = "noisy", archive: Path | str | None = None) -> Model:
     """Open Image Denoise's network in torch: differentiable (weights of the optional package pyoidn, or a .tza file).
 
     Args:
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
         auxiliary: likewise, except that "prefiltered" is rejected.
         archive: a file of weights (``.tza``) to use instead of the library's, for the network of this quality.
-        size: a narrower network than that of this quality, with the channels of the latter that matter most, to be
-            trained further; see :class:`mcdenoise.nn.oidn.OidnUNet`.
 
     Raises:
-        InputError: the package is not installed, the file is no such archive, or the size is larger.
+        InputError: the package is not installed, or the file is no such archive.
     """
     if auxiliary == "prefiltered":
         raise InputError("auxiliary: expected noisy or clean, found 'prefiltered'")
     model = _made(_IMAGES, quality, auxiliary == "clean")
     assert isinstance(model, OidnOpen)
     weights = archive_of_library(quality, auxiliary) if archive is None else read_tza(Path(archive))
-    if size is not None:
-        model = OidnOpen(size)
-        try:
-            weights = narrowed(weights, model.unet)
-        except ValueError as error:
-            expected = f"expected a network no wider than that of quality {quality}"
-            raise InputError(f"size: {expected}, found '{size}': {error}") from error
     load_archive(model.unet, weights, str(archive or "pyoidn"))
     return Tiled(model)

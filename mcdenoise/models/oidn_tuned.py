@@ -89,7 +89,6 @@ class TunedNetwork(nn.Module):
 _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("oidn_tuned", "the network of quality balanced", {}),
     ("oidn_tuned_small", "the network of quality fast", {"size": "small"}),
-    ("oidn_tuned_tiny", "the network of quality fast, narrowed", {"size": "tiny"}),
 )
 
 

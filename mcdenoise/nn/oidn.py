@@ -19,7 +19,7 @@ from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._steps.network import network_input
 from mcdenoise.ops._window import corner
 
-Size: TypeAlias = Literal["tiny", "small", "base", "large"]
+Size: TypeAlias = Literal["small", "base", "large"]
 
 _COLORS = 3
 _LEVELS = 5
@@ -40,7 +40,6 @@ class _Widths(NamedTuple):
 
 
 _SIZES: dict[Size, _Widths] = {
-    "tiny": _Widths(((16, 16), (32,), (32,), (32,), (32, 32)), ((64, 64), (48, 48), (32, 32), (16, 16))),
     "small": _Widths(((32, 32), (32,), (32,), (32,), (32, 32)), ((64, 64), (64, 64), (64, 32), (32, 32))),
     "base": _Widths(((32, 32), (48,), (64,), (80,), (96, 96)), ((112, 112), (96, 96), (64, 64), (64, 32))),
     "large": _Widths(
@@ -57,8 +56,7 @@ class OidnUNet(nn.Module):
 
     Args:
         in_channels: number of input channels: 3 color, 3 albedo and 3 normal in the library.
-        size: "tiny" has 26 thousand multiply-adds per pixel. The others are the library's: "small" has 62, "base" 125,
-            "large" 312.
+        size: size in the library: "small" has 62 thousand multiply-adds per pixel, "base" 125, "large" 312.
         out_channels: number of output channels: 3 in the library.
 
     Raises:
@@ -83,21 +81,6 @@ class OidnUNet(nn.Module):
     def convolutions(self) -> list[nn.Conv2d]:
         """All convolutions, in the order of the library's archives."""
         return [layer for layer in self.modules() if isinstance(layer, nn.Conv2d)]
-
-    @property
-    def sources(self) -> list[tuple[int, ...]]:
-        """The convolutions, by number, whose results each convolution takes, concatenated; -1 is the input."""
-        encoder, decoder = _SIZES[self.size]
-        found: list[tuple[int, ...]] = []
-        skips = [-1]
-        for widths in encoder:
-            found += [(len(found) + each - 1,) for each in range(len(widths))]
-            skips.append(len(found) - 1)
-        # The two coarsest levels have no skip connection.
-        del skips[-2:]
-        for widths in decoder:
-            found += [(len(found) - 1, skips.pop()), *((len(found) + each,) for each in range(len(widths) - 1))]
-        return [*found, (len(found) - 1,)]
 
     @property
     def multiple(self) -> int:

@@ -20,7 +20,7 @@ from mcdenoise import Denoiser, Frame
 from mcdenoise.models import create_model
 from mcdenoise.models._tza import archives_in, read_tza
 from mcdenoise.models.oidn import Oidn
-from mcdenoise.models.oidn_open import OidnOpen, OpenFilters, archive_of_library, load_archive, narrowed
+from mcdenoise.models.oidn_open import OidnOpen, OpenFilters, archive_of_library
 from mcdenoise.nn.oidn import OidnUNet, oidn_exposure
 from mcdenoise.ops._steps.transfer import MAX_RADIANCE, compress, expand
 
@@ -165,48 +165,6 @@ def test_a_pixel_farther_than_the_reach_changes_nothing(size: Any) -> None:
         changed = (unet(x) != unet(other)).any(1)[0].any(0)
     assert changed[0]
     assert not changed[unet.reach + 1 :].any()
-
-
-def test_narrowed_weights_are_those_that_matter() -> None:
-    """Channels without weights that read them do not matter, and channels in another order are the same network."""
-    torch.manual_seed(0)
-    narrow, wide = OidnUNet(9, "tiny").eval(), OidnUNet(9, "small").eval()
-    kept = {-1: torch.arange(9)}
-    width = {-1: 9, **{number: layer.out_channels for number, layer in enumerate(wide.convolutions)}}
-    archive = {}
-    layers = zip(narrow.convolutions, wide.convolutions, narrow.sources, strict=True)
-    with torch.no_grad():
-        for number, (own, layer, sources) in enumerate(layers):
-            kept[number] = torch.randperm(layer.out_channels)[: own.out_channels].sort().values
-            starts = itertools.accumulate([0, *(width[source] for source in sources[:-1])])
-            read = torch.cat([kept[source] + start for source, start in zip(sources, starts, strict=True)])
-            # The other channels have large weights, but nothing reads them.
-            weight, bias = 9 * torch.ones_like(layer.weight), torch.zeros_like(layer.bias)
-            unread = torch.ones(layer.in_channels, dtype=torch.bool).index_fill(0, read, False)
-            weight[:, unread] = 0
-            weight[kept[number][:, None], read] = own.weight
-            bias[kept[number]] = own.bias.normal_()
-            archive |= {f"layer{number}.weight": weight, f"layer{number}.bias": bias}
-        found = OidnUNet(9, "tiny").eval()
-        load_archive(found, narrowed(archive, found), "test")
-        x = torch.rand(1, 9, 32, 48)
-        torch.testing.assert_close(found(x), narrow(x), rtol=0, atol=0)
-        load_archive(wide, archive, "test")
-        # Sums in another order.
-        torch.testing.assert_close(wide(x), narrow(x), rtol=1e-4, atol=1e-5)
-
-
-@has_oidn
-def test_a_narrower_network_starts_with_weights_of_the_library() -> None:
-    weights = archive_of_library("fast")
-    model = create_model(NAME, quality="fast", size="tiny")
-    assert isinstance(model, torch.nn.Module)
-    first = next(model.parameters())
-    assert {tuple(channel.flatten().tolist()) for channel in first} <= {
-        tuple(channel.flatten().tolist()) for channel in weights["enc_conv0.weight"]
-    }
-    message = refused(lambda: create_model(NAME, quality="fast", size="base"))
-    assert message.startswith("size: expected a network no wider than that of quality fast, found 'base'")
 
 
 def test_the_scale_of_radiance() -> None:
