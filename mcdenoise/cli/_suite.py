@@ -10,6 +10,7 @@ from mcdenoise.benchmark.tables import remarks
 from mcdenoise.cli._output import progress_bar, say, write_json
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
+from mcdenoise.methods import split_methods
 from mcdenoise.models import DEFAULT
 from mcdenoise.report import check_packages, write_report, write_sample_plots
 from mcdenoise.suite import (
@@ -31,6 +32,12 @@ from mcdenoise.suite import (
 __all__ = ["SHOWN", "score_suite"]
 
 
+def with_peers(models: str) -> str:
+    """These methods, and all settings of OIDN unless some are among them."""
+    named = any(spelt.partition("(")[0].strip() == "oidn" for spelt in split_methods(models))
+    return models if named else f"{models},{PEERS}"
+
+
 def score_suite(
     data: Path,
     out: Path | None,
@@ -48,7 +55,7 @@ def score_suite(
     if out is None and not render:
         raise InputError("--out: expected a folder to write to with --no-render, found none; give one with -o")
     # Report errors in the choice of methods before hours of rendering.
-    methods = choose_methods(f"{models or DEFAULT},{PEERS}", precisions=precisions, baselines=("noisy",))
+    methods = choose_methods(with_peers(models or DEFAULT), precisions=precisions, baselines=("noisy",))
     if out is not None:
         check_packages()
     with progress_bar() as progress:

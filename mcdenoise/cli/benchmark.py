@@ -56,8 +56,8 @@ def benchmark(
 
     With --suite wild, renders the missing frames of a test suite that no training uses, in Mitsuba and in Blender's
     Cycles, to the folder of --data, and compares --models with OIDN's best setting on each row: OUT/suite.md,
-    suite.json and close-ups. Without --out it only renders. Rendering everything takes hours; it can be interrupted,
-    and resumes.
+    suite.json and close-ups. The best setting is that of eleven, or of those that --models names. Without --out it only
+    renders. Rendering everything takes hours; it can be interrupted, and resumes.
 
     Args:
         sequences: folders of sequences with references.

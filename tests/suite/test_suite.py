@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from mcdenoise.cli import main
+from mcdenoise.cli._suite import with_peers
 from mcdenoise.data import read_exr, write_exr
 from mcdenoise.errors import InputError
+from mcdenoise.methods import split_methods
 from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
 from mcdenoise.scenes.parlour import parlour_cameras, parlour_moves, parlour_scene
 from mcdenoise.suite import (
@@ -319,6 +321,13 @@ def test_close_ups_are_drawn_side_by_side(tmp_path: Path) -> None:
 
 
 # The command
+
+
+def test_named_settings_of_oidn_replace_the_eleven() -> None:
+    assert len(split_methods(with_peers("oidn_temporal, svgf"))) == 2 + 11
+    named = "svgf,oidn(quality=fast|balanced, auxiliary=noisy)"
+    assert with_peers(named) == named
+    assert with_peers("oidn") == "oidn"
 
 
 def test_the_command_scores_the_existing_rows(
