@@ -10,11 +10,9 @@ from mcdenoise.benchmark.tables import remarks
 from mcdenoise.cli._output import progress_bar, say, write_json
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
-from mcdenoise.methods import split_methods
 from mcdenoise.models import DEFAULT
 from mcdenoise.report import check_packages, write_report, write_sample_plots
 from mcdenoise.suite import (
-    PEERS,
     SHOWN,
     Progress,
     choose_rows,
@@ -26,16 +24,11 @@ from mcdenoise.suite import (
     rows_there,
     sample_curves,
     suite_lines,
+    with_peers,
     write_close_ups,
 )
 
 __all__ = ["SHOWN", "score_suite"]
-
-
-def with_peers(models: str) -> str:
-    """These methods, and all settings of OIDN unless some are among them."""
-    named = any(spelt.partition("(")[0].strip() == "oidn" for spelt in split_methods(models))
-    return models if named else f"{models},{PEERS}"
 
 
 def score_suite(

@@ -74,7 +74,7 @@ def seen_by_oidn(color: Tensor, albedo: Tensor | None = None, normal: Tensor | N
     """The network's input.
 
     Args:
-        color: ``(B, 3, H, W)``, see :func:`compress`.
+        color: ``(B, 3, H, W)`` radiance on the scale of :func:`compress`.
         albedo: ``(B, 3, H, W)`` in [0, 1].
         normal: ``(B, 3, H, W)`` in [-1, 1], in world or camera space.
 

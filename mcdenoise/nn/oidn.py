@@ -1,7 +1,7 @@
 """Open Image Denoise's network, and its exposure.
 
-Layers and exposure are those of the library (https://www.openimagedenoise.org, version 2.5, Apache
-License 2.0), so that weights are interchangeable.
+Layers and exposure are those of the library (https://www.openimagedenoise.org, version 2.5, Apache License 2.0), so
+that weights are interchangeable.
 """
 
 from __future__ import annotations

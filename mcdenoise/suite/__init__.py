@@ -4,7 +4,6 @@ from mcdenoise.suite.close_ups import write_close_ups
 from mcdenoise.suite.rendering import Progress, open_row, render_suite, rows_there
 from mcdenoise.suite.rows import SHOTS, Row, Shot, choose_rows
 from mcdenoise.suite.tables import (
-    PEERS,
     SHOWN,
     Line,
     MethodMean,
@@ -13,10 +12,10 @@ from mcdenoise.suite.tables import (
     markdown,
     sample_curves,
     suite_lines,
+    with_peers,
 )
 
 __all__ = [
-    "PEERS",
     "SHOTS",
     "SHOWN",
     "Line",
@@ -33,5 +32,6 @@ __all__ = [
     "rows_there",
     "sample_curves",
     "suite_lines",
+    "with_peers",
     "write_close_ups",
 ]

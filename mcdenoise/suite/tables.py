@@ -7,13 +7,14 @@ from dataclasses import dataclass, field, replace
 from statistics import geometric_mean
 
 from mcdenoise.evaluate import METRICS
+from mcdenoise.methods import split_methods
 from mcdenoise.results import Cell, Method, Results
 from mcdenoise.suite.rows import Row
 
 SMAPE, PSNR, TEMPORAL = "SMAPE", "PSNR 2.2", "tRMSE"
 SHOWN = (SMAPE, PSNR, TEMPORAL)
 # With noisy features, OIDN uses the same network for high and balanced quality.
-PEERS = (
+_PEERS = (
     "oidn(quality=fast|balanced, auxiliary=clean|noisy, source=raw|accumulated),"
     "oidn(quality=high, auxiliary=clean, source=raw|accumulated),"
     "oidn(quality=high, auxiliary=prefiltered)"
@@ -21,6 +22,12 @@ PEERS = (
 _PEER = "oidn"
 # If the reference's own noise is more than this fraction of an error, the row is marked as inconclusive.
 _NOISY = 0.5
+
+
+def with_peers(models: str) -> str:
+    """These methods, and all settings of OIDN unless some are among them."""
+    named = any(spelt.partition("(")[0].strip() == _PEER for spelt in split_methods(models))
+    return models if named else f"{models},{_PEERS}"
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from mcdenoise.cli import main
-from mcdenoise.cli._suite import with_peers
 from mcdenoise.data import read_exr, write_exr
 from mcdenoise.errors import InputError
 from mcdenoise.methods import split_methods
@@ -35,7 +34,7 @@ from mcdenoise.suite import (
     suite_lines,
 )
 from mcdenoise.suite.close_ups import PARTS, write_close_ups
-from mcdenoise.suite.tables import PSNR, SMAPE, TEMPORAL, verdict
+from mcdenoise.suite.tables import PSNR, SMAPE, TEMPORAL, verdict, with_peers
 
 BLENDER = os.environ.get("BLENDER_PYTHON")
 TINY: dict[str, Any] = {"frames": 2, "size": (16, 9), "reference_samples": 8}
