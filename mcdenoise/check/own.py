@@ -50,11 +50,8 @@ def find_ops(names: Sequence[str], table: Sequence[Op]) -> list[Op]:
     Raises:
         InputError: there is no such op or function, or the function runs on none of its example inputs.
     """
-    for name in names:
-        if name.endswith(".py"):
-            raise _without_function(name)
     known = {op.name: op for op in table}
-    unknown = [name for name in names if name not in known and ":" not in name]
+    unknown = [name for name in names if name not in known and ":" not in name and not name.endswith(".py")]
     if unknown:
         if near := did_you_mean(unknown[0], known):
             raise InputError(f"op: found no {unknown[0]}; {near} `mcdenoise ops` lists all")
@@ -104,20 +101,6 @@ def _with_settings(name: str, function: Any, settings: dict[str, Any]) -> Any:
     except (TypeError, ValueError) as error:
         raise InputError(f"function '{name}': {error}") from error
     return partial(function, **settings)
-
-
-def _without_function(path: str) -> InputError:
-    """The error for a file whose function is not named."""
-    _, module = load_own(f"{path}:__name__", "function", "function")
-    functions = [
-        name
-        for name, value in vars(module).items()
-        if inspect.isfunction(value) and value.__module__ == module.__name__ and not name.startswith("_")
-    ]
-    found = [name for name in functions if name != BESIDE]
-    if not found:
-        return InputError(f"{path}: expected a Python file with a function of tensors, found none")
-    return InputError(f"{path}: add ':function', such as {path}:{found[0]}; its functions are {', '.join(found)}")
 
 
 def _examples(name: str, function: Any, module: Any) -> Any:

@@ -273,7 +273,7 @@ def test_a_missing_function_is_rejected(tmp_path: Path, run: Run, command: str) 
         "package.of.nobody:square": "package.of.nobody cannot be imported",
         f"{bare}:halves": "cannot be tried on images of (1, 3, 5, 6): it fails in float64: RuntimeError: The size of ",
         f"{bare}:none": "it names no argument without a default; give it an attribute example_inputs, or its file",
-        str(bare): f"{bare}: add ':function', such as {bare}:halves; its functions are halves, none",
+        str(bare): f"expected {bare}:function, found only the file; add :halves or :none",
         "bare": "or path/to/file.py:function",
     }.items():
         status, _, err = run(command, name)

@@ -94,7 +94,7 @@ def test_a_step_with_layers_alpha_and_stages_reads_nothing() -> None:
 @torch.no_grad()
 def test_a_step_runs_without_any_values(name: str) -> None:
     model: Any = small(name)
-    frames = shot(model)
+    frames = shot(model, 2)
     if isinstance(model, nn.Module):
         model.to("meta")
     state = None
