@@ -102,6 +102,9 @@ class ClipSampler:
         gloss: probability that surfaces without albedo (mirrors, glass, black gloss, and lamps) are darkened by up to
             six stops: most of these are emitters, and without this a network would learn to treat a black screen as
             one.
+        less_noise: probability that the noise of a clip, ``color - reference``, is scaled by a factor between 1/32 and
+            1, whose logarithm is uniform: as if up to 1024 times as many samples had been taken. Only for shots
+            without other images that were computed from the noisy ones.
 
     Raises:
         InputError: no shot is long enough, or one is smaller than the crop.
@@ -118,10 +121,12 @@ class ClipSampler:
         exposure: float = 0.0,
         tint: float = 0.0,
         gloss: float = 0.0,
+        less_noise: float = 0.0,
     ) -> None:
         self.shots = [shot for shot in shots if len(shot) >= frames]
         self.frames, self.crop = frames, crop
         self.lamps, self.key, self.exposure, self.tint, self.gloss = lamps, key, exposure, tint, gloss
+        self.less_noise = less_noise
         check_sizes([(len(shot), shot.size) for shot in self.shots], frames, crop)
         self.chances = torch.tensor([float(len(shot)) for shot in self.shots])
         self.flips_and_turns = nn.Sequential(
@@ -166,6 +171,8 @@ class ClipSampler:
             view[:, :3] = view[:, axes] * signs.reshape(3, 1)
             view[..., :2] = turn.vectors(view[..., :2].mT).mT
             clip["view_projection"] = view
+        if self.less_noise and float(torch.rand(())) < self.less_noise:
+            clip["color"] = torch.lerp(clip["reference"], clip["color"], 32 ** -torch.rand(()))
         stops = self.exposure * (2 * torch.rand(1) - 1) + self.tint * (2 * torch.rand(3) - 1)
         factor = torch.exp2(stops).reshape(3, 1, 1)
         if self.key:

@@ -68,7 +68,8 @@ class DataFolders:
 
         Raises:
             InputError: there is no training folder, a sequence lacks references or features that the model needs,
-                frames are missing within a sequence, no sequence is long enough, or one is smaller than the crop.
+                frames are missing within a sequence, no sequence is long enough, one is smaller than the crop, or
+                ``less_noise`` is set for a model that is given images computed from the color.
         """
         if not training:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
@@ -76,6 +77,11 @@ class DataFolders:
         # Surfaces without albedo are glossy.
         common = frozenset.intersection(*(features_of(sequence) for sequence in opened))
         front = front.of((needs.buffers | needs.uses) & common)
+        if config.less_noise and (front.demodulates or front.parts.keys() != {"color"}):
+            raise InputError(
+                "less_noise: expected a model that is given the color of single frames as it is, found one that is "
+                "given images computed from it; set it to 0"
+            )
         used = (needs.buffers | needs.uses | ({"albedo"} if config.gloss else set())) - front.parts.keys()
         # The cache does not store single samples: methods that take samples are trained on their mean.
         used -= {"samples"}
@@ -132,6 +138,7 @@ class DataFolders:
             exposure=config.exposure,
             tint=config.tint,
             gloss=config.gloss,
+            less_noise=config.less_noise,
         )
         return TrainingData(sampler, watched, description)
 
