@@ -18,7 +18,7 @@ from mcdenoise.errors import InputError
 _beside: list[str] = []
 
 
-def load_own(name: str, kind: str, thing: str) -> tuple[Any, ModuleType]:
+def load_own(name: str, kind: str, thing: str, *, other: str = "") -> tuple[Any, ModuleType]:
     """Import an object from outside the package.
 
     A file is executed at each call, as a new module, and so are the modules beside it that it imports.
@@ -28,6 +28,7 @@ def load_own(name: str, kind: str, thing: str) -> tuple[Any, ModuleType]:
             error names those that it has.
         kind: use of the object, such as ``"model"``; for messages.
         thing: kind of attribute that is expected, such as ``"factory"``; for messages.
+        other: name of an attribute that is no such thing; for messages.
 
     Returns:
         The attribute, and the module that defines it.
@@ -36,7 +37,7 @@ def load_own(name: str, kind: str, thing: str) -> tuple[Any, ModuleType]:
         InputError: the file or module does not exist, cannot be imported, or has no such attribute.
     """
     if name.endswith(".py"):
-        functions = _functions_in(Path(name), kind, thing)
+        functions = [each for each in _functions_in(Path(name), kind, thing) if each != other]
         choice = " or ".join(f":{each}" for each in functions or [thing])
         raise InputError(f"{kind} '{name}': expected {name}:{thing}, found only the file; add {choice}")
     place, _, attribute = name.rpartition(":")

@@ -89,7 +89,7 @@ def note_of(op: Op) -> str:
 
 def _load(name: str) -> Op:
     spelling = parse_method(name)
-    function, module = load_own(spelling.model, "function", "function")
+    function, module = load_own(spelling.model, "function", "function", other=BESIDE)
     return _op(name, _with_settings(name, function, spelling.settings), _examples(name, function, module))
 
 

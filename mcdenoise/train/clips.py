@@ -172,7 +172,10 @@ class ClipSampler:
             view[..., :2] = turn.vectors(view[..., :2].mT).mT
             clip["view_projection"] = view
         if self.less_noise and float(torch.rand(())) < self.less_noise:
-            clip["color"] = torch.lerp(clip["reference"], clip["color"], 32 ** -torch.rand(()))
+            scale = 32 ** -torch.rand(())
+            clip["color"] = torch.lerp(clip["reference"], clip["color"], scale)
+            if "variance" in clip:
+                clip["variance"] *= scale.square()
         stops = self.exposure * (2 * torch.rand(1) - 1) + self.tint * (2 * torch.rand(3) - 1)
         factor = torch.exp2(stops).reshape(3, 1, 1)
         if self.key:

@@ -267,6 +267,8 @@ def test_a_missing_function_is_rejected(tmp_path: Path, run: Run, command: str) 
     bare.write_text("def halves(image, half):\n    return image * half[..., :3]\n\ndef none(*images): ...\n")
     broken = tmp_path / "broken.py"
     broken.write_text("import nothing_of_this_name")
+    beside = tmp_path / "beside.py"
+    beside.write_text("def inputs(): ...\n\ndef square(image): ...\n")
     for name, message in {
         f"{tmp_path}/absent.py:square": "expected a Python file with a function, found no such file",
         f"{broken}:square": "cannot be imported: ModuleNotFoundError",
@@ -274,6 +276,7 @@ def test_a_missing_function_is_rejected(tmp_path: Path, run: Run, command: str) 
         f"{bare}:halves": "cannot be tried on images of (1, 3, 5, 6): it fails in float64: RuntimeError: The size of ",
         f"{bare}:none": "it names no argument without a default; give it an attribute example_inputs, or its file",
         str(bare): f"expected {bare}:function, found only the file; add :halves or :none",
+        str(beside): f"expected {beside}:function, found only the file; add :square\n",
         "bare": "or path/to/file.py:function",
     }.items():
         status, _, err = run(command, name)

@@ -44,9 +44,11 @@ def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
 
 
 # bfloat16 and float16 use the same code in the ops; `mcdenoise stability` checks all dtypes.
-# Ops whose many taps or cases take half a minute, most of it for second derivatives.
-LONG = {"atrous", "softmax_splat", "affinity_filter", "importance_filter", "moments_variance", "accumulate"}
-LONG |= {"kernel_conv", "temporal_gradient", "grid_splat", "reproject"}
+# Ops whose many taps or cases take a quarter of a minute or more, most of it for second derivatives.
+LONG = {
+    *("atrous", "softmax_splat", "affinity_filter", "importance_filter", "moments_variance", "accumulate"),
+    *("kernel_conv", "temporal_gradient", "grid_splat", "reproject"),
+}
 TRIED = [
     pytest.param(op, dtype, marks=[pytest.mark.slow] if op.name in LONG or dtype == torch.float16 else [])
     for op in OPS

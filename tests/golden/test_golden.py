@@ -44,8 +44,12 @@ def beyond(shot: str, model: str, precision: str, images: dict[int, Tensor]) -> 
     return wrong
 
 
-WAYS = {"whole": ("moving", {}), "tiled": ("moving", {"tile": 64})}
-WAYS |= {"skipped": ("still", {}), "skipped and tiled": ("still", {"tile": 64})}
+WAYS: dict[str, tuple[str, dict[str, Any]]] = {
+    "whole": ("moving", {}),
+    "tiled": ("moving", {"tile": 64}),
+    "skipped": ("still", {}),
+    "skipped and tiled": ("still", {"tile": 64}),
+}
 
 
 def is_long(way: str, model: str) -> bool:

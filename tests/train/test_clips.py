@@ -186,7 +186,7 @@ def test_lamps_shine_alike_in_color_and_reference() -> None:
 def test_noise_is_scaled_by_a_factor_of_the_whole_clip() -> None:
     g = torch.Generator().manual_seed(0)
     buffers = {name: torch.rand(4, 3, 6, 6, generator=g) for name in ("color", "reference")}
-    features = {"reference": buffers["reference"].numpy()}
+    features = {"reference": buffers["reference"].numpy(), "variance": torch.ones(4, 3, 6, 6).numpy()}
     shot = CachedShot((buffers["color"].numpy(),), features, parts={"color": 3})
     seeds = list(range(400))
     plain = ClipSampler([shot], 2, 6).draw(seeds)
@@ -195,6 +195,7 @@ def test_noise_is_scaled_by_a_factor_of_the_whole_clip() -> None:
     noise, less = plain["color"] - plain["reference"], always["color"] - always["reference"]
     factors = (noise * less).flatten(1).sum(1) / noise.square().flatten(1).sum(1)
     torch.testing.assert_close(less, noise * factors.reshape(-1, 1, 1, 1, 1), rtol=0, atol=1e-6)
+    torch.testing.assert_close(always["variance"][:, 0, 0, 0, 0], factors.square(), rtol=1e-4, atol=0)
     # The logarithm to the base 32 is uniform between -1 and 0: mean -0.5, standard deviation of the mean 0.29 / 20.
     logarithms = factors.log() / torch.tensor(32.0).log()
     assert -1 - 1e-5 <= logarithms.min() < -0.95
