@@ -36,6 +36,7 @@ from mcdenoise.models.coarse_to_fine import CoarseToFine
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.recurrent import Recurrent
+from mcdenoise.models.restored import Restored
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Region, Tiled
 
@@ -61,6 +62,7 @@ __all__ = [
     "Precision",
     "Recurrent",
     "Region",
+    "Restored",
     "Skipping",
     "Stage",
     "State",

@@ -29,6 +29,7 @@ from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.coarse_to_fine import CoarseToFine
 from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.restored import Restored
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.fusion import LogFusion
@@ -207,11 +208,13 @@ def _cascade(
         anti_lag: see :class:`mcdenoise.models.Accumulated`.
         tolerance: see :class:`mcdenoise.models.Skipping`.
     """
-    return Demodulated(
-        Accumulated(
-            Skipping(both_networks(width, kernel_width, kernel_size, resolutions, half), tolerance, alpha_min),
-            alpha_min=alpha_min,
-            lag_threshold=THRESHOLD if anti_lag else math.inf,
+    return Restored(
+        Demodulated(
+            Accumulated(
+                Skipping(both_networks(width, kernel_width, kernel_size, resolutions, half), tolerance, alpha_min),
+                alpha_min=alpha_min,
+                lag_threshold=THRESHOLD if anti_lag else math.inf,
+            )
         )
     )
 

@@ -17,6 +17,7 @@ from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.cascaded_v2 import both_networks
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.refined import Refined
+from mcdenoise.models.restored import Restored
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.ops.lag import THRESHOLD
 
@@ -47,11 +48,13 @@ def _cascade(
         tolerance: see :class:`mcdenoise.models.Skipping`.
     """
     networks = Refined(both_networks(width, kernel_width, kernel_size, resolutions, half), feature_width)
-    return Demodulated(
-        Accumulated(
-            Skipping(networks, tolerance, alpha_min),
-            alpha_min=alpha_min,
-            lag_threshold=THRESHOLD if anti_lag else math.inf,
+    return Restored(
+        Demodulated(
+            Accumulated(
+                Skipping(networks, tolerance, alpha_min),
+                alpha_min=alpha_min,
+                lag_threshold=THRESHOLD if anti_lag else math.inf,
+            )
         )
     )
 

@@ -22,6 +22,7 @@ from mcdenoise.models._layers import answered
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.oidn_open import seen_by_oidn
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT, Recurrent
+from mcdenoise.models.restored import Restored
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
 from mcdenoise.ops._numbers import numbers_like
@@ -98,7 +99,7 @@ def _tuned(size: Size = "base") -> Model:
     Args:
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
     """
-    return Recurrent(Tiled(TunedNetwork(size)))
+    return Restored(Recurrent(Tiled(TunedNetwork(size))))
 
 
 for _name, _about, _settings in _PRESETS:

@@ -82,7 +82,8 @@ def test_it_starts_as_the_library(name: str, quality: str) -> None:
     assert len(start_with(model, "oidn_open", quality=quality)) == 64
     frame = frame_of(48, 64)
     with torch.no_grad():
-        image, expected = model(frame)[0].image, library(frame)[0].image
+        # Without giving back what both smooth.
+        image, expected = model.inner(frame)[0].image, library(frame)[0].image
     # The noisy pixels have a weight of e^-7 / (1 + e^-7), on a scale from 0 to 1.
     exposure = oidn_exposure(frame.color)
     difference = (compress(image * exposure) - compress(expected * exposure)).abs().max()

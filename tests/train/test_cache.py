@@ -210,7 +210,7 @@ def test_the_front_of_a_model_is_split_from_its_network() -> None:
     assert front.settings[1][1]["alpha_min"] == 0.3
     assert (front.accumulates, front.demodulates) == (True, True)
     assert {id(weight) for weight in rest.parameters()} == {id(weight) for weight in model.parameters()}
-    network = model.inner.inner.inner
+    network = model.inner.inner.inner.inner
     # Demodulation within the accumulation stays there, and so does whatever has weights before it.
     front, rest = split(Accumulated(Demodulated(network)))
     assert (front.accumulates, front.demodulates, type(rest)) == (True, False, Demodulated)

@@ -28,7 +28,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import DEFAULT, CoarseToFine, Demodulated, create_model, describe_weights, load_weights
+from mcdenoise.models import DEFAULT, CoarseToFine, Demodulated, Restored, create_model, describe_weights, load_weights
 
 pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
 pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
@@ -283,8 +283,10 @@ def test_sequences_that_are_only_watched(small_sequence: Path, tmp_path: Path) -
     data = json.loads((tmp_path / "watched" / "data.json").read_text())
     assert [entry["name"] for entry in data["sequences"]] == ["plane"]
     assert [entry["name"] for entry in data["validation_sequences"]] == ["other"]
-    # All frames of the sequence, as they are denoised when nothing is skipped.
-    model, history, errors = load_weights(watched, DEFAULT), None, []
+    # All frames of the sequence, as they are denoised when nothing is skipped, and no detail is given back.
+    whole, history, errors = load_weights(watched, DEFAULT), None, []
+    assert isinstance(whole, Restored)
+    model = whole.inner
     assert isinstance(model, Demodulated)
     model.inner.inner = model.inner.inner.inner
     sequence = open_sequence(other)
