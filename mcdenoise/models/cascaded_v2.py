@@ -5,7 +5,8 @@ It adds the following to the paper's network (:mod:`mcdenoise.models.cascaded`);
 - the networks also see the current frame alone and one over the history length;
 - the pixel network predicts the logarithm of the radiance as a residual, and takes means at coarser scales;
 - scales are fused as logarithms, and no pixel becomes brighter than the brightest input pixel;
-- the pixel network also denoises the image at half and at a quarter of its size (:class:`CoarseToFine`).
+- the pixel network also denoises the image at half and at a quarter of its size (:class:`CoarseToFine`);
+- detail of nearly clean frames, which the networks smooth, is given back (:class:`Restored`).
 
 ``cascaded_v2`` has the paper's width. ``cascaded_v2_small`` (widths 16 and 32, 0.41 of the multiply-adds) and
 ``cascaded_v2_tiny`` (width 16, 3x3 kernels, 0.18 of them) are the same network for slower processors, and the U-Nets of
@@ -195,6 +196,7 @@ def _cascade(
     alpha_min: float = 0.1,
     anti_lag: bool = True,
     tolerance: float = TOLERANCE,
+    restore: bool = True,
 ) -> Model:
     """The cascade with all its wrappers.
 
@@ -207,16 +209,16 @@ def _cascade(
         alpha_min: see :class:`mcdenoise.models.Accumulated`.
         anti_lag: see :class:`mcdenoise.models.Accumulated`.
         tolerance: see :class:`mcdenoise.models.Skipping`.
+        restore: whether :class:`mcdenoise.models.Restored` gives back detail.
     """
-    return Restored(
-        Demodulated(
-            Accumulated(
-                Skipping(both_networks(width, kernel_width, kernel_size, resolutions, half), tolerance, alpha_min),
-                alpha_min=alpha_min,
-                lag_threshold=THRESHOLD if anti_lag else math.inf,
-            )
+    model = Demodulated(
+        Accumulated(
+            Skipping(both_networks(width, kernel_width, kernel_size, resolutions, half), tolerance, alpha_min),
+            alpha_min=alpha_min,
+            lag_threshold=THRESHOLD if anti_lag else math.inf,
         )
     )
+    return Restored(model) if restore else model
 
 
 _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (

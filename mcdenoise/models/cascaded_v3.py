@@ -33,6 +33,7 @@ def _cascade(
     alpha_min: float = 0.3,
     anti_lag: bool = True,
     tolerance: float = TOLERANCE,
+    restore: bool = True,
 ) -> Model:
     """The cascade with all its wrappers.
 
@@ -46,17 +47,17 @@ def _cascade(
         alpha_min: see :class:`mcdenoise.models.Accumulated`.
         anti_lag: see :class:`mcdenoise.models.Accumulated`.
         tolerance: see :class:`mcdenoise.models.Skipping`.
+        restore: whether :class:`mcdenoise.models.Restored` gives back detail.
     """
     networks = Refined(both_networks(width, kernel_width, kernel_size, resolutions, half), feature_width)
-    return Restored(
-        Demodulated(
-            Accumulated(
-                Skipping(networks, tolerance, alpha_min),
-                alpha_min=alpha_min,
-                lag_threshold=THRESHOLD if anti_lag else math.inf,
-            )
+    model = Demodulated(
+        Accumulated(
+            Skipping(networks, tolerance, alpha_min),
+            alpha_min=alpha_min,
+            lag_threshold=THRESHOLD if anti_lag else math.inf,
         )
     )
+    return Restored(model) if restore else model
 
 
 _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (

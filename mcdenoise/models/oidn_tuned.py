@@ -5,6 +5,7 @@ image even where the input is clean. Here the same layers, which start with the 
 the previous result, reprojected, and predict for every pixel which of four images to trust: the network's own; the
 previous result in both forms of :class:`mcdenoise.models.Recurrent`; and the noisy pixels, which are right where there
 is no noise. Training on two renderers, with noisy and with exact features and 1 to 64 samples, replaces the settings.
+:class:`mcdenoise.models.Restored` around it gives back the detail of nearly clean frames.
 """
 
 from __future__ import annotations
@@ -93,13 +94,15 @@ _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 )
 
 
-def _tuned(size: Size = "base") -> Model:
+def _tuned(size: Size = "base", *, restore: bool = True) -> Model:
     """The network with its memory.
 
     Args:
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
+        restore: whether :class:`mcdenoise.models.Restored` gives back detail.
     """
-    return Restored(Recurrent(Tiled(TunedNetwork(size))))
+    model = Recurrent(Tiled(TunedNetwork(size)))
+    return Restored(model) if restore else model
 
 
 for _name, _about, _settings in _PRESETS:
