@@ -197,7 +197,11 @@ def test_bad_usage(refused: Callable[..., str], arguments: list[str], expected: 
         ("--alpha-min", "nan", "--alpha-min: expected in (0, 1], found nan"),
         ("--device", "abacus", "device 'abacus': expected one that torch can use"),
         ("--model", "cascaded_v2_tiny", "expected weights of model 'cascaded_v2_tiny', found those of 'cascaded_v2'"),
-        ("--model", "cascaded_v2(hue=1)", "expected no settings but alpha_min, anti_lag, tolerance beside its weights"),
+        (
+            "--model",
+            "cascaded_v2(hue=1)",
+            "expected no settings but alpha_min, anti_lag, tolerance, restore beside its weights",
+        ),
         ("--weights", "nothing.safetensors", "nothing.safetensors: expected a safetensors file"),
     ],
 )

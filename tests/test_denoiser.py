@@ -417,7 +417,8 @@ def test_settings_are_those_of_the_model(weights: Path) -> None:
     ):
         message = refused(make)
         assert (
-            "but alpha_min, anti_lag, tolerance beside its weights, found nonsense=1; the weights fix width" in message
+            "but alpha_min, anti_lag, tolerance, restore beside its weights, found nonsense=1; the weights fix width"
+            in message
         )
     assert refused(lambda: Denoiser(Keep(), width=8)) == "width: expected a model's name, found a model"
     assert refused(lambda: Denoiser(Keep(), weights=weights)) == "weights: expected a model's name, found a model"
