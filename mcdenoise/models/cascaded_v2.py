@@ -186,6 +186,18 @@ def both_networks(width: int, kernel_width: int | None, kernel_size: int, resolu
     )
 
 
+def with_history(networks: Model, alpha_min: float, anti_lag: bool, tolerance: float, restore: bool) -> Model:
+    """The networks with all their wrappers; for the other arguments see :func:`_cascade`."""
+    model = Demodulated(
+        Accumulated(
+            Skipping(networks, tolerance, alpha_min),
+            alpha_min=alpha_min,
+            lag_threshold=THRESHOLD if anti_lag else math.inf,
+        )
+    )
+    return Restored(model) if restore else model
+
+
 def _cascade(
     width: int = 40,
     kernel_width: int | None = None,
@@ -211,14 +223,8 @@ def _cascade(
         tolerance: see :class:`mcdenoise.models.Skipping`.
         restore: whether :class:`mcdenoise.models.Restored` gives back detail.
     """
-    model = Demodulated(
-        Accumulated(
-            Skipping(both_networks(width, kernel_width, kernel_size, resolutions, half), tolerance, alpha_min),
-            alpha_min=alpha_min,
-            lag_threshold=THRESHOLD if anti_lag else math.inf,
-        )
-    )
-    return Restored(model) if restore else model
+    networks = both_networks(width, kernel_width, kernel_size, resolutions, half)
+    return with_history(networks, alpha_min, anti_lag, tolerance, restore)
 
 
 _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (

@@ -8,18 +8,13 @@ unless the light is diffuse and very noisy.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from mcdenoise.models._interface import Model
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.accumulated import Accumulated
-from mcdenoise.models.cascaded_v2 import both_networks
-from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.cascaded_v2 import both_networks, with_history
 from mcdenoise.models.refined import Refined
-from mcdenoise.models.restored import Restored
-from mcdenoise.models.skipping import TOLERANCE, Skipping
-from mcdenoise.ops.lag import THRESHOLD
+from mcdenoise.models.skipping import TOLERANCE
 
 
 def _cascade(
@@ -50,14 +45,7 @@ def _cascade(
         restore: whether :class:`mcdenoise.models.Restored` gives back detail.
     """
     networks = Refined(both_networks(width, kernel_width, kernel_size, resolutions, half), feature_width)
-    model = Demodulated(
-        Accumulated(
-            Skipping(networks, tolerance, alpha_min),
-            alpha_min=alpha_min,
-            lag_threshold=THRESHOLD if anti_lag else math.inf,
-        )
-    )
-    return Restored(model) if restore else model
+    return with_history(networks, alpha_min, anti_lag, tolerance, restore)
 
 
 _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (

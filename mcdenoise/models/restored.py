@@ -20,14 +20,16 @@ from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._journal import timed
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops._rows import by_rows
+from mcdenoise.ops._window import pad
 
 _CELL, _CELLS = 4, 7  # the statistics are means over windows of 7x7 cells of 4x4 pixels
 _LAG = 2  # distance in pixels over which the noise is uncorrelated, also under a Gaussian pixel filter
 _DEVIATIONS = 3.0  # a correlation counts as far as it exceeds so many standard deviations
 _GAIN = 4.0  # weight per correlation: detail is correlated only in part over the lag
 _LEAST = 0.1  # smallest mean that differences are relative to, as a fraction of the window's
-# Interpolation, window and lag, and the same again for the mean that differences are relative to.
-_REACH = 36
+# Interpolation and window, twice because of the mean that differences are relative to, and the lag. It is a multiple of
+# a cell, so that bands of rows have the cells of the whole image.
+_REACH = 2 * (_CELL + 1 + _CELLS // 2 * _CELL) + _LAG
 _DARKEST, _MOST = 1e-15, 1e4  # smallest mean and largest relative difference, so that all derivatives are finite
 
 
@@ -107,7 +109,7 @@ def _pixels(cells: Tensor, size: tuple[int, int]) -> Tensor:
 
 def _mean(image: Tensor, side: int) -> Tensor:
     """Means over the window around each pixel; outside the image, its edge is repeated."""
-    image = F.pad(image, [side // 2] * 4, mode="replicate")
+    image = pad(image, side // 2, "replicate")
     for axis in (-1, -2):
         length = image.shape[axis] - side + 1
         first, *others = (image.narrow(axis, start, length) for start in range(side))
