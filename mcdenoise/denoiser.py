@@ -20,6 +20,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
 from mcdenoise.models import (
     DEFAULT,
+    FILTERED,
     Journal,
     Model,
     Output,
@@ -40,6 +41,7 @@ from mcdenoise.models._memory import Division, Frames
 from mcdenoise.models._precision import Chosen
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._spilled import drop_pages, spilled
+from mcdenoise.sampling import sampled_at_centres
 
 AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
 
@@ -389,7 +391,7 @@ def denoise(
     albedo: ArrayLike | None = None,
     normal: ArrayLike | None = None,
     depth: ArrayLike | None = None,
-    model: str | Model | nn.Module = DEFAULT,
+    model: str | Model | nn.Module | None = None,
     device: torch.device | str = "cpu",
     precision: AskedPrecision = "auto",
     extra: Mapping[str, ArrayLike] | None = None,
@@ -408,7 +410,8 @@ def denoise(
         albedo: like ``color``, in [0, 1]; this and the following buffers are optional.
         normal: like ``color``, in [-1, 1].
         depth: ``(H, W)``, or with a channel axis.
-        model: see :class:`Denoiser`.
+        model: see :class:`Denoiser`. By default it is ``"cascaded_v2"`` if positions, camera and normal tell that the
+            features were sampled at the pixel centres, otherwise ``"oidn_tuned"``.
         device: device to run on; the result is copied back from it.
         precision: see :class:`Denoiser`.
         extra: further buffers by name.
@@ -432,6 +435,8 @@ def denoise(
     settings = {name: value for name, value in others.items() if name not in OF_RENDERERS}
     buffers = {name: value for name, value in others.items() if name in OF_RENDERERS}
     frame = Frame.from_numpy(color, layout=layout, albedo=albedo, normal=normal, depth=depth, extra=extra, **buffers)
+    if model is None:
+        model = DEFAULT if sampled_at_centres(frame) else FILTERED
     denoiser = Denoiser(model, device=device, precision=precision, **settings)
     denoiser.reset(frames=1)
     image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()

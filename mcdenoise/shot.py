@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Sequence as Sequential
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.denoiser import AskedPrecision, Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.methods import Spelling, parse_method
-from mcdenoise.models import DEFAULT, describe_weights
+from mcdenoise.models import DEFAULT, FILTERED, describe_weights
+from mcdenoise.sampling import sampled_at_centres
 
 # With very many threads torch crashes instead of raising an error.
 _MOST_THREADS = 1024
@@ -23,8 +25,9 @@ class ShotSettings:
 
     Args:
         model: a name from `mcdenoise models`, optionally with settings, such as "oidn(quality=fast)"; a weights file;
-            or your own model, path/to/file.py:factory or package.module:factory. The default is cascaded_v2, or the
-            model that the weights are for.
+            or your own model, path/to/file.py:factory or package.module:factory. The default is the model that the
+            weights are for; without weights, cascaded_v2 for features sampled at the pixel centres, and oidn_tuned for
+            others, or cascaded_v3 with layers, alpha, or settings that oidn_tuned does not have.
         weights: safetensors file of your own weights for that model.
         frames: frames to denoise, such as 0-59,70; all by default.
         device: where the model runs, cpu or cuda.
@@ -130,17 +133,21 @@ class ShotSettings:
     def chosen(
         self, sequence: Sequence, on_step: Callable[[int, int], None] = lambda done, total: None
     ) -> tuple[ShotSettings, str]:
-        """Choose the model by ``budget_ms`` or ``max_error``; return the settings with it, and a description.
+        """Choose the model, if none is named; return the settings with it, and a description.
 
         Args:
             sequence: the frames.
-            on_step: called with the number of measured models, and the number of all models.
+            on_step: with ``budget_ms`` or ``max_error``, called with the number of measured models, and that of all.
 
         Raises:
             InputError: no model meets the limits.
         """
         if not self.is_budgeted:
-            return self, ""
+            if self.model is not None or self.weights is not None:
+                return self, ""
+            historic = self.alpha_min is not None or not self.anti_lag or self.tolerance is not None
+            model, why = default_model(sequence, cascade=bool(self.layers) or self.alpha or historic)
+            return replace(self, model=model), f"{model}: {why}"
         # Imported here because it loads the benchmark, which takes time.
         from mcdenoise.budget import choose_model
 
@@ -157,7 +164,7 @@ class ShotSettings:
 
     @property
     def spelling(self) -> Spelling:
-        """The requested model, the model that the weights are for, or the default.
+        """The requested model, or the model that the weights are for, or ``cascaded_v2``.
 
         Raises:
             InputError: the model is unknown, or its weights cannot be read.
@@ -189,6 +196,28 @@ class ShotSettings:
             alpha=self.alpha,
             **{name: value for name, value in asked.items() if value is not None},
         )
+
+
+def default_model(sequence: Sequence, *, cascade: bool = False) -> tuple[str, str]:
+    """The name of the model that is best for a shot without further measurement, and the reason in words.
+
+    ``cascaded_v2`` was trained on features sampled at the pixel centres, and is best there. Files of a renderer have
+    features through a pixel filter, for which the others were trained. (Blender's positions do not tell: they are those
+    of the first sample, which passes through the centre, whatever the filter is.)
+
+    Args:
+        sequence: the shot; its first frame without damage is read if the layout is one that may have features at the
+            centres.
+        cascade: whether a cascade is required, for the settings of its history, or for kernels to filter layers with.
+    """
+    if sequence.layout != "files":
+        for number in sequence.numbers:
+            # A damaged frame is not for this function to report.
+            with suppress(InputError):
+                if sampled_at_centres(sequence.frame(number)):
+                    return DEFAULT, "features are sampled at the pixel centres"
+                break
+    return "cascaded_v3" if cascade else FILTERED, "features may be noisy, or filtered over pixels"
 
 
 def check_threads(threads: int) -> None:

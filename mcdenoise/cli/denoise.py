@@ -59,13 +59,15 @@ def denoise(
             frames_per_second=shot.preview_fps,
             exposure=shot.preview_exposure,
         )
-    resolved: ShotSettings = shot
     if shot.is_budgeted:
         with progress_bar() as progress:
             task = progress.add_task("measure models", total=None)
             resolved, choice = shot.chosen(
                 opened, lambda done, total: progress.update(task, completed=done, total=total)
             )
+    else:
+        resolved, choice = shot.chosen(opened)
+    if choice:
         say(f"picked {choice}")
     denoiser, spelling = resolved.denoiser(), resolved.spelling
     # Before anything is printed about a shot that cannot be written.

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from mcdenoise.denoiser import AskedPrecision, Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import DEFAULT, Model
+from mcdenoise.models import FILTERED, Model
 
 _ROOT = "<root>"
 # Color with or without alpha; monochromatic variants render luminance.
@@ -65,7 +65,7 @@ class MitsubaDenoiser:
         temporal: whether calls are the frames of a shot, with flow; otherwise each frame is a still.
         denoise_alpha: whether alpha, the second or fourth channel, is denoised with the kernels of the color;
             otherwise, and by methods without kernels, it is returned unchanged.
-        model: as for :class:`mcdenoise.Denoiser`.
+        model: as for :class:`mcdenoise.Denoiser`; the default suits features through a pixel filter.
         device: device of torch; by default a GPU for the CUDA variants if torch has one, otherwise the CPU.
         precision: as for :class:`mcdenoise.Denoiser`.
         settings: its other arguments (``weights``, ``tile``, ``max_memory``), and settings of the model.
@@ -100,7 +100,7 @@ class MitsubaDenoiser:
         temporal: bool = False,
         denoise_alpha: bool = False,
         *,
-        model: str | Model | nn.Module = DEFAULT,
+        model: str | Model | nn.Module = FILTERED,
         device: torch.device | str | None = None,
         precision: AskedPrecision = "auto",
         **settings: Any,

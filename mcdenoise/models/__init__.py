@@ -41,9 +41,12 @@ from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Region, Tiled
 
 DEFAULT = "cascaded_v2"
+# For features through a pixel filter, with noise, or of unknown origin.
+FILTERED = "oidn_tuned"
 
 __all__ = [
     "DEFAULT",
+    "FILTERED",
     "FLOATS",
     "PRECISIONS",
     "TOLERANCE",

@@ -17,6 +17,7 @@ from mcdenoise.frame import RADIANCE, Frame, Hints
 from mcdenoise.models.accumulated import ALBEDO_HISTORY
 from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN
 from mcdenoise.nn.inputs import auto_exposure
+from mcdenoise.noise import noise_is_spread
 from mcdenoise.ops import NO_ALBEDO, demodulate
 from mcdenoise.train.cache import Array, CachedShot
 
@@ -103,8 +104,9 @@ class ClipSampler:
             six stops: most of these are emitters, and without this a network would learn to treat a black screen as
             one.
         less_noise: probability that the noise of a clip, ``color - reference``, is scaled by a factor between 1/32 and
-            1, whose logarithm is uniform: as if up to 1024 times as many samples had been taken. Only for shots
-            without other images that were computed from the noisy ones.
+            1, whose logarithm is uniform: as if up to 1024 times as many samples had been taken. Clips with correlated
+            noise are left alone, because their references have it, too. Only for shots without other images that were
+            computed from the noisy ones.
 
     Raises:
         InputError: no shot is long enough, or one is smaller than the crop.
@@ -171,7 +173,7 @@ class ClipSampler:
             view[:, :3] = view[:, axes] * signs.reshape(3, 1)
             view[..., :2] = turn.vectors(view[..., :2].mT).mT
             clip["view_projection"] = view
-        if self.less_noise and float(torch.rand(())) < self.less_noise:
+        if self.less_noise and float(torch.rand(())) < self.less_noise and not _noise_is_spread(clip):
             scale = 32 ** -torch.rand(())
             clip["color"] = torch.lerp(clip["reference"], clip["color"], scale)
             if "variance" in clip:
@@ -218,6 +220,10 @@ class ClipSampler:
         painted |= dict.fromkeys(("diffuse", "specular", "variance"), torch.zeros(1, 3, 1, 1))
         for name in painted.keys() & clip.keys():
             clip[name][..., top : top + height, left : left + width] = painted[name]
+
+
+def _noise_is_spread(clip: dict[str, Tensor]) -> bool:
+    return noise_is_spread(clip["color"], clip.get("albedo"), clip.get("normal"))
 
 
 def check_sizes(shots: Sequence[tuple[int, tuple[int, int]]], frames: int, crop: int) -> None:

@@ -64,8 +64,8 @@ class TrainConfig:
         exposure: the light of a clip is scaled by up to this many stops.
         tint: each color channel of the light is scaled by up to this many stops.
         gloss: probability that surfaces without albedo (mirrors, glass, lamps) are darkened by up to six stops.
-        less_noise: probability that the noise of a clip is reduced, as if up to 1024 times as many samples had been
-            taken; only for models that neither accumulate nor demodulate the color.
+        less_noise: probability that the noise of a clip is reduced, unless it is correlated, as if up to 1024 times as
+            many samples had been taken; only for models that neither accumulate nor demodulate the color.
         precision: bfloat16 runs convolutions in bfloat16.
         seed: seed of weights and clips.
     """

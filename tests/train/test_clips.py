@@ -7,6 +7,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from mcdenoise.errors import InputError
 from mcdenoise.ops import motion_from_position, remodulate
@@ -204,6 +205,16 @@ def test_noise_is_scaled_by_a_factor_of_the_whole_clip() -> None:
     sometimes = ClipSampler([shot], 2, 6, less_noise=0.25).draw(seeds)
     changed = ~torch.isclose(sometimes["color"], plain["color"]).flatten(1).all(1)
     assert abs(changed.float().mean() - 0.25) < 4 * (0.25 * 0.75 / 400) ** 0.5
+
+
+def test_correlated_noise_is_not_scaled() -> None:
+    g = torch.Generator().manual_seed(0)
+    noise = torch.rand(4, 3, 64, 64, generator=g)
+    constant = {name: torch.full((4, 3, 64, 64), 0.5).numpy() for name in ("reference", "albedo", "normal")}
+    for color, scaled in ((noise, True), (avg_pool2d(noise, 3, 1, 1), False)):
+        shot = CachedShot(((0.5 + color).numpy(),), constant, parts={"color": 3})
+        plain, less = (ClipSampler([shot], 2, 48, less_noise=p).draw(list(range(4))) for p in (0.0, 1.0))
+        assert torch.equal(plain["color"], less["color"]) is not scaled
 
 
 def test_shots_are_drawn_in_proportion_to_their_frames() -> None:

@@ -1,0 +1,117 @@
+"""The default model: features sampled at the pixel centres are told from features through a filter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from mcdenoise import denoise
+from mcdenoise.cli import main
+from mcdenoise.data import open_sequence
+from mcdenoise.frame import Frame
+from mcdenoise.sampling import sampled_at_centres
+from mcdenoise.shot import ShotSettings, default_model
+
+HEIGHT, WIDTH = 30, 40
+# Clip coordinates are (x, y, ., z): a pinhole camera that looks along z, with a right angle between the borders.
+CAMERA = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]])[None]
+
+
+def floor_seen_at(offset: Tensor) -> Frame:
+    """A tilted plane ``z = 3 + x``, seen through points of the pixels, ``offset`` from their centres in pixels."""
+    rows, columns = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    x, y = (2 * (columns + offset[:, 0]) / WIDTH - 1), (2 * (rows + offset[:, 1]) / HEIGHT - 1)
+    depth = 3 / (1 - x)
+    normal = torch.tensor([2**-0.5, 0, -(2**-0.5)]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
+    return Frame(
+        torch.rand(1, 3, HEIGHT, WIDTH),
+        normal=normal,
+        depth=depth[:, None],
+        position=torch.stack([x * depth, y * depth, depth], 1),
+        view_projection=CAMERA,
+    )
+
+
+@pytest.mark.parametrize("samples", [1, 16, 256])
+def test_a_filter_is_recognised_at_any_number_of_samples(samples: int) -> None:
+    jitter = (torch.rand(samples, 2, HEIGHT, WIDTH) - 0.5).mean(0, keepdim=True)
+    assert sampled_at_centres(floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH)))
+    assert not sampled_at_centres(floor_seen_at(jitter))
+
+
+def test_half_floats_do_not_count_as_a_filter() -> None:
+    frame = floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH))
+    stored = {name: getattr(frame, name).half().float() for name in ("position", "normal", "depth")}
+    assert sampled_at_centres(frame.replace(**stored))
+
+
+def test_normals_of_more_than_one_point_count_as_a_filter() -> None:
+    """Blender's positions are those of the first sample, but its normals are means."""
+    frame = floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH))
+    mixed = frame.normal.clone()
+    mixed[..., ::10] = (mixed[..., ::10] + torch.tensor([0, 1.0, 0]).reshape(1, 3, 1, 1)) / 2
+    background = frame.normal * (torch.arange(WIDTH) > 9)
+    assert sampled_at_centres(frame.replace(normal=background))
+    assert not sampled_at_centres(frame.replace(normal=mixed))
+
+
+@pytest.mark.parametrize("missing", ["position", "view_projection", "normal"])
+def test_without_positions_camera_or_normal_the_answer_is_no(missing: str) -> None:
+    assert not sampled_at_centres(floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH)).replace(**{missing: None}))
+
+
+def test_positions_that_are_nowhere_are_no_evidence() -> None:
+    frame = floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH))
+    assert not sampled_at_centres(frame.replace(position=torch.full_like(frame.position, torch.inf)))
+
+
+def test_the_layout_of_a_lab_is_examined(small_sequence: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    assert default_model(sequence) == ("cascaded_v2", "features are sampled at the pixel centres")
+    assert default_model(replace(sequence, layout="files"))[0] == "oidn_tuned"
+    assert default_model(replace(sequence, layout="files"), cascade=True)[0] == "cascaded_v3"
+    # A damaged frame is reported when it is denoised, and does not change the choice.
+    (small_sequence / "inputs" / "color0.exr").write_bytes(b"damaged")
+    assert default_model(sequence)[0] == "cascaded_v2"
+
+
+def test_settings_that_only_a_cascade_has_choose_one(small_sequence: Path) -> None:
+    sequence = replace(open_sequence(small_sequence), layout="files")
+    for settings, model in (
+        (ShotSettings(), "oidn_tuned"),
+        (ShotSettings(alpha=True), "cascaded_v3"),
+        (ShotSettings(alpha_min=0.5), "cascaded_v3"),
+        (ShotSettings(tolerance=0.0), "cascaded_v3"),
+        (ShotSettings(anti_lag=False), "cascaded_v3"),
+        (ShotSettings(model="kp"), "kp"),
+    ):
+        chosen, _ = settings.chosen(sequence)
+        assert chosen.spelling.model == model
+        chosen.denoiser()
+
+
+def test_the_command_says_what_it_picked(
+    small_sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def printed(*options: str) -> str:
+        with pytest.raises(SystemExit) as stop:
+            main(["denoise", str(small_sequence), "-o", str(tmp_path / str(len(options))), *options])
+        assert stop.value.code in (0, None)
+        return capsys.readouterr().out
+
+    assert "picked cascaded_v2: features are sampled at the pixel centres\n" in printed()
+    assert "picked" not in printed("--model", "joint_bilateral")
+
+
+def test_a_still_in_python_is_denoised_by_what_suits_it() -> None:
+    frame = floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH))
+    arrays = {name: getattr(frame, name)[0].numpy() for name in ("normal", "depth", "position")}
+    color, camera = frame.color[0].numpy(), {"view_projection": CAMERA[0].numpy()}
+    for more, model in ((camera, "cascaded_v2"), ({}, "oidn_tuned")):
+        picked, named = (denoise(color, layout="CHW", **arrays, **more, **given) for given in ({}, {"model": model}))
+        np.testing.assert_array_equal(picked, named)
