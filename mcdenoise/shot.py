@@ -217,7 +217,9 @@ def default_model(sequence: Sequence, *, cascade: bool = False) -> tuple[str, st
                 if sampled_at_centres(sequence.frame(number)):
                     return DEFAULT, "features are sampled at the pixel centres"
                 break
-    return "cascaded_v3" if cascade else FILTERED, "features may be noisy, or filtered over pixels"
+    return "cascaded_v3" if cascade else FILTERED, (
+        "features may be noisy, or filtered over pixels; oidn_temporal has a smaller error, but takes longer"
+    )
 
 
 def check_threads(threads: int) -> None:

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.nn._cpu import ConvBlock, ReLU, max_pool
+from mcdenoise.nn._cpu import ConvBlock, ReLU, UpConvBlock, max_pool
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._steps.network import network_input
 from mcdenoise.ops._window import corner
@@ -74,7 +74,7 @@ class OidnUNet(nn.Module):
         skips = [*(widths[-1] for widths in encoder[-3::-1]), in_channels]
         coarser = [encoder[-1][-1], *(widths[-1] for widths in decoder[:-1])]
         entering = [below + skip for below, skip in zip(coarser, skips, strict=True)]
-        self.decoder = nn.ModuleList(itertools.starmap(_block, zip(entering, decoder, strict=True)))
+        self.decoder = nn.ModuleList(UpConvBlock(*_block(*each)) for each in zip(entering, decoder, strict=True))
         self.last = nn.Conv2d(decoder[-1][-1], out_channels, 3, padding=1)
 
     @property
@@ -126,8 +126,7 @@ class OidnUNet(nn.Module):
         # The coarsest level is the result of the last pooling.
         skips.pop()
         for block in self.decoder:
-            skip = skips.pop()
-            x = block(torch.cat([F.interpolate(x, scale_factor=2.0), skip.to(x.dtype)], 1))
+            x = block(x, skips.pop())
         with _without_autocast(x.device.type):
             x = self.last(x.to(self.last.weight.dtype))
         return corner(x, height, width)
