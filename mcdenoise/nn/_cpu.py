@@ -52,7 +52,7 @@ class UpConvBlock(ConvBlock):
         return _run(others, _convolved(skip, fine, first.bias, dtype, "relu", onto=x))
 
 
-# Of 2x2 pixels: down and right.
+# Place of each of 2x2 pixels: down and right.
 _CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 
