@@ -53,6 +53,7 @@ from mcdenoise.models import (
     Output,
     compared_models,
     create_model,
+    find_weights,
     list_models,
     pretrained_models,
     save_weights,
@@ -659,6 +660,16 @@ def test_some_methods_in_some_precisions() -> None:
     assert len(choose_methods("accumulated,cascaded_v2_micro,pretrained", precisions="float32")) == (
         2 + len(pretrained_models())
     )
+
+
+def test_a_method_named_twice_is_measured_once_and_two_of_one_name_are_refused(tmp_path: Path) -> None:
+    name = "cascaded_v2_micro"
+    twice = [method.name for method in choose_methods(f"{name},pretrained", precisions="bfloat16")]
+    assert twice.count(f"{name}, bfloat16") == 1
+    mine = tmp_path / f"{name}.safetensors"
+    mine.write_bytes(find_weights(name).read_bytes())  # type: ignore[union-attr]
+    with pytest.raises(InputError, match=rf"found '{name}' for {name} and .*{name}\.safetensors; rename a file"):
+        choose_methods(f"{name},{mine}")
 
 
 def threaded(*, threads: int = 1) -> Model:

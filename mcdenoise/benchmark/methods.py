@@ -130,7 +130,7 @@ def choose_methods(
         unless they were named.
 
     Raises:
-        InputError: a method or precision is unknown, or a model has no weights.
+        InputError: a method or precision is unknown, two methods have one name, or a model has no weights.
     """
     chosen = [each.strip() for each in precisions.split(",")]
     for name in chosen:
@@ -139,10 +139,16 @@ def choose_methods(
     named = names not in (None, ALL)
     text = COMPARED if names is None else _everything() if names == ALL else names
     methods: list[Method] = []
+    seen: dict[str, Spelling] = {}
     for spelt in [*baselines, *(split_methods(text) if text != "none" else ())]:
         for one in pretrained_models() if spelt == PRETRAINED else [spelt]:
             spelling = parse_method(one)
-            if spelling.name in {method.name for method in methods}:
+            if (before := seen.setdefault(spelling.name, spelling)) is not spelling:
+                if before != spelling:
+                    raise InputError(
+                        f"--models: expected a name for each method, found '{spelling.name}' for "
+                        f"{before.weights or before.model} and {spelling.weights or spelling.model}; rename a file"
+                    )
                 continue
             kind: Kind = "baseline" if one in BASELINES else "fixed"
             method = Method(spelling.name, kind, "", spelling.model, spelling.settings, str(spelling.weights or ""))
