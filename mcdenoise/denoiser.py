@@ -411,7 +411,8 @@ def denoise(
         normal: like ``color``, in [-1, 1].
         depth: ``(H, W)``, or with a channel axis.
         model: see :class:`Denoiser`. By default it is ``"cascaded_v2"`` if positions, camera and normal tell that the
-            features were sampled at the pixel centres, otherwise ``"oidn_tuned"``.
+            features were sampled at the pixel centres, or if layers, weights or settings are passed; otherwise
+            ``"oidn_tuned"``.
         device: device to run on; the result is copied back from it.
         precision: see :class:`Denoiser`.
         extra: further buffers by name.
@@ -436,7 +437,8 @@ def denoise(
     buffers = {name: value for name, value in others.items() if name in OF_RENDERERS}
     frame = Frame.from_numpy(color, layout=layout, albedo=albedo, normal=normal, depth=depth, extra=extra, **buffers)
     if model is None:
-        model = DEFAULT if sampled_at_centres(frame) else FILTERED
+        # Weights and settings are those of the default, and layers are filtered with its kernels.
+        model = DEFAULT if settings or frame.layers or sampled_at_centres(frame) else FILTERED
     denoiser = Denoiser(model, device=device, precision=precision, **settings)
     denoiser.reset(frames=1)
     image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()

@@ -115,3 +115,5 @@ def test_a_still_in_python_is_denoised_by_what_suits_it() -> None:
     for more, model in ((camera, "cascaded_v2"), ({}, "oidn_tuned")):
         picked, named = (denoise(color, layout="CHW", **arrays, **more, **given) for given in ({}, {"model": model}))
         np.testing.assert_array_equal(picked, named)
+    # Settings are those of the default.
+    denoise(color, layout="CHW", alpha_min=0.5)

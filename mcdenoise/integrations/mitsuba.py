@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from mcdenoise.denoiser import AskedPrecision, Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import FILTERED, Model
+from mcdenoise.models import DEFAULT, FILTERED, Model
 
 _ROOT = "<root>"
 # Color with or without alpha; monochromatic variants render luminance.
@@ -65,7 +65,8 @@ class MitsubaDenoiser:
         temporal: whether calls are the frames of a shot, with flow; otherwise each frame is a still.
         denoise_alpha: whether alpha, the second or fourth channel, is denoised with the kernels of the color;
             otherwise, and by methods without kernels, it is returned unchanged.
-        model: as for :class:`mcdenoise.Denoiser`; the default suits features through a pixel filter.
+        model: as for :class:`mcdenoise.Denoiser`; by default ``"oidn_tuned"``, for features through a pixel
+            filter, or ``"cascaded_v2"`` with ``denoise_alpha`` or ``settings``.
         device: device of torch; by default a GPU for the CUDA variants if torch has one, otherwise the CPU.
         precision: as for :class:`mcdenoise.Denoiser`.
         settings: its other arguments (``weights``, ``tile``, ``max_memory``), and settings of the model.
@@ -100,7 +101,7 @@ class MitsubaDenoiser:
         temporal: bool = False,
         denoise_alpha: bool = False,
         *,
-        model: str | Model | nn.Module = FILTERED,
+        model: str | Model | nn.Module | None = None,
         device: torch.device | str | None = None,
         precision: AskedPrecision = "auto",
         **settings: Any,
@@ -112,6 +113,8 @@ class MitsubaDenoiser:
         if device is None:
             cuda = str(self._mi.variant()).startswith("cuda") and torch.cuda.is_available()
             device = "cuda" if cuda else "cpu"
+        if model is None:
+            model = DEFAULT if denoise_alpha or settings else FILTERED
         self.denoiser = Denoiser(model, device=device, precision=precision, **settings)
         if isinstance(model, str) and isinstance(self.denoiser.model, nn.Module):
             self.denoiser.model.requires_grad_(False)
