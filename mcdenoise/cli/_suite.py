@@ -12,6 +12,7 @@ from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT
 from mcdenoise.report import check_packages, write_report, write_sample_plots
+from mcdenoise.shot import default_model
 from mcdenoise.suite import (
     SHOWN,
     Progress,
@@ -20,6 +21,7 @@ from mcdenoise.suite import (
     error_lines,
     markdown,
     open_row,
+    picked_lines,
     render_suite,
     rows_there,
     sample_curves,
@@ -59,8 +61,8 @@ def score_suite(
             progress.update(task, description=described, completed=step.done, total=step.total)
 
         if render:
-            shots = list(dict.fromkeys(row.shot for row in rows))
-            render_suite(shots, data, blender_python=blender_python, threads=settings.threads, on_progress=show)
+            wanted = dict.fromkeys(row.shot for row in rows)
+            render_suite(wanted, data, blender_python=blender_python, threads=settings.threads, on_progress=show)
     if out is None:
         say(data)
         return 0
@@ -70,14 +72,17 @@ def score_suite(
     missing = [row.name for row in rows if row not in found]
     with progress_bar() as progress:
         task = progress.add_task("score", total=None)
+        shots = [open_row(row, data) for row in found]
         results = run_benchmark(
-            [open_row(row, data) for row in found],
+            shots,
             methods,
             out,
             settings,
             on_step=lambda done, total: progress.update(task, completed=done, total=total),
         )
     lines, curves = suite_lines(results, found), error_lines(results, found)
+    ours = dict.fromkeys(line.model for line in lines)
+    lines += picked_lines(results, lines, {shot.name: default_model(shot)[0] for shot in shots})
     text = markdown(lines, curves, *error_against_time(results, found))
     write_text(out / "suite.md", text)
     content = {"lines": [asdict(line) for line in lines], "curves": [asdict(line) for line in curves]}
@@ -85,7 +90,6 @@ def score_suite(
     write_json(json, content)
     write_sample_plots(sample_curves(curves), out)
     best = {line.best["SMAPE"].setting: None for line in lines if line.best}
-    ours = dict.fromkeys(line.model for line in lines)
     write_close_ups(out, results, found, ["noisy", *ours, *best])
     print(text)
     for line in [*remarks(results), *([f"not rendered: {', '.join(missing)}"] if missing else [])]:

@@ -21,13 +21,12 @@ from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
 from mcdenoise.models._layers import answered
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.oidn_open import seen_by_oidn
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT, Recurrent
 from mcdenoise.models.restored import Restored
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
-from mcdenoise.ops._numbers import numbers_like
-from mcdenoise.ops._steps.transfer import compress, expand
+from mcdenoise.ops._steps.tuned import tuned_choice, tuned_input
+from mcdenoise.ops._window import corner
 
 # Color, albedo and normal, as in the library; the previous result in both forms, and its weight.
 _CHANNELS = 9 + 3 + 3 + 1
@@ -70,21 +69,13 @@ class TunedNetwork(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         color = frame.color
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
-        albedo = torch.ones_like(color) if frame.albedo is None else frame.albedo
-        normal = torch.zeros_like(color) if frame.normal is None else frame.normal
         before, light = (frame.extra.get(name, torch.zeros_like(color)) for name in (PREVIOUS, PREVIOUS_LIGHT))
         valid = frame.extra.get(PREVIOUS_WEIGHT, torch.zeros_like(color[:, :1]))
         with timed("network", color.device):
-            images = compress(torch.cat([color, before, light], 1) * exposure)
-            noisy, before, light = images.split(3, 1)
-            seen = seen_by_oidn(noisy, albedo, normal)
-            predicted = self.unet(torch.cat([seen, before, light, valid], 1)).contiguous()
-            own, logits = predicted.split([3, len(_LOGITS)], 1)
-            weights = torch.softmax(logits + numbers_like(logits, _LOGITS).reshape(1, -1, 1, 1), 1)
-            weights = weights * torch.cat([torch.ones_like(valid), valid, valid, torch.ones_like(valid)], 1)
-            choices = torch.stack([own.clamp_min(0), before, light, noisy], 1)
-            mixed = (weights[:, :, None] * choices).sum(1) / weights.sum(1, keepdim=True)
-            image = (expand(mixed) / exposure).to(color.dtype)
+            buffers = (color, before, light, frame.albedo, frame.normal, valid, exposure)
+            seen, images = tuned_input(*buffers, self.unet.multiple)
+            predicted = corner(self.unet(seen), *frame.size)
+            image = tuned_choice(predicted, images, valid, exposure, _LOGITS).to(color.dtype)
         return answered(frame, image, None), None
 
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Sequence
-from typing import Any
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -40,7 +41,7 @@ class UpConvBlock(ConvBlock):
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:  # type: ignore[override]
         """Convolve ``(B, C, H, W)`` and ``(B, S, 2 H, 2 W)``."""
-        dtype, (first, *others) = _computing(x), self
+        dtype, (first, *others) = computing_dtype(x), self
         if not (is_cpu_inference(x) and _has_fused_convolution(dtype) and isinstance(first, nn.Conv2d)):
             return super().forward(torch.cat([F.interpolate(x, scale_factor=2.0), skip.to(x.dtype)], 1))
         (batch, channels, height, width), made = x.shape, first.out_channels
@@ -78,7 +79,7 @@ def _run(layers: Iterable[nn.Module], x: Tensor) -> Tensor:
 
 def _convolved_with_relu(x: Tensor, layer: nn.Conv2d) -> Tensor:
     """A convolution with ReLU, fused by oneDNN if possible; torch offers this only to its compiler."""
-    dtype = _computing(x)
+    dtype = computing_dtype(x)
     if not _has_fused_convolution(dtype):
         return F.relu_(layer(x))
     return _convolved(x, layer.weight, layer.bias, dtype, "relu", stride=layer.stride)
@@ -89,7 +90,7 @@ def _convolved(
     weight: Tensor,
     bias: Tensor | None,
     dtype: torch.dtype,
-    then: str = "none",
+    then: str | None = None,
     *,
     stride: Sequence[int] = (1, 1),
     onto: Tensor | None = None,
@@ -98,13 +99,34 @@ def _convolved(
     x, weight, bias = x.to(dtype), weight.to(dtype), None if bias is None else bias.to(dtype)
     shape = [1, 1], stride, [1, 1], 1  # padding, stride, dilation, groups
     if onto is None:
-        onto = torch.ops.mkldnn._convolution_pointwise(x, weight, bias, *shape, then, [], "")
+        onto = torch.ops.mkldnn._convolution_pointwise(x, weight, bias, *shape, then or "none", [], "")
     else:
         torch.ops.mkldnn._convolution_pointwise_.binary(onto, x, weight, bias, *shape, "add", 1.0, then, [], "")
     return onto
 
 
-def _computing(x: Tensor) -> torch.dtype:
+def convolved_in_float32(x: Tensor, layer: nn.Conv2d) -> Tensor:
+    """A convolution, with a border of one pixel, of features that may be bfloat16, with a float32 result.
+
+    oneDNN convolves bfloat16 with sums in float32, and rounds these at last. If no derivative is requested, what the
+    rounding has lost is computed by a second convolution, which begins with the negative of the first one's result.
+    """
+    dtype = x.dtype
+    if dtype != torch.bfloat16 or not (is_cpu_inference(x) and _has_fused_convolution(dtype)):
+        with _without_autocast(x.device.type):
+            return cast(Tensor, layer(x.to(layer.weight.dtype)))
+    rough = _convolved(x, layer.weight, layer.bias, dtype)
+    lost = _convolved(x, layer.weight, layer.bias, dtype, onto=-rough)
+    return rough.to(torch.float32) + lost
+
+
+def _without_autocast(device_type: str) -> AbstractContextManager[object]:
+    """Compute in the precision of the operands; devices without values have no autocast to disable."""
+    known = torch.amp.is_autocast_available(device_type)
+    return torch.autocast(device_type, enabled=False) if known else nullcontext()
+
+
+def computing_dtype(x: Tensor) -> torch.dtype:
     """The dtype in which a convolution of a tensor is computed."""
     return torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
 

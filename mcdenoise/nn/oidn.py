@@ -7,17 +7,15 @@ that weights are interchangeable.
 from __future__ import annotations
 
 import itertools
-from contextlib import AbstractContextManager, nullcontext
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.nn._cpu import ConvBlock, ReLU, UpConvBlock, max_pool
+from mcdenoise.nn._cpu import ConvBlock, ReLU, UpConvBlock, computing_dtype, convolved_in_float32, max_pool
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._steps.network import network_input
-from mcdenoise.ops._window import corner
+from mcdenoise.ops._window import corner, up_to_multiple
 
 Size: TypeAlias = Literal["small", "base", "large"]
 
@@ -115,8 +113,12 @@ class OidnUNet(nn.Module):
             than bfloat16 resolves.
         """
         height, width = x.shape[-2:]
-        x = network_input(x[:, :_COLORS], x[:, _COLORS:], logarithms=False)
-        x = F.pad(x, (0, -width % _MULTIPLE, 0, -height % _MULTIPLE)).contiguous(memory_format=torch.channels_last)
+        if x.dtype != computing_dtype(x) or not x.is_contiguous(memory_format=torch.channels_last):
+            x = network_input(x[:, :_COLORS], x[:, _COLORS:], logarithms=False)
+        # A graph for any image size cannot branch on whether padding is needed.
+        if torch.compiler.is_compiling() or height % _MULTIPLE or width % _MULTIPLE:
+            x = up_to_multiple(x, _MULTIPLE)
+        x = x.contiguous(memory_format=torch.channels_last)
         skips = [x]
         for level, block in enumerate(self.encoder):
             x = block(x)
@@ -127,15 +129,7 @@ class OidnUNet(nn.Module):
         skips.pop()
         for block in self.decoder:
             x = block(x, skips.pop())
-        with _without_autocast(x.device.type):
-            x = self.last(x.to(self.last.weight.dtype))
-        return corner(x, height, width)
-
-
-def _without_autocast(device_type: str) -> AbstractContextManager[object]:
-    """Compute in the precision of the operands; devices without values have no autocast to disable."""
-    known = torch.amp.is_autocast_available(device_type)
-    return torch.autocast(device_type, enabled=False) if known else nullcontext()
+        return corner(convolved_in_float32(x, self.last), height, width)
 
 
 def _block(in_channels: int, widths: tuple[int, ...]) -> ConvBlock:

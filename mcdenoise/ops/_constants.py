@@ -58,3 +58,13 @@ PU_BRIGHT = (1.92653254e-01, 6.26026094e-03, 9.98620152e-01)
 PU_JOINTS = (1.57945760e-06, 3.22087631e-02, 2.23151711e-03, 3.70974749e-01)
 MAX_RADIANCE = 65504.0
 PU_WHITE = PU_BRIGHT[0] * math.log(MAX_RADIANCE + PU_BRIGHT[1]) + PU_BRIGHT[2]
+
+# Where what a denoiser removed is correlated, it is detail. Statistics are means over windows of CELLS x CELLS cells
+# of CELL x CELL pixels. Over LAG pixels noise is uncorrelated, also under a Gaussian pixel filter. A correlation counts
+# as far as it exceeds DEVIATIONS standard deviations; GAIN is the weight per correlation, because detail is correlated
+# only in part over the lag. Differences are relative to a mean of at least LEAST_MEAN times the window's.
+CELL, CELLS, LAG = 4, 7, 2
+DEVIATIONS, GAIN, LEAST_MEAN = 3.0, 4.0, 0.1
+# Smallest mean and largest relative difference, so that all derivatives are finite; and smallest variance and power.
+DARKEST, MOST = 1e-15, 1e4
+LEAST_VARIANCE, LEAST_POWER = 1e-30, 1e-12

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import geometric_mean
 
@@ -13,6 +13,7 @@ from mcdenoise.suite.rows import Row
 
 SMAPE, PSNR, TEMPORAL = "SMAPE", "PSNR 2.2", "tRMSE"
 SHOWN = (SMAPE, PSNR, TEMPORAL)
+PICKED = "the model that `mcdenoise denoise` picks"
 # With noisy features, OIDN uses the same network for high and balanced quality.
 _PEERS = (
     "oidn(quality=fast|balanced, auxiliary=clean|noisy, source=raw|accumulated),"
@@ -83,6 +84,20 @@ def suite_lines(results: Results, rows: Iterable[Row]) -> list[Line]:
 def error_lines(results: Results, rows: Iterable[Row]) -> list[Line]:
     """As :func:`suite_lines`, for the curves of error over samples."""
     return _lines(results, [row for row in rows if row.shot.curve])
+
+
+def picked_lines(results: Results, lines: Iterable[Line], picks: Mapping[str, str]) -> list[Line]:
+    """The lines of the model that `mcdenoise denoise` picks on each row, under the name :data:`PICKED`.
+
+    Args:
+        results: of the benchmark.
+        lines: see :func:`suite_lines`.
+        picks: name of the model by row. If there are several methods of a model, such as precisions, the first counts.
+    """
+    methods = {name: [method.name for method in results.methods if method.model == name] for name in picks.values()}
+    by_place = {(line.row, line.model): line for line in lines}
+    found = ([by_place.get((row, method)) for method in methods[name]] for row, name in picks.items())
+    return [replace(line, model=PICKED) for row in found if (line := next(filter(None, row), None))]
 
 
 def _lines(results: Results, rows: list[Row]) -> list[Line]:

@@ -11,8 +11,8 @@ from toys import Blur, Same, frame_of
 
 from mcdenoise.frame import Frame, Hints
 from mcdenoise.models import Demodulated, Model, Needs, Output, Restored
-from mcdenoise.models.restored import weight_of_noisy
-from mcdenoise.ops._rows import by_rows
+from mcdenoise.ops._op import plain
+from mcdenoise.ops._steps.residual import weight_of_noisy
 from mcdenoise.train.front import split
 
 
@@ -193,8 +193,9 @@ def test_a_pixel_depends_on_those_within_the_reach() -> None:
 def test_bands_of_rows_give_the_same_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     clean = waves(149, 63)
     color, image = clean + 0.3 * noise(149, 63), smooth(clean)
+    whole = plain(weight_of_noisy)(color, image)
     monkeypatch.setattr("mcdenoise.ops._rows._PIXELS", 63 * 23)
-    assert torch.equal(by_rows(weight_of_noisy, color, image, reach=36), weight_of_noisy(color, image))
+    assert torch.equal(plain(weight_of_noisy)(color, image), whole)
 
 
 def test_a_network_is_trained_without_it() -> None:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.nn import Head, UNet
+from mcdenoise.nn._cpu import convolved_in_float32
 
 WIDTH = 8
 
@@ -159,3 +160,19 @@ def test_a_network_that_does_not_learn_has_its_derivative_forward() -> None:
     (unet(leaf)[0] * weights).sum().backward()
     assert leaf.grad is not None
     torch.testing.assert_close((forward * weights).sum(), (leaf.grad * direction).sum())
+
+
+@pytest.mark.parametrize("size", [(7, 9), (16, 32)], ids=str)
+def test_the_last_convolution_of_bfloat16_features_has_a_result_in_float32(size: tuple[int, int]) -> None:
+    layer = nn.Conv2d(32, 7, 3, padding=1).bfloat16().float()
+    features = torch.rand(1, 32, *size).bfloat16().contiguous(memory_format=torch.channels_last)
+    exact = layer.double()(features.double()).detach()
+    layer.float()
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        found = convolved_in_float32(features, layer)
+    assert found.dtype == torch.float32
+    # The result has an error of 2^-9, of which the same part remains; sums of 288 products in float32 have far less.
+    torch.testing.assert_close(found.double(), exact, rtol=0, atol=2.0**-17 * float(exact.abs().max()))
+    with torch.autocast("cpu", torch.bfloat16):
+        (gradient,) = torch.autograd.grad(convolved_in_float32(features, layer).sum(), layer.weight)
+    assert gradient.dtype == torch.float32

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mcdenoise.ops import downsample
 from mcdenoise.ops._numba import _runtime
-from mcdenoise.ops._steps import network, transfer
+from mcdenoise.ops._steps import network, residual, transfer, tuned
 
 # The tolerance is relative to the largest number in a result: a few roundings of sums of up to 54 products.
 TOLERANCE = {dtype: 32 * torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
@@ -61,6 +61,10 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
     depth = layout(depth)
     exposure = maximum * 0.7
     buffers = [some(5, 3), some(6, 3), depth, radiance]
+    # Some pixels have no history, and some features are out of their range.
+    seen, valid = [some(5, 3), some(6, 3)], some(23, 1).clamp(0, 1)
+    previous = [layout(draw(seed, batch, 3, height, width, dtype).exp()) for seed in (19, 20)]
+    predicted, on_scale = (layout(draw(21, batch, count, height, width, dtype).tanh()) for count in (7, 9))
     calls: list[Call] = [
         (network.low_frequencies_of, [radiance, coarse.abs(), 2 * maximum], {}),
         (network.gated_fusion, [some(7, 3), coarse, weight, bias], {}),
@@ -84,6 +88,12 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
         # From the dark, where the scale is linear, to the largest radiance and beyond.
         (transfer.compress, [layout((6 * draw(15, batch, 3, height, width, dtype)).exp())], {}),
         (transfer.expand, [layout(draw(16, batch, 3, height, width, dtype).sigmoid())], {}),
+        # Part of the noise is correlated, so that weights are neither all 0 nor all 1.
+        (residual.weight_of_noisy, [layout(radiance * (1.2 + 0.3 * draw(17, *radiance.shape, dtype))), radiance], {}),
+        (residual.weight_of_noisy, [some(18, 3) * torch.inf, radiance], {}),
+        (tuned.tuned_input, [radiance, *previous, *seen, valid, exposure, 4], {}),
+        (tuned.tuned_input, [radiance, *previous, None, None, valid, exposure, 1], {}),
+        (tuned.tuned_choice, [predicted, on_scale, valid, exposure, (0.0, -2.0, -1.0, 0.5)], {}),
     ]
     return calls
 

@@ -27,6 +27,7 @@ from mcdenoise.suite import (
     error_lines,
     markdown,
     open_row,
+    picked_lines,
     render_suite,
     rendering,
     rows_there,
@@ -34,7 +35,7 @@ from mcdenoise.suite import (
     suite_lines,
 )
 from mcdenoise.suite.close_ups import PARTS, write_close_ups
-from mcdenoise.suite.tables import PSNR, SMAPE, TEMPORAL, verdict, with_peers
+from mcdenoise.suite.tables import PICKED, PSNR, SMAPE, TEMPORAL, verdict, with_peers
 
 BLENDER = os.environ.get("BLENDER_PYTHON")
 TINY: dict[str, Any] = {"frames": 2, "size": (16, 9), "reference_samples": 8}
@@ -263,6 +264,21 @@ def test_error_against_time_uses_common_rows_and_names_the_faster_method() -> No
     assert means[1].error == pytest.approx((0.2 * 0.4) ** 0.5)
     assert "| oidn(quality=high) | 0.4000 | 40 | no: ours |" in markdown([], [], means, counted)
     assert error_against_time(results, []) == ([], 0)
+
+
+def test_lines_of_the_picked_model_are_those_of_its_first_method_on_each_row() -> None:
+    results, rows = _results([0.1, 0.2, 0.3], fast=[0.2, 0.15, 0.2], high=[0.3, 0.1, 0.2])
+    # A second precision and a second model, which has failed on row c.
+    results.methods.append(Method("ours, bfloat16", "trainable", "ours16", "cascaded_v2", precision="bfloat16"))
+    results.methods.append(Method("other", "trainable", "other", "oidn_tuned"))
+    results.cells.extend(Cell(row, "ours, bfloat16", {SMAPE: 0.5, PSNR: 50}) for row in "abc")
+    results.cells.extend(Cell(row, "other", {SMAPE: 0.4, PSNR: 60}) for row in "ab")
+    lines = suite_lines(results, rows)
+    picked = picked_lines(results, lines, {"a": "cascaded_v2", "b": "oidn_tuned", "c": "oidn_tuned"})
+    assert [(line.row, line.model, line.values[SMAPE]) for line in picked] == [("a", PICKED, 0.1), ("b", PICKED, 0.4)]
+    assert verdict(picked)[0] == "SMAPE: ahead of OIDN's best setting in 1 of 2 rows; behind in b"
+    # A model that the benchmark does not have.
+    assert picked_lines(results, lines, {"a": "svgf"}) == []
 
 
 def test_rows_with_noisy_references_are_named() -> None:

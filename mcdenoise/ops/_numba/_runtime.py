@@ -69,26 +69,27 @@ def readable(tensor: Tensor, dtype: torch.dtype) -> Tensor:
     return tensor if tensor.dtype == torch.bfloat16 and dtype == torch.float32 else tensor.to(dtype)
 
 
-def share_rows(image: Tensor, run: Callable[[int, int, int], None], light: bool = False) -> None:
+def share_rows(image: Tensor, run: Callable[[int, int, int], None], light: bool = False, step: int = 1) -> None:
     """``run(b, first, last)`` for all rows of all images of the batch, on at most as many threads as torch uses.
 
     Args:
         image: an image of the same batch and size.
         run: computes rows of one image.
         light: whether there are only a few operations for each pixel, and so fewer threads.
+        step: ``first`` is a multiple of it, and ``last`` is too or is the height.
     """
     batch, _, height, width = image.shape
-    rows = batch * height
+    steps = -(-height // step)
     least = PIXELS_A_THREAD * (LIGHT if light else 1)
-    threads = max(1, min(torch.get_num_threads(), rows, rows * width // least))
+    threads = max(1, min(torch.get_num_threads(), batch * steps, batch * height * width // least))
 
     def compute(number: int) -> None:
-        row, end = rows * number // threads, rows * (number + 1) // threads
-        while row < end:
-            b, first = divmod(row, height)
-            last = min(height, first + end - row)
-            run(b, first, last)
-            row += last - first
+        done, end = batch * steps * number // threads, batch * steps * (number + 1) // threads
+        while done < end:
+            b, first = divmod(done, steps)
+            last = min(steps, first + end - done)
+            run(b, first * step, min(last * step, height))
+            done += last - first
 
     if threads == 1:
         compute(0)

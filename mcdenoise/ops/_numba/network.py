@@ -31,17 +31,17 @@ from mcdenoise.ops._operator import custom_op
 from mcdenoise.ops._window import accumulator_dtype
 
 # Pixels whose channels are gathered at a time: they stay in the second-level cache.
-_CHUNK = 1024
+CHUNK = 1024
 
 
-def _precision(image: Tensor) -> torch.dtype:
+def precision(image: Tensor) -> torch.dtype:
     """The dtype of a convolution's input."""
     return torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else image.dtype
 
 
 def network_input(image: Tensor, features: Tensor, logarithms: bool) -> Any:
     """See :func:`mcdenoise.ops._steps.network.network_input`."""
-    dtype = _precision(image)
+    dtype = precision(image)
     if torch.float16 in (image.dtype, features.dtype, dtype):
         return NotImplemented
     return _network_input(image, features, logarithms, dtype)
@@ -57,7 +57,7 @@ def _network_input(image: Tensor, features: Tensor, logarithms: bool, dtype: tor
     if result.numel():
         sums = torch.promote_types(dtype, torch.float32)
         arguments = (source(result), source(readable(image, sums)), source(readable(features, sums)))
-        buffer = np.empty((result.shape[1], _CHUNK), torch.empty((), dtype=sums, device="cpu").numpy().dtype)
+        buffer = np.empty((result.shape[1], CHUNK), torch.empty((), dtype=sums, device="cpu").numpy().dtype)
         share_rows(image, lambda *rows: _stack(*arguments, logarithms, np.empty_like(buffer), result.shape[3], *rows))
     return result
 
@@ -86,9 +86,9 @@ def _stack(
             for c in range(own, channels):
                 read_row(rows[c, :n], features, b, c - own, y, x0)
             for c in range(channels):
-                _round(bits[c, :n], rows[c])
+                round_row(bits[c, :n], rows[c])
             start = b * strides[0] + y * strides[2] + x0 * strides[3]
-            _interleave(memory[start : start + n * channels], bits)
+            interleave(memory[start : start + n * channels], bits)
 
 
 def buffers_input(
@@ -104,7 +104,7 @@ def buffers_input(
     image_factor: Tensor | None,
 ) -> Any:
     """See :func:`mcdenoise.ops._steps.network.buffers_input`."""
-    dtype = _precision(image)
+    dtype = precision(image)
     if torch.float16 in (image.dtype, albedo.dtype, dtype):
         return NotImplemented
     buffers = (albedo, normal, depth, current, length, exposure, *scale)
@@ -141,7 +141,7 @@ def _buffers_input(
         lengths = nothing if length is None else source(readable(length, sums))
         factor = torch.ones_like(exposure) if image_factor is None else image_factor
         factors = torch.cat([each.to(sums).expand(batch, 1, 1, 1) for each in (exposure, near, typical, factor)], 1)
-        buffer = np.empty((14, _CHUNK), factors.numpy().dtype)
+        buffer = np.empty((14, CHUNK), factors.numpy().dtype)
         arguments = (source(result), images, lengths, factors.flatten(1).numpy(), logarithms)
         share_rows(image, lambda *rows: _stack_buffers(*arguments, np.empty_like(buffer), width, *rows))
     return result
@@ -202,9 +202,9 @@ def _stack_buffers(
             else:
                 row[:] = one
             for c in range(channels):
-                _round(bits[c, :n], rows[c])
+                round_row(bits[c, :n], rows[c])
             start = b * strides[0] + y * strides[2] + x0 * strides[3]
-            _interleave(memory[start : start + n * channels], bits)
+            interleave(memory[start : start + n * channels], bits)
 
 
 def network_guides(normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor]) -> Any:
@@ -255,13 +255,13 @@ def _to_logarithms(values: Any, factor: Any) -> None:
 
 
 @compiled
-def _round(bits: Any, values: Any) -> None:
+def round_row(bits: Any, values: Any) -> None:
     for x in range(bits.size):
         bits[x] = rounded(values[x], bits)
 
 
 @compiled
-def _interleave(pixels: Any, rows: Any) -> None:
+def interleave(pixels: Any, rows: Any) -> None:
     """Rows of channels to pixels with their channels side by side."""
     channels = rows.shape[0]
     n = pixels.size // channels

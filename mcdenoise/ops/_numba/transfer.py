@@ -56,32 +56,42 @@ def _empty_planes(image: Tensor) -> Tensor:
 
 @compiled
 def _compress_rows(out: Any, image: Any, b: int, first: int, last: int) -> None:
-    number = out.dtype.type
-    zero, most = number(0), number(MAX_RADIANCE)
     for y in range(first, last):
         for c in range(out.shape[1]):
             row = out[b, c, y]
             read_row(row, image, b, c, y, 0)
-            for x in range(row.size):
-                # Where a comparison with a NaN is false, `min` and `max` return their first argument, the NaN.
-                light = min(max(row[x], zero), most)
-                power = number(_B) * exp(number(_C) * log(max(light, number(_Y0)))) + number(_D)
-                bright = number(_E) * log(light + number(_F)) + number(_G)
-                found = number(PU_DARK) * light if light <= number(_Y0) else power if light <= number(_Y1) else bright
-                row[x] = found / number(PU_WHITE)
+            compress_values(row)
 
 
 @compiled
 def _expand_rows(out: Any, image: Any, b: int, first: int, last: int) -> None:
-    number = out.dtype.type
-    zero, inverse = number(0), number(1 / _C)
     for y in range(first, last):
         for c in range(out.shape[1]):
             row = out[b, c, y]
             read_row(row, image, b, c, y, 0)
-            for x in range(row.size):
-                scaled = max(row[x], zero) * number(PU_WHITE)
-                power = exp(inverse * log((max(scaled, number(_X0)) - number(_D)) / number(_B)))
-                bright = exp((max(scaled, number(_X1)) - number(_G)) / number(_E)) - number(_F)
-                lit = power if scaled <= number(_X1) else bright
-                row[x] = scaled / number(PU_DARK) if scaled <= number(_X0) else lit
+            expand_values(row)
+
+
+@compiled
+def compress_values(row: Any) -> None:
+    number = row.dtype.type
+    zero, most = number(0), number(MAX_RADIANCE)
+    for x in range(row.size):
+        # Where a comparison with a NaN is false, `min` and `max` return their first argument, the NaN.
+        light = min(max(row[x], zero), most)
+        power = number(_B) * exp(number(_C) * log(max(light, number(_Y0)))) + number(_D)
+        bright = number(_E) * log(light + number(_F)) + number(_G)
+        found = number(PU_DARK) * light if light <= number(_Y0) else power if light <= number(_Y1) else bright
+        row[x] = found / number(PU_WHITE)
+
+
+@compiled
+def expand_values(row: Any) -> None:
+    number = row.dtype.type
+    zero, inverse = number(0), number(1 / _C)
+    for x in range(row.size):
+        scaled = max(row[x], zero) * number(PU_WHITE)
+        power = exp(inverse * log((max(scaled, number(_X0)) - number(_D)) / number(_B)))
+        bright = exp((max(scaled, number(_X1)) - number(_G)) / number(_E)) - number(_F)
+        lit = power if scaled <= number(_X1) else bright
+        row[x] = scaled / number(PU_DARK) if scaled <= number(_X0) else lit

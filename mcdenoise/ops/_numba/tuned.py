@@ -1,0 +1,206 @@
+"""The steps before and behind the network of ``oidn_tuned`` on a CPU: one pass each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mcdenoise.ops._numba._runtime import compiled, exp, read_row, share_rows, source
+from mcdenoise.ops._numba.network import CHUNK, interleave, precision, round_row
+from mcdenoise.ops._numba.transfer import compress_values, expand_values
+from mcdenoise.ops._operator import custom_op
+
+
+def tuned_input(
+    color: Tensor,
+    before: Tensor,
+    light: Tensor,
+    albedo: Tensor | None,
+    normal: Tensor | None,
+    valid: Tensor,
+    exposure: Tensor,
+    multiple: int,
+) -> Any:
+    """See :func:`mcdenoise.ops._steps.tuned.tuned_input`."""
+    dtype = precision(color)
+    # A single number that is read for every pixel.
+    albedo = color.new_ones(1, 1, 1, 1).expand_as(color) if albedo is None else albedo
+    normal = color.new_zeros(1, 1, 1, 1).expand_as(color) if normal is None else normal
+    images = (color, before, light, albedo, normal, valid, exposure)
+    if dtype == torch.float16 or not _are_alike(*images):
+        return NotImplemented
+    return _tuned_input(*images, multiple, dtype)
+
+
+def tuned_choice(predicted: Tensor, images: Tensor, valid: Tensor, exposure: Tensor, offsets: Sequence[float]) -> Any:
+    """See :func:`mcdenoise.ops._steps.tuned.tuned_choice`."""
+    alike = _are_alike(predicted, images, valid, exposure)
+    return _tuned_choice(predicted, images, valid, exposure, list(offsets)) if alike else NotImplemented
+
+
+def _are_alike(*images: Tensor) -> bool:
+    dtype = images[0].dtype
+    return dtype in (torch.float32, torch.float64) and all(image.dtype == dtype for image in images)
+
+
+@custom_op(
+    "mcdenoise::tuned_input",
+    device_types="cpu",
+    schema="(Tensor color, Tensor before, Tensor light, Tensor albedo, Tensor normal, Tensor valid, Tensor exposure, "
+    "int multiple, ScalarType dtype) -> (Tensor, Tensor)",
+)
+def _tuned_input(
+    color: Tensor,
+    before: Tensor,
+    light: Tensor,
+    albedo: Tensor,
+    normal: Tensor,
+    valid: Tensor,
+    exposure: Tensor,
+    multiple: int,
+    dtype: torch.dtype,
+) -> tuple[Tensor, Tensor]:
+    seen, images = _empty_input(color, before, light, albedo, normal, valid, exposure, multiple, dtype)
+    height, width = color.shape[2:]
+    seen[..., height:, :], seen[..., width:] = 0, 0
+    if images.numel():
+        read = tuple(source(image) for image in (color, before, light, albedo, normal, valid, exposure))
+        target, scaled = source(seen), images.numpy()
+        share_rows(color, lambda *rows: _input_rows(target, scaled, *read, *rows))
+    return seen, images
+
+
+@_tuned_input.register_fake
+def _empty_input(
+    color: Tensor,
+    before: Tensor,
+    light: Tensor,
+    albedo: Tensor,
+    normal: Tensor,
+    valid: Tensor,
+    exposure: Tensor,
+    multiple: int,
+    dtype: torch.dtype,
+) -> tuple[Tensor, Tensor]:
+    batch, _, height, width = color.shape
+    channels = sum(image.shape[1] for image in (color, before, light, albedo, normal, valid))
+    rows, columns = (-(-side // multiple) * multiple for side in (height, width))
+    seen = torch.empty(
+        (batch, channels, rows, columns), dtype=dtype, device=color.device, memory_format=torch.channels_last
+    )
+    return seen, color.new_empty(batch, 9, height, width)
+
+
+@compiled
+def _input_rows(
+    out: Any,
+    images: Any,
+    color: Any,
+    before: Any,
+    light: Any,
+    albedo: Any,
+    normal: Any,
+    valid: Any,
+    exposure: Any,
+    b: int,
+    first: int,
+    last: int,
+) -> None:
+    memory, strides, channels = out
+    number = images.dtype.type
+    zero, one, half = number(0), number(1), number(0.5)
+    width = images.shape[3]
+    factor = exposure[0][b * exposure[1][0]]
+    bits = np.empty((channels, CHUNK), memory.dtype)
+    row = np.empty(CHUNK, images.dtype)
+    for y in range(first, last):
+        for x0 in range(0, width, CHUNK):
+            n = min(CHUNK, width - x0)
+            part, rows = row[:n], bits[:, :n]
+            for c in range(3):
+                _scaled(images[b, c, y, x0 : x0 + n], color, b, c, y, x0, factor)
+                _scaled(images[b, 3 + c, y, x0 : x0 + n], before, b, c, y, x0, factor)
+                _scaled(images[b, 6 + c, y, x0 : x0 + n], light, b, c, y, x0, factor)
+                round_row(rows[c], images[b, c, y, x0 : x0 + n])
+                round_row(rows[9 + c], images[b, 3 + c, y, x0 : x0 + n])
+                round_row(rows[12 + c], images[b, 6 + c, y, x0 : x0 + n])
+                read_row(part, albedo, b, c, y, x0)
+                for x in range(n):
+                    part[x] = min(max(part[x], zero), one)
+                round_row(rows[3 + c], part)
+                read_row(part, normal, b, c, y, x0)
+                for x in range(n):
+                    part[x] = min(max(part[x], -one), one) * half + half
+                round_row(rows[6 + c], part)
+            read_row(part, valid, b, 0, y, x0)
+            round_row(rows[15], part)
+            start = b * strides[0] + y * strides[2] + x0 * strides[3]
+            interleave(memory[start : start + n * channels], rows)
+
+
+@compiled
+def _scaled(row: Any, image: Any, b: int, c: int, y: int, x0: int, factor: Any) -> None:
+    read_row(row, image, b, c, y, x0)
+    for x in range(row.size):
+        row[x] *= factor
+    compress_values(row)
+
+
+@custom_op(
+    "mcdenoise::tuned_choice",
+    device_types="cpu",
+    schema="(Tensor predicted, Tensor images, Tensor valid, Tensor exposure, float[] offsets) -> Tensor",
+)
+def _tuned_choice(
+    predicted: Tensor, images: Tensor, valid: Tensor, exposure: Tensor, offsets: Sequence[float]
+) -> Tensor:
+    result = _empty_choice(predicted, images, valid, exposure, offsets)
+    if result.numel():
+        read = tuple(source(image) for image in (predicted, images, valid, exposure))
+        out, added = result.numpy(), np.array(offsets, result.numpy().dtype)
+        share_rows(images, lambda *rows: _choice_rows(out, *read, added, *rows))
+    return result
+
+
+@_tuned_choice.register_fake
+def _empty_choice(
+    predicted: Tensor, images: Tensor, valid: Tensor, exposure: Tensor, offsets: Sequence[float]
+) -> Tensor:
+    return images.new_empty(images.shape[0], 3, *images.shape[2:])
+
+
+@compiled
+def _choice_rows(
+    out: Any, predicted: Any, images: Any, valid: Any, exposure: Any, offsets: Any, b: int, first: int, last: int
+) -> None:
+    number = out.dtype.type
+    width = out.shape[3]
+    factor = exposure[0][b * exposure[1][0]]
+    weights, choices = np.empty((5, width), out.dtype), np.empty((4, width), out.dtype)
+    for y in range(first, last):
+        for k in range(4):
+            read_row(weights[k], predicted, b, 3 + k, y, 0)
+        read_row(weights[4], valid, b, 0, y, 0)
+        own, before, light, noisy, share = weights[0], weights[1], weights[2], weights[3], weights[4]
+        for x in range(width):
+            a, c, d, e = own[x] + offsets[0], before[x] + offsets[1], light[x] + offsets[2], noisy[x] + offsets[3]
+            most = max(max(a, c), max(d, e))
+            a, c, d, e = exp(a - most), share[x] * exp(c - most), share[x] * exp(d - most), exp(e - most)
+            scale = number(1) / (((a + c) + d) + e)
+            own[x], before[x], light[x], noisy[x] = a * scale, c * scale, d * scale, e * scale
+        for c in range(3):
+            row = out[b, c, y]
+            read_row(choices[0], predicted, b, c, y, 0)
+            read_row(choices[1], images, b, 3 + c, y, 0)
+            read_row(choices[2], images, b, 6 + c, y, 0)
+            read_row(choices[3], images, b, c, y, 0)
+            for x in range(width):
+                mixed = own[x] * max(choices[0, x], number(0)) + before[x] * choices[1, x]
+                row[x] = (mixed + light[x] * choices[2, x]) + noisy[x] * choices[3, x]
+            expand_values(row)
+            for x in range(width):
+                row[x] /= factor

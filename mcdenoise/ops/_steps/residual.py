@@ -1,0 +1,92 @@
+"""How much of what a denoiser removed is detail, from the correlation of the residual."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.ops._constants import (
+    CELL,
+    CELLS,
+    DARKEST,
+    DEVIATIONS,
+    GAIN,
+    LAG,
+    LEAST_MEAN,
+    LEAST_POWER,
+    LEAST_VARIANCE,
+    MOST,
+)
+from mcdenoise.ops._op import op
+from mcdenoise.ops._rows import by_rows
+from mcdenoise.ops._window import pad
+
+__all__ = ["CELL", "REACH", "weight_of_noisy"]
+
+# Interpolation and window, twice because of the mean that differences are relative to, and the lag. It is a multiple of
+# a cell, so that bands of rows have the cells of the whole image.
+REACH = 2 * (CELL + 1 + CELLS // 2 * CELL) + LAG
+
+
+@op("numba")
+def weight_of_noisy(color: Tensor, image: Tensor) -> Tensor:
+    """Weight of the noisy color beside the denoised image, see :class:`mcdenoise.models.Restored` for its equation.
+
+    Args:
+        color: ``(B, 3, H, W)`` noisy radiance.
+        image: ``(B, 3, H, W)`` denoised radiance.
+
+    Returns:
+        ``(B, 1, H, W)`` in [0, 1]. A pixel depends on those up to :data:`REACH` pixels away.
+    """
+    return by_rows(_weight, color, image, reach=REACH)
+
+
+def _weight(color: Tensor, image: Tensor) -> Tensor:
+    size = color.shape[-2], color.shape[-1]
+    bright = image.mean(1, keepdim=True)
+    scale = _mean(bright, 3) + LEAST_MEAN * _pixels(_mean(_cells(bright), CELLS), size)
+    r = ((color - image) / scale.clamp_min(DARKEST)).clamp(-MOST, MOST)
+    squares, rows, columns = (_product(r, *lag) for lag in ((0, 0), (0, LAG), (LAG, 0)))
+    statistics = (squares, rows + columns, rows * rows + columns * columns)
+    power, correlation, variance = _mean(torch.cat([_cells(each) for each in statistics], 1), CELLS).split(1, 1)
+    deviation = variance.clamp_min(LEAST_VARIANCE).sqrt() / (2 * CELL * CELLS)
+    weight = GAIN * (correlation / 2 - DEVIATIONS * deviation) / power.clamp_min(LEAST_POWER)
+    return _pixels(weight.clamp(0, 1), size)
+
+
+def _product(r: Tensor, down: int, right: int) -> Tensor:
+    """Product of each pixel with the one below or to the right, summed over the channels; 0 where that is outside."""
+    height, width = r.shape[2:]
+    product = r[..., down:, right:] * r[..., : max(height - down, 0), : max(width - right, 0)]
+    return F.pad(product.sum(1, keepdim=True), (0, min(right, width), 0, min(down, height)))
+
+
+def _cells(image: Tensor) -> Tensor:
+    """Means over cells of 4x4 pixels, as far as they lie inside the image."""
+    return F.avg_pool2d(image, CELL, ceil_mode=True, count_include_pad=False)
+
+
+def _pixels(cells: Tensor, size: tuple[int, int]) -> Tensor:
+    """Interpolate the means of cells at pixels, linearly along both axes.
+
+    ``torch.nn.functional.interpolate`` and ``torch.lerp`` would round differently in bands of rows.
+    """
+    for axis in (-1, -2):
+        count = cells.shape[axis]
+        padded = F.pad(cells, (1, 1, 0, 0) if axis == -1 else (0, 0, 1, 1), mode="replicate")
+        before, here, after = (padded.narrow(axis, start, count) for start in range(3))
+        (a, b), (c, d) = ([here + w / 8 * (other - here) for w in (3, 1)] for other in (before, after))
+        cells = torch.stack([a, b, d, c], axis).flatten(axis - 1, axis)
+    return cells[..., : size[0], : size[1]]
+
+
+def _mean(image: Tensor, side: int) -> Tensor:
+    """Means over the window around each pixel; outside the image, its edge is repeated."""
+    image = pad(image, side // 2, "replicate")
+    for axis in (-1, -2):
+        length = image.shape[axis] - side + 1
+        first, *others = (image.narrow(axis, start, length) for start in range(side))
+        image = sum(others, first)
+    return image / side**2
