@@ -234,6 +234,9 @@ def interrupted_at_random(folder: Path, name: str, arguments: list[object], coun
         time.sleep(draw.uniform(0, 0.8 * seconds))
         if process.poll() is None:
             end(process, number, name, printed.count("\n") - 1)
+        else:
+            # It was faster than the first one, and its pipes are still open.
+            process.communicate()
         assert not [path for path in folder.rglob("*") if path.name.startswith(".mcdenoise-")]
 
 

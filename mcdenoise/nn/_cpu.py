@@ -34,9 +34,9 @@ class ConvBlock(nn.Sequential):
 class UpConvBlock(ConvBlock):
     """A :class:`ConvBlock` of upsampled features and the skipped ones of the finer level, concatenated.
 
-    Nearest-neighbour upsampling gives each 2x2 pixels one value, so that a 3x3 kernel sees four different ones. If no
-    derivative is requested, the first convolution computes each of the 2x2 pixels with a 2x2 kernel of sums of weights
-    from the features before upsampling: four ninths of the work, and no upsampled features.
+    Nearest-neighbour upsampling gives each 2x2 pixels one value, so that a 3x3 kernel sees four different ones: both
+    together are a transposed convolution with a 4x4 kernel of sums of weights. If no derivative is requested, the first
+    convolution is computed so: four ninths of the work, and no upsampled features.
     """
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:  # type: ignore[override]
@@ -44,26 +44,22 @@ class UpConvBlock(ConvBlock):
         dtype, (first, *others) = computing_dtype(x), self
         if not (is_cpu_inference(x) and _has_fused_convolution(dtype) and isinstance(first, nn.Conv2d)):
             return super().forward(torch.cat([F.interpolate(x, scale_factor=2.0), skip.to(x.dtype)], 1))
-        (batch, channels, height, width), made = x.shape, first.out_channels
-        coarse, fine = first.weight.split([channels, skip.shape[1]], 1)
-        corners = _convolved(x, _kernels_of_corners(coarse), None, dtype)
-        x = corners.new_empty((batch, 2 * height, 2 * width, made)).movedim(3, 1)
-        for corner, (down, right) in zip(corners.split(made, 1), _CORNERS, strict=True):
-            x[..., down::2, right::2] = corner[..., down : down + height, right : right + width]
+        coarse, fine = first.weight.split([x.shape[1], skip.shape[1]], 1)
+        x = F.conv_transpose2d(x.to(dtype), _kernels_of_pixels(coarse).to(dtype), stride=2, padding=1)
         return _run(others, _convolved(skip, fine, first.bias, dtype, "relu", onto=x))
 
 
-# Place of each of 2x2 pixels: down and right.
-_CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
+# A pixel contributes to 4 pixels of the finer level along each axis, to each with the sum of these of 3 weights.
+_ALONG = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+_SUMS = torch.kron(_ALONG, _ALONG)
 
 
-def _kernels_of_corners(weight: Tensor) -> Tensor:
-    """The kernels ``(4 O, C, 2, 2)`` with which each of 2x2 upsampled pixels is computed, from ``(O, C, 3, 3)``."""
-    for axis in (2, 3):
-        first, middle, last = weight.unbind(axis)
-        weight = torch.stack([first, middle + last, first + middle, last], axis)
-    kernels: Tensor = weight.unflatten(3, (2, 2)).unflatten(2, (2, 2)).movedim((2, 4), (0, 1))
-    return kernels.flatten(0, 2)
+def _kernels_of_pixels(weight: Tensor) -> Tensor:
+    """The kernels ``(C, O, 4, 4)`` with which pixels contribute to upsampled ones, from ``(O, C, 3, 3)``."""
+    # A matrix product takes a sixth of the time of sums of slices.
+    with _without_autocast("cpu"):
+        kernels = weight.flatten(2) @ _SUMS.to(weight.dtype).T
+    return kernels.unflatten(2, (4, 4)).transpose(0, 1)
 
 
 def _run(layers: Iterable[nn.Module], x: Tensor) -> Tensor:
