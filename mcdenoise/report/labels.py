@@ -5,11 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Array: TypeAlias = npt.NDArray[Any]
 
 # Distances between point and label in parts of the label's height, and the directions that are tried at each of them.
 _DISTANCES = (0.55, 0.9, 1.4, 2.0, 2.8, 3.8, 5.0, 6.5, 8.5)
 _DIRECTIONS = 16
 _SWEEPS = 6
+_BLOCK = 16  # candidates whose cost is computed at a time
 # Heights of a label that it had rather be away than cover something, or cross a leader line.
 _COVERED, _CROSSED = 100.0, 8.0
 
@@ -75,22 +82,27 @@ def place_labels(
     Returns:
         The box of each label.
     """
-    candidates = [_candidates(anchor, size, bounds) for anchor, size in zip(anchors, sizes, strict=True)]
-    placed: list[Box | None] = [None] * len(anchors)
+    points = np.array(anchors, dtype=float).reshape(-1, 2)
+    candidates, alone = [], []
+    for anchor, size, point in zip(anchors, sizes, points, strict=True):
+        boxes = _array(_candidates(anchor, size, bounds))
+        # The part of the cost that does not depend on the other labels; they can only add to it.
+        cost = _distances(point, boxes) + _covered(boxes, _array(obstacles))
+        by_cost = cost.argsort(kind="stable")
+        candidates.append(boxes[by_cost])
+        alone.append(cost[by_cost])
+    placed: dict[int, int] = {}
     # The most crowded points choose first: they have the fewest good places.
     order = sorted(range(len(anchors)), key=lambda index: (-_neighbours(anchors, sizes, index), anchors[index]))
     for _ in range(_SWEEPS):
-        before = list(placed)
+        before = dict(placed)
         for index in order:
-            others = [
-                (anchor, box)
-                for other, (anchor, box) in enumerate(zip(anchors, placed, strict=True))
-                if other != index and box is not None
-            ]
-            placed[index] = _cheapest(anchors[index], candidates[index], others, obstacles)
+            others = [other for other in placed if other != index]
+            boxes = np.array([candidates[other][placed[other]] for other in others]).reshape(-1, 4)
+            placed[index] = _cheapest(points[index], candidates[index], alone[index], points[others], boxes)
         if placed == before:
             break
-    return [box for box in placed if box is not None]
+    return [Box(*map(float, candidates[index][placed[index]])) for index in range(len(anchors))]
 
 
 def _neighbours(anchors: Sequence[tuple[float, float]], sizes: Sequence[tuple[float, float]], index: int) -> int:
@@ -123,49 +135,62 @@ def _moved_into(box: Box, bounds: Box) -> Box:
     return Box(box.left + across, box.bottom + up, box.right + across, box.top + up)
 
 
-def _cheapest(
-    anchor: tuple[float, float],
-    candidates: Sequence[Box],
-    others: Sequence[tuple[tuple[float, float], Box]],
-    obstacles: Sequence[Box],
-) -> Box:
-    best, least = candidates[0], math.inf
-    for box in candidates:
-        # Covered areas and crossed lines can only add to the cost of the distance.
-        if _distance(anchor, box) < least:
-            cost = _cost(anchor, box, others, obstacles)
-            if cost < least:
-                best, least = box, cost
+def _array(boxes: Sequence[Box]) -> Array:
+    """``(N, 4)``: left, bottom, right, top."""
+    return np.array([(box.left, box.bottom, box.right, box.top) for box in boxes], dtype=float).reshape(-1, 4)
+
+
+def _cheapest(anchor: Array, boxes: Array, alone: Array, other_anchors: Array, others: Array) -> int:
+    """Index of the candidate with the smallest cost; the candidates are sorted by the cost that each has alone."""
+    best, least = 0, math.inf
+    for first in range(0, len(boxes), _BLOCK):
+        if alone[first] >= least:
+            break
+        block = slice(first, first + _BLOCK)
+        cost = alone[block] + _cost(anchor, boxes[block], other_anchors, others)
+        if cost.min() < least:
+            best, least = first + int(cost.argmin()), float(cost.min())
     return best
 
 
-def _distance(anchor: tuple[float, float], box: Box) -> float:
+def _cost(anchor: Array, boxes: Array, other_anchors: Array, others: Array) -> Array:
+    """Cost ``(K,)`` of candidates ``(K, 4)`` beside other labels ``(N, 4)``: what they cover, and crossed leaders."""
+    own = _leaders(anchor, _nearest(anchor, boxes))
+    theirs = _leaders(other_anchors, _nearest(other_anchors, others))
+    crossed = _inside(own[:, None], others[None]).sum(1) + _inside(theirs[None], boxes[:, None]).sum(1)
+    return np.asarray(_covered(boxes, others) + _CROSSED * crossed)
+
+
+def _distances(anchor: Array, boxes: Array) -> Array:
     """Between a point and its label, in heights of the label."""
-    return math.dist(anchor, box.nearest(*anchor)) / (box.top - box.bottom)
+    across, up = (_nearest(anchor, boxes) - anchor).T
+    return np.asarray(np.hypot(across, up) / (boxes[:, 3] - boxes[:, 1]))
 
 
-def _cost(
-    anchor: tuple[float, float],
-    box: Box,
-    others: Sequence[tuple[tuple[float, float], Box]],
-    obstacles: Sequence[Box],
-) -> float:
-    area = (box.top - box.bottom) * (box.right - box.left)
-    end = box.nearest(*anchor)
-    cost = _distance(anchor, box)
-    cost += sum(_COVERED * bool(box.overlap(obstacle)) * (1 + box.overlap(obstacle) / area) for obstacle in obstacles)
-    for other_anchor, other in others:
-        covered = box.overlap(other)
-        cost += _COVERED * bool(covered) * (1 + covered / area)
-        cost += _CROSSED * (_crosses(anchor, end, other) + _crosses(other_anchor, other.nearest(*other_anchor), box))
-    return cost
+def _covered(boxes: Array, others: Array) -> Array:
+    """Cost of what boxes ``(K, 4)`` cover of others ``(N, 4)``, by its area relative to the box's."""
+    width, height = (
+        np.minimum(boxes[:, None, 2 + axis], others[:, 2 + axis]) - np.maximum(boxes[:, None, axis], others[:, axis])
+        for axis in (0, 1)
+    )
+    overlap = width.clip(0) * height.clip(0)
+    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    return np.asarray(_COVERED * ((overlap > 0) * (1 + overlap / area[:, None])).sum(1))
 
 
-def _crosses(start: tuple[float, float], end: tuple[float, float], box: Box) -> bool:
-    """Whether a segment runs through a box, tested at points along it."""
-    for step in range(1, 12):
-        x = start[0] + (end[0] - start[0]) * step / 12
-        y = start[1] + (end[1] - start[1]) * step / 12
-        if box.left < x < box.right and box.bottom < y < box.top:
-            return True
-    return False
+def _nearest(points: Array, boxes: Array) -> Array:
+    """The point of each box that is nearest to a point."""
+    return points.clip(boxes[:, :2], boxes[:, 2:])
+
+
+def _leaders(starts: Array, ends: Array) -> Array:
+    """Points ``(N, 11, 2)`` along each segment."""
+    starts, ends = starts[..., None, :], ends[..., None, :]
+    return starts + (ends - starts) * np.arange(1, 12)[:, None] / 12
+
+
+def _inside(points: Array, boxes: Array) -> Array:
+    """Whether any of several points ``(..., P, 2)`` is inside of a box ``(..., 4)``."""
+    low, high = boxes[..., None, :2], boxes[..., None, 2:]
+    along_both = np.asarray((low < points) & (points < high)).all(-1)
+    return np.asarray(np.asarray(along_both).any(-1))
