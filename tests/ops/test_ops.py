@@ -170,16 +170,15 @@ def test_inputs_are_left_alone(op: Op, case: Case) -> None:
         torch.testing.assert_close(after, before, rtol=0, atol=0, equal_nan=True)
 
 
-# Generating code takes five to thirty seconds for an op, and what there is to generate is alike within a family. One of
-# each is generated here, the others where slow tests run; all go through the compiler up to its generator.
+# Generating code takes five to thirty seconds for an op, a minute for one with many taps, and what there is to generate
+# is alike within a family. One of each is generated here, the others, and those with many taps, where slow tests run;
+# all go through the compiler up to its generator.
 GENERATED = {
-    "cross_bilateral_filter",  # taps with borders, weights of guides, a softmax over taps
     "laplacian_fusion",  # resolutions
     "demodulate",  # pixels alone
     "grid_splat",  # scattered sums
     "clamp_fireflies",  # sums over windows
     "motion_from_position",  # matrices
-    "accumulate",  # gathered taps, and a test for each
 }
 # Splatting is the derivative of kernel_conv, and accumulate reprojects; the many taps of atrous and of
 # temporal_gradient take minutes with their derivatives; and torch lowers no derivative of a QR decomposition.
