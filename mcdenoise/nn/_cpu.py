@@ -46,11 +46,13 @@ class UpConvBlock(ConvBlock):
             return super().forward(torch.cat([F.interpolate(x, scale_factor=2.0), skip.to(x.dtype)], 1))
         coarse, fine = first.weight.split([x.shape[1], skip.shape[1]], 1)
         x = F.conv_transpose2d(x.to(dtype), _kernels_of_pixels(coarse).to(dtype), stride=2, padding=1)
+        # The result of a single pixel has another layout, onto which oneDNN adds nothing in bfloat16.
+        x = x.contiguous(memory_format=torch.channels_last)
         return _run(others, _convolved(skip, fine, first.bias, dtype, "relu", onto=x))
 
 
 # A pixel contributes to 4 pixels of the finer level along each axis, to each with the sum of these of 3 weights.
-_ALONG = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+_ALONG = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 0.0], [1.0, 0.0, 0.0]], device="cpu")
 _SUMS = torch.kron(_ALONG, _ALONG)
 
 
@@ -104,8 +106,9 @@ def _convolved(
 def convolved_in_float32(x: Tensor, layer: nn.Conv2d) -> Tensor:
     """A convolution, with a border of one pixel, of features that may be bfloat16, with a float32 result.
 
-    oneDNN convolves bfloat16 with sums in float32, and rounds these at last. If no derivative is requested, what the
+    oneDNN convolves bfloat16 with sums in float32, and rounds these at last. If no derivative is requested, what this
     rounding has lost is computed by a second convolution, which begins with the negative of the first one's result.
+    Weights and bias are rounded to bfloat16, as those of all other layers.
     """
     dtype = x.dtype
     if dtype != torch.bfloat16 or not (is_cpu_inference(x) and _has_fused_convolution(dtype)):

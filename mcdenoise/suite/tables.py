@@ -92,12 +92,22 @@ def picked_lines(results: Results, lines: Iterable[Line], picks: Mapping[str, st
     Args:
         results: of the benchmark.
         lines: see :func:`suite_lines`.
-        picks: name of the model by row. If there are several methods of a model, such as precisions, the first counts.
+        picks: name of the model by row; other rows are skipped.
+
+    Returns:
+        A line for each row, of the model without settings and with the shipped weights. If there are several such
+        methods, one for each precision, the first counts. Empty if the model was not measured on one of the rows.
     """
-    methods = {name: [method.name for method in results.methods if method.model == name] for name in picks.values()}
+    lines = [line for line in lines if line.row in picks]
+    plain = [method for method in results.methods if not method.settings and not method.weights]
     by_place = {(line.row, line.model): line for line in lines}
-    found = ([by_place.get((row, method)) for method in methods[name]] for row, name in picks.items())
-    return [replace(line, model=PICKED) for row in found if (line := next(filter(None, row), None))]
+    picked = []
+    for row in dict.fromkeys(line.row for line in lines):
+        names = [method.name for method in plain if method.model == picks[row] and (row, method.name) in by_place]
+        if not names:
+            return []
+        picked.append(replace(by_place[row, names[0]], model=PICKED))
+    return picked
 
 
 def _lines(results: Results, rows: list[Row]) -> list[Line]:

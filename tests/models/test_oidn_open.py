@@ -154,14 +154,15 @@ def test_layers_written_out_in_float64(size: Any) -> None:
 
 
 @pytest.mark.parametrize("size", ["small", "base", "large"])
-@pytest.mark.parametrize(("height", "width"), [(16, 16), (48, 32), (30, 37)])
-def test_features_that_are_upsampled_implicitly_give_the_same(size: Any, height: int, width: int) -> None:
-    """Without derivatives a layer computes each of 2x2 pixels with a 2x2 kernel instead of upsampling."""
+@pytest.mark.parametrize("shape", [(1, 16, 16), (2, 16, 16), (2, 48, 32), (2, 30, 37)], ids=str)
+def test_features_that_are_upsampled_implicitly_give_the_same(size: Any, shape: tuple[int, int, int]) -> None:
+    """Without derivatives a layer convolves the features that are not upsampled yet."""
+    batch, height, width = shape
     torch.manual_seed(0)
     unet = OidnUNet(12, size, 7)
     for layer in unet.convolutions:
         torch.nn.init.normal_(layer.bias, std=0.1)  # type: ignore[arg-type]
-    x = torch.rand(2, 12, height, width)
+    x = torch.rand(batch, 12, height, width)
     expected = unet.double()(x.double()).detach()
     unet.float()
     for dtype in (torch.float32, torch.bfloat16):

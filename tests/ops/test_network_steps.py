@@ -165,6 +165,24 @@ def test_a_scale_of_radiance_keeps_what_is_no_number(backend: str, dtype: torch.
     assert by(backend, transfer.expand)(ends).flatten().tolist() == [0.0, 0.0, 0.0, torch.inf]
 
 
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_a_choice_without_a_share_has_no_weight_however_large_its_logit(backend: str) -> None:
+    predicted, images = draw(1, 2, 7, 5, 6, torch.float32).tanh(), draw(2, 2, 9, 5, 6, torch.float32).sigmoid()
+    valid, exposure, offsets = torch.zeros(2, 1, 5, 6), torch.ones(1, 1, 1, 1), (0.0, 0.0, 0.0, 0.0)
+    expected = by("torch", tuned.tuned_choice)(predicted, images, valid, exposure, offsets)
+    predicted[:, 4:6] += 300
+    found = by(backend, tuned.tuned_choice)(predicted, images, valid, exposure, offsets)
+    assert_same([found], [expected], TOLERANCE[torch.float32])
+
+
+def test_one_exposure_is_for_all_images_of_a_batch() -> None:
+    images = [draw(seed, 3, 3, 4, 6, torch.float32).exp() for seed in range(3)]
+    valid, exposure = torch.ones(3, 1, 4, 6), torch.full((1, 1, 1, 1), 0.7)
+    arguments = (*images, None, None, valid, exposure, 4)
+    found, expected = (by(backend, tuned.tuned_input)(*arguments) for backend in ("numba", "torch"))
+    assert_same(list(found), list(expected), TOLERANCE[torch.float32])
+
+
 def _half(size: tuple[int, int, int]) -> tuple[int, int, int, int]:
     return size[0], 3, (size[1] + 1) // 2, (size[2] + 1) // 2
 

@@ -1,4 +1,4 @@
-"""The weight of the noisy color on a CPU: two passes over the pixels, where torch takes some eighty."""
+"""The weight of the noisy color on a CPU: three passes over the pixels, where torch takes some eighty."""
 
 from __future__ import annotations
 

@@ -30,21 +30,24 @@ def tuned_input(
     # A single number that is read for every pixel.
     albedo = color.new_ones(1, 1, 1, 1).expand_as(color) if albedo is None else albedo
     normal = color.new_zeros(1, 1, 1, 1).expand_as(color) if normal is None else normal
-    images = (color, before, light, albedo, normal, valid, exposure)
-    if dtype == torch.float16 or not _are_alike(*images):
+    images = (color, before, light, albedo, normal, valid)
+    if dtype == torch.float16 or not _are_alike(*images, exposure):
         return NotImplemented
-    return _tuned_input(*images, multiple, dtype)
+    return _tuned_input(*images, exposure.expand(len(color), 1, 1, 1), multiple, dtype)
 
 
 def tuned_choice(predicted: Tensor, images: Tensor, valid: Tensor, exposure: Tensor, offsets: Sequence[float]) -> Any:
     """See :func:`mcdenoise.ops._steps.tuned.tuned_choice`."""
-    alike = _are_alike(predicted, images, valid, exposure)
-    return _tuned_choice(predicted, images, valid, exposure, list(offsets)) if alike else NotImplemented
+    if not _are_alike(predicted, images, valid, exposure):
+        return NotImplemented
+    return _tuned_choice(predicted, images, valid, exposure.expand(len(images), 1, 1, 1), list(offsets))
 
 
 def _are_alike(*images: Tensor) -> bool:
-    dtype = images[0].dtype
-    return dtype in (torch.float32, torch.float64) and all(image.dtype == dtype for image in images)
+    """Whether all have one dtype that is supported, and all but the last, the exposure, the same batch and size."""
+    first, dtype = images[0], images[0].dtype
+    same_size = all((len(image), *image.shape[2:]) == (len(first), *first.shape[2:]) for image in images[:-1])
+    return dtype in (torch.float32, torch.float64) and all(image.dtype == dtype for image in images) and same_size
 
 
 @custom_op(
@@ -178,6 +181,7 @@ def _choice_rows(
     out: Any, predicted: Any, images: Any, valid: Any, exposure: Any, offsets: Any, b: int, first: int, last: int
 ) -> None:
     number = out.dtype.type
+    zero = number(0)
     width = out.shape[3]
     factor = exposure[0][b * exposure[1][0]]
     weights, choices = np.empty((5, width), out.dtype), np.empty((4, width), out.dtype)
@@ -188,8 +192,11 @@ def _choice_rows(
         own, before, light, noisy, share = weights[0], weights[1], weights[2], weights[3], weights[4]
         for x in range(width):
             a, c, d, e = own[x] + offsets[0], before[x] + offsets[1], light[x] + offsets[2], noisy[x] + offsets[3]
-            most = max(max(a, c), max(d, e))
-            a, c, d, e = exp(a - most), share[x] * exp(c - most), share[x] * exp(d - most), exp(e - most)
+            most = max(a, e)
+            if share[x] > zero:
+                most = max(most, max(c, d))
+            a, e = exp(a - most), exp(e - most)
+            c, d = share[x] * exp(min(c - most, zero)), share[x] * exp(min(d - most, zero))
             scale = number(1) / (((a + c) + d) + e)
             own[x], before[x], light[x], noisy[x] = a * scale, c * scale, d * scale, e * scale
         for c in range(3):
@@ -199,7 +206,7 @@ def _choice_rows(
             read_row(choices[2], images, b, 6 + c, y, 0)
             read_row(choices[3], images, b, c, y, 0)
             for x in range(width):
-                mixed = own[x] * max(choices[0, x], number(0)) + before[x] * choices[1, x]
+                mixed = own[x] * max(choices[0, x], zero) + before[x] * choices[1, x]
                 row[x] = (mixed + light[x] * choices[2, x]) + noisy[x] * choices[3, x]
             expand_values(row)
             for x in range(width):

@@ -67,8 +67,11 @@ def tuned_choice(
     """
     own, logits = predicted.split([3, 4], 1)
     noisy, before, light = images.split(3, 1)
-    weights = torch.softmax(logits + numbers_like(logits, offsets).reshape(1, -1, 1, 1), 1)
-    weights = weights * torch.cat([torch.ones_like(valid), valid, valid, torch.ones_like(valid)], 1)
+    logits = logits + numbers_like(logits, offsets).reshape(1, -1, 1, 1)
+    share = torch.cat([torch.ones_like(valid), valid, valid, torch.ones_like(valid)], 1)
+    # The largest logit of a choice that counts: beside a larger one all weights might be 0.
+    most = torch.where(share > 0, logits, -torch.inf).amax(1, keepdim=True).detach()
+    weights = share * (logits - most).clamp_max(0).exp()
     choices = torch.stack([own.clamp_min(0), before, light, noisy], 1)
     mixed = (weights[:, :, None] * choices).sum(1) / weights.sum(1, keepdim=True)
     return expand(mixed) / exposure
