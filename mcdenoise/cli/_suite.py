@@ -82,7 +82,8 @@ def score_suite(
         )
     lines, curves = suite_lines(results, found), error_lines(results, found)
     ours = dict.fromkeys(line.model for line in lines)
-    lines += picked_lines(results, lines, {shot.name: default_model(shot)[0] for shot in shots})
+    names = {line.row for line in lines}
+    lines += picked_lines(results, lines, {shot.name: default_model(shot)[0] for shot in shots if shot.name in names})
     text = markdown(lines, curves, *error_against_time(results, found))
     write_text(out / "suite.md", text)
     content = {"lines": [asdict(line) for line in lines], "curves": [asdict(line) for line in curves]}

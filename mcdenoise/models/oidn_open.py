@@ -24,7 +24,7 @@ from mcdenoise.models._tza import Archive, archives_in, read_tza
 from mcdenoise.models.oidn import Auxiliary, Oidn, Quality, guides_of, library_of_oidn
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
-from mcdenoise.ops._steps.transfer import compress, expand
+from mcdenoise.ops._steps.transfer import compress, expand, seen_by_oidn
 
 _FEATURES = ("albedo", "normal")
 _IMAGES = ("color", *_FEATURES)
@@ -68,23 +68,6 @@ class OidnOpen(nn.Module):
             seen = seen_by_oidn(compress(frame.color * exposure), **features)
             image = expand(self.unet(seen).to(exposure.dtype)) / exposure
         return Output(image.to(frame.color.dtype)), None
-
-
-def seen_by_oidn(color: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None) -> Tensor:
-    """The network's input.
-
-    Args:
-        color: ``(B, 3, H, W)`` radiance on the scale of :func:`compress`.
-        albedo: ``(B, 3, H, W)`` in [0, 1].
-        normal: ``(B, 3, H, W)`` in [-1, 1], in world or camera space.
-
-    Returns:
-        ``(B, 9, H, W)``, in [0, 1]; without a feature 3 channels fewer.
-    """
-    images = [color]
-    images += [] if albedo is None else [albedo.clamp(0, 1)]
-    images += [] if normal is None else [normal.clamp(-1, 1) * 0.5 + 0.5]
-    return torch.cat(images, 1)
 
 
 def load_archive(unet: OidnUNet, archive: Archive, where: str) -> None:

@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.ops._autograd import Function
+from mcdenoise.ops._window import computing_dtype
 
 
 def layout_of(x: Tensor) -> torch.memory_format:
@@ -123,11 +124,6 @@ def _without_autocast(device_type: str) -> AbstractContextManager[object]:
     """Compute in the precision of the operands; devices without values have no autocast to disable."""
     known = torch.amp.is_autocast_available(device_type)
     return torch.autocast(device_type, enabled=False) if known else nullcontext()
-
-
-def computing_dtype(x: Tensor) -> torch.dtype:
-    """The dtype in which a convolution of a tensor is computed."""
-    return torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
 
 
 @functools.cache

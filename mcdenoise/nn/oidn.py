@@ -12,10 +12,10 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.nn._cpu import ConvBlock, ReLU, UpConvBlock, computing_dtype, convolved_in_float32, max_pool
+from mcdenoise.nn._cpu import ConvBlock, ReLU, UpConvBlock, convolved_in_float32, max_pool
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._steps.network import network_input
-from mcdenoise.ops._window import corner, up_to_multiple
+from mcdenoise.ops._window import computing_dtype, corner, up_to_multiple
 
 Size: TypeAlias = Literal["small", "base", "large"]
 

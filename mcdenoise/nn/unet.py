@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from mcdenoise.nn._cpu import ConvBlock, ReLU, Upsampling, is_cpu_inference, layout_of, max_pool
 from mcdenoise.nn.int8 import Int8UNet, measure, wants_integers
-from mcdenoise.ops._window import corner
+from mcdenoise.ops._window import computing_dtype, corner
 
 # Peak numbers per pixel, measured: 4.5 widths inside the U-Net, and 54 for the surrounding images and features, which
 # stay float32.
@@ -97,7 +97,7 @@ class UNet(nn.Module):
         # Sizes are rounded up to multiples, so that halves are simple expressions in a graph for any image size.
         x = self._whole(x)
         if self._integers is not None and wants_integers() and is_cpu_inference(x):
-            dtype = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else x.dtype
+            dtype = computing_dtype(x)
             features = self._integers(x, self._beside(x, coarse), self.level(self.scales - 1) + 1, dtype)
         else:
             features = self._features(x, coarse)

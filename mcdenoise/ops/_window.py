@@ -99,3 +99,12 @@ def inside(height: int, width: int, kernel_size: int, device: torch.device) -> T
 def accumulator_dtype(dtype: torch.dtype) -> torch.dtype:
     """The dtype in which sums over taps are kept: half precision is summed in float32."""
     return torch.float32 if dtype in (torch.float16, torch.bfloat16) else dtype
+
+
+def computing_dtype(x: Tensor) -> torch.dtype:
+    """The dtype in which a convolution of a tensor is computed: that of autocast where it is enabled."""
+    kind = x.device.type
+    # Devices without values have no autocast to ask for.
+    if torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind):
+        return torch.get_autocast_dtype(kind)
+    return x.dtype

@@ -28,20 +28,15 @@ from mcdenoise.ops._numba._runtime import (
 )
 from mcdenoise.ops._numba.fusion import downsample
 from mcdenoise.ops._operator import custom_op
-from mcdenoise.ops._window import accumulator_dtype
+from mcdenoise.ops._window import accumulator_dtype, computing_dtype
 
 # Pixels whose channels are gathered at a time: they stay in the second-level cache.
 CHUNK = 1024
 
 
-def precision(image: Tensor) -> torch.dtype:
-    """The dtype of a convolution's input."""
-    return torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else image.dtype
-
-
 def network_input(image: Tensor, features: Tensor, logarithms: bool) -> Any:
     """See :func:`mcdenoise.ops._steps.network.network_input`."""
-    dtype = precision(image)
+    dtype = computing_dtype(image)
     if torch.float16 in (image.dtype, features.dtype, dtype):
         return NotImplemented
     return _network_input(image, features, logarithms, dtype)
@@ -104,7 +99,7 @@ def buffers_input(
     image_factor: Tensor | None,
 ) -> Any:
     """See :func:`mcdenoise.ops._steps.network.buffers_input`."""
-    dtype = precision(image)
+    dtype = computing_dtype(image)
     if torch.float16 in (image.dtype, albedo.dtype, dtype):
         return NotImplemented
     buffers = (albedo, normal, depth, current, length, exposure, *scale)

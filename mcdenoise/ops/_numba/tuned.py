@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops._numba._runtime import compiled, exp, read_row, share_rows, source
-from mcdenoise.ops._numba.network import CHUNK, interleave, precision, round_row
+from mcdenoise.ops._numba.network import CHUNK, interleave, round_row
 from mcdenoise.ops._numba.transfer import compress_values, expand_values
 from mcdenoise.ops._operator import custom_op
+from mcdenoise.ops._window import computing_dtype
 
 
 def tuned_input(
@@ -26,7 +27,7 @@ def tuned_input(
     multiple: int,
 ) -> Any:
     """See :func:`mcdenoise.ops._steps.tuned.tuned_input`."""
-    dtype = precision(color)
+    dtype = computing_dtype(color)
     # A single number that is read for every pixel.
     albedo = color.new_ones(1, 1, 1, 1).expand_as(color) if albedo is None else albedo
     normal = color.new_zeros(1, 1, 1, 1).expand_as(color) if normal is None else normal
@@ -56,41 +57,23 @@ def _are_alike(*images: Tensor) -> bool:
     schema="(Tensor color, Tensor before, Tensor light, Tensor albedo, Tensor normal, Tensor valid, Tensor exposure, "
     "int multiple, ScalarType dtype) -> (Tensor, Tensor)",
 )
-def _tuned_input(
-    color: Tensor,
-    before: Tensor,
-    light: Tensor,
-    albedo: Tensor,
-    normal: Tensor,
-    valid: Tensor,
-    exposure: Tensor,
-    multiple: int,
-    dtype: torch.dtype,
-) -> tuple[Tensor, Tensor]:
-    seen, images = _empty_input(color, before, light, albedo, normal, valid, exposure, multiple, dtype)
+def _tuned_input(color: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
+    seen, images = _empty_input(color, *others)
     height, width = color.shape[2:]
     seen[..., height:, :], seen[..., width:] = 0, 0
     if images.numel():
-        read = tuple(source(image) for image in (color, before, light, albedo, normal, valid, exposure))
+        *buffers, _, _ = others
+        read = tuple(source(image) for image in (color, *buffers))
         target, scaled = source(seen), images.numpy()
         share_rows(color, lambda *rows: _input_rows(target, scaled, *read, *rows))
     return seen, images
 
 
 @_tuned_input.register_fake
-def _empty_input(
-    color: Tensor,
-    before: Tensor,
-    light: Tensor,
-    albedo: Tensor,
-    normal: Tensor,
-    valid: Tensor,
-    exposure: Tensor,
-    multiple: int,
-    dtype: torch.dtype,
-) -> tuple[Tensor, Tensor]:
+def _empty_input(color: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
+    *buffers, _, multiple, dtype = others
     batch, _, height, width = color.shape
-    channels = sum(image.shape[1] for image in (color, before, light, albedo, normal, valid))
+    channels = sum(image.shape[1] for image in (color, *buffers))
     rows, columns = (-(-side // multiple) * multiple for side in (height, width))
     seen = torch.empty(
         (batch, channels, rows, columns), dtype=dtype, device=color.device, memory_format=torch.channels_last
@@ -170,9 +153,7 @@ def _tuned_choice(
 
 
 @_tuned_choice.register_fake
-def _empty_choice(
-    predicted: Tensor, images: Tensor, valid: Tensor, exposure: Tensor, offsets: Sequence[float]
-) -> Tensor:
+def _empty_choice(_: Tensor, images: Tensor, *others: Any) -> Tensor:
     return images.new_empty(images.shape[0], 3, *images.shape[2:])
 
 

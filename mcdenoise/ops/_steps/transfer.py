@@ -1,4 +1,4 @@
-"""Open Image Denoise's transfer function, from radiance to the scale on which its networks work."""
+"""Open Image Denoise's transfer function, from radiance to the scale on which its networks work, and their input."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from mcdenoise.ops._constants import MAX_RADIANCE, PU_BRIGHT, PU_DARK, PU_JOINTS, PU_MIDDLE, PU_WHITE
 from mcdenoise.ops._op import op
 
-__all__ = ["MAX_RADIANCE", "compress", "expand"]
+__all__ = ["MAX_RADIANCE", "compress", "expand", "seen_by_oidn"]
 
 
 @op("numba")
@@ -46,3 +46,20 @@ def expand(compressed: Tensor) -> Tensor:
     power = ((x.clamp_min(x0) - d) / b).pow(1 / c)
     bright = torch.exp((x.clamp_min(x1) - g) / e) - f
     return torch.where(x <= x0, x / PU_DARK, torch.where(x <= x1, power, bright))
+
+
+def seen_by_oidn(color: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None) -> Tensor:
+    """The network's input.
+
+    Args:
+        color: ``(B, 3, H, W)`` radiance on the scale of :func:`compress`.
+        albedo: ``(B, 3, H, W)`` in [0, 1].
+        normal: ``(B, 3, H, W)`` in [-1, 1], in world or camera space.
+
+    Returns:
+        ``(B, 9, H, W)``, in [0, 1]; without a feature 3 channels fewer.
+    """
+    images = [color]
+    images += [] if albedo is None else [albedo.clamp(0, 1)]
+    images += [] if normal is None else [normal.clamp(-1, 1) * 0.5 + 0.5]
+    return torch.cat(images, 1)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._op import op
-from mcdenoise.ops._steps.transfer import compress, expand
+from mcdenoise.ops._steps.transfer import compress, expand, seen_by_oidn
 from mcdenoise.ops._window import up_to_multiple
 
 
@@ -42,10 +42,10 @@ def tuned_input(
         convolution takes it: channels-last, in the precision of autocast.
     """
     images = compress(torch.cat([color, before, light], 1) * exposure)
-    albedo = torch.ones_like(color) if albedo is None else albedo.clamp(0, 1)
-    normal = torch.zeros_like(color) if normal is None else normal.clamp(-1, 1)
+    albedo = torch.ones_like(color) if albedo is None else albedo
+    normal = torch.zeros_like(color) if normal is None else normal
     noisy, previous = images.split([3, 6], 1)
-    seen = torch.cat([noisy, albedo, normal * 0.5 + 0.5, previous, valid], 1)
+    seen = torch.cat([seen_by_oidn(noisy, albedo, normal), previous, valid], 1)
     return up_to_multiple(seen, multiple), images
 
 

@@ -24,7 +24,7 @@ from mcdenoise.ops._triton._images import (
     tile,
     write_plane,
 )
-from mcdenoise.ops._window import accumulator_dtype
+from mcdenoise.ops._window import accumulator_dtype, computing_dtype
 
 _SHORTEST, _FARTHEST = tl.constexpr(SHORTEST), tl.constexpr(FARTHEST)
 _BLOCK, _DARK = tl.constexpr(BLOCK), tl.constexpr(DARK)
@@ -45,8 +45,7 @@ def buffers_input(
     image_factor: Tensor | None,
 ) -> Tensor:
     """See :func:`mcdenoise.ops._steps.network.buffers_input`."""
-    kind = image.device.type
-    dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else image.dtype
+    dtype = computing_dtype(image)
     buffers = (albedo, normal, depth, current, length, exposure, *scale)
     result: Tensor = _buffers_input(image, *buffers, image_factor, logarithms, dtype)
     return result
