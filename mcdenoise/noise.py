@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
-import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
+
+from mcdenoise.ops._steps.noise import second_differences
 
 
 class _Rule(NamedTuple):
@@ -64,16 +67,16 @@ def _is_spread(brightness: Tensor, features: Tensor | None, rule: _Rule) -> bool
         return None
     ratios = []
     for x, surface in ((brightness, features), (brightness.mT, None if features is None else features.mT)):
-        two, one, here, other, far = (x[..., i : x.shape[-1] - 4 + i] for i in range(5))
-        mean = (two + one + 2 * here + other + far).clamp_min(1e-9)
-        near, wide = (one - 2 * here + other).abs() / mean, (two - 2 * here + far).abs() / mean
-        if surface is not None:
-            steps = (surface[..., 1:] - surface[..., :-1]).abs().amax(1)
-            even = F.max_pool2d(steps, (1, 4), 1) < _STEP
-            near, wide = near[even], wide[even]
+        near, wide = (each.cpu().numpy() for each in second_differences(x, surface, _STEP))
         # Pixels without noise are correlated by the image content.
         noisy = near + wide > rule.noise
-        if int(noisy.sum()) < rule.least or float(wide.median()) < rule.typical:
+        if int(noisy.sum()) < rule.least or _median(wide) < rule.typical:
             return None
-        ratios.append(float(near[noisy].median() / wide[noisy].median()))
+        ratios.append(_median(near[noisy]) / _median(wide[noisy]))
     return max(ratios) < rule.spread
+
+
+def _median(values: NDArray[Any]) -> float:
+    """The lower of two middle elements; numpy finds it in a fifth of torch's time."""
+    middle = (values.size - 1) // 2
+    return float(np.partition(values, middle)[middle])

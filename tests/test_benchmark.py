@@ -875,7 +875,7 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
     results = benchmark_ops(size=(33, 20), rounds=3, out=out, ops=OPS)
     limits = {"float32": 2e-6, "bfloat16": 2e-2, "float16": 3e-3}
     # Their fast backends have no derivatives.
-    forward = ("downsample", "importance_filter", "motion_from_position", "reproject")
+    forward = ("downsample", "importance_filter", "motion_from_position", "reproject", "resample")
     by_name = {(cost.op, cost.dtype): cost for cost in results.costs if cost.backend == "torch"}
     assert list(by_name) == [(op.name, dtype) for op in OPS for dtype in limits]
     # Another backend may not run here.

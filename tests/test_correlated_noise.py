@@ -7,7 +7,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from mcdenoise import ops
 from mcdenoise.noise import noise_is_spread
+from mcdenoise.ops._steps.noise import second_differences
 
 HEIGHT, WIDTH = 192, 320
 ROWS, COLUMNS = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
@@ -77,3 +79,22 @@ def test_an_image_without_noise_has_no_correlated_noise() -> None:
     assert not noise_is_spread(smooth, None)
     assert not noise_is_spread(torch.zeros(1, 3, HEIGHT, WIDTH), None)
     assert not noise_is_spread(torch.ones(1, 3, 3, 4), None)
+
+
+@pytest.mark.parametrize("channels", [0, 4])
+@pytest.mark.parametrize("turned", [False, True])
+def test_compiled_differences_are_those_of_the_reference(channels: int, turned: bool) -> None:
+    generator = torch.Generator().manual_seed(3)
+    image = torch.rand(2, 19, 23, generator=generator, dtype=torch.float64)
+    # About one run of five pixels in three has no step of 0.4 or more.
+    features = torch.rand(2, channels, 19, 23, generator=generator, dtype=torch.float64).cumsum(-1) * 0.45
+    if turned:
+        image, features = image.mT, features.mT
+    found = []
+    for backend in ("torch", "numba"):
+        with ops.use(backend):
+            found.append(second_differences(image, features if channels else None, 0.4))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-14, atol=1e-15)
+    most = 2 * image.shape[1] * (image.shape[2] - 4)
+    assert len(found[0][0]) == most if channels == 0 else 0 < len(found[0][0]) < most

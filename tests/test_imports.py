@@ -46,7 +46,7 @@ ALLOWED: dict[str, set[str]] = {
     "commit": set(),
     "ops": set(),
     "frame": {"errors", "ops"},
-    "noise": set(),
+    "noise": {"ops"},
     "sampling": {"frame", "ops"},
     "metrics": SIGNAL,
     "nn": SIGNAL,

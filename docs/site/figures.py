@@ -261,6 +261,14 @@ def _reproject() -> Panels:
     return {"frame before": scene().clean, "fetched": value, "weight": weight.expand(-1, 3, -1, -1)}
 
 
+def _resample() -> Panels:
+    motion = torch.full((1, 2, HEIGHT, WIDTH), 0.5)
+    bilinear = bicubic = scene().clean
+    for _ in range(8):
+        bilinear, bicubic = ops.reproject(bilinear, motion)[0], ops.resample(bicubic, motion)
+    return {"eight frames before": scene().clean, "by bilinear interpolation": bilinear, "by this": bicubic}
+
+
 def _regression() -> Panels:
     shown = scene()
     features = torch.cat([torch.ones_like(shown.depth), shown.normal, shown.depth / 4, shown.albedo], 1)
@@ -308,6 +316,7 @@ FIGURES = {
     "reproject": Figure(
         "The frame before, fetched from 8.5 pixels right and 4 down; the weight says what was found.", _reproject
     ),
+    "resample": Figure("A frame, fetched from half a pixel right and down in each of eight frames.", _resample),
     "accumulate": Figure("A still camera: the average of 1, 4 and 16 frames.", _accumulate),
 }
 

@@ -39,6 +39,7 @@ from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
 from mcdenoise.ops.partition import learned_upsample, pyramid_partition
 from mcdenoise.ops.regression import BlockRegression, block_regression
+from mcdenoise.ops.resampling import resample
 from mcdenoise.ops.softmax_splat import softmax_splat
 from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
 
@@ -1026,6 +1027,43 @@ def _history_cases(accumulating: bool) -> tuple[Case, ...]:
     )
 
 
+def _resampling_cases() -> tuple[Case, ...]:
+    def case(
+        name: str,
+        kind: Kind,
+        size: tuple[int, int, int, int],
+        change: Callable[[Tensor], object] | None = None,
+        *,
+        draw: Callable[..., Tensor] = _uniform,
+        smooth: tuple[str, ...] = ("previous", "motion"),
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            motion = _motion(g, size[0], *size[2:])
+            if change is not None:
+                change(motion)
+            return {"previous": draw(g, *size), "motion": motion}
+
+        return Case(name, kind, tensors, smooth)
+
+    def far_out(motion: Tensor) -> None:
+        motion[..., 0], motion[..., 1] = 1e4 + 0.5, -1e4 - 0.5
+
+    def unknown(motion: Tensor) -> None:
+        motion[:, 0, :, 0], motion[:, 1, :, 1], motion[..., 2] = torch.inf, torch.nan, -torch.inf
+
+    return (
+        case("5x7", "ordinary", (1, 1, 5, 7)),
+        case("batch of 2, RGB", "ordinary", (2, 3, 4, 5)),
+        case("one row, 5 channels", "ordinary", (1, 5, 1, 5)),
+        case("one pixel", "ordinary", (1, 3, 1, 1)),
+        # At a whole pixel the value is at its limit, where the derivatives jump.
+        case("still", "ordinary", (1, 3, 2, 3), lambda motion: motion.zero_(), smooth=()),
+        case("fireflies", "stiff", (1, 3, 4, 5), draw=_radiance),
+        case("out of the image", "extreme", (1, 3, 2, 3), far_out),
+        case("motion unknown", "extreme", (1, 1, 2, 4), unknown),
+    )
+
+
 def _softmax(settings: dict[str, Any]) -> bool:
     return bool(settings["normalize"] == "softmax")
 
@@ -1205,6 +1243,13 @@ OPS: tuple[Op, ...] = (
         _history_cases(accumulating=False) + extreme.histories(accumulating=False),
         images=("previous",),
         rounding=extreme.history_rounding,
+    ),
+    Op(
+        resample,
+        reference.resample,
+        _resampling_cases() + extreme.resamplings(),
+        images=("previous",),
+        rounding=extreme.resampling_rounding,
     ),
     Op(
         accumulate,

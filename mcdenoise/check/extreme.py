@@ -1049,6 +1049,39 @@ def histories(accumulating: bool) -> tuple[Case, ...]:
     )
 
 
+def resamplings() -> tuple[Case, ...]:
+    """Cases of ``resample``."""
+
+    def case(
+        name: str, size: tuple[int, int, int, int] = (1, 3, 3, 4), draw: Draw = radiance, motion: float | None = None
+    ) -> Case:
+        def tensors(g: Generator) -> Inputs:
+            batch, _, height, width = size
+            moved = uniform(g, batch, 2, height, width, low=-0.9, high=0.9)
+            if motion is not None:
+                moved[..., 1] = motion
+            return {"previous": draw(g, *size), "motion": moved}
+
+        return Case(name, "extreme", tensors, ())
+
+    return (
+        *(case(*tried) for tried in _tried()),
+        *(case(f"motion {value:g}", motion=value) for value in (1e10, 1e30, torch.inf, -torch.inf, torch.nan, 1e-30)),
+    )
+
+
+def resampling_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
+    """``q = p + motion`` is rounded as a number up to the image's size, and terms of both signs are added."""
+    motion, previous = inputs["motion"], inputs["previous"]
+    assert isinstance(motion, Tensor)
+    assert isinstance(previous, Tensor)
+    magnitude = motion.abs() + float(max(motion.shape[-2:]))
+    # The magnitudes of the weights' derivatives add up to at most 3 along one axis, and those of the weights to 1.4
+    # along the other.
+    terms = 3 * 1.4 * previous.abs().amax((2, 3), keepdim=True).sum(1, keepdim=True) if previous.numel() else 0.0
+    return Rounding({"motion": magnitude}, gradients={"motion": torch.zeros_like(motion) + terms})
+
+
 def history_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
     """``q = p + motion`` is rounded as a number up to the image's size, and with it the bilinear weights."""
     motion, previous = inputs["motion"], inputs["previous"]

@@ -696,6 +696,35 @@ def reproject(
     return _tensor(value, previous.shape), _tensor(kept_weight, (batch, 1, height, width))
 
 
+def resample(previous: Tensor, motion: Tensor) -> Tensor:
+    """``sum_k k(x_k - q_x) k(y_k - q_y) previous[q_k]``, limited to the range of the four nearest pixels."""
+    _, channels, height, width = previous.shape
+    source, moved, out = previous.tolist(), motion.tolist(), _zeros(previous.shape)
+    for b, y, x in itertools.product(range(len(source)), range(height), range(width)):
+        qx, qy = x + moved[b][0][y][x], y + moved[b][1][y][x]
+        if not (math.isfinite(qx) and math.isfinite(qy)):
+            continue
+        qx, qy = min(max(qx, -1.0), float(width)), min(max(qy, -1.0), float(height))
+        rows, columns = (range(math.floor(q) - 1, math.floor(q) + 3) for q in (qy, qx))
+        for c in range(channels):
+            taps = {
+                (row, column): source[b][c][min(max(row, 0), height - 1)][min(max(column, 0), width - 1)]
+                for row, column in itertools.product(rows, columns)
+            }
+            value = sum(_keys(row - qy) * _keys(column - qx) * tap for (row, column), tap in taps.items())
+            nearest = [tap for (row, column), tap in taps.items() if row in rows[1:3] and column in columns[1:3]]
+            out[b][c][y][x] = min(max(value, min(nearest)), max(nearest))
+    return _tensor(out, previous.shape)
+
+
+def _keys(distance: float) -> float:
+    """Keys' kernel with a = -3/4."""
+    a, d = -0.75, abs(distance)
+    if d <= 1:
+        return (a + 2) * d**3 - (a + 3) * d**2 + 1
+    return a * d**3 - 5 * a * d**2 + 8 * a * d - 4 * a if d < 2 else 0.0
+
+
 def accumulate(
     color: Tensor,
     previous: Tensor,

@@ -13,11 +13,12 @@ from mcdenoise.models._journal import journal, note, tell_history, timed
 from mcdenoise.models._state import own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import comparable, has_motion, motion_unless_still, surface_before
-from mcdenoise.ops import Surface, demodulate, remodulate, reproject
+from mcdenoise.ops import Surface, demodulate, remodulate, reproject, resample
 
 # Keys in ``frame.extra``: the reprojected previous image, and its weight, the fraction that shows the same surface.
 PREVIOUS, PREVIOUS_WEIGHT = "previous", "previous_weight"
 PREVIOUS_LIGHT = "previous_light"  # the previous image with the albedo of this frame
+_WHOLE = 0.999  # smallest weight of all four taps, which is 1 up to rounding
 
 
 class Before(NamedTuple):
@@ -42,7 +43,8 @@ class Recurrent(Wrapper):
 
     The method finds it in ``frame.extra``, ``(B, 3, H, W)`` each, 0 where no tap shows the same surface:
 
-    - ``previous``: the image. Every reprojection blurs it a little more.
+    - ``previous``: the image. Every reprojection blurs it a little more, though where all four taps show the same
+      surface they are resampled without bilinear interpolation (:func:`mcdenoise.ops.resample`).
     - ``previous_light``: the demodulated image multiplied by the albedo of this frame. Textures stay sharp; but an
       albedo of few samples per pixel adds its own noise.
 
@@ -77,7 +79,7 @@ class Recurrent(Wrapper):
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.with_depth()
         with timed("accumulate", frame.color.device):
-            image, weight = from_before(frame, state, channels=6)
+            image, weight = from_before(frame, state, channels=6, sharp=True)
         image, light = image.split(3, 1)
         albedo = frame.buffer(self.albedo)
         light = light if albedo is None else remodulate(light, albedo)
@@ -98,7 +100,9 @@ def to_be_kept(frame: Frame, image: Tensor) -> Before | None:
     return Before(image, torch.ones_like(image[:, :1, :1, :1]), surface, frame.view_projection)
 
 
-def from_before(frame: Frame, state: State, channels: int, keeper: str = "recurrent") -> tuple[Tensor, Tensor]:
+def from_before(
+    frame: Frame, state: State, channels: int, keeper: str = "recurrent", *, sharp: bool = False
+) -> tuple[Tensor, Tensor]:
     """Reproject the previous image to this frame.
 
     Args:
@@ -106,6 +110,7 @@ def from_before(frame: Frame, state: State, channels: int, keeper: str = "recurr
         state: result of :func:`to_be_kept`, or ``None``.
         channels: number of channels of the image.
         keeper: name of the method for messages.
+        sharp: whether pixels of which all four taps show the same surface are resampled by bicubic interpolation.
 
     Returns:
         ``(B, channels, H, W)`` image, and ``(B, 1, H, W)`` in [0, 1] the fraction that shows the same surface; both are
@@ -127,6 +132,8 @@ def from_before(frame: Frame, state: State, channels: int, keeper: str = "recurr
         return nothing
     motion = motion_unless_still(frame, before.view_projection)
     found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
+    if sharp and motion is not None:
+        found = torch.where(weight > _WHOLE, resample(before.image, motion), found)
     weight = weight * before.weight
     _report("", None)
     tell_history(weight.mean())

@@ -18,6 +18,7 @@ from mcdenoise.ops.lag import HistoryLag, history_lag
 from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
 from mcdenoise.ops.partition import learned_upsample, pyramid_partition
 from mcdenoise.ops.regression import BlockRegression, block_regression
+from mcdenoise.ops.resampling import resample
 from mcdenoise.ops.softmax_splat import softmax_splat
 from mcdenoise.ops.temporal import Accumulate, accumulate, motion_from_position, reproject
 
@@ -65,6 +66,7 @@ __all__ = [
     "pyramid_partition",
     "remodulate",
     "reproject",
+    "resample",
     "softmax_splat",
     "temporal_gradient",
     "upsample",

@@ -19,6 +19,12 @@ NORMAL_LIMIT_SQUARED = 0.5
 # Taps of a pixel's own label are enough from this weight on; a tap in the pixel itself, which stands still, weighs 1.
 LABEL_WEIGHT = 1e-3
 
+# Parameter of Keys' bicubic kernel, its slope at a distance of 1; that of torch. Catmull-Rom splines have -0.5.
+CUBIC = -0.75
+
+# Smallest sum of pixels that differences are relative to.
+LEAST_SUM = 1e-9
+
 # Smallest lag as a fraction of the local mean: a difference that no eye sees is no lag, however little noise there is.
 SMALLEST_LAG = 1e-3
 # For a second, shorter history: the smallest weight of a frame, so that four frames have half the noise of one; and how

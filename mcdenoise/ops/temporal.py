@@ -70,7 +70,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
     in_front = hit & (w > 0)
     scale = numbers_like(position, [width, height], dtype).reshape(1, 2, 1, 1)
     previous = (clip[:, :2] / torch.where(in_front, w, 1) + 1) / 2 * scale
-    centre = _pixel_grid(height, width, position.device, dtype) + 0.5
+    centre = pixel_grid(height, width, position.device, dtype) + 0.5
     return torch.where(in_front, previous - centre, torch.inf)
 
 
@@ -159,7 +159,7 @@ def reproject(
 
     known = torch.isfinite(motion).all(1, keepdim=True)
     motion = torch.where(known, motion.to(dtype), 0)
-    q = _pixel_grid(height, width, motion.device, dtype) + motion
+    q = pixel_grid(height, width, motion.device, dtype) + motion
     # Far outside counts as just outside, which is exact as an integer.
     limit = numbers_like(q, [width + 1, height + 1]).reshape(1, 2, 1, 1)
     base = torch.minimum(torch.maximum(q.detach().floor(), torch.full_like(limit, -2)), limit)
@@ -314,7 +314,7 @@ def _check_images(motion: Tensor | None, **images: tuple[Tensor, str]) -> None:
     check_shapes(**images, **({} if motion is None else {"motion": (motion, "B 2 H W")}))
 
 
-def _pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+def pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """``(1, 2, H, W)`` integer pixel indices, x first."""
     # All of kornia comes with it, which takes as long to import as a single frame to denoise.
     from kornia.geometry.grid import create_meshgrid
