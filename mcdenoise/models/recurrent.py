@@ -120,16 +120,17 @@ def from_before(
         InputError: the state belongs to another method.
     """
     before = own_state(state, Before, frame, channels=channels, keeper=keeper)
-    nothing = frame.color.new_zeros(frame.color.shape[0], channels, *frame.size), torch.zeros_like(frame.color[:, :1])
+    shape = len(frame.color), channels, *frame.size
+    reset = ""
     if before is None:
-        _report("first frame", 0.0)
-        return nothing
-    if before.image.shape != nothing[0].shape:
-        _report("size change", 0.0)
-        return nothing
-    if not has_motion(frame, before.view_projection):
-        _report("no motion", 0.0)
-        return nothing
+        reset = "first frame"
+    elif before.image.shape != shape:
+        reset = "size change"
+    elif not has_motion(frame, before.view_projection):
+        reset = "no motion"
+    if before is None or reset:
+        _report(reset, 0.0)
+        return frame.color.new_zeros(shape), torch.zeros_like(frame.color[:, :1])
     motion = motion_unless_still(frame, before.view_projection)
     found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
     if sharp and motion is not None:

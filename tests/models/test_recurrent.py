@@ -12,6 +12,7 @@ from mcdenoise import Denoiser, Frame
 from mcdenoise.frame import Hints
 from mcdenoise.models import Needs, Output, Recurrent, State
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_WEIGHT
+from mcdenoise.ops import Surface, reproject, resample
 
 
 class Shows:
@@ -60,6 +61,25 @@ def test_the_previous_image_follows_the_motion() -> None:
     assert (inner.weight[..., 2:] == 1).all()
     assert not inner.weight[..., :2].any()
     assert not inner.previous[..., :2].any()
+
+
+def test_the_previous_image_is_resampled_where_all_taps_show_the_same_surface_and_else_interpolated() -> None:
+    inner = Shows()
+    model = Recurrent(inner)
+    first, motion = torch.rand(1, 3, 6, 9), (0.4, 0.3)
+    columns = torch.arange(9).expand(1, 1, 6, 9)
+    depth = torch.where(columns < 4, 1.0, 3.0)
+    _, state = model(moving(first, (0, 0), depth))
+    frame = moving(torch.rand(1, 3, 6, 9), motion, depth)
+    model(frame, state)
+    surface = Surface(depth=depth)
+    bilinear, weight = reproject(first, frame.motion, surface, surface)
+    bicubic = resample(first, frame.motion)
+    # The third column's taps are on both sides of the edge, and those of the last column and row are outside.
+    whole = (columns != 3) & (columns != 8) & (torch.arange(6).reshape(1, 1, 6, 1) != 5)
+    assert torch.equal(weight > 0.999, whole)
+    assert torch.equal(inner.previous, torch.where(whole, bicubic, bilinear))
+    assert (bicubic - bilinear).abs()[whole.expand_as(first)].mean() > 0.01
 
 
 def test_pixels_of_another_surface_have_no_previous_image() -> None:
