@@ -120,7 +120,7 @@ def from_before(
         InputError: the state belongs to another method.
     """
     before = own_state(state, Before, frame, channels=channels, keeper=keeper)
-    shape = len(frame.color), channels, *frame.size
+    shape = (frame.color.shape[0], channels, *frame.size)
     reset = ""
     if before is None:
         reset = "first frame"
