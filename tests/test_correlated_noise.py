@@ -74,6 +74,20 @@ def test_a_normal_shows_correlation_of_little_noise(kind: str) -> None:
     assert noise_is_spread(through_film(albedo * light(0)), albedo, torch.rand_like(normal))
 
 
+def test_the_correlation_of_many_samples_through_a_tent_is_recognised() -> None:
+    torch.manual_seed(1)
+    # The weights of a tent of radius 1 in its own pixel and the next have the autocorrelation 1/6, 2/3, 1/6; so have
+    # two taps whose product is 1/6 and whose sum is 1.
+    near = (1 + (1 / 3) ** 0.5) / 2
+    taps = torch.tensor([near, 1 - near])
+    assert float(taps.prod()) == pytest.approx(1 / 6)
+    noise = torch.randn(1, 1, HEIGHT, WIDTH)
+    through_tent = F.conv2d(F.pad(noise, (1, 0, 1, 0), mode="circular"), (taps[:, None] * taps)[None, None])
+    albedo, normal = texture("grey"), torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
+    assert noise_is_spread(albedo * (1 + 0.1 * through_tent), albedo, normal)
+    assert not noise_is_spread(albedo * (1 + 0.1 * noise), albedo, normal)
+
+
 def test_an_image_without_noise_has_no_correlated_noise() -> None:
     smooth = (2 + torch.sin(ROWS / 9) * torch.cos(COLUMNS / 7)).expand(1, 3, -1, -1)
     assert not noise_is_spread(smooth, None)
