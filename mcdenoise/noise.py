@@ -51,7 +51,7 @@ def noise_is_spread(color: Tensor, albedo: Tensor | None, normal: Tensor | None 
     # The centre of a large image suffices.
     rows, columns = (slice(max(side - _MIDDLE, 0) // 2, (side + _MIDDLE) // 2) for side in color.shape[-2:])
     features = [each.detach()[..., rows, columns] for each in (albedo, normal) if each is not None]
-    light = color.detach()[..., rows, columns]
+    light = color.detach()[..., rows, columns].to(torch.promote_types(color.dtype, torch.float32))
     if albedo is not None:
         light = light / features[0].clamp_min(_DARKEST)
     brightness = light.mean(1)

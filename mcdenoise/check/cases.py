@@ -1054,6 +1054,7 @@ def _resampling_cases() -> tuple[Case, ...]:
     return (
         case("5x7", "ordinary", (1, 1, 5, 7)),
         case("batch of 2, RGB", "ordinary", (2, 3, 4, 5)),
+        case("RGB", "ordinary", (1, 3, 4, 5)),
         case("one row, 5 channels", "ordinary", (1, 5, 1, 5)),
         case("one pixel", "ordinary", (1, 3, 1, 1)),
         # At a whole pixel the value is at its limit, where the derivatives jump.

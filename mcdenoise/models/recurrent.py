@@ -18,7 +18,7 @@ from mcdenoise.ops import Surface, demodulate, remodulate, reproject, resample
 # Keys in ``frame.extra``: the reprojected previous image, and its weight, the fraction that shows the same surface.
 PREVIOUS, PREVIOUS_WEIGHT = "previous", "previous_weight"
 PREVIOUS_LIGHT = "previous_light"  # the previous image with the albedo of this frame
-_WHOLE = 0.999  # smallest weight of all four taps, which is 1 up to rounding
+_ROUNDED = 8  # largest rounding error of the weight of all four taps, which is 1, in units of eps
 
 
 class Before(NamedTuple):
@@ -43,8 +43,8 @@ class Recurrent(Wrapper):
 
     The method finds it in ``frame.extra``, ``(B, 3, H, W)`` each, 0 where no tap shows the same surface:
 
-    - ``previous``: the image. Every reprojection blurs it a little more, though where all four taps show the same
-      surface they are resampled without bilinear interpolation (:func:`mcdenoise.ops.resample`).
+    - ``previous``: the image. Where one of the four nearest pixels shows another surface, every reprojection blurs it a
+      little more; elsewhere :func:`mcdenoise.ops.resample` keeps it sharp.
     - ``previous_light``: the demodulated image multiplied by the albedo of this frame. Textures stay sharp; but an
       albedo of few samples per pixel adds its own noise.
 
@@ -110,7 +110,7 @@ def from_before(
         state: result of :func:`to_be_kept`, or ``None``.
         channels: number of channels of the image.
         keeper: name of the method for messages.
-        sharp: whether pixels of which all four taps show the same surface are resampled by bicubic interpolation.
+        sharp: whether pixels whose four nearest show the same surface are resampled by bicubic interpolation.
 
     Returns:
         ``(B, channels, H, W)`` image, and ``(B, 1, H, W)`` in [0, 1] the fraction that shows the same surface; both are
@@ -134,7 +134,8 @@ def from_before(
     motion = motion_unless_still(frame, before.view_projection)
     found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
     if sharp and motion is not None:
-        found = torch.where(weight > _WHOLE, resample(before.image, motion), found)
+        whole = weight > 1 - _ROUNDED * torch.finfo(weight.dtype).eps
+        found = torch.where(whole, resample(before.image, motion), found)
     weight = weight * before.weight
     _report("", None)
     tell_history(weight.mean())

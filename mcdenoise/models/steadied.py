@@ -38,9 +38,9 @@ class Steadied(nn.Module):
     fraction of the previous frame that shows the same surface; ``d_s`` are the differences of the means over 3x3 and
     15x15 pixels, and ``noise`` is the mean deviation of single samples over 15x15, all relative to the mean.
 
-    The previous result is known in two forms: as it was, which every reprojection blurs; and demodulated and multiplied
-    by this frame's albedo, which is sharp, but has the noise of both albedos. Their mean has a smaller error than
-    either. An albedo from rays through the pixels' centres has no noise, so the second form is taken alone.
+    The previous result is known in two forms: as it was, which reprojection blurs a little; and demodulated and
+    multiplied by this frame's albedo, which is sharp, but has the noise of both albedos. Their mean has a smaller error
+    than either. An albedo from rays through the pixels' centres has no noise, so the second form is taken alone.
 
     It has to be wrapped in :class:`mcdenoise.models.Recurrent`, and takes ``noisy`` and ``centred`` of
     :class:`mcdenoise.models.with_oidn.WithOidn` from ``frame.extra``.

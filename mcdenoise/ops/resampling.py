@@ -26,9 +26,10 @@ def resample(previous: Tensor, motion: Tensor) -> Tensor:
     previous[q_k]``, limited to the range of the four nearest of them. ``k`` is Keys' kernel with ``a = -0.75``, that of
     ``torch.nn.functional.grid_sample``: ``(a + 2) |d|^3 - (a + 3) |d|^2 + 1`` up to a distance of 1, and
     ``a |d|^3 - 5 a |d|^2 + 8 a |d| - 4 a`` from there to 2. Bilinear interpolation blurs a history a little in every
-    frame; this hardly does, and its limit keeps bright pixels from leaving dark rings.
+    frame; this sharpens some frequencies by a few per cent. Its limit stops that, and dark rings around bright pixels.
 
-    It tests no surfaces: take it where :func:`reproject` keeps all four taps.
+    It tests no surfaces: take it where :func:`reproject` keeps all four taps. The twelve others may show another
+    surface, but cannot move the value out of the range of the four.
 
     Args:
         previous: ``(B, C, H, W)`` anything of the previous frame, finite. Outside, its edge is repeated.
@@ -57,8 +58,9 @@ def resample(previous: Tensor, motion: Tensor) -> Tensor:
     """
     height, width = previous.shape[-2:]
     dtype = torch.promote_types(previous.dtype, torch.float32)
+    motion = motion.to(dtype)
     known = torch.isfinite(motion).all(1, keepdim=True)
-    q = pixel_grid(height, width, motion.device, dtype) + torch.where(known, motion.to(dtype), 0)
+    q = pixel_grid(height, width, motion.device, dtype) + torch.where(known, motion, 0)
     # Far outside counts as just outside.
     limit = numbers_like(q, [width, height]).reshape(1, 2, 1, 1)
     base = torch.minimum(torch.maximum(q.detach().floor(), torch.full_like(limit, -1)), limit)
