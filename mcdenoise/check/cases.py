@@ -1057,8 +1057,8 @@ def _resampling_cases() -> tuple[Case, ...]:
         case("RGB", "ordinary", (1, 3, 4, 5)),
         case("one row, 5 channels", "ordinary", (1, 5, 1, 5)),
         case("one pixel", "ordinary", (1, 3, 1, 1)),
-        # At a whole pixel the value is at its limit, where the derivatives jump.
-        case("still", "ordinary", (1, 3, 2, 3), lambda motion: motion.zero_(), smooth=()),
+        # Zero is a whole pixel, where the derivative in the motion jumps.
+        case("still", "ordinary", (1, 3, 2, 3), lambda motion: motion.zero_(), smooth=("previous",)),
         case("fireflies", "stiff", (1, 3, 4, 5), draw=_radiance),
         case("out of the image", "extreme", (1, 3, 2, 3), far_out),
         case("motion unknown", "extreme", (1, 1, 2, 4), unknown),

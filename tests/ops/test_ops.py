@@ -371,6 +371,8 @@ REFUSED: list[tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], type[Ex
     (ops.motion_from_position, (THREE, image(4, 4)), {}, ValueError, "previous_view_projection: expected shape"),
     (ops.motion_from_position, (THREE, image(2, 4, 4)), {}, ValueError, "previous_view_projection: expected B = 1"),
     (ops.reproject, (THREE, THREE), {}, ValueError, "motion: expected shape (B, 2, H, W), found (1, 3, 4, 5)"),
+    (ops.resample, (THREE, THREE), {}, ValueError, "motion: expected shape (B, 2, H, W), found (1, 3, 4, 5)"),
+    (ops.resample, (THREE, THREE[:, :2, 1:]), {}, ValueError, "motion: expected H = 4 as in previous, found 3"),
     (ops.history_lag, (THREE, ONE, ONE), {}, ValueError, "recent: expected C = 3 as in history, found 1"),
     (
         ops.history_lag,
